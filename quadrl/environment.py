@@ -1,0 +1,339 @@
+"""The core of every door: a task and a simulation make transitions.
+
+One environment flies one aircraft (`num_envs=None`, arrays without a leading axis) or a batch.
+It keeps the clock, the generators and the episode's fields; it resets what it is told to and
+never by itself. Aircraft i of a batch seeded with s is the single environment seeded with s + i.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from quadrl import tasks
+from quadrl.rotation import Array
+from quadrl.simulation import BatchSimulation, Rows, Simulation, SingleSimulation
+from quadrl.state import State
+from quadrl.task import EPISODE_DRAWS, Draw, Errors, Fields, Measures, Task, total
+from quadrl.vehicle import ROTORS, Vehicle
+
+Observation = dict[str, Array]
+MAX_ENVS = 1 << 20
+
+
+class ActionError(ValueError):
+    """An action of the wrong shape, or with a number that is not finite."""
+
+
+@dataclasses.dataclass(slots=True)
+class Transition:
+    """What one control step gave; arrays (...) of the environment's shape, one row an aircraft.
+
+    The parts of the observation are live views: copy them before the next step or reset.
+    """
+
+    observation: Observation
+    """Named parts (..., k) in the task's order."""
+    reward: Array
+    """The sum of the terms."""
+    reward_terms: dict[str, Array]
+    """Named terms of the reward."""
+    terminated: Array
+    """bool: over by failure, or by success where the task says so."""
+    truncated: Array
+    """bool: over by the clock; never together with terminated."""
+    is_success: Array
+    """bool: over, and what was asked is done."""
+    diverged: Array
+    """bool: the simulation broke down; the state is the last good one, and terminated is set."""
+    error: Array
+    """The task's error [m]."""
+
+
+class Environment:
+    """A task flown by a vehicle in a simulation."""
+
+    def __init__(
+        self,
+        task: str | Task,
+        *,
+        num_envs: int | None = None,
+        seed: int | None = None,
+        vehicle: Vehicle | None = None,
+        num_threads: int = 0,
+        simulation: Simulation | None = None,
+    ) -> None:
+        """Make the simulation and seed the generators.
+
+        Args:
+            task: A name of the catalogue or a task.
+            num_envs: Number of aircraft N; None for one without a leading axis.
+            seed: Aircraft i is seeded with seed + i; None draws one from the system.
+            vehicle: The aircraft; None for the paper's.
+            num_threads: Threads of a batch; 0 for every core.
+            simulation: Use this one instead of making one (then N is its own).
+
+        Raises:
+            ValueError: Unknown task, or a number of aircraft that cannot be.
+            NativeError: The rotor callbacks cannot be built or installed.
+        """
+        self.task = tasks.make(task)
+        self.vehicle = vehicle or (simulation.vehicle if simulation else Vehicle())
+        if simulation is None:
+            simulation = _simulation(self.task, self.vehicle, num_envs, num_threads)
+        self.simulation = simulation
+        self.shape = simulation.shape
+        self.num_envs = self.shape[0] if self.shape else 1
+        self.horizon_steps = max(1, round(self.task.horizon / self.vehicle.control_step))
+        settle_steps = round(self.task.settle / self.vehicle.control_step)
+        self._settle_steps = min(max(1, settle_steps), self.horizon_steps)
+        self.layout: dict[str, slice] = {}
+        """Where each named part of the observation stands in the flat vector."""
+        self.size = 0
+        for name, part in self.task.observation.items():
+            self.layout[name] = slice(self.size, self.size + part.size)
+            self.size += part.size
+        self.generators: list[np.random.Generator] = []
+        self.seed(seed)
+        self._steps: Any = None
+        self.fields: Fields
+        self._measures: Measures
+        self._command: np.ndarray
+
+    def seed(self, seed: int | None = None) -> int:
+        """Give every aircraft a new generator; returns the seed of the first."""
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        self.generators = [np.random.default_rng(seed + i) for i in range(self.num_envs)]
+        return seed
+
+    def reset(self, rows: Rows = None) -> Observation:
+        """Begin an episode.
+
+        Args:
+            rows: Numbers (n,) or mask (N,) of the aircraft that begin one; None for all.
+
+        Returns:
+            The observation of those aircraft, parts (n, k), or (k,) for a single one.
+        """
+        if rows is not None:
+            rows = np.asarray(rows)
+            rows = np.flatnonzero(rows) if rows.dtype == bool else rows.astype(np.int64)
+        if self._steps is None:
+            if rows is not None and len(rows) < self.num_envs:
+                raise RuntimeError("the first reset must be of every aircraft")
+            rows = None
+        everyone = rows is None
+        if self.shape and rows is None:
+            rows = np.arange(self.num_envs)
+        start, fields = self.task.sample(Draw(self._draw_block(rows)), self.vehicle)
+        state = self.simulation.place(rows, start)
+        measures = self.task.measure(state, fields)
+        observation = self.task.observe(state, measures, fields, self.vehicle)
+        if everyone:
+            self.fields, self._measures = fields, measures
+            self._steps = np.zeros(self.shape, dtype=np.int64)
+            self._error_sum, self._final_sum = np.zeros(self.shape), np.zeros(self.shape)
+        else:
+            _put(self.fields, rows, fields)
+            _put(self._measures, rows, measures)
+            self._steps[rows] = 0
+            self._error_sum[rows] = self._final_sum[rows] = 0.0
+        return observation
+
+    def step(self, action: Array) -> Transition:
+        """Fly one control step.
+
+        Args:
+            action: (..., 4); clipped to [-1, 1].
+
+        Returns:
+            The transition. An aircraft whose episode is over flies on until it is reset.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite.
+            RuntimeError: There was no reset before.
+        """
+        self.begin(action)
+        self.simulation.advance()
+        return self.finish()
+
+    def begin(self, action: Array) -> None:
+        """First half of a step: the commands to the rotors."""
+        if self._steps is None:
+            raise RuntimeError("call reset before the first step")
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (*self.shape, ROTORS):
+            raise ActionError(
+                f"an action of shape {action.shape} was given; {(*self.shape, ROTORS)} is expected"
+            )
+        if not np.isfinite(action).all():
+            where = np.argwhere(~np.isfinite(action))[0]
+            raise ActionError(
+                f"action{where.tolist()} is {action[tuple(where)]}: every number must be finite"
+            )
+        self._command = self.vehicle.rotor_command(action)
+        self.simulation.ctrl[...] = self._command
+
+    def finish(self) -> Transition:
+        """Second half of a step, after the simulation has advanced."""
+        task, vehicle = self.task, self.vehicle
+        diverged = self.simulation.read()
+        self._steps = self._steps + 1
+        state = self.simulation.state
+        state.time[...] = self._steps * vehicle.control_step
+        measures = task.measure(state, self.fields)
+        terms = task.reward(self._measures, measures, self._command, vehicle)
+        terminated = task.terminated(state, measures, self.fields)
+        if diverged is None:
+            diverged = np.zeros(self.shape, dtype=bool) if self.shape else np.False_
+        else:
+            terminated = terminated | diverged
+        truncated = (self._steps >= self.horizon_steps) & ~terminated
+        error = task.error(state, measures, self.fields)
+        is_success = self._judge(state, error, terminated, truncated)
+        fields = task.update(state, measures, self.fields)
+        if fields is not self.fields:
+            self.fields, measures = fields, task.measure(state, fields)
+        self._measures = measures
+        return Transition(
+            observation=task.observe(state, measures, fields, vehicle),
+            reward=total(terms),
+            reward_terms=terms,
+            terminated=terminated,
+            truncated=truncated,
+            is_success=is_success & ~diverged,
+            diverged=diverged,
+            error=error,
+        )
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Names of the reward's terms, in their order."""
+        start, fields = self.task.sample(Draw(np.full(EPISODE_DRAWS, 0.5)), self.vehicle)
+        state = State.of_coordinates(**vars(start), time=np.zeros(()))
+        measures = self.task.measure(state, fields)
+        return tuple(self.task.reward(measures, measures, start.rotor_speed, self.vehicle))
+
+    def flatten(self, observation: Observation, out: np.ndarray | None = None) -> np.ndarray:
+        """The parts of an observation as one vector (..., size), float32 unless `out` is given."""
+        parts = list(observation.values())
+        if not self.shape:
+            return np.concatenate(parts, out=out, dtype=None if out is not None else np.float32)
+        if out is None:
+            out = np.empty((len(parts[0]), self.size), dtype=np.float32)
+        for part, columns in zip(parts, self.layout.values(), strict=True):
+            out[:, columns] = part
+        return out
+
+    def markers(self, row: int = 0) -> Sequence[Any]:
+        """What the task asks to be drawn of one aircraft's episode."""
+        fields = self.fields
+        if self.shape:
+            values = {f.name: getattr(fields, f.name)[row] for f in _fields(fields)}
+            fields = type(fields)(**values)
+        return self.task.markers(fields)
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Everything that the next steps depend on, as arrays: `restore` continues bit for bit."""
+        saved = {f"simulation.{k}": v for k, v in self.simulation.save().items()}
+        saved |= {"steps": self._steps, "error": self._error_sum, "final": self._final_sum}
+        for name, record in (("fields", self.fields), ("measures", self._measures)):
+            saved |= {f"{name}.{f.name}": getattr(record, f.name) for f in _fields(record)}
+        saved["generators"] = np.array([_generator_words(g) for g in self.generators])
+        return {name: np.array(value) for name, value in saved.items()}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> Observation:
+        """Take up what `save` gave; returns the observation of that moment."""
+        prefix = "simulation."
+        self.simulation.restore(
+            {k.removeprefix(prefix): v for k, v in saved.items() if k.startswith(prefix)}
+        )
+        if self._steps is None:
+            self.reset()  # makes the records, which are filled below
+            self.simulation.restore(
+                {k.removeprefix(prefix): v for k, v in saved.items() if k.startswith(prefix)}
+            )
+        self._steps = saved["steps"].copy()
+        self._error_sum, self._final_sum = saved["error"].copy(), saved["final"].copy()
+        for name in ("fields", "measures"):
+            record = getattr(self, "fields" if name == "fields" else "_measures")
+            values = {f.name: saved[f"{name}.{f.name}"].copy() for f in _fields(record)}
+            setattr(
+                self, "fields" if name == "fields" else "_measures", type(record)(**values)
+            )
+        for generator, words in zip(self.generators, saved["generators"], strict=True):
+            _set_generator_words(generator, words)
+        state = self.simulation.state
+        return self.task.observe(state, self._measures, self.fields, self.vehicle)
+
+    def _judge(self, state: State, error: Array, terminated: Array, truncated: Array) -> Array:
+        """Add up the errors, and decide on the episodes that end now."""
+        self._error_sum = self._error_sum + error
+        settling = self._steps > self.horizon_steps - self._settle_steps
+        self._final_sum = self._final_sum + error * settling
+        over = terminated | truncated
+        if not over.any():
+            return over
+        errors = Errors(
+            final=self._final_sum / self._settle_steps, mean=self._error_sum / self._steps
+        )
+        return over & self.task.success(state, self.fields, errors, terminated, truncated)
+
+    def _draw_block(self, rows: Rows) -> np.ndarray:
+        if rows is None:
+            return self.generators[0].random(EPISODE_DRAWS)
+        block = np.empty((len(rows), EPISODE_DRAWS))
+        for into, row in zip(block, rows, strict=True):
+            self.generators[row].random(out=into)
+        return block
+
+
+def _simulation(
+    task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int
+) -> Simulation:
+    if num_envs is None:
+        model = vehicle.compile_lean(contact=task.contact)
+        import mujoco
+
+        return SingleSimulation(vehicle, model, mujoco.MjData(model), altitude=task.altitude)
+    if not isinstance(num_envs, (int, np.integer)) or not 1 <= num_envs <= MAX_ENVS:
+        raise ValueError(f"num_envs = {num_envs!r}: a whole number from 1 to {MAX_ENVS} is allowed")
+    return BatchSimulation(
+        vehicle,
+        int(num_envs),
+        altitude=task.altitude,
+        contact=task.contact,
+        num_threads=num_threads,
+    )
+
+
+def _fields(record: Any) -> Sequence[dataclasses.Field]:
+    return dataclasses.fields(record)
+
+
+def _put(record: Any, rows: Rows, new: Any) -> None:
+    """Write rows of a record of arrays."""
+    for field in _fields(record):
+        getattr(record, field.name)[rows] = getattr(new, field.name)
+
+
+def _generator_words(generator: np.random.Generator) -> list[int]:
+    """The state of a PCG64 generator as six 64-bit words."""
+    state: Any = generator.bit_generator.state
+    mask = (1 << 64) - 1
+    words = [w for n in (state["state"]["state"], state["state"]["inc"]) for w in (n >> 64, n & mask)]
+    return [np.uint64(w) for w in (*words, state["has_uint32"], state["uinteger"])]
+
+
+def _set_generator_words(generator: np.random.Generator, words: np.ndarray) -> None:
+    high, low, inc_high, inc_low, has, value = (int(w) for w in words)
+    generator.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": high << 64 | low, "inc": inc_high << 64 | inc_low},
+        "has_uint32": has,
+        "uinteger": value,
+    }

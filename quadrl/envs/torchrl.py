@@ -1,0 +1,134 @@
+"""Door three: a batched TorchRL environment.
+
+Not imported with `import quadrl`, since it needs torch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from quadrl import tasks
+from quadrl.environment import Environment
+from quadrl.task import Task
+from quadrl.vehicle import ROTORS, Vehicle
+
+FLAGS = ("done", "terminated", "truncated", "is_success")
+
+
+class QuadrotorEnv(EnvBase):
+    """N aircraft, batch size [N]; observation (N, size) float32, action (N, 4) in [-1, 1].
+
+    Simulated on the CPU, whatever the device of the tensors. Beside the observation stand
+    `is_success`, `error` [m] and, when asked for, the named `reward_terms`.
+    """
+
+    def __init__(
+        self,
+        task: str | Task = "hover",
+        num_envs: int = 1,
+        seed: int | None = None,
+        device: str | torch.device = "cpu",
+        *,
+        vehicle: Vehicle | None = None,
+        num_threads: int = 0,
+        reward_terms: bool = False,
+        **options: Any,
+    ) -> None:
+        """Make the environments.
+
+        Args:
+            task: A name of the catalogue or a task.
+            num_envs: N.
+            seed: Aircraft i is seeded with seed + i.
+            device: Of the tensors.
+            vehicle: The aircraft; None for the paper's.
+            num_threads: Threads of the simulation; 0 for every core.
+            reward_terms: Whether to give the named terms of the reward (they cost time).
+            **options: Fields of the task.
+
+        Raises:
+            ValueError: Unknown task or option, or an impossible number of environments.
+        """
+        self.environment = Environment(
+            tasks.make(task, **options),
+            num_envs=num_envs,
+            seed=seed,
+            vehicle=vehicle,
+            num_threads=num_threads,
+        )
+        super().__init__(device=device, batch_size=[num_envs])
+        self._terms = self.environment.term_names if reward_terms else ()
+        shape = (num_envs,)
+        size = self.environment.size
+        parts: dict[str, Any] = {
+            "observation": Unbounded((*shape, size), dtype=torch.float32),
+            "is_success": Binary(shape=(*shape, 1), dtype=torch.bool),
+            "error": Unbounded((*shape, 1), dtype=torch.float32),
+        }
+        if self._terms:
+            terms = {name: Unbounded((*shape, 1)) for name in self._terms}
+            parts["reward_terms"] = Composite(terms, shape=shape)
+        self.observation_spec = Composite(parts, shape=shape).to(self.device)
+        self.action_spec = Bounded(-1.0, 1.0, (*shape, ROTORS), dtype=torch.float32).to(self.device)
+        self.reward_spec = Unbounded((*shape, 1), dtype=torch.float32).to(self.device)
+        self.done_spec = Composite(
+            {flag: Binary(shape=(*shape, 1), dtype=torch.bool) for flag in FLAGS[:3]}, shape=shape
+        ).to(self.device)
+        self._restored = False
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Go on where `environment.save` was called: the next full reset returns that moment."""
+        self._observation = self.environment.flatten(self.environment.restore(saved))
+        self._restored = True
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is not None and not mask.all():
+            rows = mask.reshape(-1).cpu().numpy()
+            self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
+        elif not self._restored:
+            self._observation = self.environment.flatten(self.environment.reset())
+        flags = {flag: torch.zeros(self.num_envs, 1, dtype=torch.bool) for flag in FLAGS}
+        zeros = {name: torch.zeros(self.num_envs, 1) for name in ("error", *self._terms)}
+        return self._pack(flags | {"error": zeros.pop("error")}, zeros)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._restored = False
+        now = self.environment.step(tensordict["action"].detach().cpu().numpy())
+        self._observation = self.environment.flatten(now.observation)
+        columns = {
+            "reward": now.reward.astype(np.float32),
+            "done": now.terminated | now.truncated,
+            "terminated": now.terminated,
+            "truncated": now.truncated,
+            "is_success": now.is_success,
+            "error": now.error.astype(np.float32),
+        }
+        terms = {name: now.reward_terms[name].astype(np.float32) for name in self._terms}
+        return self._pack(
+            {name: torch.from_numpy(column[:, None]) for name, column in columns.items()},
+            {name: torch.from_numpy(column[:, None]) for name, column in terms.items()},
+        )
+
+    def _pack(
+        self, columns: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]
+    ) -> TensorDictBase:
+        content: dict[str, Any] = {"observation": torch.from_numpy(self._observation.copy())}
+        content |= columns
+        if terms:
+            content["reward_terms"] = TensorDict(terms, batch_size=self.batch_size)
+        return TensorDict(content, batch_size=self.batch_size).to(self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.environment.seed(seed)
+
+    @property
+    def num_envs(self) -> int:
+        """N."""
+        return self.environment.num_envs

@@ -1,0 +1,188 @@
+"""The compiled part: MuJoCo callbacks of the rotors, and the state kernel.
+
+The C sources beside this file are compiled at first use with the machine's own compiler against
+the headers of the installed mujoco, because they read the structs of exactly that version. The
+library is kept in a cache folder (`$QUADRL_CACHE`, else the user's cache folder), one for each
+version of mujoco, of the sources and of the flags.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+
+import mujoco
+
+SOURCES = ("callbacks.c", "state.c")
+HEADERS = ("equations.h",)
+# No contraction: a fused multiply-add would round otherwise than NumPy does.
+FLAGS = ("-std=c11", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off")
+CALLBACKS = ("act_dyn", "act_gain", "passive")
+
+_FOLDER = Path(__file__).parent
+_ACTUATOR_CALLBACK = ctypes.CFUNCTYPE(
+    ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int
+)
+_GENERIC_CALLBACK = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+
+
+class NativeError(RuntimeError):
+    """The C part cannot be built, is for another mujoco, or is not installed."""
+
+
+def cache_folder() -> Path:
+    """The folder of compiled libraries: `$QUADRL_CACHE` or the user's cache folder."""
+    if chosen := os.environ.get("QUADRL_CACHE"):
+        return Path(chosen)
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "quadrl"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "quadrl"
+
+
+def compiler() -> str:
+    """Path of the C compiler: `$CC`, cc, gcc or clang.
+
+    Raises:
+        NativeError: None is there; the message says what to install.
+    """
+    for name in filter(None, (os.environ.get("CC"), "cc", "gcc", "clang")):
+        if path := shutil.which(name):
+            return path
+    raise NativeError(
+        "no C compiler found (looked for $CC, cc, gcc, clang); install one: "
+        "`apt-get install build-essential` on Debian or Ubuntu, `dnf install gcc` on Fedora, "
+        "`xcode-select --install` on macOS"
+    )
+
+
+def build(include: Path | None = None) -> Path:
+    """Compile the library unless the cache holds it.
+
+    Args:
+        include: Folder with mujoco's headers; None for those of the installed package.
+
+    Returns:
+        The path of the shared library.
+
+    Raises:
+        NativeError: There is no compiler, or it refused the sources.
+    """
+    include = include or Path(mujoco.__file__).parent / "include"
+    digest = hashlib.sha256(" ".join((*FLAGS, platform.machine(), str(include))).encode())
+    for name in HEADERS + SOURCES:
+        digest.update((_FOLDER / name).read_bytes())
+    digest.update((include / "mujoco" / "mujoco.h").read_bytes())
+    name = f"quadrl-mujoco-{mujoco.__version__}-{digest.hexdigest()[:16]}.so"
+    folder = cache_folder()
+    if (folder / name).exists():
+        return folder / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        scratch = tempfile.mkdtemp(dir=folder)
+    except OSError:  # a read-only home: a library for this process alone
+        folder = Path(tempfile.mkdtemp(prefix="quadrl-"))
+        scratch = tempfile.mkdtemp(dir=folder)
+    try:
+        command = [compiler(), *FLAGS, f"-I{include}", "-o", f"{scratch}/{name}"]
+        command += [str(_FOLDER / source) for source in SOURCES] + ["-lm"]
+        outcome = subprocess.run(command, capture_output=True, text=True)
+        if outcome.returncode != 0:
+            raise NativeError(
+                f"the C compiler failed: {' '.join(command)}\n{outcome.stderr.strip()[-2000:]}"
+            )
+        os.replace(f"{scratch}/{name}", folder / name)  # whole or not at all
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return folder / name
+
+
+def load(path: Path) -> ctypes.CDLL:
+    """Open a compiled library and make sure that it belongs to the mujoco that runs.
+
+    Raises:
+        NativeError: It was compiled against another version of mujoco.
+    """
+    opened = ctypes.CDLL(str(path))
+    built, running = opened.quadrl_mujoco_version(), mujoco.mj_version()
+    if built != running:
+        raise NativeError(
+            f"{path} was compiled against mujoco {built}, but mujoco {running} is running; "
+            "delete it, and it is compiled again at the next use"
+        )
+    for name in CALLBACKS:
+        kind = _GENERIC_CALLBACK if name == "passive" else _ACTUATOR_CALLBACK
+        address = ctypes.cast(getattr(opened, f"quadrl_{name}"), ctypes.c_void_p).value
+        setattr(opened, name, kind(address))
+    opened.quadrl_state.restype = ctypes.c_int64
+    pointer, integer = ctypes.c_void_p, ctypes.c_int64
+    opened.quadrl_state.argtypes = (
+        [integer] + [pointer] * 4 + [integer, pointer, pointer, integer]
+    )
+    return opened
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The library for this process, built when needed."""
+    return load(build())
+
+
+def install(replace: bool = False) -> None:
+    """Install the rotor callbacks in this process (idempotent).
+
+    Every model that `Vehicle.compile` makes needs them; it calls this itself. A process that
+    receives such a model from elsewhere (a spawned worker) calls it once.
+
+    Args:
+        replace: Take over callbacks that somebody else installed, with a warning.
+
+    Raises:
+        NativeError: Somebody else's callback is installed and `replace` is False.
+    """
+    ours = library()
+    foreign = [
+        name
+        for name in CALLBACKS
+        if (current := _current(name)) is not None and current != getattr(ours, name)
+    ]
+    if foreign and not replace:
+        raise NativeError(
+            f"another callback is installed as {_names(foreign)}; quadrl does not take it over "
+            "unasked: remove it, or call quadrl.native.install(replace=True)"
+        )
+    if foreign:
+        warnings.warn(f"quadrl replaces the callback {_names(foreign)}", stacklevel=2)
+    for name in CALLBACKS:
+        getattr(mujoco, f"set_mjcb_{name}")(getattr(ours, name))
+
+
+def check_installed() -> None:
+    """Raise unless the rotor callbacks are in place.
+
+    Raises:
+        NativeError: One of them was removed or replaced: the physics would be wrong.
+    """
+    ours = library()
+    missing = [name for name in CALLBACKS if _current(name) != getattr(ours, name)]
+    if missing:
+        raise NativeError(
+            f"the rotor callback {_names(missing)} was removed or replaced by somebody else, and "
+            "the physics would be wrong; call quadrl.native.install() again"
+        )
+
+
+def _current(name: str) -> object:
+    return getattr(mujoco, f"get_mjcb_{name}")()
+
+
+def _names(callbacks: list[str]) -> str:
+    return ", ".join(f"mjcb_{name}" for name in callbacks)

@@ -1,0 +1,135 @@
+"""A trained policy as numbers: NumPy in, NumPy out, no torch.
+
+The file is safetensors: arrays and a table of strings, nothing that could run. Its network is the
+paper's: hidden layers of tanh, and the mean and the log-variance of a normal distribution over
+the actions; observations are normalised with the mean and the deviation of the training.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+FORMAT = "quadrl-policy-1"
+FILE = "policy.safetensors"
+CLIP = 10.0
+"""Normalised observations are held within +-CLIP."""
+
+
+class PolicyError(ValueError):
+    """A file that is no policy of quadrl, or a policy for something else."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """The mean action of a trained network."""
+
+    weights: tuple[np.ndarray, ...]
+    """Of each layer, (outputs, inputs); the last gives mean and log-variance, (2 * 4, hidden)."""
+    biases: tuple[np.ndarray, ...]
+    """Of each layer, (outputs,)."""
+    mean: np.ndarray
+    """Of the observations in training, (size,)."""
+    deviation: np.ndarray
+    """Of the observations in training, (size,)."""
+    task: str
+    """The task that it was trained for."""
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """How it was made: algorithm, seed, steps, vehicle, action interface."""
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """The mean action.
+
+        Args:
+            observation: Flat vector (..., size) in the order of the task's parts.
+
+        Returns:
+            Actions (..., 4), within [-1, 1].
+
+        Raises:
+            ValueError: The observation has another size.
+        """
+        observation = np.asarray(observation, dtype=np.float32)
+        if observation.shape[-1:] != self.mean.shape:
+            raise ValueError(
+                f"an observation of shape {observation.shape} was given; the policy for "
+                f"{self.task} expects (..., {len(self.mean)})"
+            )
+        hidden = np.clip((observation - self.mean) / self.deviation, -CLIP, CLIP)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = np.tanh(hidden @ weight.T + bias)
+        output = hidden @ self.weights[-1].T + self.biases[-1]
+        return np.clip(output[..., : output.shape[-1] // 2], -1.0, 1.0)
+
+    def save(self, path: str | Path) -> None:
+        """Write the file, whole or not at all."""
+        arrays = {"mean": self.mean, "deviation": self.deviation}
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
+        arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
+        header = {"format": FORMAT, "task": self.task, "metadata": json.dumps(self.metadata)}
+        scratch = Path(f"{path}.part")
+        save_file(arrays, scratch, metadata=header)
+        os.replace(scratch, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Policy:
+        """Read a policy; nothing in the file is run.
+
+        Args:
+            path: A .safetensors file, or a run folder that holds policy.safetensors.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            PolicyError: It is damaged, or no policy of quadrl.
+        """
+        path = Path(path)
+        file = path / FILE if path.is_dir() else path
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"no policy at {file}; give a run folder (quadrl train ... --out FOLDER makes one) "
+                "or a .safetensors file"
+            )
+        try:
+            with safe_open(file, framework="numpy") as opened:
+                header = opened.metadata() or {}
+                arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+        except (SafetensorError, OSError, ValueError) as error:
+            raise PolicyError(f"{file} is damaged or no safetensors file: {error}") from error
+        if header.get("format") != FORMAT:
+            raise PolicyError(
+                f"{file} is no policy of this version of quadrl: its format is "
+                f"{header.get('format')!r}, {FORMAT!r} is expected"
+            )
+        return cls._of_arrays(file, arrays, header)
+
+    @classmethod
+    def _of_arrays(
+        cls, file: Path, arrays: dict[str, np.ndarray], header: dict[str, str]
+    ) -> Policy:
+        """Check that the arrays make a network, and build it."""
+        try:
+            layers = (len(arrays) - 2) // 2
+            weights = tuple(arrays[f"weight_{k}"] for k in range(layers))
+            biases = tuple(arrays[f"bias_{k}"] for k in range(layers))
+            mean, deviation = arrays["mean"], arrays["deviation"]
+            metadata = json.loads(header["metadata"])
+            task = header["task"]
+        except (KeyError, ValueError) as error:
+            raise PolicyError(f"{file} lacks a part of a policy: {error}") from error
+        width = len(mean)
+        sound = layers >= 1 and mean.ndim == 1 and mean.shape == deviation.shape
+        for weight, bias in zip(weights, biases, strict=True):
+            sound = sound and weight.ndim == 2 and weight.shape == (len(bias), width)
+            width = len(bias)
+        numbers = all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values())
+        if not sound or not numbers or width % 2 or not (deviation > 0).all():
+            raise PolicyError(f"{file}: the arrays in it do not make a policy network")
+        return cls(weights, biases, mean, deviation, task, metadata)

@@ -1,0 +1,529 @@
+"""Pictures and videos of flights, drawn off screen with MuJoCo.
+
+Everything is in the world frame (East-North-Up, metres). Drawing calls only MuJoCo's kinematics,
+never its dynamics: it needs no rotor callbacks and leaves the simulation's own data alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import math
+import os
+import shutil
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, get_args
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Rgba = tuple[float, float, float, float]
+Kind = Literal["goal", "sphere", "ring", "pad", "line", "arrow", "path"]
+
+# The camera of videos: moves with the aircraft, keeps the goal in view, never turns or rolls.
+FOLLOW = "follow"
+FOLLOW_AZIMUTH, FOLLOW_ELEVATION = 40.0, -20.0  # [deg]
+FOLLOW_DISTANCE = (1.7, 7.0)  # [m]
+FOLLOW_SMOOTHING = 0.4  # [s], standard deviation of the low pass
+TRAIL_SEGMENTS = 120
+TRAIL_SECONDS = 4.0
+TRAIL_WIDTH = 0.008  # [m]
+TRAIL_OLD, TRAIL_NEW = np.array([0.35, 0.55, 0.80, 1.0]), np.array([1.0, 0.72, 0.30, 1.0])
+GOAL_RGBA: Rgba = (0.25, 0.92, 0.50, 0.28)
+GOAL_RADIUS = 0.08  # [m]
+FASTEST_GOAL = 10.0  # [m/s]; one that moves faster has jumped
+FRONT, SIDE, BACK = (255, 122, 41), (205, 212, 222), (66, 148, 255)
+ROTOR_COLOURS = (FRONT, SIDE, BACK, SIDE)  # rotors 1 to 4: ahead, left, behind, right
+SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # about body z; the reaction torque of (7) is opposite
+
+
+class RenderingUnavailable(RuntimeError):
+    """Nothing can be drawn here; simulation and training do not need to."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Marker:
+    """Something a task asks to be drawn, in the world frame."""
+
+    kind: Kind
+    """goal: a sphere with a core and a drop line to the ground. ring, pad: circles that lie flat
+    unless `end` is a point on their axis."""
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre, or where a line or an arrow begins [m]."""
+    size: float = 0.1
+    """Radius of a goal, sphere, ring or pad; width of a line, arrow or path [m]."""
+    rgba: Rgba = GOAL_RGBA
+    """Colour and opacity, each 0 to 1."""
+    end: tuple[float, float, float] | None = None
+    """Where a line or an arrow ends [m]."""
+    points: ArrayLike = ()
+    """(n, 3) corners of a path [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn."""
+        if self.kind not in get_args(Kind):
+            kinds = ", ".join(get_args(Kind))
+            raise ValueError(f"unknown marker {self.kind!r}; choose from {kinds}")
+        if self.kind in ("line", "arrow") and self.end is None:
+            raise ValueError(f"a marker of kind {self.kind!r} needs its end")
+
+
+@dataclasses.dataclass(frozen=True)
+class Flight:
+    """A recorded flight of T states."""
+
+    time: Array  # (T,) [s], increasing
+    qpos: Array  # (T, 7) position [m] and attitude (w, x, y, z), world frame
+    rotor_speed: Array  # (T, 4) [rad/s]
+    error: Array  # (T,) [m], distance from the goal
+    reward: Array  # (T,)
+    goal: Array  # (T, 3) [m], world frame
+    control_step: float  # [s]
+    max_rotor_speed: float  # [rad/s]
+    task: str
+    markers: Sequence[tuple[Marker, ...]] = ((),)  # one tuple a state, or one for all
+
+    def resampled(self, fps: float) -> Flight:
+        """The same flight at `fps` states a second; a goal that jumps is not interpolated."""
+        from scipy.interpolate import PchipInterpolator
+        from scipy.spatial.transform import Rotation, Slerp
+
+        if len(self.time) < 2:
+            return self
+        time = np.arange(self.time[0], self.time[-1] + 1e-9, 1 / fps).clip(max=self.time[-1])
+        right = np.clip(np.searchsorted(self.time, time, side="right"), 1, len(self.time) - 1)
+        blend = (time - self.time[right - 1]) / np.diff(self.time)[right - 1]
+
+        def linear(values: Array) -> Array:
+            weight = blend.reshape(-1, *[1] * (values.ndim - 1))
+            return (1 - weight) * values[right - 1] + weight * values[right]
+
+        held = right - (blend < 1)
+        stride = np.linalg.norm(self.goal[right] - self.goal[right - 1], axis=-1, keepdims=True)
+        jump = stride > FASTEST_GOAL * self.control_step
+        attitude = Slerp(self.time, Rotation.from_quat(self.qpos[:, 3:], scalar_first=True))(time)
+        position = PchipInterpolator(self.time, self.qpos[:, :3])(time)
+        markers = self.markers
+        if len(markers) > 1:
+            pairs = zip(right, blend, strict=True)
+            markers = [_between(markers[k - 1], markers[k], share) for k, share in pairs]
+        return dataclasses.replace(
+            self,
+            time=time,
+            qpos=np.concatenate([position, attitude.as_quat(scalar_first=True)], axis=1),
+            rotor_speed=linear(self.rotor_speed),
+            error=linear(self.error),
+            reward=self.reward[held],
+            goal=np.where(jump, self.goal[held], linear(self.goal)),
+            markers=markers,
+        )
+
+
+class Renderer:
+    """Draws a model's aircraft in any pose; holds a graphics context, so use it in a `with`."""
+
+    def __init__(self, model: mujoco.MjModel, width: int = 1280, height: int = 720) -> None:
+        """Open an off-screen context of width x height pixels.
+
+        Raises:
+            RenderingUnavailable: There is no graphics library to draw with.
+            ValueError: The picture is larger than the model's off-screen buffer.
+        """
+        limit = model.vis.global_
+        if not (0 < width <= limit.offwidth and 0 < height <= limit.offheight):
+            raise ValueError(
+                f"{width}x{height} pixels: at most {limit.offwidth}x{limit.offheight} can be drawn"
+            )
+        self.model = model
+        self._data = mujoco.MjData(model)
+        self._renderer = _open(model, width, height)
+        self._blades = [  # (blade, its hub, index of its rotor)
+            (geom, model.geom(f"hub_{name.split('_')[1]}").id, int(name.split("_")[1]) - 1)
+            for geom in range(model.ngeom)
+            if (name := model.geom(geom).name).startswith("blade_")
+        ]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The names that `frame` takes for its camera."""
+        return (FOLLOW, *(self.model.cam(k).name for k in range(self.model.ncam)))
+
+    def frame(
+        self,
+        qpos: ArrayLike,
+        *,
+        camera: str | mujoco.MjvCamera = FOLLOW,
+        rotor_angles: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+        trail: ArrayLike | None = None,
+        markers: Sequence[Marker] = (),
+    ) -> NDArray[np.uint8]:
+        """Draw one picture.
+
+        Args:
+            qpos: (7,) position [m] and attitude (w, x, y, z) of the aircraft, world frame.
+            camera: One of `cameras`, or a camera of your own.
+            rotor_angles: (4,) angle by which each rotor has turned [rad].
+            goal: (3,) [m] where the aircraft should be; the camera "follow" keeps it in view.
+            trail: (n, 3) [m] where it has been, oldest first.
+            markers: What else to draw.
+
+        Returns:
+            (height, width, 3) colours.
+
+        Raises:
+            ValueError: There is no such camera.
+        """
+        model, data = self.model, self._data
+        if isinstance(camera, str) and camera not in self.cameras:
+            raise ValueError(f"unknown camera {camera!r}; choose from {', '.join(self.cameras)}")
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        if rotor_angles is not None:
+            self._turn_blades(np.asarray(rotor_angles, dtype=float))
+        position = data.qpos[:3].copy()
+        target = position if goal is None else np.asarray(goal, dtype=float)
+        if camera == FOLLOW:
+            camera = follow_cameras(position[None], target[None])[0]
+        self._renderer.update_scene(data, camera)
+        if trail is not None:
+            self._draw_trail(np.asarray(trail, dtype=float))
+        if goal is not None:
+            # It fades as the aircraft comes near, so as not to veil it.
+            nearness = np.clip(np.linalg.norm(target - position) / 0.4, 0.25, 1.0)
+            rgba = (*GOAL_RGBA[:3], GOAL_RGBA[3] * float(nearness))
+            self._draw_marker(Marker("goal", tuple(target), GOAL_RADIUS, rgba))
+        for marker in markers:
+            self._draw_marker(marker)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Give the graphics context back."""
+        self._renderer.close()
+
+    def __enter__(self) -> Renderer:
+        """Enter with the context open."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the context."""
+        self.close()
+
+    def _turn_blades(self, angles: Array) -> None:
+        data = self._data
+        for blade, hub, rotor in self._blades:
+            axes = data.geom_xmat[hub].reshape(3, 3)
+            cos, sin = math.cos(angles[rotor]), math.sin(angles[rotor])
+            turn = axes @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ axes.T
+            centre = data.geom_xpos[hub]
+            data.geom_xpos[blade] = centre + turn @ (data.geom_xpos[blade] - centre)
+            data.geom_xmat[blade] = (turn @ data.geom_xmat[blade].reshape(3, 3)).ravel()
+
+    def _add(
+        self, shape: mujoco.mjtGeom, rgba: ArrayLike, size: ArrayLike, position: Array, axes: Array
+    ) -> mujoco.MjvGeom:
+        """Add a shape to the scene and return it."""
+        scene = self._renderer.scene
+        if scene.ngeom >= scene.maxgeom:
+            raise ValueError(f"more than {scene.maxgeom} shapes to draw; give fewer markers")
+        geom = scene.geoms[scene.ngeom]
+        scene.ngeom += 1
+        colour, extent = np.asarray(rgba, dtype=np.float32), np.asarray(size, dtype=float)
+        mujoco.mjv_initGeom(geom, shape, extent, position, axes.ravel(), colour)
+        geom.emission = 0.45
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # casts no shadow
+        return geom
+
+    def _connect(
+        self, shape: mujoco.mjtGeom, rgba: ArrayLike, width: float, start: Array, end: Array
+    ) -> None:
+        geom = self._add(shape, rgba, np.zeros(3), start, np.eye(3))
+        box = shape == mujoco.mjtGeom.mjGEOM_BOX  # mjv_connector does not know it
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER if box else shape
+        mujoco.mjv_connector(geom, kind, width, start, end)
+        geom.type = shape
+
+    def _draw_chain(self, points: Array, colours: Array, widths: Array) -> None:
+        for k in np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6):
+            box = mujoco.mjtGeom.mjGEOM_BOX  # the cheapest: a trail of capsules took 40 ms a frame
+            self._connect(box, colours[k], widths[k], points[k], points[k + 1])
+
+    def _draw_trail(self, points: Array) -> None:
+        shown = np.unique(np.linspace(0, len(points) - 1, TRAIL_SEGMENTS + 1).astype(int))
+        youth = np.linspace(0, 1, len(shown))
+        colours = TRAIL_OLD + youth[:, None] * (TRAIL_NEW - TRAIL_OLD)
+        self._draw_chain(points[shown], colours, TRAIL_WIDTH * youth**0.7)
+
+    def _draw_marker(self, marker: Marker) -> None:
+        shape, size, rgba = mujoco.mjtGeom, marker.size, marker.rgba
+        solid = (*rgba[:3], min(1.0, 3.0 * rgba[3]))
+        position = np.asarray(marker.position, dtype=float)
+        end = position if marker.end is None else np.asarray(marker.end, dtype=float)
+        quaternion, axes = np.empty(4), np.empty(9)
+        mujoco.mju_quatZ2Vec(quaternion, end - position)  # upright where there is no end
+        mujoco.mju_quat2Mat(axes, quaternion)
+        axes = axes.reshape(3, 3)
+        if marker.kind in ("goal", "sphere"):
+            self._add(shape.mjGEOM_SPHERE, rgba, (size,) * 3, position, axes)
+        if marker.kind == "goal":
+            foot = np.array([position[0], position[1], 0.004])  # [m], clear of the ground
+            self._add(shape.mjGEOM_SPHERE, solid, (0.22 * size,) * 3, position, axes)
+            self._connect(shape.mjGEOM_CYLINDER, (*rgba[:3], 0.55), 0.004, foot, position)
+            self._draw_marker(Marker("ring", tuple(foot), 1.8 * size, (*rgba[:3], 0.7)))
+        elif marker.kind in ("ring", "pad"):
+            angle = np.linspace(0, 2 * np.pi, 49)
+            circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+            width = np.full(49, 0.025 * size + 0.003)
+            self._draw_chain(position + size * circle @ axes.T, np.tile(solid, (49, 1)), width)
+            if marker.kind == "pad":
+                self._add(shape.mjGEOM_CYLINDER, rgba, (size, size, 0.002), position, axes)
+        elif marker.kind == "path":
+            points = np.asarray(marker.points, dtype=float)
+            self._draw_chain(points, np.tile(rgba, (len(points), 1)), np.full(len(points), size))
+        elif marker.kind in ("line", "arrow"):
+            arrow = marker.kind == "arrow"
+            kind = shape.mjGEOM_ARROW if arrow else shape.mjGEOM_CYLINDER
+            self._connect(kind, rgba, size, position, end)
+
+
+def follow_cameras(position: Array, goal: Array, smoothing: float = 0.0) -> list[mujoco.MjvCamera]:
+    """Cameras that follow a flight smoothly and step back to keep the goal in view.
+
+    Args:
+        position: (T, 3) [m], of the aircraft, world frame.
+        goal: (T, 3) [m], world frame.
+        smoothing: Standard deviation of the low pass [states]; it looks both ways, so nothing lags.
+
+    Returns:
+        T cameras.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    away = goal - position
+    separation = np.linalg.norm(away, axis=-1, keepdims=True)
+    away = away * np.minimum(1.0, FOLLOW_DISTANCE[1] / 2 / np.maximum(separation, 1e-9))
+    distance = np.clip(1.2 + 1.3 * separation, *FOLLOW_DISTANCE)
+    path = np.concatenate([position + 0.5 * away, distance], axis=1)
+    if smoothing > 0:
+        path = gaussian_filter1d(path, smoothing, axis=0, mode="nearest")
+    cameras = [mujoco.MjvCamera() for _ in path]
+    for camera, row in zip(cameras, path, strict=True):
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.lookat, camera.distance = row[:3], row[3]
+        camera.azimuth, camera.elevation = FOLLOW_AZIMUTH, FOLLOW_ELEVATION
+    return cameras
+
+
+def render_flight(
+    flight: Flight,
+    model: mujoco.MjModel,
+    *,
+    width: int = 848,
+    height: int = 480,
+    fps: float = 30.0,
+    camera: str = FOLLOW,
+    overlay: bool = True,
+    trail: bool = True,
+) -> Generator[NDArray[np.uint8]]:
+    """Draw a flight: pictures (height, width, 3) one at a time, arguments as for `write_video`."""
+    from scipy.integrate import cumulative_trapezoid
+
+    flight = flight.resampled(fps)
+    position = flight.qpos[:, :3]
+    angles = SPIN * cumulative_trapezoid(flight.rotor_speed, flight.time, axis=0, initial=0)
+    speed = np.zeros(len(position))
+    if len(position) > 1:
+        speed = np.linalg.norm(np.gradient(position, flight.time, axis=0), axis=1)
+    cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
+    if camera == FOLLOW:
+        cameras = follow_cameras(position, flight.goal, FOLLOW_SMOOTHING * fps)
+    panel = _Panel(height, flight.task) if overlay else None
+    with Renderer(model, width, height) as renderer:
+        for k in range(len(position)):
+            picture = renderer.frame(
+                flight.qpos[k],
+                camera=cameras[k],
+                rotor_angles=angles[k],
+                goal=flight.goal[k],
+                trail=position[max(0, k - round(TRAIL_SECONDS * fps)) : k + 1] if trail else None,
+                markers=flight.markers[k if len(flight.markers) > 1 else 0],
+            )
+            if panel is not None:
+                lines = (
+                    ("time", f"{flight.time[k]:.2f} s"),
+                    ("error", f"{flight.error[k]:.2f} m"),
+                    ("speed", f"{speed[k]:.2f} m/s"),
+                    ("reward", f"{flight.reward[k]:+.2f}"),
+                )
+                panel.draw(picture, lines, flight.rotor_speed[k] / flight.max_rotor_speed)
+            yield picture
+
+
+def write_video(
+    flight: Flight,
+    model: mujoco.MjModel,
+    path: str | os.PathLike[str],
+    *,
+    width: int = 848,
+    height: int = 480,
+    fps: float = 30.0,
+    camera: str = FOLLOW,
+    overlay: bool = True,
+    trail: bool = True,
+) -> Path:
+    """Write a flight as an MP4 (H.264, yuv420p). An unfinished file never bears the name.
+
+    Ten seconds at the default size take about 20 s on two cores without a GPU.
+
+    Args:
+        flight: What was flown.
+        model: The drawn model of the aircraft that flew it.
+        path: The file, ending in .mp4.
+        width: Of the picture [pixels], even.
+        height: Of the picture [pixels], even.
+        fps: Frames a second; the recorded states are interpolated.
+        camera: "follow", or a camera of the model.
+        overlay: Show time, error, speed, reward and rotor speeds.
+        trail: Show where the aircraft has been.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        RenderingUnavailable: There is no graphics library, mediapy, Pillow or ffmpeg.
+        ValueError: The size or the camera is not one that can be drawn.
+    """
+    mediapy = _video_library()
+    if width % 2 or height % 2:
+        raise ValueError(f"{width}x{height} pixels: a video needs an even width and height")
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
+    frames = render_flight(
+        flight,
+        model,
+        width=width,
+        height=height,
+        fps=fps,
+        camera=camera,
+        overlay=overlay,
+        trail=trail,
+    )
+    writer = mediapy.VideoWriter(
+        temporary,
+        (height, width),
+        fps=fps,
+        crf=20,
+        encoded_format="yuv420p",
+        ffmpeg_args="-preset veryfast -movflags +faststart",
+    )
+    try:
+        with contextlib.closing(frames), writer:
+            for frame in frames:
+                writer.add_image(frame)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+class _Panel:
+    """The small panel in the corner of a video."""
+
+    def __init__(self, height: int, title: str) -> None:
+        self._image = _require("PIL.Image", "Pillow")
+        self._draw = _require("PIL.ImageDraw", "Pillow")
+        load_font = _require("PIL.ImageFont", "Pillow").load_default
+        self._scale = max(height / 720, 0.72)  # smaller print cannot be read
+        self._title = title.replace("_", " ").capitalize()
+        self._fonts = {size: load_font(size=size * self._scale) for size in (13, 15, 18)}
+        width, height = self._at(286, 138)
+        large = self._image.new("RGBA", (4 * width, 4 * height), (13, 18, 26, 0))
+        box, corner = (0, 0, 4 * width - 1, 4 * height - 1), round(56 * self._scale)
+        self._draw.Draw(large).rounded_rectangle(box, corner, fill=(13, 18, 26, 165))
+        self._background = large.resize((width, height))  # drawn larger, for a smooth edge
+
+    def draw(
+        self, picture: NDArray[np.uint8], lines: Sequence[tuple[str, str]], shares: Array
+    ) -> None:
+        """Draw labelled values and rotor speeds (4,), 1 at most, into a picture, in place."""
+        margin = round(18 * self._scale)
+        width, height = self._background.size
+        corner = picture[margin : margin + height, margin : margin + width]
+        image = self._image.fromarray(corner)
+        image.paste(self._background, mask=self._background)
+        draw = self._draw.Draw(image)
+        draw.text(self._at(16, 11), self._title, font=self._fonts[18], fill=(255, 255, 255))
+        for row, (label, value) in enumerate(lines):
+            y = 41 + 21 * row
+            draw.text(self._at(16, y), label, font=self._fonts[15], fill=(150, 163, 180))
+            draw.text(
+                self._at(166, y), value, font=self._fonts[15], fill=(236, 240, 246), anchor="ra"
+            )
+        for rotor, share in enumerate(np.clip(shares, 0, 1)):
+            left, top, bottom = 190 + 21 * rotor, 17, 103
+            level = bottom - float(share) * (bottom - top)
+            for upper, fill in ((top, (44, 52, 64)), (level, ROTOR_COLOURS[rotor])):
+                draw.rectangle((*self._at(left, upper), *self._at(left + 12, bottom)), fill=fill)
+            number, at = str(rotor + 1), self._at(left + 6, 109)
+            draw.text(at, number, font=self._fonts[13], fill=(150, 163, 180), anchor="ma")
+        corner[:] = np.asarray(image)
+
+    def _at(self, x: float, y: float) -> tuple[int, int]:
+        return round(x * self._scale), round(y * self._scale)
+
+
+def _open(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    try:
+        return mujoco.Renderer(model, height, width, max_geom=2000)
+    except Exception as error:  # each platform fails in a way of its own
+        raise RenderingUnavailable(
+            "no OpenGL context can be had here, so nothing can be drawn; simulation and training "
+            "work without. On Debian: apt install libegl1 libgl1-mesa-dri, then MUJOCO_GL=egl "
+            f"(now {os.environ.get('MUJOCO_GL', 'unset')}). It failed with: {error}"
+        ) from error
+
+
+def _require(module: str, package: str) -> Any:  # noqa: ANN401 - a module
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise RenderingUnavailable(
+            f"videos need {package}: pip install 'quadrl[video]'; simulation and training do not"
+        ) from error
+
+
+def _video_library() -> Any:  # noqa: ANN401 - a module
+    """Mediapy with an ffmpeg: the system's, else the one that imageio-ffmpeg brings."""
+    mediapy = _require("mediapy", "mediapy")
+    if shutil.which("ffmpeg") is None:
+        mediapy.set_ffmpeg(_require("imageio_ffmpeg", "imageio-ffmpeg").get_ffmpeg_exe())
+    return mediapy
+
+
+def _between(
+    before: tuple[Marker, ...], after: tuple[Marker, ...], share: float
+) -> tuple[Marker, ...]:
+    """Markers on their way from one state to the next; those with an end stay until they jump."""
+    if [marker.kind for marker in before] != [marker.kind for marker in after]:
+        return before
+    moved = [
+        (1 - share) * np.array(a.position) + share * np.array(b.position)
+        for a, b in zip(before, after, strict=True)
+    ]
+    return tuple(
+        a if a.end else dataclasses.replace(a, position=tuple(position))
+        for a, position in zip(before, moved, strict=True)
+    )

@@ -1,0 +1,109 @@
+"""Attitude: quaternions, rotation matrices and the sines and cosines of the Z-Y-X angles.
+
+Arrays are (..., k) of any namespace of the array API (NumPy, PyTorch). Quaternions are
+(w, x, y, z), body to world; a rotation matrix takes body to world. Observations are built from
+additions, products, quotients and square roots alone, which IEEE 754 rounds exactly: the same
+numbers come out for one aircraft, for a batch, and from the C kernel (`native/state.c`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from array_api_compat import array_namespace
+
+Array: TypeAlias = Any
+"""An array of any namespace of the array API: numpy.ndarray, torch.Tensor."""
+
+
+def namespace(array: Array) -> Any:
+    """The array API namespace of an array: NumPy itself for NumPy's (the short way)."""
+    if isinstance(array, (np.ndarray, np.generic)):
+        return np
+    return array_namespace(array)
+
+
+def square_norm(vector: Array) -> Array:
+    """Sum of squares over the last axis, (..., k) to (...), added from left to right."""
+    first = vector[..., 0]
+    total = first * first
+    for k in range(1, vector.shape[-1]):
+        component = vector[..., k]
+        total = total + component * component
+    return total
+
+
+def norm(vector: Array) -> Array:
+    """Euclidean norm over the last axis, (..., k) to (...)."""
+    return namespace(vector).sqrt(square_norm(vector))
+
+
+def rotation_matrix(quaternion: Array) -> Array:
+    """Rotation matrix (..., 3, 3), body to world, of a unit quaternion (..., 4)."""
+    xp = namespace(quaternion)
+    w, x, y, z = (quaternion[..., k] for k in range(4))
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def to_body(rotation: Array, vector: Array) -> Array:
+    """World vector (..., 3) in the body frame: the transposed rotation times the vector."""
+    return namespace(vector).sum(rotation * vector[..., :, None], axis=-2)
+
+
+def to_world(rotation: Array, vector: Array) -> Array:
+    """Body vector (..., 3) in the world frame: the rotation times the vector."""
+    return namespace(vector).sum(rotation * vector[..., None, :], axis=-1)
+
+
+def sin_cos_attitude(rotation: Array) -> tuple[Array, Array]:
+    """Sines and cosines (..., 3) of roll, pitch and yaw (Z-Y-X) of a rotation matrix.
+
+    Straight up or down, where roll and yaw are one rotation, both quotients are still bounded.
+    """
+    xp = namespace(rotation)
+    r = rotation
+    horizontal = xp.sqrt(r[..., 0, 0] * r[..., 0, 0] + r[..., 1, 0] * r[..., 1, 0])
+    cos_pitch = xp.where(horizontal > 1e-9, horizontal, xp.full_like(horizontal, 1e-9))
+    sines = (r[..., 2, 1] / cos_pitch, -r[..., 2, 0], r[..., 1, 0] / cos_pitch)
+    cosines = (r[..., 2, 2] / cos_pitch, horizontal, r[..., 0, 0] / cos_pitch)
+    return xp.stack(sines, axis=-1), xp.stack(cosines, axis=-1)
+
+
+def quaternion_product(first: Array, second: Array) -> Array:
+    """Hamilton product (..., 4): the rotation `second` followed by `first`."""
+    xp = namespace(first)
+    a, b, c, d = (first[..., k] for k in range(4))
+    w, x, y, z = (second[..., k] for k in range(4))
+    return xp.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_from_heading_and_tilt(heading: Array, tilt: Array, direction: Array) -> Array:
+    """Unit quaternion (..., 4) of a heading, then a tilt about a level body axis.
+
+    Args:
+        heading: (...) [rad], counter-clockwise from east.
+        tilt: (...) [rad], the angle between the body's z axis and the vertical.
+        direction: (...) [rad], of the axis of the tilt in the body's x-y plane, from x.
+    """
+    xp = namespace(heading)
+    zero = xp.zeros_like(heading)
+    turn = xp.stack([xp.cos(heading / 2), zero, zero, xp.sin(heading / 2)], axis=-1)
+    half = xp.sin(tilt / 2)
+    lean = xp.stack(
+        [xp.cos(tilt / 2), half * xp.cos(direction), half * xp.sin(direction), zero], axis=-1
+    )
+    return quaternion_product(turn, lean)

@@ -1,0 +1,240 @@
+"""Aircraft advanced together: the engines behind one interface.
+
+A simulation has a leading shape, () for one aircraft or (N,) for a batch, and a State of that
+shape. It takes rotor commands, advances one control step, and says which aircraft diverged.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from quadrl import native
+from quadrl.state import ROWS, TABLE_ROWS, Start, State
+from quadrl.vehicle import Vehicle
+
+COORDINATES = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
+Rows = np.ndarray | None
+"""Numbers (n,) of aircraft in a batch; None for all of them, or for the one."""
+
+
+class Simulation(abc.ABC):
+    """Common part: the table of the state, filled from rows of generalised coordinates."""
+
+    def __init__(self, vehicle: Vehicle, shape: tuple[int, ...], altitude: float) -> None:
+        """Set up the tables.
+
+        Args:
+            vehicle: The aircraft.
+            shape: () or (N,).
+            altitude: Height of the origin of the task's frame above the ground [m].
+        """
+        self.vehicle = vehicle
+        self.shape = shape
+        self.origin = np.array([0.0, 0.0, altitude])  # (3,) [m], world
+        # Two frames in turn: the last state stays whole while the next one is computed.
+        self._frames = [_Frame(np.zeros((TABLE_ROWS, *shape))) for _ in range(2)]
+        self._kernel = native.library().quadrl_state
+        self._count = shape[0] if shape else 1
+        self._bind()
+        # Addresses never change, and looking them up costs a single environment more than the rest.
+        self._coordinates = (
+            *(array.ctypes.data for array in (self.qpos, self.qvel, self.act)),
+            self.qpos.strides[0] // 8 if shape else 0,
+            self.origin.ctypes.data,
+        )
+
+    @property
+    def state(self) -> State:
+        """The current state (live views)."""
+        return self._frames[0].state
+
+    @abc.abstractmethod
+    def _bind(self) -> None:
+        """Set self.qpos (..., 7), qvel (..., 6), act (..., 4), ctrl (..., 4): live views."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    act: np.ndarray
+    ctrl: np.ndarray
+
+    @abc.abstractmethod
+    def advance(self) -> None:
+        """One control step with the commands in `ctrl`."""
+
+    @abc.abstractmethod
+    def clear(self, rows: Rows) -> None:
+        """Reset the engine's own memory of some aircraft (warm starts, warnings)."""
+
+    def read(self) -> np.ndarray | None:
+        """Compute the state after `advance`.
+
+        Returns:
+            None when all went well; else which aircraft diverged (shape of the simulation, bool).
+            Those keep their last good state.
+        """
+        self._frames.reverse()
+        if not self._fill(None):
+            return None
+        table, last = (frame.table for frame in self._frames)
+        broken = ~(np.abs(table[: ROWS["time"].start]) < mujoco.mjMAXVAL).all(axis=0)
+        if self.shape:
+            rows = np.flatnonzero(broken)
+            table[:, rows] = last[:, rows]
+            self._write(rows, State.of_table(table[:, rows]))
+            self.clear(rows)
+        else:
+            table[:] = last
+            self._write(None, self.state)
+            self.clear(None)
+        return broken
+
+    def place(self, rows: Rows, start: Start) -> State:
+        """Put aircraft where an episode begins.
+
+        Args:
+            rows: Which aircraft.
+            start: Arrays (n, k), or (k,) for a single one.
+
+        Returns:
+            The state of those aircraft.
+        """
+        self.clear(rows)
+        self._write(rows, start)
+        self._fill(rows)
+        if rows is None:
+            self._frames[0].table[ROWS["time"]] = 0.0
+            return self.state
+        self._frames[0].table[ROWS["time"].start, rows] = 0.0
+        return State.of_table(self._frames[0].table[:, rows])
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Everything that the next step depends on, as arrays."""
+        return {"table": self._frames[0].table.copy(), **self._save()}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Take up what `save` gave."""
+        self._frames[0].table[:] = saved["table"]
+        self._restore(saved)
+
+    @abc.abstractmethod
+    def _save(self) -> dict[str, np.ndarray]: ...
+
+    @abc.abstractmethod
+    def _restore(self, saved: dict[str, np.ndarray]) -> None: ...
+
+    def _write(self, rows: Rows, start: Start | State) -> None:
+        index: Any = ... if rows is None else rows
+        self.qpos[index] = np.concatenate(
+            [start.position + self.origin, start.quaternion], axis=-1
+        )
+        self.qvel[index] = np.concatenate([start.velocity, start.body_rate], axis=-1)
+        self.act[index] = start.rotor_speed
+
+    def _fill(self, rows: Rows) -> int:
+        """Run the C kernel; how many aircraft hold numbers that are not finite or too large."""
+        count, address = (self._count, None) if rows is None else (len(rows), rows.ctypes.data)
+        return self._kernel(
+            count, address, *self._coordinates, self._frames[0].address, self._count
+        )
+
+
+class _Frame:
+    """One table of state with its named views and its address."""
+
+    def __init__(self, table: np.ndarray) -> None:
+        self.table = table
+        self.state = State.of_table(table)
+        self.address = table.ctypes.data
+
+
+class BatchSimulation(Simulation):
+    """N aircraft on all cores with MuJoCo's native batch."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        num_envs: int,
+        *,
+        altitude: float,
+        contact: bool = False,
+        num_threads: int = 0,
+    ) -> None:
+        """Compile the lean model and make the batch.
+
+        Args:
+            vehicle: The aircraft.
+            num_envs: N, at least 1.
+            altitude: Height of the origin of the task's frame above the ground [m].
+            contact: Whether the aircraft can touch the ground.
+            num_threads: Threads to step on; 0 for every core.
+        """
+        self.model = vehicle.compile_lean(contact=contact)
+        self.batch = Batch(self.model, num_envs, nthread=num_threads)
+        super().__init__(vehicle, (num_envs,), altitude)
+
+    def _bind(self) -> None:
+        self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
+
+    def advance(self) -> None:
+        """One control step of every aircraft.
+
+        Raises:
+            NativeError: The rotor callbacks were taken away.
+        """
+        native.check_installed()
+        self.batch.step(nstep=self.vehicle.substeps)
+
+    def clear(self, rows: Rows) -> None:
+        """Reset the warm starts and the warnings of some aircraft."""
+        self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
+
+    def _save(self) -> dict[str, np.ndarray]:
+        return {"rows": self.batch.state.copy()}
+
+    def _restore(self, saved: dict[str, np.ndarray]) -> None:
+        self.batch.state[:] = saved["rows"]
+
+
+class SingleSimulation(Simulation):
+    """One aircraft in an MjData, stepped by `mj_step` or by whoever owns the data."""
+
+    def __init__(
+        self, vehicle: Vehicle, model: mujoco.MjModel, data: mujoco.MjData, *, altitude: float
+    ) -> None:
+        """Wrap a model of the vehicle and its data."""
+        self.model, self.data = model, data
+        super().__init__(vehicle, (), altitude)
+
+    def _bind(self) -> None:
+        data = self.data
+        self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
+
+    def advance(self) -> None:
+        """One control step.
+
+        Raises:
+            NativeError: The rotor callbacks were taken away.
+        """
+        native.check_installed()
+        mujoco.mj_step(self.model, self.data, self.vehicle.substeps)
+
+    def clear(self, rows: Rows) -> None:
+        """Reset the data: warm start, warnings, time."""
+        mujoco.mj_resetData(self.model, self.data)
+
+    def _save(self) -> dict[str, np.ndarray]:
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        row = np.empty(mujoco.mj_stateSize(self.model, spec))
+        mujoco.mj_getState(self.model, self.data, row, spec)
+        return {"rows": row}
+
+    def _restore(self, saved: dict[str, np.ndarray]) -> None:
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        mujoco.mj_setState(self.model, self.data, saved["rows"], spec)

@@ -1,0 +1,288 @@
+"""What a task is: where an episode begins, what is seen, what is rewarded and what ends it.
+
+A task is a frozen dataclass: its fields are its options, its methods are pure functions of arrays
+with any leading shape, () for one aircraft and (N,) for a batch, in any array namespace. It knows
+no front end, no clock and no batch size.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import difflib
+import functools
+import math
+import operator
+from collections.abc import Iterable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from quadrl.rotation import (
+    Array,
+    namespace,
+    norm,
+    quaternion_from_heading_and_tilt,
+    square_norm,
+    to_body,
+)
+from quadrl.state import Start, State
+from quadrl.vehicle import Vehicle
+
+EPISODE_DRAWS = 64
+"""Uniform numbers that every episode takes from its aircraft's generator, used or not."""
+
+FULL_TURN = 2 * math.pi
+
+
+class Draw:
+    """Random numbers of the start of an episode, from a block of uniform ones (..., 64).
+
+    One block an episode: adding a draw to a task leaves the later episodes as they were.
+    """
+
+    def __init__(self, block: Array) -> None:
+        """Take a block of numbers in [0, 1), (..., EPISODE_DRAWS)."""
+        self._block = block
+        self._used = 0
+
+    def uniform(self, low: float, high: float, size: int | None = None) -> Array:
+        """Uniform numbers in [low, high): (...), or (..., size)."""
+        first, count = self._used, 1 if size is None else size
+        self._used += count
+        if self._used > self._block.shape[-1]:
+            raise ValueError(
+                f"an episode has {self._block.shape[-1]} random numbers to start from, and the "
+                f"task asked for {self._used}"
+            )
+        taken = self._block[..., first] if size is None else self._block[..., first : self._used]
+        return low + (high - low) * taken
+
+    def direction(self) -> Array:
+        """Unit vectors (..., 3), evenly over the sphere."""
+        height = self.uniform(-1.0, 1.0)
+        heading = self.uniform(0.0, FULL_TURN)
+        xp = namespace(height)
+        level = xp.sqrt(1 - height * height)
+        return xp.stack([level * xp.cos(heading), level * xp.sin(heading), height], axis=-1)
+
+    def vector(self, length: float, shortest: float = 0.0) -> Array:
+        """Vectors (..., 3) of any direction, their length uniform in [shortest, length)."""
+        return self.uniform(shortest, length)[..., None] * self.direction()
+
+    def attitude(self, tilt: float, heading: float = FULL_TURN) -> Array:
+        """Unit quaternions (..., 4): a heading up to `heading`, a tilt up to `tilt` [rad]."""
+        return quaternion_from_heading_and_tilt(
+            heading=self.uniform(0.0, heading),
+            tilt=self.uniform(0.0, tilt),
+            direction=self.uniform(0.0, FULL_TURN),
+        )
+
+
+@dataclasses.dataclass
+class Fields:
+    """What a task remembers of an episode, arrays (..., k); a task may add its own."""
+
+    goal: Array  # (..., 3) [m], task frame
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Measures:
+    """Distances from what is asked; the reward is their decrease over a control step."""
+
+    to_goal: Array  # (..., 3) [m], from the aircraft to the goal, world frame
+    distance: Array  # (...) [m], what is left to the goal
+    attitude: Array  # (...) attitude error |sin zeta - sin zeta_g| + |cos zeta - cos zeta_g|
+    speed: Array  # (...) [m/s]
+    spin: Array  # (...) [rad/s]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Errors:
+    """Mean of a task's error over an episode, for the judgement at its end."""
+
+    final: Array  # (...) [m], over the last `settle` seconds before the horizon
+    mean: Array  # (...) [m], over all of it
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One named entry of the observation."""
+
+    size: int
+    unit: str
+    meaning: str
+
+
+OBSERVATION = {
+    "position": Part(3, "m", "world frame, from the origin of the task's frame"),
+    "sin_attitude": Part(3, "1", "sine of roll, pitch and yaw (Z-Y-X)"),
+    "cos_attitude": Part(3, "1", "cosine of roll, pitch and yaw"),
+    "velocity": Part(3, "m/s", "body frame"),
+    "body_rate": Part(3, "rad/s", "angular velocity, body frame"),
+    "rotor_speed": Part(4, "1", "over the largest rotor speed"),
+    "goal": Part(3, "m", "from the aircraft to the goal, body frame"),
+}
+"""The observation of every task, in the order of the flat vector."""
+
+TARGET_VELOCITY = {
+    "target_velocity": Part(3, "m/s", "of the target relative to the aircraft, body frame")
+}
+"""What tasks with a moving target add at the end."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Task(abc.ABC):
+    """Base of all tasks: fly to a goal and stay there."""
+
+    name: ClassVar[str]
+    """The name in the catalogue."""
+    asks: ClassVar[str]
+    """What it asks of the aircraft, in a line."""
+    ends: ClassVar[str]
+    """What ends an episode early, in a line."""
+    solved: ClassVar[str]
+    """What counts as success, in a line."""
+    observation: ClassVar[dict[str, Part]] = OBSERVATION
+    """The parts of the observation in the order of the flat vector."""
+    heading_matters: ClassVar[bool] = False
+    """Whether the attitude error counts yaw against east (0), or only roll and pitch."""
+    contact: ClassVar[bool] = False
+    """Whether the aircraft can touch anything without the episode being over."""
+
+    horizon: float = 10.0
+    """Time limit of an episode [s]."""
+    settle: float = 2.0
+    """Length of the stretch before the horizon over which the final error is taken [s]."""
+    altitude: float = 3.0
+    """Height of the origin of the task's frame above the ground [m]."""
+    ground_clearance: float = 0.07
+    """Height of the aircraft above the ground at which it touches [m]."""
+    progress_weight: float = 100.0
+    """Reward for a metre of distance gained."""
+    attitude_weight: float = 10.0
+    """Reward for a unit of attitude error gained."""
+    speed_weight: float = 0.1
+    """Reward for a m/s of speed lost."""
+    spin_weight: float = 0.1
+    """Reward for a rad/s of body rate lost."""
+    control_weight: float = 1.0
+    """Cost of sum((Omega_c - Omega_hover)^2) / Omega_max^2 at each step."""
+    survival_weight: float = 10.0
+    """Reward for each step in the air."""
+
+    def __post_init__(self) -> None:
+        """Refuse options that mean nothing."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            numbers = value if isinstance(value, tuple) else (value,)
+            flat = np.asarray(numbers, dtype=float) if numbers else np.zeros(1)
+            if not np.all(np.isfinite(flat)):
+                raise ValueError(f"{self.name}: {field.name} = {value!r} is not finite")
+        for positive in ("horizon", "altitude"):
+            if getattr(self, positive) <= 0:
+                raise ValueError(f"{self.name}: {positive} = {getattr(self, positive)} must be > 0")
+
+    @abc.abstractmethod
+    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Fields]:
+        """How an episode begins, from random numbers alone."""
+
+    def update(self, state: State, measures: Measures, fields: Fields) -> Fields:
+        """The fields after a control step: the same object, or a new one (a waypoint reached)."""
+        return fields
+
+    def goal(self, state: State, fields: Fields) -> Array:
+        """Where to be, (..., 3) [m], task frame."""
+        return fields.goal
+
+    def error(self, state: State, measures: Measures, fields: Fields) -> Array:
+        """How far the task is from being done, (...) [m]."""
+        return measures.distance
+
+    def measure(self, state: State, fields: Fields) -> Measures:
+        """The distances that the reward is made of."""
+        to_goal = self.goal(state, fields) - state.position
+        sine, cosine = state.sin_attitude, state.cos_attitude - 1.0
+        if not self.heading_matters:
+            sine, cosine = sine[..., :2], cosine[..., :2]
+        return Measures(
+            to_goal=to_goal,
+            distance=norm(to_goal),
+            attitude=norm(sine) + norm(cosine),
+            speed=norm(state.velocity),
+            spin=norm(state.body_rate),
+        )
+
+    def observe(
+        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
+    ) -> dict[str, Array]:
+        """What the policy sees, by name, in the order of `observation`."""
+        return {
+            "position": state.position,
+            "sin_attitude": state.sin_attitude,
+            "cos_attitude": state.cos_attitude,
+            "velocity": state.body_velocity,
+            "body_rate": state.body_rate,
+            "rotor_speed": state.rotor_speed / vehicle.max_speed,
+            "goal": to_body(state.rotation, measures.to_goal),
+        }
+
+    def reward(
+        self, before: Measures, now: Measures, rotor_command: Array, vehicle: Vehicle
+    ) -> dict[str, Array]:
+        """Named terms (...) of the reward of one control step; it is their sum, in this order."""
+        effort = square_norm((rotor_command - vehicle.hover_speed) / vehicle.max_speed)
+        return {
+            "progress": self.progress_weight * (before.distance - now.distance),
+            "attitude": self.attitude_weight * (before.attitude - now.attitude),
+            "speed": self.speed_weight * (before.speed - now.speed),
+            "spin": self.spin_weight * (before.spin - now.spin),
+            "control": -self.control_weight * effort,
+            "survival": self.survival_weight + 0.0 * effort,
+        }
+
+    @abc.abstractmethod
+    def terminated(self, state: State, measures: Measures, fields: Fields) -> Array:
+        """Whether the episode is over before its time, (...) bool."""
+
+    @abc.abstractmethod
+    def success(
+        self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array
+    ) -> Array:
+        """Whether an episode that ends now did what was asked, (...) bool."""
+
+    def markers(self, fields: Fields) -> Sequence[Any]:
+        """What to draw of the task in one aircraft's episode (quadrl.rendering.Marker)."""
+        return ()
+
+    def touches_ground(self, state: State) -> Array:
+        """Whether the aircraft has come down to the ground, (...) bool."""
+        return state.position[..., 2] < self.ground_clearance - self.altitude
+
+    def replace(self, **options: Any) -> Task:
+        """A variant with other options.
+
+        Raises:
+            ValueError: An option that the task does not have; the message lists the choices.
+        """
+        check_choices(options, [f.name for f in dataclasses.fields(self)], f"{self.name} option")
+        return dataclasses.replace(self, **options)
+
+
+def total(terms: dict[str, Array]) -> Array:
+    """The sum of reward terms, from the first to the last."""
+    return functools.reduce(operator.add, terms.values())
+
+
+def check_choices(given: Iterable[str], choices: Iterable[str], what: str) -> None:
+    """Raise for the first name that is not among the choices.
+
+    Raises:
+        ValueError: The message names it, the nearest choice and all choices.
+    """
+    allowed = list(choices)
+    for name in given:
+        if name not in allowed:
+            near = difflib.get_close_matches(str(name), allowed, n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise ValueError(f"unknown {what} {name!r}{hint}; choices: {', '.join(allowed)}")

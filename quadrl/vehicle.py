@@ -1,0 +1,225 @@
+"""The aircraft: its parameters, its MuJoCo models, and what an action asks of its rotors."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from quadrl import native
+from quadrl.rotation import Array, namespace
+
+ASSETS = Path(__file__).parent / "assets"
+GRAVITY = 9.81  # [m/s^2]
+ROTORS = 4
+# Rotors 1 to 4 sit ahead, left, behind and right; 1 and 3 turn so that their reaction yaws the
+# aircraft to the right (negative z), 2 and 4 to the left (equation 7).
+ROTOR_DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+YAW_REACTION = (-1, 1, -1, 1)
+DRAWN_ARM_LENGTH = 0.23  # [m], of the aircraft in assets/quadrotor.xml
+DRAWN_ROTOR_RADIUS = 0.06  # [m]
+# As in native/equations.h.
+MARK = 1903518052.0
+MARK_SLOT = 9
+
+
+class VehicleError(ValueError):
+    """A parameter of an aircraft that no aircraft can have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Vehicle:
+    """A plus-configuration quadrotor. The defaults are the paper's aircraft (gym-aero, 2018)."""
+
+    name: str = "paper"
+    """What it is called."""
+    mass: float = 0.65
+    """m [kg] (gym-aero)."""
+    arm_length: float = 0.23
+    """l [m], from the centre of mass to a rotor's axis (gym-aero)."""
+    inertia: tuple[float, float, float] = (7.5e-3, 7.5e-3, 1.3e-2)
+    """Principal moments J about x, y, z [kg m^2] (gym-aero)."""
+    thrust_coefficient: float = 3.13e-5
+    """k_T [N s^2]: thrust over the square of the rotor speed (gym-aero)."""
+    torque_coefficient: float = 7.5e-7
+    """k_Q [N m s^2]: rotor torque over the square of the rotor speed (gym-aero)."""
+    drag_coefficient: float = 9e-3
+    """k_D [N s^2/m^2]: quadratic drag (gym-aero)."""
+    moment_coefficient: float = 9e-4
+    """k_M [N m s^2]: quadratic aerodynamic moment (gym-aero)."""
+    lag_rate: float = 1 / 0.18
+    """k_c [1/s]: inverse time constant of the rotor speed (gym-aero)."""
+    rotor_radius: float = 0.06
+    """[m], drawn only."""
+    max_thrust_ratio: float = 2.0
+    """Largest thrust over weight (gym-aero: it hovers at half of its thrust)."""
+    action_scale: float = 35.0
+    """Change of the rotor speed command from hover at an action of 1 [rad/s] (gym-aero)."""
+    physics_step: float = 0.01
+    """Step of the RK4 integrator [s] (gym-aero)."""
+    control_step: float = 0.05
+    """Time between two actions [s] (gym-aero); a whole number of physics steps."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot fly."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            numbers = value if isinstance(value, tuple) else (value,)
+            if field.name == "name":
+                continue
+            zero_allowed = field.name in ("drag_coefficient", "moment_coefficient")
+            if not all(
+                math.isfinite(v) and (v > 0 or (zero_allowed and v == 0)) for v in numbers
+            ):
+                raise VehicleError(f"{field.name} = {value!r}: positive and finite is allowed")
+        if len(self.inertia) != 3 or 2 * max(self.inertia) > sum(self.inertia) * (1 + 1e-9):
+            raise VehicleError(
+                f"inertia = {self.inertia}: three principal moments are allowed, "
+                "each at most the sum of the other two"
+            )
+        if self.max_thrust_ratio <= 1:
+            raise VehicleError(f"max_thrust_ratio = {self.max_thrust_ratio}: it must exceed 1")
+        if not math.isclose(self.substeps * self.physics_step, self.control_step, rel_tol=1e-9):
+            raise VehicleError(
+                f"control_step = {self.control_step} s is no whole number of physics steps "
+                f"of {self.physics_step} s"
+            )
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps in a control step."""
+        return max(1, round(self.control_step / self.physics_step))
+
+    @property
+    def hover_speed(self) -> float:
+        """Omega_hover [rad/s]: the four rotors carry the weight."""
+        return math.sqrt(self.mass * GRAVITY / (ROTORS * self.thrust_coefficient))
+
+    @property
+    def max_speed(self) -> float:
+        """Omega_max [rad/s]."""
+        return math.sqrt(self.max_thrust_ratio) * self.hover_speed
+
+    def rotor_command(self, action: Array) -> Array:
+        """Rotor speed commands Omega_c [rad/s] of actions, both (..., 4).
+
+        Omega_c = clip(Omega_hover + action_scale * clip(action, -1, 1), 0, Omega_max).
+        """
+        clip = namespace(action).clip
+        command = self.hover_speed + self.action_scale * clip(action, -1.0, 1.0)
+        return clip(command, 0.0, self.max_speed)
+
+    def spec(self, *, contact: bool = False, drawn: bool = True) -> mujoco.MjSpec:
+        """The aircraft over the ground as an MjSpec, to add to or to compile.
+
+        Args:
+            contact: Feet, hull, rotors and ground collide.
+            drawn: Keep what is only seen (geoms, lights, cameras, textures).
+        """
+        spec = mujoco.MjSpec.from_file(str(ASSETS / "scene.xml"))
+        self._write_parameters(spec)
+        spec.nuser_body = 3
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        spec.option.timestep = self.physics_step
+        spec.option.gravity = (0, 0, -GRAVITY)
+        _set_contact(spec, contact)
+        if not drawn:
+            _strip(spec)
+        return spec
+
+    def compile(self, *, contact: bool = False) -> mujoco.MjModel:
+        """The complete model, with everything that is drawn; installs the rotor callbacks.
+
+        Stepped in a process without the callbacks it fails at once instead of flying wrongly: its
+        gravity compensation is not a number, which only the callbacks take out again.
+
+        Raises:
+            NativeError: The callbacks cannot be built or installed.
+        """
+        native.install()
+        spec = self.spec(contact=contact)
+        spec.body("aircraft").gravcomp = 1.0  # so that MuJoCo computes it at all
+        model = spec.compile()
+        model.body_gravcomp[model.body("aircraft").id] = math.nan
+        return model
+
+    def compile_lean(self, *, contact: bool = False) -> mujoco.MjModel:
+        """The model that is simulated: nothing drawn, and no stage that has nothing to do.
+
+        Same physics bit for bit. Whoever steps it checks the callbacks (`native.check_installed`).
+
+        Raises:
+            NativeError: The callbacks cannot be built or installed.
+        """
+        native.install()
+        model = self.spec(contact=contact, drawn=False).compile()
+        disable = mujoco.mjtDisableBit
+        # No automatic reset: a simulation that diverges must not pass for a fresh one.
+        unused = disable.mjDSBL_AUTORESET | disable.mjDSBL_SENSOR | disable.mjDSBL_CLAMPCTRL
+        if not contact:
+            unused |= disable.mjDSBL_CONSTRAINT | disable.mjDSBL_CONTACT
+        model.opt.disableflags = int(unused)
+        return model
+
+    def _write_parameters(self, spec: mujoco.MjSpec) -> None:
+        scale = self.arm_length / DRAWN_ARM_LENGTH
+        rotor_scale = self.rotor_radius / DRAWN_ROTOR_RADIUS
+        body = spec.body("aircraft")
+        for geom in body.geoms:
+            rotor = geom.name.startswith(("disc", "strike_1", "strike_2", "strike_3", "strike_4"))
+            geom.size = np.asarray(geom.size) * (rotor_scale if rotor else scale)
+            geom.pos = np.asarray(geom.pos) * scale
+            if not math.isnan(geom.fromto[0]):
+                geom.fromto = np.asarray(geom.fromto) * scale
+        for mesh in spec.meshes:
+            rotor = mesh.name in ("blade", "rotor_rim")
+            mesh.scale = np.asarray(mesh.scale) * (rotor_scale if rotor else scale)
+        for camera in body.cameras:
+            camera.pos = np.asarray(camera.pos) * scale
+        body.mass = self.mass
+        body.ipos = (0, 0, 0)
+        body.inertia = self.inertia
+        body.userdata = (MARK, self.drag_coefficient, self.moment_coefficient)
+        for k, (x, y) in enumerate(ROTOR_DIRECTIONS):
+            name = f"rotor_{k + 1}"
+            spec.site(name).pos = (x * self.arm_length, y * self.arm_length, 0)
+            actuator = spec.actuator(name)
+            ratio = self.torque_coefficient / self.thrust_coefficient
+            actuator.gear = (0, 0, 1, 0, 0, YAW_REACTION[k] * ratio)
+            actuator.ctrlrange = (0, self.max_speed)
+            actuator.dynprm[0], actuator.dynprm[MARK_SLOT] = self.lag_rate, MARK
+            actuator.gainprm[0] = self.thrust_coefficient
+
+
+def _set_contact(spec: mujoco.MjSpec, contact: bool) -> None:
+    """Let the aircraft and the ground touch, or take away what could."""
+    for geom in list(spec.geoms):
+        if geom.name == "ground":
+            geom.contype, geom.conaffinity = (1, 0) if contact else (0, 0)
+        elif geom.classname.name == "collision":
+            if contact:
+                geom.contype, geom.conaffinity = 0, 1
+            else:
+                spec.delete(geom)
+
+
+def _strip(spec: mujoco.MjSpec) -> None:
+    """Delete what is only seen: a step of a model without it takes a sixth less."""
+    for elements in (spec.geoms, spec.lights, spec.cameras):
+        for element in list(elements):
+            if getattr(element, "contype", 0) == getattr(element, "conaffinity", 0) == 0:
+                spec.delete(element)
+    for elements in (spec.materials, spec.textures):
+        for element in list(elements):
+            spec.delete(element)
+    for mesh in list(spec.meshes):
+        spec.delete(mesh)
+    for geom in spec.geoms:
+        geom.material = ""
+
+
+VEHICLES = {vehicle.name: vehicle for vehicle in (Vehicle(),)}
+"""The aircraft that the command line knows by name."""

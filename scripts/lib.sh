@@ -1,0 +1,152 @@
+# shellcheck shell=bash
+# What scripts/quickstart and scripts/test share: the environment in .venv. To be sourced; needs bash 3.2 or later.
+
+REPOSITORY="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
+ENVIRONMENT="$REPOSITORY/.venv"
+ENVIRONMENT_PYTHON="$ENVIRONMENT/bin/python"
+# First line: "incomplete", or the fingerprint of what was installed. Second line: the extras.
+STAMP="$ENVIRONMENT/quadrl-environment"
+
+say() { printf 'quadrl: %s\n' "$*" >&2; }
+
+die() {
+    say "$*"
+    exit 1
+}
+
+# install_packages NAME...: with apt-get where this user may; fails without a word where not.
+install_packages() {
+    [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null || return 1
+    say "installing $*"
+    apt-get update -qq >&2 &&
+        DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >&2
+}
+
+# find_python: prints the command of a Python that the dependencies have wheels for; $PYTHON overrules the choice.
+find_python() {
+    local candidate
+    if [ -n "${PYTHON:-}" ]; then
+        "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null ||
+            die "PYTHON=$PYTHON is not a Python of version 3.11 or later"
+        echo "$PYTHON"
+        return
+    fi
+    for candidate in python3 python3.12 python3.11 python; do
+        if "$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))' 2>/dev/null; then
+            echo "$candidate"
+            return
+        fi
+    done
+    die "needs Python 3.11 or 3.12, and found $(python3 --version 2>/dev/null || echo none)." \
+        "(labmaze, which dm-control needs, has no wheels for later versions.)" \
+        "Install one, or name it: PYTHON=/path/to/python3.12 $0"
+}
+
+# has_compiler: whether the C compiler that quadrl.native will pick makes a shared library; C's headers belong to it.
+has_compiler() {
+    local compiler library works=1
+    library="$(mktemp)"
+    for compiler in ${CC:+"$CC"} cc gcc clang; do
+        if command -v "$compiler" >/dev/null; then
+            printf '#include <math.h>\ndouble f(double x) { return sqrt(x); }\n' |
+                "$compiler" -shared -fPIC -x c -o "$library" - 2>/dev/null && works=0
+            break
+        fi
+    done
+    rm -f "$library"
+    return "$works"
+}
+
+# ensure_compiler: the rotor callbacks are compiled against the installed mujoco at their first use.
+ensure_compiler() {
+    has_compiler && return
+    install_packages build-essential && has_compiler && return
+    case "$(uname -s)" in
+        Darwin) die "needs a C compiler: run 'xcode-select --install'" ;;
+        *) die "needs a C compiler: install 'build-essential' (Debian, Ubuntu) or 'gcc' (Fedora, Arch)" ;;
+    esac
+}
+
+draws_without_screen() {
+    MUJOCO_GL=egl "$ENVIRONMENT_PYTHON" -c 'import mujoco; mujoco.GLContext(64, 64).free()' >/dev/null 2>&1
+}
+
+# ensure_renderer: EGL draws the pictures where there is no screen. Nothing else depends on it.
+ensure_renderer() {
+    local packages=(libegl1 libgl1 libgl1-mesa-dri)
+    [ "$(uname -s)" = Linux ] || return 0
+    [ -z "${DISPLAY:-}${WAYLAND_DISPLAY:-}" ] && [ "${MUJOCO_GL:-egl}" = egl ] || return 0
+    draws_without_screen && return
+    if ! dpkg -s "${packages[@]}" >/dev/null 2>&1; then
+        install_packages "${packages[@]}" && draws_without_screen && return
+    fi
+    say "no EGL here: pictures and video are left out; simulation and training work." \
+        "For pictures install ${packages[*]} (Debian, Ubuntu)" \
+        "or mesa-libEGL mesa-libGL mesa-dri-drivers (Fedora)."
+}
+
+# fingerprint: changes with anything that the environment is made from.
+fingerprint() {
+    "$1" - "$REPOSITORY" <<'END'
+import hashlib, pathlib, sys
+repository = pathlib.Path(sys.argv[1])
+parts = [(repository / name).read_bytes() for name in ("pyproject.toml", "constraints.txt")]
+print(hashlib.sha256(b"\0".join([str(repository).encode(), *parts])).hexdigest())
+END
+}
+
+make_venv() {
+    local python
+    python="$(find_python)"
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        local package
+        package="$("$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])')"
+        install_packages "$package" || die "$python cannot make environments: install '$package' (Debian, Ubuntu)"
+    fi
+    say "making the environment $ENVIRONMENT"
+    mkdir -p "$ENVIRONMENT"
+    echo incomplete >"$STAMP"
+    "$python" -m venv "$ENVIRONMENT"
+}
+
+# ensure_environment EXTRA...: quadrl, editable, with these extras and the versions of constraints.txt in .venv.
+# An environment that an interrupted run left behind is made anew; one that is complete is used as it is.
+ensure_environment() {
+    local complete=no extra installed="" wanted
+    ensure_compiler
+    if [ -f "$STAMP" ] && [ "$(head -n 1 "$STAMP")" = incomplete ]; then
+        say "removing an unfinished environment"
+        rm -rf "$ENVIRONMENT"
+    fi
+    if [ ! -f "$ENVIRONMENT/pyvenv.cfg" ]; then
+        make_venv
+    elif ! "$ENVIRONMENT_PYTHON" -c 'import pip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+        die "$ENVIRONMENT has no Python 3.11 or later that works: remove it and run again"
+    fi
+
+    wanted="$(fingerprint "$ENVIRONMENT_PYTHON")"
+    if [ -f "$STAMP" ]; then
+        installed="$(sed -n 2p "$STAMP")"
+        [ "$(head -n 1 "$STAMP")" != "$wanted" ] || complete=yes
+    fi
+    for extra in "$@"; do
+        case " $installed " in
+            *" $extra "*) ;;
+            *)
+                installed="${installed:+$installed }$extra"
+                complete=no
+                ;;
+        esac
+    done
+
+    if [ "$complete" = no ]; then
+        say "installing quadrl[${installed// /,}]; the first time takes minutes and, with torch, some gigabytes"
+        # Without a stamp .venv is somebody else's: install into it, but never mark it for removal.
+        [ ! -f "$STAMP" ] || echo incomplete >"$STAMP"
+        "$ENVIRONMENT_PYTHON" -m pip install --disable-pip-version-check \
+            --constraint "$REPOSITORY/constraints.txt" --editable "${REPOSITORY}[${installed// /,}]" >&2
+        printf '%s\n%s\n' "$wanted" "$installed" >"$STAMP.new"
+        mv "$STAMP.new" "$STAMP"
+    fi
+    ensure_renderer
+}

@@ -1,0 +1,39 @@
+"""The catalogue of tasks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from quadrl.task import Task, check_choices
+from quadrl.tasks.hover import Hover
+
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Hover,)}
+"""Every registered task by name."""
+
+
+def register(task: type[Task]) -> type[Task]:
+    """Add a task to the catalogue, so that every door knows it by its name.
+
+    Raises:
+        ValueError: Another task has the name.
+    """
+    if TASKS.get(task.name, task) is not task:
+        raise ValueError(f"a task named {task.name!r} is registered already")
+    TASKS[task.name] = task
+    return task
+
+
+def make(name: str | Task, **options: Any) -> Task:
+    """The task of a name with some options changed.
+
+    Args:
+        name: A name of the catalogue, or a task already made.
+        **options: Fields of the task.
+
+    Raises:
+        ValueError: Unknown task or option; the message lists the choices.
+    """
+    if isinstance(name, Task):
+        return name.replace(**options)
+    check_choices([name], TASKS, "task")
+    return TASKS[name]().replace(**options)
