@@ -76,9 +76,7 @@ def load(
     """Load a task the dm_control way; see `quadrl.suite.load`."""
     from quadrl import suite
 
-    return suite.load(
-        suite.DOMAIN, task_name, task_kwargs, environment_kwargs, visualize_reward
-    )
+    return suite.load(suite.DOMAIN, task_name, task_kwargs, environment_kwargs, visualize_reward)
 
 
 def __getattr__(name: str) -> Any:

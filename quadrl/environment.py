@@ -14,17 +14,28 @@ from typing import Any
 import numpy as np
 
 from quadrl import tasks
+from quadrl.errors import QuadrlError
 from quadrl.rotation import Array
 from quadrl.simulation import BatchSimulation, Rows, Simulation, SingleSimulation
 from quadrl.state import State
-from quadrl.task import EPISODE_DRAWS, Draw, Errors, Fields, Measures, Task, total
+from quadrl.task import (
+    EPISODE_DRAWS,
+    Draw,
+    Errors,
+    Fields,
+    Marker,
+    Measures,
+    OptionError,
+    Task,
+    total,
+)
 from quadrl.vehicle import ROTORS, Vehicle
 
 Observation = dict[str, Array]
 MAX_ENVS = 1 << 20
 
 
-class ActionError(ValueError):
+class ActionError(QuadrlError, ValueError):
     """An action of the wrong shape, or with a number that is not finite."""
 
 
@@ -229,13 +240,13 @@ class Environment:
             out[:, columns] = part
         return out
 
-    def markers(self, row: int = 0) -> Sequence[Any]:
-        """What the task asks to be drawn of one aircraft's episode."""
+    def markers(self, row: int = 0) -> tuple[Marker, ...]:
+        """What the task asks to be drawn of one aircraft's episode, world frame."""
         fields = self.fields
         if self.shape:
             values = {f.name: getattr(fields, f.name)[row] for f in _fields(fields)}
             fields = type(fields)(**values)
-        return self.task.markers(fields)
+        return tuple(m.moved(self.simulation.origin) for m in self.task.markers(fields))
 
     def save(self) -> dict[str, np.ndarray]:
         """Everything that the next steps depend on, as arrays: `restore` continues bit for bit."""
@@ -262,9 +273,7 @@ class Environment:
         for name in ("fields", "measures"):
             record = getattr(self, "fields" if name == "fields" else "_measures")
             values = {f.name: saved[f"{name}.{f.name}"].copy() for f in _fields(record)}
-            setattr(
-                self, "fields" if name == "fields" else "_measures", type(record)(**values)
-            )
+            setattr(self, "fields" if name == "fields" else "_measures", type(record)(**values))
         for generator, words in zip(self.generators, saved["generators"], strict=True):
             _set_generator_words(generator, words)
         state = self.simulation.state
@@ -292,16 +301,16 @@ class Environment:
         return block
 
 
-def _simulation(
-    task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int
-) -> Simulation:
+def _simulation(task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int) -> Simulation:
     if num_envs is None:
         model = vehicle.compile_lean(contact=task.contact)
         import mujoco
 
         return SingleSimulation(vehicle, model, mujoco.MjData(model), altitude=task.altitude)
     if not isinstance(num_envs, (int, np.integer)) or not 1 <= num_envs <= MAX_ENVS:
-        raise ValueError(f"num_envs = {num_envs!r}: a whole number from 1 to {MAX_ENVS} is allowed")
+        raise OptionError(
+            f"num_envs = {num_envs!r}: a whole number from 1 to {MAX_ENVS} is allowed"
+        )
     return BatchSimulation(
         vehicle,
         int(num_envs),
@@ -325,7 +334,9 @@ def _generator_words(generator: np.random.Generator) -> list[int]:
     """The state of a PCG64 generator as six 64-bit words."""
     state: Any = generator.bit_generator.state
     mask = (1 << 64) - 1
-    words = [w for n in (state["state"]["state"], state["state"]["inc"]) for w in (n >> 64, n & mask)]
+    words = [
+        w for n in (state["state"]["state"], state["state"]["inc"]) for w in (n >> 64, n & mask)
+    ]
     return [np.uint64(w) for w in (*words, state["has_uint32"], state["uinteger"])]
 
 

@@ -17,13 +17,15 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from quadrl.errors import QuadrlError
+
 FORMAT = "quadrl-policy-1"
 FILE = "policy.safetensors"
 CLIP = 10.0
 """Normalised observations are held within +-CLIP."""
 
 
-class PolicyError(ValueError):
+class PolicyError(QuadrlError, ValueError):
     """A file that is no policy of quadrl, or a policy for something else."""
 
 
@@ -87,13 +89,12 @@ class Policy:
             path: A .safetensors file, or a run folder that holds policy.safetensors.
 
         Raises:
-            FileNotFoundError: There is no such file.
-            PolicyError: It is damaged, or no policy of quadrl.
+            PolicyError: There is no such file, or it is damaged, or no policy of quadrl.
         """
         path = Path(path)
         file = path / FILE if path.is_dir() else path
         if not file.is_file():
-            raise FileNotFoundError(
+            raise PolicyError(
                 f"no policy at {file}; give a run folder (quadrl train ... --out FOLDER makes one) "
                 "or a .safetensors file"
             )

@@ -15,26 +15,26 @@ import shutil
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, get_args
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quadrl.errors import QuadrlError
+from quadrl.task import GOAL_RGBA, Marker, OptionError
+
 Array = NDArray[np.float64]
-Rgba = tuple[float, float, float, float]
-Kind = Literal["goal", "sphere", "ring", "pad", "line", "arrow", "path"]
 
 # The camera of videos: moves with the aircraft, keeps the goal in view, never turns or rolls.
 FOLLOW = "follow"
-FOLLOW_AZIMUTH, FOLLOW_ELEVATION = 40.0, -20.0  # [deg]
-FOLLOW_DISTANCE = (1.7, 7.0)  # [m]
+FOLLOW_AZIMUTH, FOLLOW_ELEVATION = 30.0, -21.0  # [deg]
+FOLLOW_DISTANCE = (1.8, 7.0)  # [m]
 FOLLOW_SMOOTHING = 0.4  # [s], standard deviation of the low pass
 TRAIL_SEGMENTS = 120
 TRAIL_SECONDS = 4.0
 TRAIL_WIDTH = 0.008  # [m]
 TRAIL_OLD, TRAIL_NEW = np.array([0.35, 0.55, 0.80, 1.0]), np.array([1.0, 0.72, 0.30, 1.0])
-GOAL_RGBA: Rgba = (0.25, 0.92, 0.50, 0.28)
 GOAL_RADIUS = 0.08  # [m]
 FASTEST_GOAL = 10.0  # [m/s]; one that moves faster has jumped
 FRONT, SIDE, BACK = (255, 122, 41), (205, 212, 222), (66, 148, 255)
@@ -42,35 +42,8 @@ ROTOR_COLOURS = (FRONT, SIDE, BACK, SIDE)  # rotors 1 to 4: ahead, left, behind,
 SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # about body z; the reaction torque of (7) is opposite
 
 
-class RenderingUnavailable(RuntimeError):
+class RenderingUnavailable(QuadrlError, RuntimeError):
     """Nothing can be drawn here; simulation and training do not need to."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Marker:
-    """Something a task asks to be drawn, in the world frame."""
-
-    kind: Kind
-    """goal: a sphere with a core and a drop line to the ground. ring, pad: circles that lie flat
-    unless `end` is a point on their axis."""
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Centre, or where a line or an arrow begins [m]."""
-    size: float = 0.1
-    """Radius of a goal, sphere, ring or pad; width of a line, arrow or path [m]."""
-    rgba: Rgba = GOAL_RGBA
-    """Colour and opacity, each 0 to 1."""
-    end: tuple[float, float, float] | None = None
-    """Where a line or an arrow ends [m]."""
-    points: ArrayLike = ()
-    """(n, 3) corners of a path [m]."""
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be drawn."""
-        if self.kind not in get_args(Kind):
-            kinds = ", ".join(get_args(Kind))
-            raise ValueError(f"unknown marker {self.kind!r}; choose from {kinds}")
-        if self.kind in ("line", "arrow") and self.end is None:
-            raise ValueError(f"a marker of kind {self.kind!r} needs its end")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +109,7 @@ class Renderer:
         """
         limit = model.vis.global_
         if not (0 < width <= limit.offwidth and 0 < height <= limit.offheight):
-            raise ValueError(
+            raise OptionError(
                 f"{width}x{height} pixels: at most {limit.offwidth}x{limit.offheight} can be drawn"
             )
         self.model = model
@@ -181,7 +154,7 @@ class Renderer:
         """
         model, data = self.model, self._data
         if isinstance(camera, str) and camera not in self.cameras:
-            raise ValueError(f"unknown camera {camera!r}; choose from {', '.join(self.cameras)}")
+            raise OptionError(f"unknown camera {camera!r}; choose from {', '.join(self.cameras)}")
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -237,12 +210,12 @@ class Renderer:
         """Add a shape to the scene and return it."""
         scene = self._renderer.scene
         if scene.ngeom >= scene.maxgeom:
-            raise ValueError(f"more than {scene.maxgeom} shapes to draw; give fewer markers")
+            raise OptionError(f"more than {scene.maxgeom} shapes to draw; give fewer markers")
         geom = scene.geoms[scene.ngeom]
         scene.ngeom += 1
         colour, extent = np.asarray(rgba, dtype=np.float32), np.asarray(size, dtype=float)
         mujoco.mjv_initGeom(geom, shape, extent, position, axes.ravel(), colour)
-        geom.emission = 0.45
+        geom.rgba[:3], geom.emission = 0.6 * colour[:3], 1.0  # glows rather than catches the sun
         geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # casts no shadow
         return geom
 
@@ -255,16 +228,19 @@ class Renderer:
         mujoco.mjv_connector(geom, kind, width, start, end)
         geom.type = shape
 
-    def _draw_chain(self, points: Array, colours: Array, widths: Array) -> None:
+    def _draw_chain(
+        self, shape: mujoco.mjtGeom, points: Array, colours: Array, widths: Array
+    ) -> None:
         for k in np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6):
-            box = mujoco.mjtGeom.mjGEOM_BOX  # the cheapest: a trail of capsules took 40 ms a frame
-            self._connect(box, colours[k], widths[k], points[k], points[k + 1])
+            self._connect(shape, colours[k], widths[k], points[k], points[k + 1])
 
     def _draw_trail(self, points: Array) -> None:
         shown = np.unique(np.linspace(0, len(points) - 1, TRAIL_SEGMENTS + 1).astype(int))
         youth = np.linspace(0, 1, len(shown))
         colours = TRAIL_OLD + youth[:, None] * (TRAIL_NEW - TRAIL_OLD)
-        self._draw_chain(points[shown], colours, TRAIL_WIDTH * youth**0.7)
+        # Boxes are the cheapest shape: a trail of capsules took 40 ms a frame.
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        self._draw_chain(box, points[shown], colours, TRAIL_WIDTH * youth**0.7)
 
     def _draw_marker(self, marker: Marker) -> None:
         shape, size, rgba = mujoco.mjtGeom, marker.size, marker.rgba
@@ -285,13 +261,15 @@ class Renderer:
         elif marker.kind in ("ring", "pad"):
             angle = np.linspace(0, 2 * np.pi, 49)
             circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
-            width = np.full(49, 0.025 * size + 0.003)
-            self._draw_chain(position + size * circle @ axes.T, np.tile(solid, (49, 1)), width)
+            width = np.full(49, 0.02 * size + 0.003)
+            edge, colours = position + size * circle @ axes.T, np.tile((*rgba[:3], 1), (49, 1))
+            self._draw_chain(shape.mjGEOM_CAPSULE, edge, colours, width)
             if marker.kind == "pad":
-                self._add(shape.mjGEOM_CYLINDER, rgba, (size, size, 0.002), position, axes)
+                self._add(shape.mjGEOM_CYLINDER, rgba, (size, 0.002, 0), position, axes)
         elif marker.kind == "path":
             points = np.asarray(marker.points, dtype=float)
-            self._draw_chain(points, np.tile(rgba, (len(points), 1)), np.full(len(points), size))
+            colours, width = np.tile(rgba, (len(points), 1)), np.full(len(points), size)
+            self._draw_chain(shape.mjGEOM_BOX, points, colours, width)
         elif marker.kind in ("line", "arrow"):
             arrow = marker.kind == "arrow"
             kind = shape.mjGEOM_ARROW if arrow else shape.mjGEOM_CYLINDER
@@ -317,7 +295,7 @@ def follow_cameras(position: Array, goal: Array, smoothing: float = 0.0) -> list
     distance = np.clip(1.2 + 1.3 * separation, *FOLLOW_DISTANCE)
     path = np.concatenate([position + 0.5 * away, distance], axis=1)
     if smoothing > 0:
-        path = gaussian_filter1d(path, smoothing, axis=0, mode="nearest")
+        path = np.asarray(gaussian_filter1d(path, smoothing, axis=0, mode="nearest"))
     cameras = [mujoco.MjvCamera() for _ in path]
     for camera, row in zip(cameras, path, strict=True):
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
@@ -332,7 +310,7 @@ def render_flight(
     *,
     width: int = 848,
     height: int = 480,
-    fps: float = 30.0,
+    fps: float = 25.0,
     camera: str = FOLLOW,
     overlay: bool = True,
     trail: bool = True,
@@ -378,14 +356,14 @@ def write_video(
     *,
     width: int = 848,
     height: int = 480,
-    fps: float = 30.0,
+    fps: float = 25.0,
     camera: str = FOLLOW,
     overlay: bool = True,
     trail: bool = True,
 ) -> Path:
     """Write a flight as an MP4 (H.264, yuv420p). An unfinished file never bears the name.
 
-    Ten seconds at the default size take about 20 s on two cores without a GPU.
+    Ten seconds of flight at the defaults cost about 35 s of CPU time, on all cores, without a GPU.
 
     Args:
         flight: What was flown.
@@ -403,11 +381,11 @@ def write_video(
 
     Raises:
         RenderingUnavailable: There is no graphics library, mediapy, Pillow or ffmpeg.
-        ValueError: The size or the camera is not one that can be drawn.
+        OptionError: The size or the camera is not one that can be drawn.
     """
     mediapy = _video_library()
     if width % 2 or height % 2:
-        raise ValueError(f"{width}x{height} pixels: a video needs an even width and height")
+        raise OptionError(f"{width}x{height} pixels: a video needs an even width and height")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")

@@ -129,9 +129,7 @@ class Simulation(abc.ABC):
 
     def _write(self, rows: Rows, start: Start | State) -> None:
         index: Any = ... if rows is None else rows
-        self.qpos[index] = np.concatenate(
-            [start.position + self.origin, start.quaternion], axis=-1
-        )
+        self.qpos[index] = np.concatenate([start.position + self.origin, start.quaternion], axis=-1)
         self.qvel[index] = np.concatenate([start.velocity, start.body_rate], axis=-1)
         self.act[index] = start.rotor_speed
 

@@ -15,6 +15,7 @@ from typing import Any
 import mujoco as _mujoco
 import numpy as np
 from dm_control import mujoco
+from dm_control.mujoco import wrapper
 from dm_control.rl import control
 from dm_control.suite import base
 from dm_control.utils import containers
@@ -28,6 +29,20 @@ from quadrl.vehicle import ROTORS, Vehicle
 
 DOMAIN = "quadrotor"
 SUITE = containers.TaggedTasks()
+ENVIRONMENT_KWARGS = (
+    "time_limit",
+    "control_timestep",
+    "n_sub_steps",
+    "flat_observation",
+    "legacy_step",
+)
+
+ALL_TASKS: tuple[tuple[str, str], ...]
+"""(domain, task) pairs, as dm_control.suite has them."""
+TASKS_BY_DOMAIN: dict[str, tuple[str, ...]]
+"""The task names of the domain."""
+BENCHMARKING: tuple[tuple[str, str], ...] = ()
+"""Empty: dm_control asks of these that every reward lies in [0, 1], and the paper's do not."""
 
 
 class Physics(mujoco.Physics):
@@ -52,7 +67,7 @@ class Physics(mujoco.Physics):
 class QuadrotorTask(base.Task):
     """A task of the catalogue in dm_control's terms."""
 
-    def __init__(self, task: Task, vehicle: Vehicle, random: Any = None) -> None:
+    def __init__(self, task: Task, vehicle: Vehicle, random: Any = None) -> None:  # noqa: ANN401
         """Wrap a task.
 
         Args:
@@ -67,12 +82,15 @@ class QuadrotorTask(base.Task):
         self._task, self._vehicle = task, vehicle
         self._environment: Environment | None = None
         self._physics: Physics | None = None
-        self._transition: Transition | None = None
+        self._observation = {name: np.zeros(p.size) for name, p in task.observation.items()}
+        self.transition: Transition | None = None
+        """The last step with its named reward terms and success; None after a reset."""
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Four rotors, -1 to 1."""
         names = "\t".join(f"rotor_{k + 1}" for k in range(ROTORS))
-        return specs.BoundedArray((ROTORS,), np.float64, -1.0, 1.0, name=names)
+        bound = np.ones(ROTORS)
+        return specs.BoundedArray((ROTORS,), np.float64, -bound, bound, name=names)
 
     def initialize_episode(self, physics: Physics) -> None:
         """Begin an episode."""
@@ -84,8 +102,8 @@ class QuadrotorTask(base.Task):
             if self._environment is not None:
                 environment.generators = self._environment.generators
             self._environment, self._physics = environment, physics
-        self._observation = self._environment.reset()
-        self._transition = None
+        self._observation, self.transition = self._environment.reset(), None
+        super().after_step(physics)  # colours the reward
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Hand the action to the rotors."""
@@ -93,12 +111,9 @@ class QuadrotorTask(base.Task):
 
     def after_step(self, physics: Physics) -> None:
         """Work out the transition."""
-        self._transition = self._environment.finish()
-        self._observation = self._transition.observation
-        if self.visualize_reward:
-            colours, closeness = physics.named.model.mat_rgba, 1 / (1 + self._transition.error)
-            plain, highlight = colours["self_default"], colours["self_highlight"]
-            colours["self"] = plain + closeness**4 * (highlight - plain)
+        self.transition = self._environment.finish()
+        self._observation = self.transition.observation
+        super().after_step(physics)
 
     def get_observation(self, physics: Physics) -> dict[str, np.ndarray]:
         """Named parts, float64."""
@@ -106,38 +121,47 @@ class QuadrotorTask(base.Task):
 
     def get_reward(self, physics: Physics) -> float:
         """The reward of the last step."""
-        return float(self._transition.reward) if self._transition else 0.0
+        return float(self.transition.reward) if self.transition else 0.0
 
     def get_termination(self, physics: Physics) -> float | None:
         """Discount at the end: 0 for terminated, 1 for truncated; None before."""
-        if self._transition is None or not (
-            self._transition.terminated or self._transition.truncated
-        ):
-            return None
-        return 0.0 if self._transition.terminated else 1.0
-
-    @property
-    def transition(self) -> Transition | None:
-        """The last transition with its named reward terms and success; None after a reset."""
-        return self._transition
+        if self.transition.terminated:
+            return 0.0
+        return 1.0 if self.transition.truncated else None
 
 
-def _make(
-    name: str,
+def make(
+    task: str | Task,
     time_limit: float | None = None,
-    random: Any = None,
+    random: Any = None,  # noqa: ANN401 - what dm_control takes
     environment_kwargs: dict[str, Any] | None = None,
     vehicle: Vehicle | None = None,
-    **options: Any,
+    **options: Any,  # noqa: ANN401
 ) -> control.Environment:
-    """Build the environment of a task; options are the task's fields."""
+    """Build the environment of a task.
+
+    Args:
+        task: A name of the catalogue or a task.
+        time_limit: Horizon of an episode [s]; None for the task's.
+        random: Seed, RandomState or None.
+        environment_kwargs: As `load` has them.
+        vehicle: The aircraft; None for the paper's.
+        **options: Fields of the task.
+
+    Raises:
+        OptionError: Unknown task or option; the message lists the choices.
+        ValueError: Both control_timestep and n_sub_steps are given.
+    """
     settings = dict(environment_kwargs or {})
+    check_choices(settings, ENVIRONMENT_KWARGS, "environment_kwargs entry")
+    # The task keeps the clock, not dm_control: there a time limit hides a crash on the last step.
     if (limit := settings.pop("time_limit", time_limit)) is not None:
         options["horizon"] = limit
-    task = tasks.make(name, **options)
-    vehicle = vehicle or Vehicle()
+    task, vehicle = tasks.make(task, **options), vehicle or Vehicle()
     control_step = settings.pop("control_timestep", None)
     if (substeps := settings.pop("n_sub_steps", None)) is not None:
+        if control_step is not None:
+            raise ValueError("both control_timestep and n_sub_steps were given; give one")
         control_step = substeps * vehicle.physics_step
     if control_step is not None:
         vehicle = dataclasses.replace(vehicle, control_step=control_step)
@@ -145,32 +169,11 @@ def _make(
     # A simulation that diverges must not pass for a fresh one.
     model.opt.disableflags |= int(_mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     return control.Environment(
-        Physics.from_model(model),
+        Physics.from_model(wrapper.MjModel(model)),
         QuadrotorTask(task, vehicle, random),
-        n_sub_steps=vehicle.substeps,  # the task keeps the clock: a crash on the last step counts
+        n_sub_steps=vehicle.substeps,
         **settings,
     )
-
-
-def _collect() -> None:
-    """Put every task of the catalogue into SUITE, and the constants after it."""
-    global ALL_TASKS, TASKS_BY_DOMAIN
-    for name in tasks.TASKS:
-        if name not in SUITE:
-            factory = functools.partial(_make, name)
-            factory.__name__ = name  # type: ignore[attr-defined]
-            SUITE.add()(factory)
-    ALL_TASKS = tuple((DOMAIN, name) for name in SUITE)
-    TASKS_BY_DOMAIN = {DOMAIN: tuple(SUITE)}
-
-
-ALL_TASKS: tuple[tuple[str, str], ...] = ()
-"""(domain, task) pairs, as dm_control.suite has them."""
-BENCHMARKING: tuple[tuple[str, str], ...] = ()
-"""Empty: dm_control asks of these that every reward lies in [0, 1], and the paper's do not."""
-TASKS_BY_DOMAIN: dict[str, tuple[str, ...]] = {}
-"""The task names of the domain."""
-_collect()
 
 
 def load(
@@ -186,15 +189,16 @@ def load(
         domain_name: "quadrotor".
         task_name: A name of the catalogue.
         task_kwargs: `random` (seed), `time_limit` [s], `vehicle`, and any field of the task.
-        environment_kwargs: For `dm_control.rl.control.Environment`.
-        visualize_reward: Colour the hull by how close the aircraft is to what is asked.
+        environment_kwargs: `time_limit` and `control_timestep` [s], `n_sub_steps`,
+            `flat_observation`, `legacy_step`: those of `dm_control.rl.control.Environment`.
+        visualize_reward: Colour the aircraft by its reward, clipped to [0, 1].
 
     Raises:
-        ValueError: Unknown domain, task or option; the message lists the choices.
+        OptionError: Unknown domain, task or option; the message lists the choices.
     """
     check_choices([domain_name], [DOMAIN], "domain")
     check_choices([task_name], tasks.TASKS, "task")
-    environment = _make(task_name, environment_kwargs=environment_kwargs, **(task_kwargs or {}))
+    environment = make(task_name, environment_kwargs=environment_kwargs, **(task_kwargs or {}))
     environment.task.visualize_reward = visualize_reward
     return environment
 
@@ -203,7 +207,11 @@ def register() -> None:
     """Put the domain, with every task of the catalogue, among dm_control's own (idempotent)."""
     from dm_control import suite
 
-    _collect()
+    for name in tasks.TASKS:
+        if name not in SUITE:
+            factory = functools.partial(make, name)
+            factory.__name__ = name  # type: ignore[attr-defined]
+            SUITE.add()(factory)
     suite._DOMAINS[DOMAIN] = sys.modules[__name__]
     suite.ALL_TASKS = suite._get_tasks(tag=None)
     suite.BENCHMARKING = suite._get_tasks("benchmarking")
@@ -212,3 +220,12 @@ def register() -> None:
     suite.NO_REWARD_VIZ = suite._get_tasks("no_reward_visualization")
     suite.REWARD_VIZ = tuple(sorted(set(suite.ALL_TASKS) - set(suite.NO_REWARD_VIZ)))
     suite.TASKS_BY_DOMAIN = suite._get_tasks_by_domain(suite.ALL_TASKS)
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401
+    """The constants that grow with the catalogue."""
+    if name == "ALL_TASKS":
+        return tuple((DOMAIN, task) for task in tasks.TASKS)
+    if name == "TASKS_BY_DOMAIN":
+        return {DOMAIN: tuple(tasks.TASKS)}
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

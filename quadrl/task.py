@@ -14,10 +14,11 @@ import functools
 import math
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
+from quadrl.errors import QuadrlError
 from quadrl.rotation import (
     Array,
     namespace,
@@ -33,6 +34,10 @@ EPISODE_DRAWS = 64
 """Uniform numbers that every episode takes from its aircraft's generator, used or not."""
 
 FULL_TURN = 2 * math.pi
+
+
+class OptionError(QuadrlError, ValueError):
+    """A name or a value that is not among the choices."""
 
 
 class Draw:
@@ -131,6 +136,48 @@ TARGET_VELOCITY = {
 """What tasks with a moving target add at the end."""
 
 
+Rgba = tuple[float, float, float, float]
+Kind = Literal["goal", "sphere", "ring", "pad", "line", "arrow", "path"]
+GOAL_RGBA: Rgba = (0.25, 0.92, 0.50, 0.28)
+
+
+@dataclasses.dataclass(frozen=True)
+class Marker:
+    """Something to be drawn, in the task's frame; an environment hands it out in the world's."""
+
+    kind: Kind
+    """goal: a sphere with a core and a drop line to the ground. ring, pad: circles that lie flat
+    unless `end` is a point on their axis."""
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre, or where a line or an arrow begins [m]."""
+    size: float = 0.1
+    """Radius of a goal, sphere, ring or pad; width of a line, arrow or path [m]."""
+    rgba: Rgba = GOAL_RGBA
+    """Colour and opacity, each 0 to 1."""
+    end: tuple[float, float, float] | None = None
+    """Where a line or an arrow ends [m]."""
+    points: Sequence[Sequence[float]] | np.ndarray = ()
+    """(n, 3) corners of a path [m]."""
+
+    def moved(self, offset: np.ndarray) -> Marker:
+        """The same marker elsewhere; offset (3,) [m]."""
+        points = np.asarray(self.points, dtype=float)
+        return dataclasses.replace(
+            self,
+            position=tuple(np.asarray(self.position) + offset),
+            end=None if self.end is None else tuple(np.asarray(self.end) + offset),
+            points=points + offset if points.size else (),
+        )
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn."""
+        if self.kind not in get_args(Kind):
+            kinds = ", ".join(get_args(Kind))
+            raise OptionError(f"unknown marker {self.kind!r}; choose from {kinds}")
+        if self.kind in ("line", "arrow") and self.end is None:
+            raise OptionError(f"a marker of kind {self.kind!r} needs its end")
+
+
 @dataclasses.dataclass(frozen=True)
 class Task(abc.ABC):
     """Base of all tasks: fly to a goal and stay there."""
@@ -162,10 +209,10 @@ class Task(abc.ABC):
     """Reward for a metre of distance gained."""
     attitude_weight: float = 10.0
     """Reward for a unit of attitude error gained."""
-    speed_weight: float = 0.1
-    """Reward for a m/s of speed lost."""
-    spin_weight: float = 0.1
-    """Reward for a rad/s of body rate lost."""
+    speed_weight: float = 2.0
+    """Reward for a m/s of speed lost (gym-aero has 0.1, which learns to hover half as fast)."""
+    spin_weight: float = 1.0
+    """Reward for a rad/s of body rate lost (gym-aero: 0.1)."""
     control_weight: float = 1.0
     """Cost of sum((Omega_c - Omega_hover)^2) / Omega_max^2 at each step."""
     survival_weight: float = 10.0
@@ -178,10 +225,12 @@ class Task(abc.ABC):
             numbers = value if isinstance(value, tuple) else (value,)
             flat = np.asarray(numbers, dtype=float) if numbers else np.zeros(1)
             if not np.all(np.isfinite(flat)):
-                raise ValueError(f"{self.name}: {field.name} = {value!r} is not finite")
+                raise OptionError(f"{self.name}: {field.name} = {value!r} is not finite")
         for positive in ("horizon", "altitude"):
             if getattr(self, positive) <= 0:
-                raise ValueError(f"{self.name}: {positive} = {getattr(self, positive)} must be > 0")
+                raise OptionError(
+                    f"{self.name}: {positive} = {getattr(self, positive)} must be > 0"
+                )
 
     @abc.abstractmethod
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Fields]:
@@ -251,8 +300,8 @@ class Task(abc.ABC):
     ) -> Array:
         """Whether an episode that ends now did what was asked, (...) bool."""
 
-    def markers(self, fields: Fields) -> Sequence[Any]:
-        """What to draw of the task in one aircraft's episode (quadrl.rendering.Marker)."""
+    def markers(self, fields: Fields) -> Sequence[Marker]:
+        """What to draw of the task in one aircraft's episode; the goal is drawn anyway."""
         return ()
 
     def touches_ground(self, state: State) -> Array:
@@ -263,7 +312,7 @@ class Task(abc.ABC):
         """A variant with other options.
 
         Raises:
-            ValueError: An option that the task does not have; the message lists the choices.
+            OptionError: An option that the task does not have; the message lists the choices.
         """
         check_choices(options, [f.name for f in dataclasses.fields(self)], f"{self.name} option")
         return dataclasses.replace(self, **options)
@@ -278,11 +327,11 @@ def check_choices(given: Iterable[str], choices: Iterable[str], what: str) -> No
     """Raise for the first name that is not among the choices.
 
     Raises:
-        ValueError: The message names it, the nearest choice and all choices.
+        OptionError: The message names it, the nearest choice and all choices.
     """
     allowed = list(choices)
     for name in given:
         if name not in allowed:
             near = difflib.get_close_matches(str(name), allowed, n=1)
             hint = f" (did you mean {near[0]}?)" if near else ""
-            raise ValueError(f"unknown {what} {name!r}{hint}; choices: {', '.join(allowed)}")
+            raise OptionError(f"unknown {what} {name!r}{hint}; choices: {', '.join(allowed)}")

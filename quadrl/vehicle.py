@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from quadrl import native
+from quadrl.errors import QuadrlError
 from quadrl.rotation import Array, namespace
 
 ASSETS = Path(__file__).parent / "assets"
@@ -26,7 +27,7 @@ MARK = 1903518052.0
 MARK_SLOT = 9
 
 
-class VehicleError(ValueError):
+class VehicleError(QuadrlError, ValueError):
     """A parameter of an aircraft that no aircraft can have."""
 
 
@@ -71,9 +72,7 @@ class Vehicle:
             if field.name == "name":
                 continue
             zero_allowed = field.name in ("drag_coefficient", "moment_coefficient")
-            if not all(
-                math.isfinite(v) and (v > 0 or (zero_allowed and v == 0)) for v in numbers
-            ):
+            if not all(math.isfinite(v) and (v > 0 or (zero_allowed and v == 0)) for v in numbers):
                 raise VehicleError(f"{field.name} = {value!r}: positive and finite is allowed")
         if len(self.inertia) != 3 or 2 * max(self.inertia) > sum(self.inertia) * (1 + 1e-9):
             raise VehicleError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quadrl.task import Task, check_choices
+from quadrl.task import OptionError, Task, check_choices
 from quadrl.tasks.hover import Hover
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Hover,)}
@@ -18,7 +18,7 @@ def register(task: type[Task]) -> type[Task]:
         ValueError: Another task has the name.
     """
     if TASKS.get(task.name, task) is not task:
-        raise ValueError(f"a task named {task.name!r} is registered already")
+        raise OptionError(f"a task named {task.name!r} is registered already")
     TASKS[task.name] = task
     return task
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 from quadrl.rotation import Array, namespace
 from quadrl.state import Start, State
@@ -50,16 +49,10 @@ class Hover(Task):
     def terminated(self, state: State, measures: Measures, fields: Fields) -> Array:
         """Away, on the ground or on its back."""
         upside_down = state.rotation[..., 2, 2] < 0
-        return (
-            (measures.distance > self.max_distance) | self.touches_ground(state) | upside_down
-        )
+        return (measures.distance > self.max_distance) | self.touches_ground(state) | upside_down
 
     def success(
         self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array
     ) -> Array:
         """Still flying at the end, and close."""
         return truncated & (errors.final < self.tolerance)
-
-    def markers(self, fields: Fields) -> Sequence[tuple]:
-        """The waypoint."""
-        return (("sphere", fields.goal, self.tolerance),)

@@ -1,8 +1,8 @@
 """Door two: Gymnasium, one aircraft or a native vector of them.
 
-The observation is the flat float32 vector of the task's parts (`QuadrotorEnv.layout` says which
-entry is what); the action is Box(-1, 1, (4,)). `info` carries `reward_terms`, `is_success`,
-`error` [m] and `diverged`. A new version of an id (-vN) means that its numbers changed.
+The observation is the flat float32 vector of the task's parts (`environment.layout` says which
+entry is what); the action is Box(-1, 1, (4,)). `info` of a step carries `reward_terms`,
+`is_success`, `error` [m] and `diverged`. A new version of an id (-vN) means other numbers.
 """
 
 from __future__ import annotations
@@ -16,137 +16,138 @@ from gymnasium.vector.utils import batch_space
 
 from quadrl import tasks
 from quadrl.environment import Environment, Transition
-from quadrl.task import Task
+from quadrl.task import OptionError, Task, check_choices
 from quadrl.vehicle import ROTORS, Vehicle
 
-
-def _task(task: str | Task, max_episode_steps: int | None, vehicle: Vehicle, **options: Any) -> Task:
-    """The task with its options, its horizon as long as `max_episode_steps` control steps."""
-    if max_episode_steps is not None:
-        options["horizon"] = max_episode_steps * vehicle.control_step
-    return tasks.make(task, **options)
+Info = dict[str, Any]
 
 
-def _spaces(size: int) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    return (
-        gym.spaces.Box(-np.inf, np.inf, (size,), np.float32),
-        gym.spaces.Box(-1.0, 1.0, (ROTORS,), np.float32),
-    )
+class _Door:
+    """What the single environment and the vector share: how they are made, and how they draw."""
 
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
-class QuadrotorEnv(gym.Env):
-    """One aircraft. `gym.make("quadrl/Hover-v0")`."""
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
-
-    def __init__(
+    def _make(
         self,
-        task: str | Task = "hover",
+        task: str | Task,
+        num_envs: int | None,
         *,
-        render_mode: str | None = None,
         vehicle: Vehicle | None = None,
         max_episode_steps: int | None = None,
+        num_threads: int = 0,
+        render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
         camera: str = "track",
-        **options: Any,
-    ) -> None:
+        reward_terms: bool = True,
+        **options: Any,  # noqa: ANN401 - of the task's own types
+    ) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+        """Make the environment; returns the spaces of one aircraft."""
+        if render_mode not in (None, "rgb_array"):
+            raise OptionError(f"unknown render_mode {render_mode!r}; choices: None, 'rgb_array'")
+        vehicle = vehicle or Vehicle()
+        if max_episode_steps is not None:
+            options["horizon"] = max_episode_steps * vehicle.control_step
+        self.environment = Environment(
+            tasks.make(task, **options), num_envs=num_envs, vehicle=vehicle, num_threads=num_threads
+        )
+        self.render_mode, self._terms_wanted = render_mode, reward_terms
+        self.metadata = self.metadata | {"render_fps": round(1 / vehicle.control_step)}
+        self._camera, self._picture = camera, {"width": width, "height": height}
+        self._renderer: Any = None
+        return (
+            gym.spaces.Box(-np.inf, np.inf, (self.environment.size,), np.float32),
+            gym.spaces.Box(-1.0, 1.0, (ROTORS,), np.float32),
+        )
+
+    def _frame(self, row: int = 0) -> np.ndarray:
+        """The picture (height, width, 3) of one aircraft, uint8."""
+        environment = self.environment
+        if self._renderer is None:
+            from quadrl.rendering import Renderer
+
+            model = environment.vehicle.compile(contact=environment.task.contact)
+            self._renderer = Renderer(model, **self._picture)
+        qpos = environment.simulation.qpos.reshape(-1, 7)[row]
+        markers = environment.markers(row)
+        return self._renderer.frame(qpos, camera=self._camera, markers=markers)
+
+    def _close(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+class QuadrotorEnv(_Door, gym.Env):
+    """One aircraft. `gym.make("quadrl/Hover-v0")`.
+
+    `gym.make` keeps its argument `max_episode_steps` to itself, for a TimeLimit that knows nothing
+    of success: give `horizon` [s] instead.
+    """
+
+    def __init__(self, task: str | Task = "hover", **settings: Any) -> None:  # noqa: ANN401
         """Make the environment.
 
         Args:
             task: A name of the catalogue or a task.
-            render_mode: None or "rgb_array".
-            vehicle: The aircraft; None for the paper's.
-            max_episode_steps: Control steps of an episode; None for the task's horizon.
-            width: Of a rendered frame [pixels].
-            height: Of a rendered frame [pixels].
-            camera: A camera of `quadrl.rendering`.
-            **options: Fields of the task.
+            **settings: `vehicle` (None: the paper's); `max_episode_steps` (None: the task's
+                horizon); `render_mode` (None or "rgb_array"), `width` and `height` [pixels] and
+                `camera` (a camera of `quadrl.rendering`) of a picture; `reward_terms` (True: in
+                `info`); any field of the task.
 
         Raises:
-            ValueError: Unknown task, option or render mode.
+            OptionError: Unknown task, option or render mode; the message lists the choices.
         """
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode = {render_mode!r}: None or 'rgb_array' is allowed")
-        vehicle = vehicle or Vehicle()
-        self.environment = Environment(
-            _task(task, max_episode_steps, vehicle, **options), vehicle=vehicle
-        )
-        self.observation_space, self.action_space = _spaces(self.environment.size)
-        self.render_mode = render_mode
-        self.metadata = self.metadata | {"render_fps": round(1 / vehicle.control_step)}
-        self._view = (width, height, camera)
-        self._renderer: Any = None
-
-    @property
-    def layout(self) -> dict[str, slice]:
-        """Where each named part stands in the observation."""
-        return self.environment.layout
+        self.observation_space, self.action_space = self._make(task, None, **settings)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[np.ndarray, Info]:
         """Begin an episode; a seed starts the sequence of episodes anew."""
         super().reset(seed=seed)
         self.environment.generators = [self.np_random]
         return self.environment.flatten(self.environment.reset()), {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Fly one control step.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
         now = self.environment.step(action)
-        return (
-            self.environment.flatten(now.observation),
-            float(now.reward),
-            bool(now.terminated),
-            bool(now.truncated),
-            {
-                "reward_terms": now.reward_terms,
-                "is_success": bool(now.is_success),
-                "error": float(now.error),
-                "diverged": bool(now.diverged),
-            },
-        )
+        info: Info = {
+            "is_success": bool(now.is_success),
+            "error": float(now.error),
+            "diverged": bool(now.diverged),
+        }
+        if self._terms_wanted:
+            info["reward_terms"] = {name: float(term) for name, term in now.reward_terms.items()}
+        observation = self.environment.flatten(now.observation)
+        return observation, float(now.reward), bool(now.terminated), bool(now.truncated), info
 
     def render(self) -> np.ndarray | None:
         """The current picture (height, width, 3) uint8, or None without a render mode.
 
         Raises:
-            RenderingUnavailable: The machine has no EGL.
+            RenderingUnavailable: There is nothing to draw with.
         """
-        if self.render_mode is None:
-            return None
-        if self._renderer is None:
-            from quadrl.rendering import Renderer
-
-            width, height, self._camera = self._view
-            model = self.environment.vehicle.compile(contact=self.environment.task.contact)
-            self._renderer = Renderer(model, width=width, height=height)
-        return self._renderer.frame(
-            self.environment.simulation.qpos,
-            camera=self._camera,
-            markers=self.environment.markers(),
-        )
+        return None if self.render_mode is None else self._frame()
 
     def close(self) -> None:
         """Free the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._close()
 
 
-class QuadrotorVectorEnv(VectorEnv):
+class QuadrotorVectorEnv(_Door, VectorEnv):
     """Many aircraft on all cores. `gym.make_vec("quadrl/Hover-v0", num_envs=1024)`.
 
-    Autoreset: NEXT_STEP (default; the step after an end ignores the action, resets, and gives
-    reward 0), SAME_STEP (the end's own observation in `info["final_obs"]`), or DISABLED (reset with
-    `options={"reset_mask": mask}`).
+    Autoreset as Gymnasium's SyncVectorEnv has it: NEXT_STEP (default; the step after an end ignores
+    the row's action, resets it and gives reward 0), SAME_STEP (the end's own observation and info
+    are `info["final_obs"]` and `info["final_info"]`), or DISABLED (reset with
+    `options={"reset_mask": mask}`). `info["_name"]` says which rows `info["name"]` holds for.
+    TorchRL's GymWrapper takes DISABLED, and SAME_STEP with `reward_terms=False`: it cannot read an
+    info within an info.
     """
-
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self,
@@ -154,93 +155,106 @@ class QuadrotorVectorEnv(VectorEnv):
         num_envs: int = 1,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        vehicle: Vehicle | None = None,
-        max_episode_steps: int | None = None,
-        num_threads: int = 0,
-        **options: Any,
+        **settings: Any,  # noqa: ANN401
     ) -> None:
-        """Make the environments; arguments as `QuadrotorEnv` and `Environment` have them."""
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        vehicle = vehicle or Vehicle()
-        self.environment = Environment(
-            _task(task, max_episode_steps, vehicle, **options),
-            num_envs=num_envs,
-            vehicle=vehicle,
-            num_threads=num_threads,
+        """Make the environments.
+
+        Args:
+            task: A name of the catalogue or a task.
+            num_envs: N.
+            autoreset_mode: Or its name.
+            **settings: As `QuadrotorEnv` has them, and `num_threads` (0: every core).
+
+        Raises:
+            OptionError: Unknown task, option or mode, or an impossible number of environments.
+        """
+        modes = {mode.value: mode for mode in AutoresetMode} | dict(AutoresetMode.__members__)
+        if not isinstance(autoreset_mode, AutoresetMode):
+            check_choices([autoreset_mode], modes, "autoreset mode")
+            autoreset_mode = modes[autoreset_mode]
+        self.single_observation_space, self.single_action_space = self._make(
+            task, num_envs, **settings
         )
-        self.num_envs = num_envs
-        self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
-        self.single_observation_space, self.single_action_space = _spaces(self.environment.size)
+        self.num_envs, self.autoreset_mode = num_envs, autoreset_mode
+        self.metadata = self.metadata | {"autoreset_mode": autoreset_mode}
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._over = np.zeros(num_envs, dtype=bool)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[np.ndarray, Info]:
         """Begin episodes, in all environments or in those of `options["reset_mask"]`.
 
         Environment i is seeded with seed + i.
         """
-        if seed is not None:
-            self.environment.seed(seed)
-        mask = (options or {}).get("reset_mask")
-        if mask is None:
-            self._observation = self.environment.flatten(self.environment.reset())
-            self._over[:] = False
-            return self._observation.copy(), {}
-        mask = np.asarray(mask)
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(f"reset_mask must be bool of shape ({self.num_envs},), some of it True")
-        self._reset_rows(mask)
+            raise OptionError(f"reset_mask: bool of shape ({self.num_envs},), some of it True")
+        if seed is not None:
+            for i in np.flatnonzero(mask):
+                self.environment.generators[i] = np.random.default_rng(seed + int(i))
+        if mask.all():
+            self._observation = self.environment.flatten(self.environment.reset())
+            self._over = np.zeros(self.num_envs, dtype=bool)
+        else:
+            self._renew(mask)
         return self._observation.copy(), {}
 
     def step(
         self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Fly one control step in every environment.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        resting = self._over if self.autoreset_mode == AutoresetMode.NEXT_STEP else None
         now = self.environment.step(actions)
         self._observation = self.environment.flatten(now.observation)
-        info = _info(now)
         reward, terminated, truncated = now.reward, now.terminated, now.truncated
-        if resting is not None and resting.any():
-            self._reset_rows(resting.copy())
-            reward = np.where(resting, 0.0, reward)
-            terminated, truncated = terminated & ~resting, truncated & ~resting
-            for name in ("is_success", "diverged"):
-                info[name] = info[name] & ~resting
-        self._over = terminated | truncated
+        last, self._over = self._over, terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over.any():
             over = self._over.copy()
-            final, present = np.full(self.num_envs, None, dtype=object), over.copy()
+            final = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(over):
                 final[i] = self._observation[i].copy()
-            ended = {k: v for k, v in info.items() if not k.startswith("_")}
-            info |= {"final_obs": final, "_final_obs": present}
-            info |= {"final_info": ended, "_final_info": present}
-            self._reset_rows(over)
+            info = self._info(now, ~over) | {"final_obs": final, "_final_obs": over}
+            info |= {"final_info": self._info(now, over), "_final_info": over.copy()}
+            self._renew(over)
+        elif self.autoreset_mode == AutoresetMode.NEXT_STEP and last.any():
+            info = self._info(now, ~last)
+            reward = np.where(last, 0.0, reward)
+            terminated, truncated = terminated & ~last, truncated & ~last
+            self._renew(last)
+        else:
+            info = self._info(now, np.ones(self.num_envs, dtype=bool))
         return self._observation.copy(), reward, terminated, truncated, info
 
-    def _reset_rows(self, mask: np.ndarray) -> None:
-        self._observation[mask] = self.environment.flatten(self.environment.reset(mask))
-        self._over[mask] = False
+    def _info(self, now: Transition, rows: np.ndarray) -> Info:
+        """A step's info for `rows` (N,) bool: an array a name, 0 elsewhere, and a mask a name."""
 
+        def masked(**values: np.ndarray) -> Info:
+            arrays = {k: np.where(rows, value, np.zeros_like(value)) for k, value in values.items()}
+            return arrays | {f"_{name}": rows.copy() for name in values}
 
-def _info(now: Transition) -> dict[str, Any]:
-    """Gymnasium's vector convention: an array a name, and a mask of who has it."""
-    everyone = np.ones(len(now.reward), dtype=bool)
-    info = {
-        "reward_terms": now.reward_terms | {f"_{name}": everyone for name in now.reward_terms},
-        "is_success": now.is_success,
-        "error": now.error.copy(),
-        "diverged": now.diverged,
-    }
-    return info | {f"_{name}": everyone for name in info}
+        info = masked(is_success=now.is_success, error=now.error, diverged=now.diverged)
+        if self._terms_wanted:
+            info |= {"reward_terms": masked(**now.reward_terms), "_reward_terms": rows.copy()}
+        return info
+
+    def _renew(self, rows: np.ndarray) -> None:
+        """Begin an episode in some rows (N,) bool."""
+        self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
+        self._over[rows] = False
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture (height, width, 3) uint8 of each aircraft, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(self._frame(row) for row in range(self.num_envs))
+
+    def close_extras(self, **_: Any) -> None:  # noqa: ANN401
+        """Free the renderer."""
+        self._close()
 
 
 def register_ids() -> None:

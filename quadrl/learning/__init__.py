@@ -1,0 +1,1 @@
+"""Training, evaluation and their figures; needs the extra `train`."""

@@ -22,6 +22,8 @@ from pathlib import Path
 
 import mujoco
 
+from quadrl.errors import QuadrlError
+
 SOURCES = ("callbacks.c", "state.c")
 HEADERS = ("equations.h",)
 # No contraction: a fused multiply-add would round otherwise than NumPy does.
@@ -35,7 +37,7 @@ _ACTUATOR_CALLBACK = ctypes.CFUNCTYPE(
 _GENERIC_CALLBACK = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 
 
-class NativeError(RuntimeError):
+class NativeError(QuadrlError, RuntimeError):
     """The C part cannot be built, is for another mujoco, or is not installed."""
 
 
@@ -124,9 +126,7 @@ def load(path: Path) -> ctypes.CDLL:
         setattr(opened, name, kind(address))
     opened.quadrl_state.restype = ctypes.c_int64
     pointer, integer = ctypes.c_void_p, ctypes.c_int64
-    opened.quadrl_state.argtypes = (
-        [integer] + [pointer] * 4 + [integer, pointer, pointer, integer]
-    )
+    opened.quadrl_state.argtypes = [integer] + [pointer] * 4 + [integer, pointer, pointer, integer]
     return opened
 
 

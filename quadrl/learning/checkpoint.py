@@ -1,0 +1,80 @@
+"""Checkpoints from which training goes on bit for bit.
+
+A checkpoint is one safetensors file, so that reading it runs nothing: tensors by name, and a
+header of JSON. It is written whole or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from quadrl.learning.config import RunError
+
+FORMAT = "quadrl-checkpoint-1"
+CHECKPOINT = "checkpoint.safetensors"
+
+
+def save(path: Path, tensors: dict[str, Any], numbers: dict[str, Any]) -> None:
+    """Write a checkpoint.
+
+    Args:
+        path: The file; the one that stands there is replaced once the new one is on the disk.
+        tensors: Tensors and arrays, nested dicts of them allowed.
+        numbers: Whatever JSON can hold.
+    """
+    flat = {name: tensor.detach().clone() for name, tensor in _flatten(tensors)}
+    scratch = path.with_name(path.name + ".part")
+    save_file(flat, scratch, metadata={"format": FORMAT, "numbers": json.dumps(numbers)})
+    with open(scratch, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(scratch, path)
+
+
+def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a checkpoint: its tensors (nested as they were saved) and numbers.
+
+    Raises:
+        RunError: There is none, it is damaged, or of another version.
+    """
+    if not path.is_file():
+        raise RunError(f"there is no checkpoint at {path}")
+    try:
+        with safe_open(path, framework="pt") as opened:
+            header = opened.metadata() or {}
+            flat = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+        if header.get("format") != FORMAT:
+            raise RunError(
+                f"{path} has the format {header.get('format')!r}; this version of quadrl reads "
+                f"{FORMAT!r}"
+            )
+        numbers = json.loads(header["numbers"])
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise RunError(f"{path} is damaged or no checkpoint: {error}") from error
+    tensors: dict[str, Any] = {}
+    for name, tensor in flat.items():
+        *folders, last = name.split("/")
+        into = tensors
+        for folder in folders:
+            into = into.setdefault(folder, {})
+        into[last] = tensor
+    return tensors, numbers
+
+
+def _flatten(tensors: dict[str, Any], prefix: str = "") -> list[tuple[str, torch.Tensor]]:
+    flat: list[tuple[str, torch.Tensor]] = []
+    for name, value in tensors.items():
+        if isinstance(value, dict):
+            flat += _flatten(value, f"{prefix}{name}/")
+        elif isinstance(value, torch.Tensor):
+            flat.append((prefix + str(name), value))
+        else:
+            flat.append((prefix + str(name), torch.from_numpy(np.array(value))))
+    return flat
