@@ -162,7 +162,7 @@ class Render:
         record = fly(policy, made, episodes=1, seed=seed, vehicle=vehicle)
         with console.status(f"drawing {self.out}"):
             write_video(
-                record.flight(made, vehicle),
+                record.flight(vehicle),
                 vehicle.compile(contact=made.contact),
                 self.out,
                 camera=self.camera,
@@ -314,7 +314,12 @@ def _commands(arguments: list[str]) -> Any:
     named = [a for a in arguments[1:2] if a in tasks.TASKS]
     train = Train(config=recipe(named[0] if named else "hover"))
     annotated = [
-        Annotated[kind, tyro.conf.subcommand(name, **({"default": train} if kind is Train else {}))]
+        Annotated[
+            kind,
+            tyro.conf.subcommand(name, default=train)
+            if kind is Train
+            else tyro.conf.subcommand(name),
+        ]
         for name, kind in COMMANDS.items()
     ]
     union: Any = annotated[0]
@@ -390,7 +395,7 @@ def _draw_run(
         made = tasks.make(task, **options)
         try:
             write_video(
-                record.flight(made, vehicle), vehicle.compile(contact=made.contact), folder / VIDEO
+                record.flight(vehicle), vehicle.compile(contact=made.contact), folder / VIDEO
             )
         except RenderingUnavailable as error:
             console.print(f"[yellow]no video:[/yellow] {error}")

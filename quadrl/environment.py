@@ -26,6 +26,7 @@ from quadrl.task import (
     Marker,
     Measures,
     OptionError,
+    Outcome,
     Task,
     total,
 )
@@ -197,16 +198,17 @@ class Environment:
         state = self.simulation.state
         state.time[...] = self._steps * vehicle.control_step
         measures = task.measure(state, self.fields)
-        terms = task.reward(self._measures, measures, self._command, vehicle)
-        terminated = task.terminated(state, measures, self.fields)
+        terminated = task.terminated(state, measures, self.fields, vehicle)
         if diverged is None:
             diverged = np.zeros(self.shape, dtype=bool) if self.shape else np.False_
         else:
             terminated = terminated | diverged
         truncated = (self._steps >= self.horizon_steps) & ~terminated
         error = task.error(state, measures, self.fields)
-        is_success = self._judge(state, error, terminated, truncated)
-        fields = task.update(state, measures, self.fields)
+        is_success = self._judge(state, error, terminated, truncated) & ~diverged
+        outcome = Outcome(failed=terminated & ~is_success, succeeded=is_success)
+        terms = task.reward(self._measures, measures, self._command, outcome, vehicle)
+        fields = task.update(state, measures, self.fields, vehicle)
         if fields is not self.fields:
             self.fields, measures = fields, task.measure(state, fields)
         self._measures = measures
@@ -216,7 +218,7 @@ class Environment:
             reward_terms=terms,
             terminated=terminated,
             truncated=truncated,
-            is_success=is_success & ~diverged,
+            is_success=is_success,
             diverged=diverged,
             error=error,
         )
@@ -227,7 +229,10 @@ class Environment:
         start, fields = self.task.sample(Draw(np.full(EPISODE_DRAWS, 0.5)), self.vehicle)
         state = State.of_coordinates(**vars(start), time=np.zeros(()))
         measures = self.task.measure(state, fields)
-        return tuple(self.task.reward(measures, measures, start.rotor_speed, self.vehicle))
+        outcome = Outcome(np.False_, np.False_)
+        return tuple(
+            self.task.reward(measures, measures, start.rotor_speed, outcome, self.vehicle)
+        )
 
     def flatten(self, observation: Observation, out: np.ndarray | None = None) -> np.ndarray:
         """The parts of an observation as one vector (..., size), float32 unless `out` is given."""

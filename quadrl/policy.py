@@ -7,6 +7,7 @@ the actions; observations are normalised with the mean and the deviation of the 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -15,14 +16,19 @@ from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from quadrl.errors import QuadrlError
+from quadrl.vehicle import ROTORS
 
 FORMAT = "quadrl-policy-1"
 FILE = "policy.safetensors"
 CLIP = 10.0
 """Normalised observations are held within +-CLIP."""
+
+
+HEADER = "quadrl"
+"""The one entry of the file's table, JSON: of several, safetensors writes the order at random."""
 
 
 class PolicyError(QuadrlError, ValueError):
@@ -76,10 +82,8 @@ class Policy:
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
         arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
-        header = {"format": FORMAT, "task": self.task, "metadata": json.dumps(self.metadata)}
-        scratch = Path(f"{path}.part")
-        save_file(arrays, scratch, metadata=header)
-        os.replace(scratch, path)
+        header = {"format": FORMAT, "task": self.task, "metadata": self.metadata}
+        write_whole(Path(path), save(arrays, metadata={HEADER: json.dumps(header)}))
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
@@ -100,9 +104,10 @@ class Policy:
             )
         try:
             with safe_open(file, framework="numpy") as opened:
-                header = opened.metadata() or {}
-                arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError, ValueError) as error:
+                header = read_header(opened.metadata())
+                names = opened.keys() if header.get("format") == FORMAT else ()
+                arrays = {name: opened.get_tensor(name) for name in names}
+        except (SafetensorError, OSError, ValueError, TypeError) as error:
             raise PolicyError(f"{file} is damaged or no safetensors file: {error}") from error
         if header.get("format") != FORMAT:
             raise PolicyError(
@@ -113,24 +118,51 @@ class Policy:
 
     @classmethod
     def _of_arrays(
-        cls, file: Path, arrays: dict[str, np.ndarray], header: dict[str, str]
+        cls, file: Path, arrays: dict[str, np.ndarray], header: dict[str, Any]
     ) -> Policy:
         """Check that the arrays make a network, and build it."""
         try:
-            layers = (len(arrays) - 2) // 2
+            layers = max(1, len(arrays) // 2 - 1)
             weights = tuple(arrays[f"weight_{k}"] for k in range(layers))
             biases = tuple(arrays[f"bias_{k}"] for k in range(layers))
             mean, deviation = arrays["mean"], arrays["deviation"]
-            metadata = json.loads(header["metadata"])
-            task = header["task"]
-        except (KeyError, ValueError) as error:
+            task, metadata = header["task"], header["metadata"]
+        except KeyError as error:
             raise PolicyError(f"{file} lacks a part of a policy: {error}") from error
-        width = len(mean)
-        sound = layers >= 1 and mean.ndim == 1 and mean.shape == deviation.shape
+        width = mean.size
+        sound = mean.shape == deviation.shape == (width,) and len(arrays) == 2 * layers + 2
         for weight, bias in zip(weights, biases, strict=True):
-            sound = sound and weight.ndim == 2 and weight.shape == (len(bias), width)
-            width = len(bias)
+            sound = sound and weight.shape == (bias.size, width) and bias.shape == (bias.size,)
+            width = bias.size
         numbers = all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values())
-        if not sound or not numbers or width % 2 or not (deviation > 0).all():
+        if not sound or not numbers or width != 2 * ROTORS or not (deviation > 0).all():
             raise PolicyError(f"{file}: the arrays in it do not make a policy network")
+        known = isinstance(task, str) and isinstance(metadata, dict)
+        if not known or not isinstance(metadata.get("task_options", {}), dict):
+            raise PolicyError(f"{file} does not say what the policy was trained for")
         return cls(weights, biases, mean, deviation, task, metadata)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all: what stood there stays until the new one is on the disk."""
+    scratch = path.with_name(path.name + ".part")
+    try:
+        with open(scratch, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(scratch, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            scratch.unlink()
+        raise
+
+
+def read_header(table: dict[str, str] | None) -> dict[str, Any]:
+    """What `HEADER` says in the table of a safetensors file; nothing when it is not there.
+
+    Raises:
+        ValueError: It is no JSON.
+    """
+    header = json.loads((table or {}).get(HEADER, "{}"))
+    return header if isinstance(header, dict) else {}

@@ -85,12 +85,12 @@ class Simulation(abc.ABC):
         if self.shape:
             rows = np.flatnonzero(broken)
             table[:, rows] = last[:, rows]
-            self._write(rows, State.of_table(table[:, rows]))
             self.clear(rows)
+            self._write(rows, State.of_table(table[:, rows]))
         else:
             table[:] = last
-            self._write(None, self.state)
             self.clear(None)
+            self._write(None, self.state)
         return broken
 
     def place(self, rows: Rows, start: Start) -> State:

@@ -14,7 +14,7 @@ import functools
 import math
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from quadrl.rotation import (
 )
 from quadrl.state import Start, State
 from quadrl.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadrl.learning.evaluate import Record
 
 EPISODE_DRAWS = 64
 """Uniform numbers that every episode takes from its aircraft's generator, used or not."""
@@ -98,7 +101,7 @@ class Measures:
     to_goal: Array  # (..., 3) [m], from the aircraft to the goal, world frame
     distance: Array  # (...) [m], what is left to the goal
     attitude: Array  # (...) attitude error |sin zeta - sin zeta_g| + |cos zeta - cos zeta_g|
-    speed: Array  # (...) [m/s]
+    speed: Array  # (...) [m/s], relative to the target where there is one
     spin: Array  # (...) [rad/s]
 
 
@@ -108,6 +111,14 @@ class Errors:
 
     final: Array  # (...) [m], over the last `settle` seconds before the horizon
     mean: Array  # (...) [m], over all of it
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Outcome:
+    """How an episode ends, if it ends now."""
+
+    failed: Array  # (...) bool: over before its time, and not by success
+    succeeded: Array  # (...) bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,6 +197,8 @@ class Task(abc.ABC):
     """The name in the catalogue."""
     asks: ClassVar[str]
     """What it asks of the aircraft, in a line."""
+    starts: ClassVar[str]
+    """How an episode begins, in a line."""
     ends: ClassVar[str]
     """What ends an episode early, in a line."""
     solved: ClassVar[str]
@@ -203,14 +216,13 @@ class Task(abc.ABC):
     """Length of the stretch before the horizon over which the final error is taken [s]."""
     altitude: float = 3.0
     """Height of the origin of the task's frame above the ground [m]."""
-    ground_clearance: float = 0.07
-    """Height of the aircraft above the ground at which it touches [m]."""
     progress_weight: float = 100.0
     """Reward for a metre of distance gained."""
     attitude_weight: float = 10.0
     """Reward for a unit of attitude error gained."""
     speed_weight: float = 2.0
-    """Reward for a m/s of speed lost (gym-aero has 0.1, which learns to hover half as fast)."""
+    """Reward for a m/s lost of the speed, or of that relative to a target (gym-aero has 0.1, with
+    which hover takes twice the steps)."""
     spin_weight: float = 1.0
     """Reward for a rad/s of body rate lost (gym-aero: 0.1)."""
     control_weight: float = 1.0
@@ -227,22 +239,26 @@ class Task(abc.ABC):
             if not np.all(np.isfinite(flat)):
                 raise OptionError(f"{self.name}: {field.name} = {value!r} is not finite")
         for positive in ("horizon", "altitude"):
-            if getattr(self, positive) <= 0:
-                raise OptionError(
-                    f"{self.name}: {positive} = {getattr(self, positive)} must be > 0"
-                )
+            if (value := getattr(self, positive)) <= 0:
+                raise OptionError(f"{self.name}: {positive} = {value} must be positive")
 
     @abc.abstractmethod
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Fields]:
         """How an episode begins, from random numbers alone."""
 
-    def update(self, state: State, measures: Measures, fields: Fields) -> Fields:
+    def update(
+        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
+    ) -> Fields:
         """The fields after a control step: the same object, or a new one (a waypoint reached)."""
         return fields
 
     def goal(self, state: State, fields: Fields) -> Array:
         """Where to be, (..., 3) [m], task frame."""
         return fields.goal
+
+    def target_velocity(self, state: State, fields: Fields) -> Array | None:
+        """Velocity of the target, (..., 3) [m/s], world frame; None where nothing moves."""
+        return None
 
     def error(self, state: State, measures: Measures, fields: Fields) -> Array:
         """How far the task is from being done, (...) [m]."""
@@ -251,6 +267,8 @@ class Task(abc.ABC):
     def measure(self, state: State, fields: Fields) -> Measures:
         """The distances that the reward is made of."""
         to_goal = self.goal(state, fields) - state.position
+        target_velocity = self.target_velocity(state, fields)
+        velocity = state.velocity if target_velocity is None else state.velocity - target_velocity
         sine, cosine = state.sin_attitude, state.cos_attitude - 1.0
         if not self.heading_matters:
             sine, cosine = sine[..., :2], cosine[..., :2]
@@ -258,7 +276,7 @@ class Task(abc.ABC):
             to_goal=to_goal,
             distance=norm(to_goal),
             attitude=norm(sine) + norm(cosine),
-            speed=norm(state.velocity),
+            speed=norm(velocity),
             spin=norm(state.body_rate),
         )
 
@@ -266,7 +284,7 @@ class Task(abc.ABC):
         self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
     ) -> dict[str, Array]:
         """What the policy sees, by name, in the order of `observation`."""
-        return {
+        parts = {
             "position": state.position,
             "sin_attitude": state.sin_attitude,
             "cos_attitude": state.cos_attitude,
@@ -275,9 +293,19 @@ class Task(abc.ABC):
             "rotor_speed": state.rotor_speed / vehicle.max_speed,
             "goal": to_body(state.rotation, measures.to_goal),
         }
+        target_velocity = self.target_velocity(state, fields)
+        if target_velocity is not None:
+            relative = target_velocity - state.velocity
+            parts["target_velocity"] = to_body(state.rotation, relative)
+        return parts
 
     def reward(
-        self, before: Measures, now: Measures, rotor_command: Array, vehicle: Vehicle
+        self,
+        before: Measures,
+        now: Measures,
+        rotor_command: Array,
+        outcome: Outcome,
+        vehicle: Vehicle,
     ) -> dict[str, Array]:
         """Named terms (...) of the reward of one control step; it is their sum, in this order."""
         effort = square_norm((rotor_command - vehicle.hover_speed) / vehicle.max_speed)
@@ -291,7 +319,9 @@ class Task(abc.ABC):
         }
 
     @abc.abstractmethod
-    def terminated(self, state: State, measures: Measures, fields: Fields) -> Array:
+    def terminated(
+        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
+    ) -> Array:
         """Whether the episode is over before its time, (...) bool."""
 
     @abc.abstractmethod
@@ -304,9 +334,13 @@ class Task(abc.ABC):
         """What to draw of the task in one aircraft's episode; the goal is drawn anyway."""
         return ()
 
-    def touches_ground(self, state: State) -> Array:
+    def touches_ground(self, state: State, vehicle: Vehicle) -> Array:
         """Whether the aircraft has come down to the ground, (...) bool."""
-        return state.position[..., 2] < self.ground_clearance - self.altitude
+        return state.position[..., 2] < vehicle.ground_clearance - self.altitude
+
+    def figures(self, record: Record) -> dict[str, float]:
+        """The task's own figures of an evaluation, with their units in their names."""
+        return {}
 
     def replace(self, **options: Any) -> Task:
         """A variant with other options.

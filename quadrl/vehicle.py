@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 
@@ -22,6 +23,10 @@ ROTOR_DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 YAW_REACTION = (-1, 1, -1, 1)
 DRAWN_ARM_LENGTH = 0.23  # [m], of the aircraft in assets/quadrotor.xml
 DRAWN_ROTOR_RADIUS = 0.06  # [m]
+# Of the drawn aircraft [m], body frame; they grow with the arms.
+FEET = ((0.08, 0.08, -0.07), (-0.08, 0.08, -0.07), (-0.08, -0.08, -0.07), (0.08, -0.08, -0.07))
+HULL = (0.075, 0.060, 0.045)  # semi-axes
+ROTOR_HEIGHT = 0.030
 # As in native/equations.h.
 MARK = 1903518052.0
 MARK_SLOT = 9
@@ -92,15 +97,46 @@ class Vehicle:
         """Physics steps in a control step."""
         return max(1, round(self.control_step / self.physics_step))
 
-    @property
+    @functools.cached_property
     def hover_speed(self) -> float:
         """Omega_hover [rad/s]: the four rotors carry the weight."""
         return math.sqrt(self.mass * GRAVITY / (ROTORS * self.thrust_coefficient))
 
-    @property
+    @functools.cached_property
     def max_speed(self) -> float:
         """Omega_max [rad/s]."""
         return math.sqrt(self.max_thrust_ratio) * self.hover_speed
+
+    @functools.cached_property
+    def _scale(self) -> float:
+        return self.arm_length / DRAWN_ARM_LENGTH
+
+    @property
+    def ground_clearance(self) -> float:
+        """Height of the centre of mass above the ground when it stands on its feet [m]."""
+        return -FEET[0][2] * self._scale
+
+    def foot_depth(self, rotation: Array) -> Array:
+        """How far the lowest foot reaches below the centre of mass, (...) [m].
+
+        Args:
+            rotation: (..., 3, 3) body to world.
+        """
+        up = rotation[..., 2, :]
+        depths = [-_along(up, foot) * self._scale for foot in FEET]
+        return functools.reduce(namespace(rotation).maximum, depths)
+
+    def strike_depth(self, rotation: Array) -> Array:
+        """How far the hull and the rotor discs, which must not touch, reach below, (...) [m]."""
+        xp = namespace(rotation)
+        up = rotation[..., 2, :]
+        x, y, z = (up[..., k] * HULL[k] * self._scale for k in range(3))
+        depth = xp.sqrt(x * x + y * y + z * z)
+        edge = xp.sqrt(up[..., 0] * up[..., 0] + up[..., 1] * up[..., 1]) * self.rotor_radius
+        for direction in ROTOR_DIRECTIONS:
+            centre = (*(c * self.arm_length for c in direction), ROTOR_HEIGHT * self._scale)
+            depth = xp.maximum(depth, edge - _along(up, centre))
+        return depth
 
     def rotor_command(self, action: Array) -> Array:
         """Rotor speed commands Omega_c [rad/s] of actions, both (..., 4).
@@ -164,7 +200,7 @@ class Vehicle:
         return model
 
     def _write_parameters(self, spec: mujoco.MjSpec) -> None:
-        scale = self.arm_length / DRAWN_ARM_LENGTH
+        scale = self._scale
         rotor_scale = self.rotor_radius / DRAWN_ROTOR_RADIUS
         body = spec.body("aircraft")
         for geom in body.geoms:
@@ -191,6 +227,11 @@ class Vehicle:
             actuator.ctrlrange = (0, self.max_speed)
             actuator.dynprm[0], actuator.dynprm[MARK_SLOT] = self.lag_rate, MARK
             actuator.gainprm[0] = self.thrust_coefficient
+
+
+def _along(up: Array, point: tuple[float, ...]) -> Array:
+    """Height of a body-fixed point (3,) over the centre of mass; up (..., 3) in the body frame."""
+    return up[..., 0] * point[0] + up[..., 1] * point[1] + up[..., 2] * point[2]
 
 
 def _set_contact(spec: mujoco.MjSpec, contact: bool) -> None:

@@ -6,8 +6,23 @@ from typing import Any
 
 from quadrl.task import OptionError, Task, check_choices
 from quadrl.tasks.hover import Hover
+from quadrl.tasks.landing import Landing
+from quadrl.tasks.random_waypoint import RandomWaypoint
+from quadrl.tasks.static_waypoint import StaticWaypoint
+from quadrl.tasks.straight_and_level import StraightAndLevel
+from quadrl.tasks.target_following import TargetFollowing
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Hover,)}
+TASKS: dict[str, type[Task]] = {
+    task.name: task
+    for task in (
+        Hover,
+        StaticWaypoint,
+        RandomWaypoint,
+        StraightAndLevel,
+        Landing,
+        TargetFollowing,
+    )
+}
 """Every registered task by name."""
 
 

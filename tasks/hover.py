@@ -16,6 +16,7 @@ class Hover(Task):
 
     name = "hover"
     asks = "hold a static waypoint for the whole episode, heading east"
+    starts = "within 0.5 m of it, any heading, slightly tilted, moving and turning"
     ends = "more than 3 m away, on the ground, tilted past 90 degrees"
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
     heading_matters = True
@@ -46,10 +47,12 @@ class Hover(Task):
         )
         return start, Fields(goal=xp.zeros_like(position))
 
-    def terminated(self, state: State, measures: Measures, fields: Fields) -> Array:
+    def terminated(
+        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
+    ) -> Array:
         """Away, on the ground or on its back."""
         upside_down = state.rotation[..., 2, 2] < 0
-        return (measures.distance > self.max_distance) | self.touches_ground(state) | upside_down
+        return (measures.distance > self.max_distance) | self.touches_ground(state, vehicle) | upside_down
 
     def success(
         self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array

@@ -7,16 +7,16 @@ header of JSON. It is written whole or not at all.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as to_bytes
 
 from quadrl.learning.config import RunError
+from quadrl.policy import HEADER, read_header, write_whole
 
 FORMAT = "quadrl-checkpoint-1"
 CHECKPOINT = "checkpoint.safetensors"
@@ -31,11 +31,8 @@ def save(path: Path, tensors: dict[str, Any], numbers: dict[str, Any]) -> None:
         numbers: Whatever JSON can hold.
     """
     flat = {name: tensor.detach().clone() for name, tensor in _flatten(tensors)}
-    scratch = path.with_name(path.name + ".part")
-    save_file(flat, scratch, metadata={"format": FORMAT, "numbers": json.dumps(numbers)})
-    with open(scratch, "rb") as file:
-        os.fsync(file.fileno())
-    os.replace(scratch, path)
+    header = {"format": FORMAT, "numbers": numbers}
+    write_whole(path, to_bytes(flat, metadata={HEADER: json.dumps(header)}))
 
 
 def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -48,16 +45,16 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise RunError(f"there is no checkpoint at {path}")
     try:
         with safe_open(path, framework="pt") as opened:
-            header = opened.metadata() or {}
-            flat = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-        if header.get("format") != FORMAT:
-            raise RunError(
-                f"{path} has the format {header.get('format')!r}; this version of quadrl reads "
-                f"{FORMAT!r}"
-            )
-        numbers = json.loads(header["numbers"])
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+            header = read_header(opened.metadata())
+            names = opened.keys() if header.get("format") == FORMAT else ()
+            flat = {name: opened.get_tensor(name) for name in names}
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
         raise RunError(f"{path} is damaged or no checkpoint: {error}") from error
+    if header.get("format") != FORMAT:
+        raise RunError(
+            f"{path} has the format {header.get('format')!r}; this version of quadrl reads "
+            f"{FORMAT!r}"
+        )
     tensors: dict[str, Any] = {}
     for name, tensor in flat.items():
         *folders, last = name.split("/")
@@ -65,7 +62,7 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         for folder in folders:
             into = into.setdefault(folder, {})
         into[last] = tensor
-    return tensors, numbers
+    return tensors, header["numbers"]
 
 
 def _flatten(tensors: dict[str, Any], prefix: str = "") -> list[tuple[str, torch.Tensor]]:

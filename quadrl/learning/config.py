@@ -5,23 +5,30 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 import tyro
 
 from quadrl import tasks
+from quadrl.environment import MAX_ENVS
 from quadrl.errors import QuadrlError
-from quadrl.task import OptionError, check_choices
+from quadrl.policy import write_whole
+from quadrl.task import OptionError, Task, check_choices
 from quadrl.vehicle import VEHICLES
 
 CONFIG = "config.json"
 ALGORITHMS = ("ppo",)
+MAX_BATCH = 1 << 24
+"""Most transitions in a batch: some GB."""
 
 
 class RunError(QuadrlError):
     """A run folder or a checkpoint that cannot be used."""
+
+
+class ConfigError(QuadrlError):
+    """A configuration that cannot be trained; no ValueError, which tyro would put in a frame."""
 
 
 def new_folder(path: Path) -> Path:
@@ -50,9 +57,7 @@ def new_folder(path: Path) -> Path:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
-    scratch = path.with_name(path.name + ".part")
-    scratch.write_text(text)
-    os.replace(scratch, path)
+    write_whole(path, text.encode())
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -79,7 +84,7 @@ class PPOConfig:
 
     learning_rate: float = 3e-3
     """Of Adam, at the start; it falls linearly to zero over the training."""
-    epochs: int = 5
+    epochs: int = 8
     """Passes over each batch."""
     minibatch: int = 1024
     """Transitions in one gradient step: few and large, since each step costs milliseconds."""
@@ -91,6 +96,22 @@ class PPOConfig:
     """Weight of the critic's squared error."""
     max_gradient: float = 1.0
     """Norm to which gradients are clipped."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be trained.
+
+        Raises:
+            ConfigError: The message names the value and what is allowed.
+        """
+        try:
+            for name in ("epochs", "minibatch"):
+                _check_number(name, getattr(self, name), 1)
+            for name in ("learning_rate", "clip", "max_gradient"):
+                _check_number(name, getattr(self, name), 1e-9)
+            for name in ("entropy", "critic"):
+                _check_number(name, getattr(self, name), 0)
+        except OptionError as error:
+            raise ConfigError(str(error)) from error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +132,7 @@ class TrainConfig:
     """Aircraft flown together."""
     rollout: int = 16
     """Control steps of each aircraft in a batch."""
-    steps: int = 491_520
+    steps: int = 327_680
     """Control steps of all aircraft in the training."""
     gamma: float = 0.95
     """Discount: the reward is the gain of a step, so a short sight (1 s) is enough, and sharper."""
@@ -121,7 +142,7 @@ class TrainConfig:
     """Factor on the rewards, so that the critic's targets are of the order of 1."""
     hidden: tuple[int, ...] = (128,)
     """Hidden layers of the policy; the paper's is one of 128."""
-    critic_hidden: tuple[int, ...] = (128,)
+    critic_hidden: tuple[int, ...] = (64,)
     """Hidden layers of the critic."""
     initial_deviation: float = 0.6
     """Standard deviation of the actions at the start."""
@@ -133,18 +154,37 @@ class TrainConfig:
     """Least time between two checkpoints [s]."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be trained."""
-        for name in ("num_envs", "rollout", "steps"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} = {getattr(self, name)}: at least 1 is allowed")
+        """Refuse what cannot be trained.
+
+        Raises:
+            ConfigError: The message names the value and what is allowed.
+        """
+        try:
+            self._check()
+        except QuadrlError as error:
+            raise ConfigError(str(error)) from error
+
+    def _check(self) -> None:
+        for name in ("rollout", "steps"):
+            _check_number(name, getattr(self, name), 1)
+        _check_number("num_envs", self.num_envs, 1, MAX_ENVS)
+        if self.num_envs * self.rollout > MAX_BATCH:
+            raise OptionError(
+                f"num_envs = {self.num_envs} with rollout = {self.rollout}: at most {MAX_BATCH} "
+                "transitions in a batch are allowed"
+            )
         for name in ("gamma", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise OptionError(f"{name} = {getattr(self, name)}: 0 to 1 is allowed")
-        if not 0 <= self.seed < 1000:
-            raise OptionError(f"seed = {self.seed}: 0 to 999 is allowed")
+            _check_number(name, getattr(self, name), 0, 1)
+        _check_number("seed", self.seed, 0, 999)
+        _check_number("initial_deviation", self.initial_deviation, 0.01, math.e)
+        _check_number("num_threads", self.num_threads, 0, 1024)
+        _check_number("checkpoint_seconds", self.checkpoint_seconds, 0)
+        _check_number("reward_scale", self.reward_scale, 1e-9)
+        for width in (*self.hidden, *self.critic_hidden):
+            _check_number("width of a hidden layer", width, 1, 1 << 16)
         check_choices([self.vehicle], VEHICLES, "vehicle")
         check_choices([self.algo], ALGORITHMS, "algorithm")
-        tasks.make(self.task, **self.options)
+        make_task(self.task, self.options)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -191,7 +231,7 @@ class TrainConfig:
 
 
 def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
-    """Options given as NAME=VALUE; a value is read as JSON where it is some.
+    """Options given as NAME=VALUE; a value is read as JSON where it is some, lists as tuples.
 
     Raises:
         OptionError: One has no equals sign.
@@ -202,10 +242,47 @@ def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
         if not equals:
             raise OptionError(f"option {pair!r}: NAME=VALUE is expected, such as horizon=5")
         try:
-            options[name] = json.loads(text)
-        except ValueError:
+            options[name] = _tuples(json.loads(text))
+        except (ValueError, RecursionError):
             options[name] = text
     return options
+
+
+def make_task(name: str, options: dict[str, Any]) -> Task:
+    """A task of the catalogue with options that came as text or from a file.
+
+    Raises:
+        OptionError: Unknown task or option, or a value of another kind than the default's.
+    """
+    task = tasks.make(name)
+    check_choices(options, [f.name for f in dataclasses.fields(task)], f"{name} option")
+    for option, value in options.items():
+        default = getattr(task, option)
+        if _kind(value) != _kind(default):
+            raise OptionError(
+                f"{name} option {option} = {value!r}: a {_kind(default)} is expected, such as "
+                f"{default!r}"
+            )
+    try:
+        return task.replace(**options)
+    except (TypeError, ArithmeticError) as error:
+        raise OptionError(f"{name} options {options}: {error}") from error
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, (bool, str)):
+        return type(value).__name__
+    return "number" if isinstance(value, (int, float)) else "list"
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _check_number(name: str, value: float, low: float, high: float = math.inf) -> None:
+    if not (low <= value <= high and math.isfinite(value)):
+        allowed = f"at least {low:g}" if math.isinf(high) else f"{low:g} to {high:.10g}"
+        raise OptionError(f"{name} = {value}: {allowed} is allowed")
 
 
 def versions() -> dict[str, str]:

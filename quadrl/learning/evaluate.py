@@ -46,13 +46,14 @@ class Record:
     diverged: np.ndarray  # (N,) bool
     markers: tuple[Any, ...]  # what the task asks to be drawn, of the first aircraft
     control_step: float  # [s]
+    task: Task
 
-    def flight(self, task: Task, vehicle: Vehicle, episode: int = 0) -> Flight:
+    def flight(self, vehicle: Vehicle, episode: int = 0) -> Flight:
         """One aircraft's flight, to be drawn."""
         from quadrl.rendering import Flight
 
         steps = slice(0, int(self.length[episode]))
-        origin = np.array([0.0, 0.0, task.altitude])
+        origin = np.array([0.0, 0.0, self.task.altitude])
         position = self.position[steps, episode] + origin
         return Flight(
             time=np.arange(1, len(position) + 1) * self.control_step,
@@ -63,7 +64,7 @@ class Record:
             goal=self.goal[steps, episode] + origin,
             control_step=self.control_step,
             max_rotor_speed=vehicle.max_speed,
-            task=task.name,
+            task=self.task.name,
             markers=(self.markers,),
         )
 
@@ -114,6 +115,7 @@ def fly(
         **ends,
         markers=markers,
         control_step=environment.vehicle.control_step,
+        task=environment.task,
     )
 
 
@@ -122,7 +124,8 @@ def judge(record: Record) -> dict[str, Any]:
 
     Returns:
         episodes; success_rate and survival_rate (shares); position_error_m: mean of the error over
-        the last 2 s of the episodes [m]; return_mean and return_std; length_mean_s.
+        the last 2 s of the episodes [m]; return_mean and return_std; length_mean_s; diverged; and
+        the task's own.
     """
     steps = max(1, round(FINAL_STRETCH / record.control_step))
     number = np.arange(len(record.error))[:, None]
@@ -138,4 +141,4 @@ def judge(record: Record) -> dict[str, Any]:
         "return_std": float(returns.std()),
         "length_mean_s": float(record.length.mean() * record.control_step),
         "diverged": int(record.diverged.sum()),
-    }
+    } | record.task.figures(record)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -14,6 +15,12 @@ from quadrl.policy import CLIP, Policy
 
 class Normaliser(nn.Module):
     """Running mean and deviation of the observations (Chan, Golub and LeVeque 1979)."""
+
+    count: torch.Tensor  # () observations so far
+    mean: torch.Tensor  # (size,) in double precision, as the sum below
+    square_sum: torch.Tensor  # (size,) of the distances from the mean
+    shift: torch.Tensor  # (size,) the mean as the networks use it
+    deviation: torch.Tensor  # (size,)
 
     def __init__(self, size: int) -> None:
         """Start from no observation at all."""
@@ -42,39 +49,29 @@ class Normaliser(nn.Module):
         self.deviation.copy_((self.square_sum / total).sqrt().clamp(min=1e-4))
 
 
-class Network(nn.Module):
-    """Hidden layers of tanh behind the normaliser."""
+class MeanAndDeviation(nn.Module):
+    """The last step of the paper's policy: mean and log-variance of a normal distribution."""
 
-    def __init__(
-        self, normaliser: Normaliser, size: int, hidden: tuple[int, ...], outputs: int, gain: float
-    ) -> None:
-        """Orthogonal weights, zero biases; `gain` scales the last layer's."""
-        super().__init__()
-        self.normaliser = normaliser
-        widths = (size, *hidden, outputs)
-        self.layers = nn.ModuleList(
-            nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)
-        )
-        for k, layer in enumerate(self.layers):
-            last = k == len(self.layers) - 1
-            nn.init.orthogonal_(layer.weight, gain if last else 2**0.5)  # type: ignore[arg-type]
-            nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Outputs (..., outputs) of observations (..., size)."""
-        hidden = self.normaliser(observation)
-        for layer in self.layers[:-1]:
-            hidden = torch.tanh(layer(hidden))
-        return self.layers[-1](hidden)
-
-
-class GaussianNetwork(Network):
-    """The paper's policy network: mean and log-variance of a normal distribution."""
-
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and standard deviation, each (..., actions)."""
-        mean, log_variance = super().forward(observation).chunk(2, -1)
+    def forward(self, output: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and standard deviation (..., actions) from outputs (..., 2 * actions)."""
+        mean, log_variance = output.chunk(2, -1)
         return mean, (0.5 * log_variance.clamp(-12.0, 2.0)).exp()
+
+
+def make_layers(size: int, hidden: tuple[int, ...], outputs: int, gain: float) -> list[nn.Linear]:
+    """Linear layers: orthogonal weights, zero biases; `gain` scales the last layer's."""
+    widths = (size, *hidden, outputs)
+    layers = [nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+    for layer in layers:
+        nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else 2**0.5)
+        nn.init.zeros_(layer.bias)
+    return layers
+
+
+def chain(normaliser: Normaliser, layers: list[nn.Linear], *last: nn.Module) -> nn.Sequential:
+    """The normaliser, the layers with tanh between them, and what comes last."""
+    between = [module for layer in layers[:-1] for module in (layer, nn.Tanh())]
+    return nn.Sequential(normaliser, *between, layers[-1], *last)
 
 
 def make_actor_critic(
@@ -95,30 +92,34 @@ def make_actor_critic(
         initial_deviation: Of the actions, at the start.
     """
     normaliser = Normaliser(size)
-    network = GaussianNetwork(normaliser, size, hidden, 2 * actions, gain=0.01)
+    layers = make_layers(size, hidden, 2 * actions, gain=0.01)
     with torch.no_grad():
-        network.layers[-1].bias[actions:] = 2 * torch.tensor(initial_deviation).log()  # type: ignore[index]
+        layers[-1].bias[actions:] = 2 * torch.tensor(initial_deviation).log()
+    network = chain(normaliser, layers, MeanAndDeviation())
     actor = ProbabilisticActor(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
     )
-    critic = ValueOperator(
-        Network(normaliser, size, critic_hidden, 1, gain=1.0), in_keys=["observation"]
-    )
+    critic_layers = make_layers(size, critic_hidden, 1, gain=1.0)
+    critic = ValueOperator(chain(normaliser, critic_layers), in_keys=["observation"])
     return actor, critic, normaliser
 
 
 def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Policy:
     """The NumPy policy of an actor."""
-    network = actor.module[0].module  # type: ignore[union-attr]
-    to_numpy = lambda tensor: tensor.detach().cpu().float().numpy().copy()  # noqa: E731
+    layers = [module for module in actor.modules() if isinstance(module, nn.Linear)]
+    (normaliser,) = (module for module in actor.modules() if isinstance(module, Normaliser))
     return Policy(
-        weights=tuple(to_numpy(layer.weight) for layer in network.layers),
-        biases=tuple(to_numpy(layer.bias) for layer in network.layers),
-        mean=to_numpy(network.normaliser.shift),
-        deviation=to_numpy(network.normaliser.deviation),
+        weights=tuple(_array(layer.weight) for layer in layers),
+        biases=tuple(_array(layer.bias) for layer in layers),
+        mean=_array(normaliser.shift),
+        deviation=_array(normaliser.deviation),
         task=task,
         metadata=metadata,
     )
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().float().numpy().copy()

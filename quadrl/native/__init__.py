@@ -85,7 +85,7 @@ def build(include: Path | None = None) -> Path:
     digest.update((include / "mujoco" / "mujoco.h").read_bytes())
     name = f"quadrl-mujoco-{mujoco.__version__}-{digest.hexdigest()[:16]}.so"
     folder = cache_folder()
-    if (folder / name).exists():
+    if os.path.exists(folder / name):  # False, too, for a folder that may not be looked into
         return folder / name
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -122,8 +122,7 @@ def load(path: Path) -> ctypes.CDLL:
         )
     for name in CALLBACKS:
         kind = _GENERIC_CALLBACK if name == "passive" else _ACTUATOR_CALLBACK
-        address = ctypes.cast(getattr(opened, f"quadrl_{name}"), ctypes.c_void_p).value
-        setattr(opened, name, kind(address))
+        setattr(opened, name, ctypes.cast(getattr(opened, f"quadrl_{name}"), kind))
     opened.quadrl_state.restype = ctypes.c_int64
     pointer, integer = ctypes.c_void_p, ctypes.c_int64
     opened.quadrl_state.argtypes = [integer] + [pointer] * 4 + [integer, pointer, pointer, integer]

@@ -1,0 +1,176 @@
+"""Landing: touch down on a pad, smoothly, and come to rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from quadrl.rotation import Array, namespace, norm, square_norm
+from quadrl.state import Start, State
+from quadrl.task import Draw, Errors, Fields, Marker, Measures, Outcome, Task
+from quadrl.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadrl.learning.evaluate import Record
+
+REST_SPEED = 0.05  # [m/s] and [rad/s], below which the aircraft counts as at rest
+CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which it counts as down
+
+
+@dataclasses.dataclass
+class Touchdown(Fields):
+    """What has happened so far."""
+
+    down: Array  # (...) 1 once a foot has touched, 0 before
+    speed: Array  # (...) [m/s], at the last control step
+    rest: Array  # (...) control steps at rest on the pad, without a break
+
+
+@dataclasses.dataclass(frozen=True)
+class Landing(Task):
+    """Land on the pad; the origin of the frame is where the aircraft's centre comes to rest."""
+
+    name = "landing"
+    asks = "touch down smoothly on a pad, without a crash and without sinking into its own wash"
+    starts = "3 m up, within 1.5 m sideways"
+    ends = (
+        "at rest on the pad (success); sinking faster than 2 m/s along the body's axis; rotor or "
+        "hull strikes, touchdown faster than 0.5 m/s or tilted more than 15 degrees; more than "
+        "5 m away"
+    )
+    solved = "at rest on the pad, upright"
+    heading_matters = True
+    contact = True
+
+    altitude: float = 0.07
+    """Height of the origin above the ground: of the paper's aircraft on its feet [m]."""
+    survival_weight: float = 0.0
+    """Reward for each step in the air."""
+    success_weight: float = 100.0
+    """Reward for coming to rest on the pad."""
+    failure_weight: float = 100.0
+    """Cost of a crash."""
+    start_height: float = 3.0
+    """Height of the start over the pad [m]."""
+    start_offset: float = 1.5
+    """Largest distance of the start from the pad's axis [m]."""
+    max_sink: float = 2.0
+    """Speed along the negative body z axis that ends the episode: its own rotor wash [m/s]."""
+    max_touchdown: float = 0.5
+    """Largest speed of a touchdown [m/s]."""
+    max_tilt: float = math.radians(15.0)
+    """Largest tilt of a touchdown [rad]."""
+    max_distance: float = 5.0
+    """Distance from the pad that ends the episode [m]."""
+    pad_radius: float = 0.5
+    """[m]"""
+    rest_time: float = 0.25
+    """How long the aircraft has to be at rest [s]."""
+
+    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Touchdown]:
+        """Level and at rest, high over the pad and beside its axis."""
+        offset = draw.uniform(0.0, self.start_offset)
+        bearing = draw.uniform(0.0, 2 * math.pi)
+        xp = namespace(offset)
+        height = xp.full_like(offset, self.start_height)
+        east, north = offset * xp.cos(bearing), offset * xp.sin(bearing)
+        position = xp.stack([east, north, height], axis=-1)
+        rest = xp.zeros_like(position)
+        start = Start(
+            position=position,
+            quaternion=draw.attitude(tilt=0.0),
+            velocity=rest,
+            body_rate=rest,
+            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
+        )
+        zero = xp.zeros_like(offset)
+        return start, Touchdown(goal=rest, down=zero, speed=zero, rest=zero)
+
+    def terminated(
+        self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
+    ) -> Array:
+        """Crashed, in its own wash, away, or at rest for long enough."""
+        height = state.position[..., 2] + self.altitude
+        touches = height - vehicle.foot_depth(state.rotation) < CONTACT_HEIGHT
+        strikes = height < vehicle.strike_depth(state.rotation)
+        tilted = state.rotation[..., 2, 2] < math.cos(self.max_tilt)
+        # The speed of a touchdown is that of the last control step in the air.
+        hard = (fields.down == 0) & (fields.speed > self.max_touchdown)
+        sinks = state.body_velocity[..., 2] < -self.max_sink
+        rested = self._rested(state, fields, vehicle) * vehicle.control_step >= self.rest_time
+        away = measures.distance > self.max_distance
+        return strikes | (touches & (tilted | hard)) | sinks | away | rested
+
+    def success(
+        self, state: State, fields: Touchdown, errors: Errors, terminated: Array, truncated: Array
+    ) -> Array:
+        """At rest on the pad: the only way in which a soft, upright, unmoving end comes about."""
+        slow = (norm(state.velocity) < REST_SPEED) & (norm(state.body_rate) < REST_SPEED)
+        return terminated & slow & (fields.down > 0) & self._over_pad(state)
+
+    def update(
+        self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
+    ) -> Touchdown:
+        """Remember the touchdown, the speed and how long the aircraft has been at rest."""
+        height = state.position[..., 2] + self.altitude
+        xp = namespace(height)
+        touches = height - vehicle.foot_depth(state.rotation) < CONTACT_HEIGHT
+        return Touchdown(
+            goal=fields.goal,
+            down=xp.where(touches, xp.ones_like(height), fields.down),
+            speed=measures.speed,
+            rest=self._rested(state, fields, vehicle),
+        )
+
+    def reward(
+        self,
+        before: Measures,
+        now: Measures,
+        rotor_command: Array,
+        outcome: Outcome,
+        vehicle: Vehicle,
+    ) -> dict[str, Array]:
+        """The common terms, and what the end is worth."""
+        terms = super().reward(before, now, rotor_command, outcome, vehicle)
+        terms["success"] = self.success_weight * outcome.succeeded
+        terms["failure"] = -self.failure_weight * outcome.failed
+        return terms
+
+    def markers(self, fields: Touchdown) -> Sequence[Marker]:
+        """The pad, and the column of air over it."""
+        ground = (0.0, 0.0, -self.altitude)
+        return [
+            Marker("pad", ground, self.pad_radius, (0.95, 0.95, 0.95, 1.0)),
+            Marker("ring", (0.0, 0.0, 0.002 - self.altitude), 0.8 * self.pad_radius),
+        ]
+
+    def figures(self, record: Record) -> dict[str, float]:
+        """Speed of the touchdowns, the crashes, and the time that a landing takes."""
+        height = record.position[..., 2] + self.altitude
+        down = height < self.altitude + 0.01
+        first = down.argmax(0)
+        flights = np.flatnonzero(down.any(0) & (first > 0))
+        speed = np.linalg.norm(record.velocity[first[flights] - 1, flights], axis=-1)
+        landed = record.length[record.is_success] * record.control_step
+        return {
+            "touchdown_speed_median_m_s": float(np.median(speed)) if len(speed) else math.nan,
+            "touchdown_speed_max_m_s": float(speed.max()) if len(speed) else math.nan,
+            "crash_rate": float((record.terminated & ~record.is_success).mean()),
+            "landing_time_mean_s": float(landed.mean()) if len(landed) else math.nan,
+        }
+
+    def _rested(self, state: State, fields: Touchdown, vehicle: Vehicle) -> Array:
+        """Control steps at rest on the pad, this one included."""
+        height = state.position[..., 2] + self.altitude
+        stands = height - vehicle.foot_depth(state.rotation) < CONTACT_HEIGHT
+        slow = (norm(state.velocity) < REST_SPEED) & (norm(state.body_rate) < REST_SPEED)
+        at_rest = stands & slow & self._over_pad(state)
+        xp = namespace(height)
+        return xp.where(at_rest, fields.rest + 1, xp.zeros_like(height))
+
+    def _over_pad(self, state: State) -> Array:
+        return square_norm(state.position[..., :2]) < self.pad_radius**2

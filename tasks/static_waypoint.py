@@ -1,0 +1,94 @@
+"""Static waypoints: fly to fixed points in order, then hover on the last."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from quadrl.rotation import Array, namespace
+from quadrl.state import Start, State
+from quadrl.task import Draw, Errors, Fields, Marker, Measures, OptionError
+from quadrl.tasks.waypoints import WaypointTask
+from quadrl.vehicle import Vehicle
+
+WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
+
+
+@dataclasses.dataclass
+class Route(Fields):
+    """Where the aircraft is on its route."""
+
+    leg: Array  # (...) number of the current waypoint, from 0
+
+
+@dataclasses.dataclass(frozen=True)
+class StaticWaypoint(WaypointTask):
+    """Fly to a list of waypoints in order, heading east, and hold the last."""
+
+    name = "static_waypoint"
+    asks = "fly to fixed waypoints in order, then hover on the last until the end, heading east"
+    starts = "at rest at the origin, slightly disturbed"
+    ends = "more than 5 m from the current waypoint, on the ground"
+    solved = "in the air to the end, mean error of the last 2 s under 0.1 m, on the last waypoint"
+    heading_matters = True
+
+    waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)
+    """Where to fly, in order [m], task frame."""
+    reach: float = 0.2
+    """Distance at which a waypoint counts as reached and the next one is the goal [m]."""
+    disturbance: float = 0.05
+    """Largest tilt [rad], speed [m/s] and body rate [rad/s] at the start."""
+
+    def __post_init__(self) -> None:
+        """Refuse a route that is none."""
+        object.__setattr__(self, "waypoints", tuple(tuple(w) for w in self.waypoints))
+        if not self.waypoints or any(len(w) != 3 for w in self.waypoints):
+            raise OptionError(
+                f"waypoints = {self.waypoints}: at least one point of three coordinates is expected"
+            )
+        super().__post_init__()
+
+    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Route]:
+        """At rest at the origin, heading east, slightly disturbed."""
+        velocity = draw.vector(self.disturbance)
+        xp = namespace(velocity)
+        position = xp.zeros_like(velocity)
+        start = Start(
+            position=position,
+            quaternion=draw.attitude(self.disturbance, heading=0.0),
+            velocity=velocity,
+            body_rate=draw.vector(self.disturbance),
+            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
+        )
+        leg = xp.zeros_like(position[..., 0])
+        return start, Route(goal=position + xp.asarray(self.waypoints[0]), leg=leg)
+
+    def update(self, state: State, measures: Measures, fields: Route, vehicle: Vehicle) -> Route:
+        """On to the next waypoint when this one is reached."""
+        xp = namespace(fields.goal)
+        last = len(self.waypoints) - 1
+        onward = (measures.distance < self.reach) & (fields.leg < last)
+        if not onward.any():
+            return fields
+        leg = fields.leg + xp.where(onward, 1.0, 0.0)
+        goal = fields.goal
+        for number, waypoint in enumerate(self.waypoints):
+            here = (onward & (leg == number))[..., None]
+            goal = xp.where(here, xp.asarray(waypoint), goal)
+        return Route(goal=goal, leg=leg)
+
+    def success(
+        self, state: State, fields: Route, errors: Errors, terminated: Array, truncated: Array
+    ) -> Array:
+        """Still flying at the end, and close to the last waypoint."""
+        close = super().success(state, fields, errors, terminated, truncated)
+        return close & (fields.leg == len(self.waypoints) - 1)
+
+    def markers(self, fields: Route) -> Sequence[Marker]:
+        """The route, and the waypoints that are still to come."""
+        route = np.array([(0.0, 0.0, 0.0), *self.waypoints])
+        later = self.waypoints[int(fields.leg) + 1 :]
+        spheres = [Marker("sphere", waypoint, 0.06, WAITING) for waypoint in later]
+        return [Marker("path", size=0.006, rgba=WAITING, points=route), *spheres]
