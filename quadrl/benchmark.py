@@ -37,6 +37,8 @@ Work = Callable[[], int]
 ALL_CORES, ONE_CORE = "all cores", "one core"
 CHUNK = 200
 """Control steps of one aircraft between two looks at the clock."""
+HEIGHT = 3.0
+"""At which the aircraft of bare mj_step hover, clear of everything [m]."""
 MEMORY_ENVS = 4096
 MEMORY_STEPS = 3
 MEMORY_TARGET = 500.0  # [MB]
@@ -101,10 +103,8 @@ def benchmark(task: str, *, num_envs: int, seconds: float, repeats: int) -> dict
         layers = _layers(made, num_envs, stack)
         rates = _measure([layer.work for layer in layers], seconds, repeats)
     best = [max(measured) for measured in rates]
-    yardsticks = {
-        of: max(rate for layer, rate in zip(layers, best, strict=True) if layer.bare and layer.of == of)
-        for of in (ALL_CORES, ONE_CORE)
-    }
+    bare = [(layer.of, rate) for layer, rate in zip(layers, best, strict=True) if layer.bare]
+    yardsticks = {of: max(rate for on, rate in bare if on == of) for of in (ALL_CORES, ONE_CORE)}
     return {
         "task": task,
         "num_envs": num_envs,
@@ -126,6 +126,30 @@ def benchmark(task: str, *, num_envs: int, seconds: float, repeats: int) -> dict
         "memory_target_mb": MEMORY_TARGET,
         "machine": machine(),
     }
+
+
+def rows(measured: dict[str, Any]) -> list[tuple[str, str, str, str]]:
+    """What `benchmark` returned, to be read: what, rate, share of bare mj_step, target."""
+    written = []
+    for row in measured["rates"]:
+        target = "" if row["target_share"] is None else f"{row['target_share']:.2f}"
+        if row["target_rate"] is not None:
+            target = f"{row['target_rate']:,}/s"
+        share = f"{row['share']:.2f} ({row['of']})"
+        written.append((row["what"], f"{row['rate']:,.0f}", share, target))
+    return written
+
+
+def summary(measured: dict[str, Any]) -> str:
+    """The memory and the machine in two lines."""
+    computer = dict(measured["machine"])
+    cpu, cores, system = (computer.pop(name) for name in ("cpu", "cores", "system"))
+    versions = ", ".join(f"{name} {version}" for name, version in computer.items())
+    return (
+        f"memory of {measured['memory_envs']:,} aircraft: {measured['memory_mb']:.0f} MB beyond "
+        f"the imports (target: {measured['memory_target_mb']:.0f} MB)\n"
+        f"{cpu}, {cores} core{'s' * (cores > 1)}, {system}, {versions}"
+    )
 
 
 def memory_mb(task: str, num_envs: int = MEMORY_ENVS) -> float:
@@ -228,6 +252,7 @@ def _actions(*shape: int) -> Iterator[np.ndarray]:
 
 def _hovering(model: mujoco.MjModel, vehicle: Vehicle) -> mujoco.MjData:
     data = mujoco.MjData(model)
+    data.qpos[2] = HEIGHT
     data.act[:] = data.ctrl[:] = vehicle.hover_speed
     return data
 
@@ -266,6 +291,7 @@ def _batched_mj_step(task: Task, num_envs: int) -> Work:
     vehicle = Vehicle()
     batch = Batch(vehicle.compile_lean(contact=task.contact), num_envs)
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+    batch.bind("qpos")[:, 2] = HEIGHT
     batch.bind("act")[:] = batch.bind("ctrl")[:] = vehicle.hover_speed
 
     def work() -> int:
@@ -283,7 +309,7 @@ def _environment(task: Task, num_envs: int) -> Work:
     def work() -> int:
         now = environment.step(next(actions))
         observation = environment.flatten(now.observation)
-        over = now.terminated | now.truncated
+        over = np.asarray(now.terminated | now.truncated)
         if over.any():
             observation[over] = environment.flatten(environment.reset(over))
         return num_envs

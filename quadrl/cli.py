@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import os
 import sys
@@ -17,7 +18,10 @@ from rich.table import Table
 from quadrl import tasks
 from quadrl.errors import QuadrlError
 from quadrl.learning.config import (
+    CONFIG,
+    RunError,
     TrainConfig,
+    make_task,
     parse_options,
     read_config,
     recipe,
@@ -28,7 +32,7 @@ from quadrl.task import OptionError, Task, check_choices
 from quadrl.vehicle import VEHICLES, Vehicle
 
 if TYPE_CHECKING:
-    from quadrl.learning.evaluate import Record
+    from quadrl.learning.evaluate import Controller, Record
     from quadrl.learning.train import Progress
 
 console = Console()
@@ -51,7 +55,7 @@ class Tasks:
             return
         table = Table(box=None, header_style="bold", padding=(0, 2, 1, 0))
         for column in ("task", "asks", "ends early", "success", "horizon"):
-            table.add_column(column)
+            table.add_column(column, no_wrap=column in ("task", "horizon"))
         for name, task in tasks.TASKS.items():
             horizon = f"{tasks.make(name).horizon:g} s"
             table.add_row(name, task.asks, task.ends, task.solved, horizon)
@@ -63,7 +67,7 @@ class Tasks:
 class Train:
     """Train a policy from nothing, evaluate it and draw it, into a run folder."""
 
-    config: tyro.conf.OmitArgPrefixes[TrainConfig]
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     out: Path | None = None
     """Folder of the run; by default runs/TASK-ALGO-SEED. It must not hold a run."""
     resume: Path | None = None
@@ -87,60 +91,102 @@ class Train:
             config = TrainConfig.of_folder(folder)
         training = Training(config, folder, resume=self.resume is not None)
         if self.resume is not None:
-            console.print(f"going on with {folder} at iteration {training.iteration}")
-        with _ProgressBar(config) as bar:
-            policy = training.run(bar.show)
-        vehicle = VEHICLES[config.vehicle]
-        judged, record = _evaluate(policy, config.task, config.options, vehicle, self.episodes)
-        judged |= {"training_s": round(training.seconds, 2), "imports_s": round(imports, 2)}
-        write_text(folder / EVALUATION, json.dumps(judged, indent=2))
-        _draw_run(folder, config.task, record, vehicle, config.options, self.video)
+            _say(f"going on with {folder} at iteration {training.iteration}")
+        go_on = f"go on with it: quadrl train --resume {folder}"
+        try:
+            with _ProgressBar(config) as bar:
+                policy = training.run(bar.show)
+            vehicle = VEHICLES[config.vehicle]
+            task = make_task(config.task, config.options)
+            judged, record = _evaluate(policy, task, vehicle, self.episodes)
+            judged |= {"training_s": round(training.seconds, 2), "imports_s": round(imports, 2)}
+            write_text(folder / EVALUATION, json.dumps(judged, indent=2))
+            _draw_run(folder, config.task, record, vehicle, self.video)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"stopped; the run is kept, {go_on}") from None
+        except OSError as error:
+            raise RunError(f"{_reason(error)}; the run is kept, {go_on}") from error
         _sum_up(folder, config, judged)
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate:
-    """Fly the mean action of a policy through fresh episodes and judge it."""
+class _Pilot:
+    """Who flies what: common to the commands that fly without learning."""
 
-    policy: tyro.conf.Positional[Path]
+    policy: tyro.conf.Positional[Path | None] = None
     """A run folder or a .safetensors file."""
+    controller: str = ""
+    """A controller instead of a policy: geometric or lqr."""
     task: str = ""
-    """Another task than the one it was trained for."""
-    episodes: int = 100
-    """Number of episodes."""
+    """The task; by default the one that the policy was trained for."""
+    vehicle: str = ""
+    """The aircraft; by default the one that the policy was trained with."""
     seed: int = 0
     """Of the episodes."""
     task_options: tuple[str, ...] = ()
     """Fields of the task that differ from the training's, such as horizon=5."""
+
+    def setting(self) -> tuple[Controller, Task, Vehicle]:
+        """Controller, task and aircraft.
+
+        Raises:
+            QuadrlError: They do not fit together, or are not there.
+        """
+        from quadrl import controllers
+
+        _check_seed(self.seed)
+        if (self.policy is None) == (self.controller == ""):
+            raise OptionError(
+                "one of both is needed: a policy (a run folder or a .safetensors file), or "
+                f"--controller {' or '.join(controllers.CONTROLLERS)} with --task"
+            )
+        if self.policy is not None:
+            policy = Policy.load(self.policy)
+            name, options, vehicle = _setting(policy, self.task, self.task_options)
+            if self.vehicle:
+                check_choices([self.vehicle], VEHICLES, "vehicle")
+                vehicle = VEHICLES[self.vehicle]
+            return policy, make_task(name, options), vehicle
+        check_choices([self.vehicle or "paper"], VEHICLES, "vehicle")
+        vehicle = VEHICLES[self.vehicle or "paper"]
+        task = make_task(self.task or "hover", parse_options(self.task_options))
+        return controllers.make(self.controller, task, vehicle), task, vehicle
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate(_Pilot):
+    """Fly a policy's mean action, or a controller, through fresh episodes and judge it."""
+
+    episodes: int = 100
+    """Number of episodes."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
-        """Print the figures."""
+        """Print the figures, beside those of the geometric controller."""
+        from quadrl import controllers
+
         _check_episodes(self.episodes)
-        policy = Policy.load(self.policy)
-        task, options, vehicle = _setting(policy, self.task, self.task_options)
-        judged, _ = _evaluate(policy, task, options, vehicle, self.episodes, self.seed)
+        pilot, task, vehicle = self.setting()
+        judged, _ = _evaluate(pilot, task, vehicle, self.episodes, self.seed)
         if self.json:
             sys.stdout.write(json.dumps(judged) + "\n")
-        else:
-            console.print(_figures_table(judged))
+            return
+        columns = {self.controller or "policy": judged}
+        if self.controller != "geometric":
+            yardstick = controllers.make("geometric", task, vehicle)
+            columns["geometric controller"], _ = _evaluate(
+                yardstick, task, vehicle, self.episodes, self.seed
+            )
+        console.print(_figures_table(columns))
 
 
 @dataclasses.dataclass(frozen=True)
-class Render:
-    """Draw a flight of a policy as a video."""
+class Render(_Pilot):
+    """Draw a flight of a policy or a controller as a video."""
 
-    policy: tyro.conf.Positional[Path]
-    """A run folder or a .safetensors file."""
     out: Path = Path("flight.mp4")
     """The video."""
-    task: str = ""
-    """Another task than the one it was trained for."""
-    seed: int = 0
-    """Of the episode."""
-    task_options: tuple[str, ...] = ()
-    """Fields of the task that differ from the training's."""
     camera: str = "follow"
     """follow, track, chase, onboard or fixed."""
     width: int = 848
@@ -155,22 +201,21 @@ class Render:
         from quadrl.learning.evaluate import EVALUATION_SEED, fly
         from quadrl.rendering import write_video
 
-        policy = Policy.load(self.policy)
-        task, options, vehicle = _setting(policy, self.task, self.task_options)
-        made = tasks.make(task, **options)
+        _check_out(self.out)
+        pilot, task, vehicle = self.setting()
         seed = EVALUATION_SEED + self.seed
-        record = fly(policy, made, episodes=1, seed=seed, vehicle=vehicle)
+        record = fly(pilot, task, episodes=1, seed=seed, vehicle=vehicle)
         with console.status(f"drawing {self.out}"):
             write_video(
                 record.flight(vehicle),
-                vehicle.compile(contact=made.contact),
+                vehicle.compile(contact=task.contact),
                 self.out,
                 camera=self.camera,
                 width=self.width,
                 height=self.height,
                 fps=self.fps,
             )
-        console.print(f"wrote {self.out}")
+        _say(f"wrote {self.out}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +229,10 @@ class Plot:
 
     def run(self) -> None:
         """Write the picture."""
-        console.print(f"wrote {_draw_curve(self.run_folder, self.out or self.run_folder / CURVE)}")
+        out = self.out or self.run_folder / CURVE
+        if self.out:
+            _check_out(self.out)
+        _say(f"wrote {_draw_curve(self.run_folder, out)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +244,7 @@ class Benchmark:
     seconds: float = 2.0
     """Of each measurement."""
     repeats: int = 3
-    """Of each; the best counts."""
+    """Of each; the fastest counts."""
     task: str = "hover"
     """The task that is flown."""
     json: bool = False
@@ -204,7 +252,7 @@ class Benchmark:
 
     def run(self) -> None:
         """Measure and print."""
-        from quadrl.benchmark import benchmark
+        from quadrl.benchmark import benchmark, rows, summary
 
         if self.seconds <= 0 or self.repeats < 1:
             raise OptionError("seconds must be positive and repeats at least 1")
@@ -215,13 +263,12 @@ class Benchmark:
             sys.stdout.write(json.dumps(measured) + "\n")
             return
         table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-        for column in ("what", "control steps/s", "of bare mj_step"):
+        for column in ("what", "control steps/s", "of bare mj_step", "target"):
             table.add_column(column, justify="left" if column == "what" else "right")
-        for row in measured["rates"]:
-            table.add_row(row["what"], f"{row['rate']:,.0f}", f"{row['share']:.2f}")
+        for row in rows(measured):
+            table.add_row(*row)
         console.print(table)
-        console.print(f"\nmemory of 4,096 aircraft: {measured['memory_mb']:.0f} MB")
-        console.print(f"[dim]{measured['machine']}[/dim]")
+        console.print(f"\n{summary(measured)}", highlight=False)
 
 
 COMMANDS = {
@@ -236,24 +283,45 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command; what the user can mend is one line on stderr and exit code 2."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    stderr = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
     try:
+        _import_own(arguments)
         chosen = tyro.cli(
             _commands(arguments),
             args=arguments,
             prog="quadrl",
-            description="Reinforcement learning for quadrotors on MuJoCo.",
+            description="Reinforcement learning for quadrotors on MuJoCo. --import FILE, anywhere, "
+            "brings in tasks and aircraft of your own.",
         )
         chosen.run()
     except (QuadrlError, OSError) as error:
         if os.environ.get("QUADRL_TRACEBACK"):
             raise
-        Console(stderr=True, highlight=False, soft_wrap=True).print(
-            f"quadrl: {error}", markup=False
-        )
+        stderr.print(f"quadrl: {_reason(error) if isinstance(error, OSError) else error}")
         sys.exit(2)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        stderr.print(f"quadrl: {stop.args[0] if stop.args else 'stopped'}")
         sys.exit(130)
+
+
+def _import_own(arguments: list[str]) -> None:
+    """Run the files named by `--import FILE`, which register the user's own tasks and aircraft.
+
+    Raises:
+        OptionError: There is no such file.
+    """
+    while "--import" in arguments:
+        at = arguments.index("--import")
+        if at + 1 == len(arguments) or not Path(arguments[at + 1]).is_file():
+            named = arguments[at + 1 :][:1]
+            raise OptionError(f"--import {' '.join(named)}: the path of a Python file is expected")
+        path = Path(arguments[at + 1])
+        del arguments[at : at + 2]
+        spec: Any = importlib.util.spec_from_file_location(path.stem, path)
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[path.stem] = module
+        spec.loader.exec_module(module)
 
 
 class _ProgressBar:
@@ -311,7 +379,7 @@ class _ProgressBar:
 
 def _commands(arguments: list[str]) -> Any:
     """The commands; a task has its own defaults for `train`."""
-    named = [a for a in arguments[1:2] if a in tasks.TASKS]
+    named = [argument for argument in arguments if argument in tasks.TASKS]
     train = Train(config=recipe(named[0] if named else "hover"))
     annotated = [
         Annotated[
@@ -328,9 +396,36 @@ def _commands(arguments: list[str]) -> Any:
     return union
 
 
+def _say(text: str) -> None:
+    """Print text with paths and commands, which are neither markup nor to be broken in two."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _reason(error: OSError) -> str:
+    """What the system refused, in the words that a shell would use."""
+    path = error.filename2 or error.filename
+    return f"cannot read or write {path}: {error.strerror}" if path else str(error)
+
+
 def _check_episodes(episodes: int) -> None:
     if not 1 <= episodes <= MAX_EPISODES:
         raise OptionError(f"episodes = {episodes}: 1 to {MAX_EPISODES} is allowed")
+
+
+def _check_out(path: Path) -> None:
+    """Make the folder of a file that is to be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"cannot write {path}: {path.parent} is no folder and cannot be made one; choose "
+            "another with --out"
+        ) from error
+
+
+def _check_seed(seed: int) -> None:
+    if seed < 0:
+        raise OptionError(f"seed = {seed}: at least 0 is allowed")
 
 
 def _setting(
@@ -350,38 +445,32 @@ def _setting(
             f"a policy for {policy.task} sees {len(policy.mean)} numbers, and the task {name} "
             f"shows {size}: train one with quadrl train {name}"
         )
-    options = dict(policy.metadata.get("task_options", {})) if same else {}
+    options = policy.metadata.get("task_options", {}) if same else {}
     vehicle = str(policy.metadata.get("vehicle", "paper"))
     check_choices([vehicle], VEHICLES, "vehicle")
     return name, options | parse_options(pairs), VEHICLES[vehicle]
 
 
 def _evaluate(
-    policy: Policy,
-    task: str,
-    options: dict[str, Any],
-    vehicle: Vehicle,
-    episodes: int,
-    seed: int = 0,
+    pilot: Controller, task: Task, vehicle: Vehicle, episodes: int, seed: int = 0
 ) -> tuple[dict[str, Any], Record]:
     from quadrl.learning.evaluate import EVALUATION_SEED, fly, judge
 
-    made = tasks.make(task, **options)
-    record = fly(policy, made, episodes=episodes, seed=EVALUATION_SEED + seed, vehicle=vehicle)
-    return {"task": task, "seed": seed} | judge(record), record
+    record = fly(pilot, task, episodes=episodes, seed=EVALUATION_SEED + seed, vehicle=vehicle)
+    return {"task": task.name, "seed": seed} | judge(record), record
 
 
 def _draw_curve(folder: Path, path: Path) -> Path:
     from quadrl.learning.figures import learning_curve, read_metrics
 
     config = read_config(folder)
-    title = f"{config['task']}, {config['algo'].upper()}, seed {config['seed']}"
+    if missing := {"task", "algo", "seed"} - set(config):
+        raise RunError(f"{folder / CONFIG} does not say the run's {', '.join(sorted(missing))}")
+    title = f"{config['task']}, {str(config['algo']).upper()}, seed {config['seed']}"
     return learning_curve(read_metrics(folder / "metrics.csv"), title, path)
 
 
-def _draw_run(
-    folder: Path, task: str, record: Record, vehicle: Vehicle, options: dict[str, Any], video: bool
-) -> None:
+def _draw_run(folder: Path, task: str, record: Record, vehicle: Vehicle, video: bool) -> None:
     """The pictures of a run; without a graphics library the video is left out and said so."""
     from quadrl.learning.figures import trajectory
 
@@ -392,19 +481,23 @@ def _draw_run(
             return
         from quadrl.rendering import RenderingUnavailable, write_video
 
-        made = tasks.make(task, **options)
         try:
-            write_video(
-                record.flight(vehicle), vehicle.compile(contact=made.contact), folder / VIDEO
-            )
+            model = vehicle.compile(contact=record.task.contact)
+            write_video(record.flight(vehicle), model, folder / VIDEO)
         except RenderingUnavailable as error:
-            console.print(f"[yellow]no video:[/yellow] {error}")
+            _say(f"no video: {error}")
 
 
-def _figures_table(judged: dict[str, Any]) -> Table:
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-    for name, value in judged.items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+def _figures_table(columns: dict[str, dict[str, Any]]) -> Table:
+    """Figures in rows, who flew them in columns."""
+    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
+    table.add_column("")
+    for pilot in columns:
+        table.add_column(pilot, justify="right")
+    for name in next(iter(columns.values())):
+        values = [figures[name] for figures in columns.values()]
+        shown = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in values]
+        table.add_row(name, *shown)
     return table
 
 
@@ -419,22 +512,21 @@ def _sum_up(folder: Path, config: TrainConfig, judged: dict[str, Any]) -> None:
         f"{100 * judged['success_rate']:.0f} % successful, error over the last 2 s "
         f"{100 * judged['position_error_m']:.1f} cm\n"
     )
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
     meanings = {
         "policy.safetensors": "the policy",
         CURVE: "return, success and error over the training",
         TRAJECTORY: "flights of the evaluation",
         VIDEO: "one of them on video",
         EVALUATION: "the figures",
-        "metrics.csv": "the training, row by row; TensorBoard: tensorboard --logdir " + str(folder),
-        "config.json": "the resolved configuration",
-        "checkpoint.safetensors": "to go on: quadrl train --resume " + str(folder),
+        "metrics.csv": f"the training, row by row; also: tensorboard --logdir {folder}",
+        CONFIG: "the resolved configuration",
+        "checkpoint.safetensors": f"to go on: quadrl train --resume {folder}",
     }
+    _say(f"in {folder}")
     for name, meaning in meanings.items():
         if (folder / name).exists():
-            table.add_row(str(folder / name), f"[dim]{meaning}[/dim]")
-    console.print(table)
-    console.print(
+            _say(f"  {name:<22}  {meaning}")
+    _say(
         f"\nnext: quadrl render {folder} --camera chase --seed 7\n"
         f"      quadrl evaluate {folder} --episodes 1000\n"
         f"      quadrl tasks"

@@ -8,9 +8,11 @@ never by itself. Aircraft i of a batch seeded with s is the single environment s
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from quadrl import tasks
@@ -130,22 +132,21 @@ class Environment:
 
         Returns:
             The observation of those aircraft, parts (n, k), or (k,) for a single one.
+
+        Raises:
+            OptionError: A number of an aircraft that is not there, or one twice.
         """
-        if rows is not None:
-            rows = np.asarray(rows)
-            rows = np.flatnonzero(rows) if rows.dtype == bool else rows.astype(np.int64)
-        if self._steps is None:
-            if rows is not None and len(rows) < self.num_envs:
-                raise RuntimeError("the first reset must be of every aircraft")
-            rows = None
-        everyone = rows is None
+        rows = None if rows is None else self._checked(rows)
+        if self._steps is None and rows is not None and len(rows) < self.num_envs:
+            raise RuntimeError("the first reset must be of every aircraft")
+        everyone = rows is None or len(rows) == self.num_envs
         if self.shape and rows is None:
             rows = np.arange(self.num_envs)
         start, fields = self.task.sample(Draw(self._draw_block(rows)), self.vehicle)
         state = self.simulation.place(rows, start)
         measures = self.task.measure(state, fields)
         observation = self.task.observe(state, measures, fields, self.vehicle)
-        if everyone:
+        if everyone or rows is None:
             self.fields, self._measures = fields, measures
             self._steps = np.zeros(self.shape, dtype=np.int64)
             self._error_sum, self._final_sum = np.zeros(self.shape), np.zeros(self.shape)
@@ -182,7 +183,8 @@ class Environment:
             raise ActionError(
                 f"an action of shape {action.shape} was given; {(*self.shape, ROTORS)} is expected"
             )
-        if not np.isfinite(action).all():
+        # One number that is not finite makes the sum so, and a sum is cheaper than a test of each.
+        if not math.isfinite(np.add.reduce(action, axis=None)) and not np.isfinite(action).all():
             where = np.argwhere(~np.isfinite(action))[0]
             raise ActionError(
                 f"action{where.tolist()} is {action[tuple(where)]}: every number must be finite"
@@ -230,9 +232,7 @@ class Environment:
         state = State.of_coordinates(**vars(start), time=np.zeros(()))
         measures = self.task.measure(state, fields)
         outcome = Outcome(np.False_, np.False_)
-        return tuple(
-            self.task.reward(measures, measures, start.rotor_speed, outcome, self.vehicle)
-        )
+        return tuple(self.task.reward(measures, measures, start.rotor_speed, outcome, self.vehicle))
 
     def flatten(self, observation: Observation, out: np.ndarray | None = None) -> np.ndarray:
         """The parts of an observation as one vector (..., size), float32 unless `out` is given."""
@@ -290,12 +290,26 @@ class Environment:
         settling = self._steps > self.horizon_steps - self._settle_steps
         self._final_sum = self._final_sum + error * settling
         over = terminated | truncated
-        if not over.any():
+        if not np.any(over):
             return over
         errors = Errors(
             final=self._final_sum / self._settle_steps, mean=self._error_sum / self._steps
         )
         return over & self.task.success(state, self.fields, errors, terminated, truncated)
+
+    def _checked(self, rows: np.ndarray) -> np.ndarray:
+        """Numbers of aircraft, in order, from numbers or a mask."""
+        given = np.asarray(rows)
+        if given.dtype == bool and given.shape == self.shape:
+            return np.flatnonzero(given)
+        numbers = np.unique(given)
+        within = len(numbers) == 0 or (numbers[0] >= 0 and numbers[-1] < self.num_envs)
+        if not self.shape or given.ndim != 1 or len(numbers) != len(given) or not within:
+            raise OptionError(
+                f"rows = {rows}: different numbers from 0 to {self.num_envs - 1} are allowed, or a "
+                f"mask of shape {self.shape}"
+            )
+        return numbers.astype(np.int64)
 
     def _draw_block(self, rows: Rows) -> np.ndarray:
         if rows is None:
@@ -309,8 +323,6 @@ class Environment:
 def _simulation(task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int) -> Simulation:
     if num_envs is None:
         model = vehicle.compile_lean(contact=task.contact)
-        import mujoco
-
         return SingleSimulation(vehicle, model, mujoco.MjData(model), altitude=task.altitude)
     if not isinstance(num_envs, (int, np.integer)) or not 1 <= num_envs <= MAX_ENVS:
         raise OptionError(
@@ -335,7 +347,7 @@ def _put(record: Any, rows: Rows, new: Any) -> None:
         getattr(record, field.name)[rows] = getattr(new, field.name)
 
 
-def _generator_words(generator: np.random.Generator) -> list[int]:
+def _generator_words(generator: np.random.Generator) -> list[np.uint64]:
     """The state of a PCG64 generator as six 64-bit words."""
     state: Any = generator.bit_generator.state
     mask = (1 << 64) - 1

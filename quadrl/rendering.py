@@ -9,10 +9,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import itertools
 import math
 import os
 import shutil
-from collections.abc import Generator, Sequence
+import sys
+from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -22,9 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadrl.errors import QuadrlError
-from quadrl.task import GOAL_RGBA, Marker, OptionError
+from quadrl.task import GOAL_RGBA, Marker, OptionError, check_choices
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 # The camera of videos: moves with the aircraft, keeps the goal in view, never turns or rolls.
 FOLLOW = "follow"
@@ -39,6 +41,7 @@ GOAL_RADIUS = 0.08  # [m]
 FASTEST_GOAL = 10.0  # [m/s]; one that moves faster has jumped
 FRONT, SIDE, BACK = (255, 122, 41), (205, 212, 222), (66, 148, 255)
 ROTOR_COLOURS = (FRONT, SIDE, BACK, SIDE)  # rotors 1 to 4: ahead, left, behind, right
+MAX_FPS = 240
 SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # about body z; the reaction torque of (7) is opposite
 
 
@@ -107,14 +110,11 @@ class Renderer:
             RenderingUnavailable: There is no graphics library to draw with.
             ValueError: The picture is larger than the model's off-screen buffer.
         """
-        limit = model.vis.global_
-        if not (0 < width <= limit.offwidth and 0 < height <= limit.offheight):
-            raise OptionError(
-                f"{width}x{height} pixels: at most {limit.offwidth}x{limit.offheight} can be drawn"
-            )
+        _check_size(model, width, height)
         self.model = model
         self._data = mujoco.MjData(model)
-        self._renderer = _open(model, width, height)
+        with _current_context_kept():
+            self._renderer = _open(model, width, height)
         self._blades = [  # (blade, its hub, index of its rotor)
             (geom, model.geom(f"hub_{name.split('_')[1]}").id, int(name.split("_")[1]) - 1)
             for geom in range(model.ngeom)
@@ -124,7 +124,7 @@ class Renderer:
     @property
     def cameras(self) -> tuple[str, ...]:
         """The names that `frame` takes for its camera."""
-        return (FOLLOW, *(self.model.cam(k).name for k in range(self.model.ncam)))
+        return _cameras(self.model)
 
     def frame(
         self,
@@ -153,8 +153,8 @@ class Renderer:
             ValueError: There is no such camera.
         """
         model, data = self.model, self._data
-        if isinstance(camera, str) and camera not in self.cameras:
-            raise OptionError(f"unknown camera {camera!r}; choose from {', '.join(self.cameras)}")
+        if isinstance(camera, str):
+            check_choices([camera], self.cameras, "camera")
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -175,11 +175,16 @@ class Renderer:
             self._draw_marker(Marker("goal", tuple(target), GOAL_RADIUS, rgba))
         for marker in markers:
             self._draw_marker(marker)
-        return self._renderer.render()
+        with _current_context_kept():
+            return self._renderer.render()
 
     def close(self) -> None:
         """Give the graphics context back."""
-        self._renderer.close()
+        context = self._renderer._gl_context  # None once it is closed
+        if context is not None:
+            with _current_context_kept():
+                context.make_current()  # what is freed is freed in the current one
+                self._renderer.close()
 
     def __enter__(self) -> Renderer:
         """Enter with the context open."""
@@ -227,6 +232,8 @@ class Renderer:
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER if box else shape
         mujoco.mjv_connector(geom, kind, width, start, end)
         geom.type = shape
+        if shape == mujoco.mjtGeom.mjGEOM_ARROW:
+            geom.size = (width, width, 2 * geom.size[2])  # MuJoCo draws half of what it says
 
     def _draw_chain(
         self, shape: mujoco.mjtGeom, points: Array, colours: Array, widths: Array
@@ -381,12 +388,20 @@ def write_video(
 
     Raises:
         RenderingUnavailable: There is no graphics library, mediapy, Pillow or ffmpeg.
-        OptionError: The size or the camera is not one that can be drawn.
+        OptionError: The size, the camera, the frame rate or the name is not one for a video.
     """
-    mediapy = _video_library()
+    path = Path(path)
+    if path.suffix.lower() != ".mp4":
+        raise OptionError(f"{path}: the name of a video must end in .mp4")
+    if path.is_dir():
+        raise OptionError(f"{path} is a folder; give the name of a file")
     if width % 2 or height % 2:
         raise OptionError(f"{width}x{height} pixels: a video needs an even width and height")
-    path = Path(path)
+    if not 1 <= fps <= MAX_FPS:
+        raise OptionError(f"fps = {fps}: 1 to {MAX_FPS} frames a second are allowed")
+    _check_size(model, width, height)
+    check_choices([camera], _cameras(model), "camera")
+    mediapy = _video_library()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
     frames = render_flight(
@@ -408,13 +423,30 @@ def write_video(
         ffmpeg_args="-preset veryfast -movflags +faststart",
     )
     try:
-        with contextlib.closing(frames), writer:
-            for frame in frames:
-                writer.add_image(frame)
+        with contextlib.closing(frames):
+            first = next(frames)  # what cannot be drawn fails here, before ffmpeg begins
+            _encode(writer, itertools.chain([first], frames))
         os.replace(temporary, path)
+    except (BrokenPipeError, RuntimeError) as error:
+        if isinstance(error, RenderingUnavailable):
+            raise
+        raise RenderingUnavailable(f"{path} could not be written: {error}") from error
     finally:
         temporary.unlink(missing_ok=True)
     return path
+
+
+def _encode(writer: Any, frames: Iterable[NDArray[np.uint8]]) -> None:  # noqa: ANN401
+    """Send frames to a mediapy writer; what goes wrong first is what is raised."""
+    writer.__enter__()
+    try:
+        for frame in frames:
+            writer.add_image(frame)
+    except BaseException:
+        with contextlib.suppress(Exception):
+            writer.close()
+        raise
+    writer.close()
 
 
 class _Panel:
@@ -463,8 +495,21 @@ class _Panel:
         return round(x * self._scale), round(y * self._scale)
 
 
+def _cameras(model: mujoco.MjModel) -> tuple[str, ...]:
+    return (FOLLOW, *(model.cam(k).name for k in range(model.ncam)))
+
+
+def _check_size(model: mujoco.MjModel, width: int, height: int) -> None:
+    limit = model.vis.global_
+    if not (0 < width <= limit.offwidth and 0 < height <= limit.offheight):
+        raise OptionError(
+            f"{width}x{height} pixels: at most {limit.offwidth}x{limit.offheight} can be drawn"
+        )
+
+
 def _open(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
     try:
+        _open_display()
         return mujoco.Renderer(model, height, width, max_geom=2000)
     except Exception as error:  # each platform fails in a way of its own
         raise RenderingUnavailable(
@@ -472,6 +517,38 @@ def _open(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
             "work without. On Debian: apt install libegl1 libgl1-mesa-dri, then MUJOCO_GL=egl "
             f"(now {os.environ.get('MUJOCO_GL', 'unset')}). It failed with: {error}"
         ) from error
+
+
+def _open_display() -> None:
+    """Open the EGL display in mujoco's place, which would close it at the end of the process.
+
+    dm_control shares the display, and could no longer free its own contexts.
+    """
+    egl: Any = sys.modules.get("mujoco.egl")
+    if egl is not None and egl.EGL_DISPLAY is None:
+        display = egl.create_initialized_egl_device_display()
+        if display != egl.EGL.EGL_NO_DISPLAY:
+            egl.EGL_DISPLAY = display
+
+
+@contextlib.contextmanager
+def _current_context_kept() -> Generator[None]:
+    """Leave the thread with the EGL context that it had.
+
+    dm_control makes its own current once and takes it for granted; it would go on to draw in ours.
+    """
+    egl = sys.modules.get("mujoco.egl")
+    if egl is None:
+        yield
+        return
+    gl = egl.EGL
+    before = gl.eglGetCurrentContext()
+    try:
+        yield
+    finally:
+        if egl.EGL_DISPLAY is not None:
+            context = before or gl.EGL_NO_CONTEXT
+            gl.eglMakeCurrent(egl.EGL_DISPLAY, gl.EGL_NO_SURFACE, gl.EGL_NO_SURFACE, context)
 
 
 def _require(module: str, package: str) -> Any:  # noqa: ANN401 - a module

@@ -8,6 +8,7 @@ numbers come out for one aircraft, for a batch, and from the C kernel (`native/s
 
 from __future__ import annotations
 
+import math
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -26,17 +27,24 @@ def namespace(array: Array) -> Any:
 
 def square_norm(vector: Array) -> Array:
     """Sum of squares over the last axis, (..., k) to (...), added from left to right."""
-    first = vector[..., 0]
-    total = first * first
-    for k in range(1, vector.shape[-1]):
-        component = vector[..., k]
-        total = total + component * component
-    return total
+    if isinstance(vector, np.ndarray) and vector.ndim == 1:
+        return np.float64(_sum_of_squares(vector.tolist()))
+    return _sum_of_squares([vector[..., k] for k in range(vector.shape[-1])])
 
 
 def norm(vector: Array) -> Array:
     """Euclidean norm over the last axis, (..., k) to (...)."""
+    if isinstance(vector, np.ndarray) and vector.ndim == 1:
+        # Python's numbers are the same doubles, and ten times faster than arrays without axes.
+        return np.float64(math.sqrt(_sum_of_squares(vector.tolist())))
     return namespace(vector).sqrt(square_norm(vector))
+
+
+def _sum_of_squares(parts: list[Array]) -> Array:
+    total = parts[0] * parts[0]
+    for part in parts[1:]:
+        total = total + part * part
+    return total
 
 
 def rotation_matrix(quaternion: Array) -> Array:
@@ -53,12 +61,12 @@ def rotation_matrix(quaternion: Array) -> Array:
 
 def to_body(rotation: Array, vector: Array) -> Array:
     """World vector (..., 3) in the body frame: the transposed rotation times the vector."""
-    return namespace(vector).sum(rotation * vector[..., :, None], axis=-2)
+    return (rotation * vector[..., :, None]).sum(-2)
 
 
 def to_world(rotation: Array, vector: Array) -> Array:
     """Body vector (..., 3) in the world frame: the rotation times the vector."""
-    return namespace(vector).sum(rotation * vector[..., None, :], axis=-1)
+    return (rotation * vector[..., None, :]).sum(-1)
 
 
 def sin_cos_attitude(rotation: Array) -> tuple[Array, Array]:

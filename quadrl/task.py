@@ -14,7 +14,7 @@ import functools
 import math
 import operator
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -94,7 +94,11 @@ class Fields:
     goal: Array  # (..., 3) [m], task frame
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+FieldsT = TypeVar("FieldsT", bound=Fields)
+"""The fields of a task."""
+
+
+@dataclasses.dataclass(slots=True)
 class Measures:
     """Distances from what is asked; the reward is their decrease over a control step."""
 
@@ -190,7 +194,7 @@ class Marker:
 
 
 @dataclasses.dataclass(frozen=True)
-class Task(abc.ABC):
+class Task(abc.ABC, Generic[FieldsT]):
     """Base of all tasks: fly to a goal and stay there."""
 
     name: ClassVar[str]
@@ -219,7 +223,7 @@ class Task(abc.ABC):
     progress_weight: float = 100.0
     """Reward for a metre of distance gained."""
     attitude_weight: float = 10.0
-    """Reward for a unit of attitude error gained."""
+    """Reward for a unit of attitude error lost."""
     speed_weight: float = 2.0
     """Reward for a m/s lost of the speed, or of that relative to a target (gym-aero has 0.1, with
     which hover takes twice the steps)."""
@@ -243,28 +247,28 @@ class Task(abc.ABC):
                 raise OptionError(f"{self.name}: {positive} = {value} must be positive")
 
     @abc.abstractmethod
-    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Fields]:
+    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, FieldsT]:
         """How an episode begins, from random numbers alone."""
 
     def update(
-        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
-    ) -> Fields:
+        self, state: State, measures: Measures, fields: FieldsT, vehicle: Vehicle
+    ) -> FieldsT:
         """The fields after a control step: the same object, or a new one (a waypoint reached)."""
         return fields
 
-    def goal(self, state: State, fields: Fields) -> Array:
+    def goal(self, state: State, fields: FieldsT) -> Array:
         """Where to be, (..., 3) [m], task frame."""
         return fields.goal
 
-    def target_velocity(self, state: State, fields: Fields) -> Array | None:
+    def target_velocity(self, state: State, fields: FieldsT) -> Array | None:
         """Velocity of the target, (..., 3) [m/s], world frame; None where nothing moves."""
         return None
 
-    def error(self, state: State, measures: Measures, fields: Fields) -> Array:
+    def error(self, state: State, measures: Measures, fields: FieldsT) -> Array:
         """How far the task is from being done, (...) [m]."""
         return measures.distance
 
-    def measure(self, state: State, fields: Fields) -> Measures:
+    def measure(self, state: State, fields: FieldsT) -> Measures:
         """The distances that the reward is made of."""
         to_goal = self.goal(state, fields) - state.position
         target_velocity = self.target_velocity(state, fields)
@@ -281,7 +285,7 @@ class Task(abc.ABC):
         )
 
     def observe(
-        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
+        self, state: State, measures: Measures, fields: FieldsT, vehicle: Vehicle
     ) -> dict[str, Array]:
         """What the policy sees, by name, in the order of `observation`."""
         parts = {
@@ -320,17 +324,17 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def terminated(
-        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
+        self, state: State, measures: Measures, fields: FieldsT, vehicle: Vehicle
     ) -> Array:
         """Whether the episode is over before its time, (...) bool."""
 
     @abc.abstractmethod
     def success(
-        self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array
+        self, state: State, fields: FieldsT, errors: Errors, terminated: Array, truncated: Array
     ) -> Array:
         """Whether an episode that ends now did what was asked, (...) bool."""
 
-    def markers(self, fields: Fields) -> Sequence[Marker]:
+    def markers(self, fields: FieldsT) -> Sequence[Marker]:
         """What to draw of the task in one aircraft's episode; the goal is drawn anyway."""
         return ()
 

@@ -71,13 +71,22 @@ class Vehicle:
 
     def __post_init__(self) -> None:
         """Refuse what cannot fly."""
+        try:
+            object.__setattr__(self, "inertia", tuple(float(moment) for moment in self.inertia))
+        except (TypeError, ValueError) as error:
+            raise VehicleError(f"inertia = {self.inertia!r}: three numbers are allowed") from error
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             numbers = value if isinstance(value, tuple) else (value,)
             if field.name == "name":
                 continue
             zero_allowed = field.name in ("drag_coefficient", "moment_coefficient")
-            if not all(math.isfinite(v) and (v > 0 or (zero_allowed and v == 0)) for v in numbers):
+            if not all(
+                isinstance(v, (int, float))
+                and math.isfinite(v)
+                and (v > 0 or (zero_allowed and v == 0))
+                for v in numbers
+            ):
                 raise VehicleError(f"{field.name} = {value!r}: positive and finite is allowed")
         if len(self.inertia) != 3 or 2 * max(self.inertia) > sum(self.inertia) * (1 + 1e-9):
             raise VehicleError(
@@ -111,6 +120,11 @@ class Vehicle:
     def _scale(self) -> float:
         return self.arm_length / DRAWN_ARM_LENGTH
 
+    @functools.cached_property
+    def _always_within(self) -> bool:
+        """Whether no action commands a speed below zero or past the largest."""
+        return self.action_scale <= min(self.hover_speed, self.max_speed - self.hover_speed)
+
     @property
     def ground_clearance(self) -> float:
         """Height of the centre of mass above the ground when it stands on its feet [m]."""
@@ -143,9 +157,10 @@ class Vehicle:
 
         Omega_c = clip(Omega_hover + action_scale * clip(action, -1, 1), 0, Omega_max).
         """
-        clip = namespace(action).clip
-        command = self.hover_speed + self.action_scale * clip(action, -1.0, 1.0)
-        return clip(command, 0.0, self.max_speed)
+        command = self.hover_speed + self.action_scale * action.clip(-1.0, 1.0)
+        if self._always_within:
+            return command
+        return command.clip(0.0, self.max_speed)
 
     def spec(self, *, contact: bool = False, drawn: bool = True) -> mujoco.MjSpec:
         """The aircraft over the ground as an MjSpec, to add to or to compile.
@@ -261,5 +276,37 @@ def _strip(spec: mujoco.MjSpec) -> None:
         geom.material = ""
 
 
-VEHICLES = {vehicle.name: vehicle for vehicle in (Vehicle(),)}
+CRAZYFLIE = Vehicle(
+    name="crazyflie",
+    mass=0.0293,  # Foerster 2015, "System Identification of the Crazyflie 2.0 Nano Quadrocopter"
+    arm_length=0.046,  # ibid.
+    inertia=(16.6e-6, 16.6e-6, 29.3e-6),  # ibid., principal part
+    thrust_coefficient=2.3e-8,  # 14.5 g at 2500 rad/s (Bitcraze, propeller measurements of 2015)
+    torque_coefficient=2.3e-8 * 5.965e-3,  # ratio of torque to thrust: Foerster 2015
+    drag_coefficient=5e-3,  # chosen: 7.6 m/s of terminal speed
+    moment_coefficient=1e-7,  # chosen: the paper's, over the fifth power of the arm length
+    lag_rate=1 / 0.05,  # chosen: published values run from 0.005 to 0.15 s
+    rotor_radius=0.0225,
+    max_thrust_ratio=2.0,  # 2500 rad/s, ibid.
+    action_scale=200.0,
+    physics_step=0.005,
+    control_step=0.02,
+)
+RACER = Vehicle(
+    name="racer",
+    mass=0.752,  # Foehn et al. 2022, "Agilicious", Science Robotics 7
+    arm_length=0.125,  # ibid.: rotors at 0.075 and 0.1 m
+    inertia=(2.5e-3, 2.1e-3, 4.3e-3),  # ibid.
+    thrust_coefficient=1.562e-6,  # ibid.
+    torque_coefficient=1.562e-6 * 0.022,  # ibid., ratio of torque to thrust
+    drag_coefficient=2e-2,  # chosen: 19 m/s of terminal speed
+    moment_coefficient=1e-4,  # chosen
+    lag_rate=1 / 0.033,  # ibid.
+    rotor_radius=0.0635,  # propellers of 5 inches
+    max_thrust_ratio=4.5,  # 8.5 N a rotor, ibid.
+    action_scale=150.0,
+    physics_step=0.005,
+    control_step=0.02,
+)
+VEHICLES = {vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, RACER)}
 """The aircraft that the command line knows by name."""

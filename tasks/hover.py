@@ -11,7 +11,7 @@ from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)
-class Hover(Task):
+class Hover(Task[Fields]):
     """Hold the origin of the task's frame, heading east."""
 
     name = "hover"
@@ -52,7 +52,11 @@ class Hover(Task):
     ) -> Array:
         """Away, on the ground or on its back."""
         upside_down = state.rotation[..., 2, 2] < 0
-        return (measures.distance > self.max_distance) | self.touches_ground(state, vehicle) | upside_down
+        return (
+            (measures.distance > self.max_distance)
+            | self.touches_ground(state, vehicle)
+            | upside_down
+        )
 
     def success(
         self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array

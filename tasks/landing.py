@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from quadrl.vehicle import Vehicle
 if TYPE_CHECKING:
     from quadrl.learning.evaluate import Record
 
-REST_SPEED = 0.05  # [m/s] and [rad/s], below which the aircraft counts as at rest
+REST_SPEED, REST_SPIN = 0.05, 0.1  # [m/s], [rad/s]: slower is at rest
 CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which it counts as down
 
 
@@ -30,8 +30,15 @@ class Touchdown(Fields):
     rest: Array  # (...) control steps at rest on the pad, without a break
 
 
+@dataclasses.dataclass(slots=True)
+class LandingMeasures(Measures):
+    """The common measures, and the touchdown."""
+
+    impact: Array  # (...) [m/s], speed of a touchdown that has just been, else 0
+
+
 @dataclasses.dataclass(frozen=True)
-class Landing(Task):
+class Landing(Task[Touchdown]):
     """Land on the pad; the origin of the frame is where the aircraft's centre comes to rest."""
 
     name = "landing"
@@ -49,11 +56,15 @@ class Landing(Task):
     altitude: float = 0.07
     """Height of the origin above the ground: of the paper's aircraft on its feet [m]."""
     survival_weight: float = 0.0
-    """Reward for each step in the air."""
-    success_weight: float = 100.0
+    """Reward for each step: none, or it would hover over the pad rather than come to rest."""
+    speed_weight: float = 5.0
+    """Reward for a m/s of speed lost."""
+    touchdown_weight: float = 200.0
+    """Cost of a m/s of the speed of the touchdown."""
+    success_weight: float = 300.0
     """Reward for coming to rest on the pad."""
-    failure_weight: float = 100.0
-    """Cost of a crash."""
+    failure_weight: float = 300.0
+    """Cost of a crash: more than the progress of a dive to the ground."""
     start_height: float = 3.0
     """Height of the start over the pad [m]."""
     start_offset: float = 1.5
@@ -90,6 +101,15 @@ class Landing(Task):
         zero = xp.zeros_like(offset)
         return start, Touchdown(goal=rest, down=zero, speed=zero, rest=zero)
 
+    def measure(self, state: State, fields: Touchdown) -> LandingMeasures:
+        """The common measures, and the speed of the touchdown when it has just been."""
+        common = super().measure(state, fields)
+        xp = namespace(common.distance)
+        now = (state.position[..., 2] < CONTACT_HEIGHT) & (fields.down == 0)
+        impact = xp.where(now, fields.speed, 0.0 * common.speed)
+        values = {f.name: getattr(common, f.name) for f in dataclasses.fields(common)}
+        return LandingMeasures(**values, impact=impact)
+
     def terminated(
         self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
     ) -> Array:
@@ -109,8 +129,7 @@ class Landing(Task):
         self, state: State, fields: Touchdown, errors: Errors, terminated: Array, truncated: Array
     ) -> Array:
         """At rest on the pad: the only way in which a soft, upright, unmoving end comes about."""
-        slow = (norm(state.velocity) < REST_SPEED) & (norm(state.body_rate) < REST_SPEED)
-        return terminated & slow & (fields.down > 0) & self._over_pad(state)
+        return terminated & _is_slow(state) & (fields.down > 0) & self._over_pad(state)
 
     def update(
         self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
@@ -129,15 +148,17 @@ class Landing(Task):
     def reward(
         self,
         before: Measures,
-        now: Measures,
+        now: Any,
         rotor_command: Array,
         outcome: Outcome,
         vehicle: Vehicle,
     ) -> dict[str, Array]:
         """The common terms, and what the end is worth."""
         terms = super().reward(before, now, rotor_command, outcome, vehicle)
-        terms["success"] = self.success_weight * outcome.succeeded
-        terms["failure"] = -self.failure_weight * outcome.failed
+        terms["touchdown"] = -self.touchdown_weight * now.impact
+        xp, zero = namespace(now.distance), 0.0 * now.distance
+        terms["success"] = xp.where(outcome.succeeded, zero + self.success_weight, zero)
+        terms["failure"] = xp.where(outcome.failed, zero - self.failure_weight, zero)
         return terms
 
     def markers(self, fields: Touchdown) -> Sequence[Marker]:
@@ -167,10 +188,13 @@ class Landing(Task):
         """Control steps at rest on the pad, this one included."""
         height = state.position[..., 2] + self.altitude
         stands = height - vehicle.foot_depth(state.rotation) < CONTACT_HEIGHT
-        slow = (norm(state.velocity) < REST_SPEED) & (norm(state.body_rate) < REST_SPEED)
-        at_rest = stands & slow & self._over_pad(state)
+        at_rest = stands & _is_slow(state) & self._over_pad(state)
         xp = namespace(height)
         return xp.where(at_rest, fields.rest + 1, xp.zeros_like(height))
 
     def _over_pad(self, state: State) -> Array:
         return square_norm(state.position[..., :2]) < self.pad_radius**2
+
+
+def _is_slow(state: State) -> Array:
+    return (norm(state.velocity) < REST_SPEED) & (norm(state.body_rate) < REST_SPIN)

@@ -12,7 +12,7 @@ from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)
-class RandomWaypoint(WaypointTask):
+class RandomWaypoint(WaypointTask[Fields]):
     """Fly to a waypoint in a shell around the start and hold it; the heading is free."""
 
     name = "random_waypoint"

@@ -24,7 +24,7 @@ class Route(Fields):
 
 
 @dataclasses.dataclass(frozen=True)
-class StaticWaypoint(WaypointTask):
+class StaticWaypoint(WaypointTask[Route]):
     """Fly to a list of waypoints in order, heading east, and hold the last."""
 
     name = "static_waypoint"
@@ -63,7 +63,7 @@ class StaticWaypoint(WaypointTask):
             rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
         )
         leg = xp.zeros_like(position[..., 0])
-        return start, Route(goal=position + xp.asarray(self.waypoints[0]), leg=leg)
+        return start, Route(goal=position + _point(self.waypoints[0], position), leg=leg)
 
     def update(self, state: State, measures: Measures, fields: Route, vehicle: Vehicle) -> Route:
         """On to the next waypoint when this one is reached."""
@@ -76,7 +76,7 @@ class StaticWaypoint(WaypointTask):
         goal = fields.goal
         for number, waypoint in enumerate(self.waypoints):
             here = (onward & (leg == number))[..., None]
-            goal = xp.where(here, xp.asarray(waypoint), goal)
+            goal = xp.where(here, _point(waypoint, goal), goal)
         return Route(goal=goal, leg=leg)
 
     def success(
@@ -92,3 +92,10 @@ class StaticWaypoint(WaypointTask):
         later = self.waypoints[int(fields.leg) + 1 :]
         spheres = [Marker("sphere", waypoint, 0.06, WAITING) for waypoint in later]
         return [Marker("path", size=0.006, rgba=WAITING, points=route), *spheres]
+
+
+def _point(waypoint: tuple[float, float, float], like: Array) -> Array:
+    """A waypoint (3,) as an array of the kind of another."""
+    if isinstance(like, np.ndarray):
+        return np.array(waypoint)
+    return namespace(like).asarray(waypoint, dtype=like.dtype, device=like.device)

@@ -37,7 +37,7 @@ class Line(Fields):
 
 
 @dataclasses.dataclass(frozen=True)
-class StraightAndLevel(Task):
+class StraightAndLevel(Task[Line]):
     """Fly along a line at a set speed; the goal runs ahead of the aircraft on the line."""
 
     name = "straight_and_level"
@@ -49,9 +49,7 @@ class StraightAndLevel(Task):
 
     horizon: float = 20.0
     """Time limit of an episode [s]."""
-    progress_weight: float = 50.0
-    """Reward for a metre gained towards the line."""
-    speed_weight: float = 50.0
+    speed_weight: float = 20.0
     """Reward for a m/s gained towards the line's velocity."""
     line_speed: float = 2.0
     """Speed along the line [m/s]."""
@@ -95,9 +93,7 @@ class StraightAndLevel(Task):
         offset = measures.to_goal - self.lead * fields.direction
         return dataclasses.replace(measures, distance=norm(offset))
 
-    def terminated(
-        self, state: State, measures: Measures, fields: Line, vehicle: Vehicle
-    ) -> Array:
+    def terminated(self, state: State, measures: Measures, fields: Line, vehicle: Vehicle) -> Array:
         """Off the altitude, off the line or on the ground."""
         height = state.position[..., 2]
         return (
@@ -127,7 +123,7 @@ class StraightAndLevel(Task):
             "altitude_rms_m": float(np.sqrt(np.nanmean(record.position[..., 2] ** 2))),
             "cross_track_rms_m": float(np.sqrt(np.nanmean(across**2))),
             "speed_error_share": float(
-                np.abs(np.nanmean(speed, 0) / self.line_speed - 1).mean()
+                np.nanmean(np.abs(np.nanmean(speed, 0) / self.line_speed - 1))
                 if np.isfinite(speed).any()
                 else np.nan
             ),

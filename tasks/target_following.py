@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from quadrl.task import (
 )
 from quadrl.vehicle import Vehicle
 
+if TYPE_CHECKING:
+    from quadrl.learning.evaluate import Record
+
 WAVES = 2  # sines in each coordinate of the target's path
 AXES = 3
 PATH: tuple[float, float, float, float] = (0.95, 0.55, 0.20, 0.35)
@@ -37,7 +41,7 @@ class Path(Fields):
 
 
 @dataclasses.dataclass(frozen=True)
-class TargetFollowing(Task):
+class TargetFollowing(Task[Path]):
     """Stay 1 m from a target on a smooth random path; from which side is free."""
 
     name = "target_following"
@@ -107,9 +111,7 @@ class TargetFollowing(Task):
         measures = super().measure(state, fields)
         return dataclasses.replace(measures, distance=abs(measures.distance - self.keep))
 
-    def terminated(
-        self, state: State, measures: Measures, fields: Path, vehicle: Vehicle
-    ) -> Array:
+    def terminated(self, state: State, measures: Measures, fields: Path, vehicle: Vehicle) -> Array:
         """Too far from the target, or on the ground."""
         lost = measures.distance > self.max_distance - self.keep
         return lost | self.touches_ground(state, vehicle)
@@ -127,9 +129,9 @@ class TargetFollowing(Task):
         points = _by_axis(fields.amplitude * (np.sin(angle) - np.sin(fields.phase)))
         return [Marker("path", size=0.008, rgba=PATH, points=points)]
 
-    def figures(self, record: object) -> dict[str, float]:
+    def figures(self, record: Record) -> dict[str, float]:
         """How well the distance is kept over the flight."""
-        return {"distance_rms_m": float(np.sqrt(np.nanmean(record.error**2)))}  # type: ignore[attr-defined]
+        return {"distance_rms_m": float(np.sqrt(np.nanmean(record.error**2)))}
 
 
 def _by_axis(waves: Array) -> Array:

@@ -6,12 +6,12 @@ import dataclasses
 
 from quadrl.rotation import Array
 from quadrl.state import State
-from quadrl.task import Errors, Fields, Measures, Task
+from quadrl.task import Errors, FieldsT, Measures, Task
 from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)
-class WaypointTask(Task):
+class WaypointTask(Task[FieldsT]):
     """Fly to the goal and hold it."""
 
     max_distance: float = 5.0
@@ -20,13 +20,13 @@ class WaypointTask(Task):
     """Largest final error that counts as success [m]."""
 
     def terminated(
-        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
+        self, state: State, measures: Measures, fields: FieldsT, vehicle: Vehicle
     ) -> Array:
         """Far away or on the ground."""
         return (measures.distance > self.max_distance) | self.touches_ground(state, vehicle)
 
     def success(
-        self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array
+        self, state: State, fields: FieldsT, errors: Errors, terminated: Array, truncated: Array
     ) -> Array:
         """Still flying at the end, and close."""
         return truncated & (errors.final < self.tolerance)

@@ -62,15 +62,19 @@ class _Door:
 
     def _frame(self, row: int = 0) -> np.ndarray:
         """The picture (height, width, 3) of one aircraft, uint8."""
-        environment = self.environment
+        environment, simulation = self.environment, self.environment.simulation
         if self._renderer is None:
             from quadrl.rendering import Renderer
 
             model = environment.vehicle.compile(contact=environment.task.contact)
             self._renderer = Renderer(model, **self._picture)
-        qpos = environment.simulation.qpos.reshape(-1, 7)[row]
-        markers = environment.markers(row)
-        return self._renderer.frame(qpos, camera=self._camera, markers=markers)
+        goal = environment.task.goal(simulation.state, environment.fields) + simulation.origin
+        return self._renderer.frame(
+            simulation.qpos.reshape(-1, 7)[row],
+            camera=self._camera,
+            goal=goal.reshape(-1, 3)[row],
+            markers=environment.markers(row),
+        )
 
     def _close(self) -> None:
         if self._renderer is not None:
@@ -211,7 +215,7 @@ class QuadrotorVectorEnv(_Door, VectorEnv):
         now = self.environment.step(actions)
         self._observation = self.environment.flatten(now.observation)
         reward, terminated, truncated = now.reward, now.terminated, now.truncated
-        last, self._over = self._over, terminated | truncated
+        last, self._over = self._over, np.logical_or(terminated, truncated)
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over.any():
             over = self._over.copy()
             final = np.full(self.num_envs, None, dtype=object)

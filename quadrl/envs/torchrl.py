@@ -38,7 +38,7 @@ class QuadrotorEnv(EnvBase):
         vehicle: Vehicle | None = None,
         num_threads: int = 0,
         reward_terms: bool = False,
-        **options: Any,
+        **options: Any,  # noqa: ANN401 - of the task's own types
     ) -> None:
         """Make the environments.
 
@@ -62,23 +62,23 @@ class QuadrotorEnv(EnvBase):
             vehicle=vehicle,
             num_threads=num_threads,
         )
-        super().__init__(device=device, batch_size=[num_envs])
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._terms = self.environment.term_names if reward_terms else ()
-        shape = (num_envs,)
-        size = self.environment.size
+        shape, column = torch.Size([num_envs]), torch.Size([num_envs, 1])
+        vector, action = (torch.Size([num_envs, k]) for k in (self.environment.size, ROTORS))
         parts: dict[str, Any] = {
-            "observation": Unbounded((*shape, size), dtype=torch.float32),
-            "is_success": Binary(shape=(*shape, 1), dtype=torch.bool),
-            "error": Unbounded((*shape, 1), dtype=torch.float32),
+            "observation": Unbounded(vector, dtype=torch.float32),
+            "is_success": Binary(shape=column, dtype=torch.bool),
+            "error": Unbounded(column, dtype=torch.float32),
         }
         if self._terms:
-            terms = {name: Unbounded((*shape, 1)) for name in self._terms}
+            terms = {name: Unbounded(column) for name in self._terms}
             parts["reward_terms"] = Composite(terms, shape=shape)
         self.observation_spec = Composite(parts, shape=shape).to(self.device)
-        self.action_spec = Bounded(-1.0, 1.0, (*shape, ROTORS), dtype=torch.float32).to(self.device)
-        self.reward_spec = Unbounded((*shape, 1), dtype=torch.float32).to(self.device)
+        self.action_spec = Bounded(-1.0, 1.0, action, dtype=torch.float32).to(self.device)
+        self.reward_spec = Unbounded(column, dtype=torch.float32).to(self.device)
         self.done_spec = Composite(
-            {flag: Binary(shape=(*shape, 1), dtype=torch.bool) for flag in FLAGS[:3]}, shape=shape
+            {flag: Binary(shape=column, dtype=torch.bool) for flag in FLAGS[:3]}, shape=shape
         ).to(self.device)
         self._restored = False
 
@@ -87,7 +87,7 @@ class QuadrotorEnv(EnvBase):
         self._observation = self.environment.flatten(self.environment.restore(saved))
         self._restored = True
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:  # noqa: ANN401
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None and not mask.all():
             rows = mask.reshape(-1).cpu().numpy()

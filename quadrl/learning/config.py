@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import tyro
 
@@ -18,7 +18,7 @@ from quadrl.task import OptionError, Task, check_choices
 from quadrl.vehicle import VEHICLES
 
 CONFIG = "config.json"
-ALGORITHMS = ("ppo",)
+ALGORITHMS = ("ppo", "trpo", "gae")
 MAX_BATCH = 1 << 24
 """Most transitions in a batch: some GB."""
 
@@ -79,7 +79,32 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True)
-class PPOConfig:
+class _Settings:
+    """Numbers of an algorithm: whole ones are counts, others are positive unless they may be 0."""
+
+    MAY_BE_ZERO: ClassVar[tuple[str, ...]] = ("entropy", "critic", "damping")
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be trained.
+
+        Raises:
+            ConfigError: The message names the value and what is allowed.
+        """
+        try:
+            for field in dataclasses.fields(self):
+                value = getattr(self, field.name)
+                if isinstance(field.default, int):
+                    _check_number(field.name, value, 1)
+                elif field.name in self.MAY_BE_ZERO:
+                    _check_number(field.name, value, 0)
+                else:
+                    _check_positive(field.name, value)
+        except OptionError as error:
+            raise ConfigError(str(error)) from error
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig(_Settings):
     """What is PPO's own."""
 
     learning_rate: float = 3e-3
@@ -97,21 +122,43 @@ class PPOConfig:
     max_gradient: float = 1.0
     """Norm to which gradients are clipped."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be trained.
 
-        Raises:
-            ConfigError: The message names the value and what is allowed.
-        """
-        try:
-            for name in ("epochs", "minibatch"):
-                _check_number(name, getattr(self, name), 1)
-            for name in ("learning_rate", "clip", "max_gradient"):
-                _check_number(name, getattr(self, name), 1e-9)
-            for name in ("entropy", "critic"):
-                _check_number(name, getattr(self, name), 0)
-        except OptionError as error:
-            raise ConfigError(str(error)) from error
+@dataclasses.dataclass(frozen=True)
+class TRPOConfig(_Settings):
+    """What is TRPO's own."""
+
+    max_kl: float = 0.02
+    """Bound of the mean KL divergence of a step."""
+    damping: float = 0.01
+    """Added to the diagonal of the Fisher matrix."""
+    iterations: int = 10
+    """Of the conjugate gradients."""
+    backtracks: int = 10
+    """Steps tried in the line search."""
+    shrink: float = 0.7
+    """Factor from one tried step to the next."""
+    critic_rate: float = 3e-3
+    """Learning rate of the critic, at the start; it falls linearly to zero."""
+    critic_epochs: int = 8
+    """Passes of the critic over each batch."""
+    minibatch: int = 1024
+    """Transitions in one gradient step of the critic."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GAEConfig(_Settings):
+    """What is the plain policy gradient's own."""
+
+    learning_rate: float = 1e-2
+    """Of the policy's one step on a batch, at the start; it falls linearly to zero."""
+    critic_rate: float = 3e-3
+    """Learning rate of the critic, at the start; it falls linearly to zero."""
+    critic_epochs: int = 4
+    """Passes of the critic over each batch."""
+    minibatch: int = 1024
+    """Transitions in one gradient step of the critic."""
+    max_gradient: float = 1.0
+    """Norm to which gradients are clipped."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +168,7 @@ class TrainConfig:
     task: tyro.conf.Positional[str] = "hover"
     """Name of the task."""
     algo: str = "ppo"
-    """Algorithm: ppo."""
+    """Algorithm: ppo, trpo, or gae (the plain policy gradient)."""
     seed: int = 0
     """Of the networks, the exploration and the episodes."""
     vehicle: str = "paper"
@@ -132,10 +179,11 @@ class TrainConfig:
     """Aircraft flown together."""
     rollout: int = 16
     """Control steps of each aircraft in a batch."""
-    steps: int = 327_680
+    steps: int = 360_448
     """Control steps of all aircraft in the training."""
-    gamma: float = 0.95
-    """Discount: the reward is the gain of a step, so a short sight (1 s) is enough, and sharper."""
+    gamma: float = 0.9
+    """Discount a control step: rewards are gains, so a sight of half a second is enough, and the
+    shorter it is, the more an error that stays costs against one that is mended."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimation."""
     reward_scale: float = 0.01
@@ -146,6 +194,10 @@ class TrainConfig:
     """Hidden layers of the critic."""
     initial_deviation: float = 0.6
     """Standard deviation of the actions at the start."""
+    trpo: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
+    """TRPO's own."""
+    gae: GAEConfig = dataclasses.field(default_factory=GAEConfig)
+    """The plain policy gradient's own."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     """PPO's own."""
     num_threads: int = 0
@@ -168,9 +220,9 @@ class TrainConfig:
         for name in ("rollout", "steps"):
             _check_number(name, getattr(self, name), 1)
         _check_number("num_envs", self.num_envs, 1, MAX_ENVS)
-        if self.num_envs * self.rollout > MAX_BATCH:
+        if not 2 <= self.num_envs * self.rollout <= MAX_BATCH:  # one advantage has no deviation
             raise OptionError(
-                f"num_envs = {self.num_envs} with rollout = {self.rollout}: at most {MAX_BATCH} "
+                f"num_envs = {self.num_envs} with rollout = {self.rollout}: 2 to {MAX_BATCH} "
                 "transitions in a batch are allowed"
             )
         for name in ("gamma", "gae_lambda"):
@@ -179,7 +231,7 @@ class TrainConfig:
         _check_number("initial_deviation", self.initial_deviation, 0.01, math.e)
         _check_number("num_threads", self.num_threads, 0, 1024)
         _check_number("checkpoint_seconds", self.checkpoint_seconds, 0)
-        _check_number("reward_scale", self.reward_scale, 1e-9)
+        _check_positive("reward_scale", self.reward_scale)
         for width in (*self.hidden, *self.critic_hidden):
             _check_number("width of a hidden layer", width, 1, 1 << 16)
         check_choices([self.vehicle], VEHICLES, "vehicle")
@@ -215,7 +267,8 @@ class TrainConfig:
         known = {f.name for f in dataclasses.fields(cls)}
         values = {k: v for k, v in saved.items() if k in known}
         try:
-            values["ppo"] = PPOConfig(**values["ppo"])
+            for name, kind in (("ppo", PPOConfig), ("trpo", TRPOConfig), ("gae", GAEConfig)):
+                values[name] = kind(**values[name])
             values |= {k: tuple(values[k]) for k in ("hidden", "critic_hidden", "task_options")}
             config = cls(**values)
         except (KeyError, TypeError, AttributeError) as error:
@@ -277,6 +330,11 @@ def _kind(value: object) -> str:
 
 def _tuples(value: Any) -> Any:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not (value > 0 and math.isfinite(value)):
+        raise OptionError(f"{name} = {value}: a positive number is allowed")
 
 
 def _check_number(name: str, value: float, low: float, high: float = math.inf) -> None:

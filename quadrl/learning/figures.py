@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 
 from quadrl.errors import QuadrlError
 from quadrl.learning.evaluate import Record
+from quadrl.policy import write_whole
 
 STYLE = {
     "blue": "#2a6fbb",
@@ -21,6 +23,12 @@ STYLE = {
     "violet": "#7c5cbf",
 }
 DPI = 130
+PANELS = {
+    "return": ("return of an episode", "blue"),
+    "success": ("share of episodes", "green"),
+    "error": ("error [m]", "orange"),
+}
+"""Of a learning curve: column of metrics.csv, label and colour."""
 
 
 class FigureError(QuadrlError):
@@ -31,7 +39,7 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
     """Columns of a metrics.csv, (iterations,) each; what is missing is not a number.
 
     Raises:
-        FigureError: There is none, or nothing in it.
+        FigureError: There is none, or nothing in it, or something else.
     """
     if not path.is_file():
         raise FigureError(f"nothing to plot: there is no {path}")
@@ -39,22 +47,23 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
         rows = list(csv.DictReader(file))
     if not rows:
         raise FigureError(f"nothing to plot yet: {path} has no rows")
-    return {
-        name: np.array([float(row[name]) if row[name] else np.nan for row in rows])
-        for name in rows[0]
-    }
+    try:
+        metrics = {
+            name: np.array([float(row[name]) if row[name] else np.nan for row in rows])
+            for name in rows[0]
+        }
+    except (TypeError, ValueError) as error:
+        raise FigureError(f"{path} holds something that is no number: {error}") from error
+    if missing := {"steps", "seconds", *PANELS, "survival"} - set(metrics):
+        raise FigureError(f"{path} has no column {', '.join(sorted(missing))}")
+    return metrics
 
 
 def learning_curve(metrics: dict[str, np.ndarray], title: str, path: Path) -> Path:
     """Return, success and error over the steps of a training; figure 3 of the paper."""
     figure, axes = _figure(3, (8.0, 7.2), sharex=True)
     steps = metrics["steps"] / 1e3
-    panels = (
-        ("return", "return of an episode", "blue"),
-        ("success", "share of episodes", "green"),
-        ("error", "error [m]", "orange"),
-    )
-    for axis, (name, label, colour) in zip(axes, panels, strict=True):
+    for axis, (name, (label, colour)) in zip(axes, PANELS.items(), strict=True):
         ended = np.isfinite(metrics[name])  # in some batches no episode ends
         axis.plot(steps[ended], metrics[name][ended], color=STYLE[colour], lw=2, label=name)
         axis.set_ylabel(label)
@@ -135,6 +144,12 @@ def _equal_axes(axis: object, *points: np.ndarray) -> None:
 
 
 def _write(figure: Figure, path: Path) -> Path:
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=DPI)
+    kinds = FigureCanvasAgg(figure).get_supported_filetypes()
+    kind = path.suffix.removeprefix(".").lower()
+    if kind not in kinds:
+        raise FigureError(f"{path}: a picture's name ends in one of .{', .'.join(sorted(kinds))}")
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=DPI, format=kind)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, picture.getvalue())
     return path

@@ -22,8 +22,10 @@ import torch
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning import checkpoint
 from quadrl.learning.config import CONFIG, RunError, TrainConfig, new_folder, write_text
+from quadrl.learning.gae import GAE as PolicyGradient
 from quadrl.learning.policy import export, make_actor_critic
 from quadrl.learning.ppo import PPO
+from quadrl.learning.trpo import TRPO
 from quadrl.policy import FILE as POLICY_FILE
 from quadrl.policy import Policy
 from quadrl.vehicle import ROTORS, VEHICLES
@@ -38,7 +40,7 @@ METRICS = "metrics.csv"
 EVENTS = "events"
 SEED_STRIDE = 1 << 20
 """Distance between the aircraft's seeds of two trainings: the most aircraft that there can be."""
-ALGORITHMS = {"ppo": PPO}
+ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "gae": PolicyGradient}
 
 
 @dataclasses.dataclass
@@ -56,16 +58,12 @@ class Training:
     """A run in its folder."""
 
     def __init__(self, config: TrainConfig, folder: Path, *, resume: bool = False) -> None:
-        """Make everything that learns, and take up the checkpoint when resuming.
+        """Make everything that learns; then the folder, or take up its checkpoint when resuming.
 
         Raises:
             RunError: The folder cannot be used.
         """
         self.config, self.folder = config, folder
-        if not resume:
-            new_folder(folder)
-            text = json.dumps(config.resolved(), indent=2)
-            write_text(folder / CONFIG, text)
         torch.manual_seed(config.seed)
         self.env = QuadrotorEnv(
             config.task,
@@ -98,14 +96,20 @@ class Training:
             "length": np.zeros(config.num_envs),
         }
         self._generator_state: torch.Tensor | None = None
-        if resume and (folder / checkpoint.CHECKPOINT).exists():
-            self._restore()
+        if not resume:
+            new_folder(folder)
+            write_text(folder / CONFIG, json.dumps(config.resolved(), indent=2))
+        elif any((folder / name).exists() for name in (checkpoint.CHECKPOINT, POLICY_FILE)):
+            self._restore()  # without either, it was stopped before the first checkpoint
 
     def run(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> Policy:
         """Train to the end, and save the policy.
 
         Returns:
             The policy that was saved.
+
+        Raises:
+            RunError: A weight is no longer a finite number.
         """
         config = self.config
         if self.iteration >= config.iterations and (self.folder / POLICY_FILE).exists():
@@ -135,6 +139,11 @@ class Training:
                 self.iteration += 1
                 self.seconds = begun_at + time.perf_counter() - started
                 steps = self.iteration * config.num_envs * config.rollout
+                if not all(weight.isfinite().all() for weight in self.algorithm.parameters):
+                    raise RunError(
+                        f"the training diverged after {steps} steps: a weight is no longer finite; "
+                        "lower the learning rate and start a new run"
+                    )
                 log.write(self.iteration, steps, self.seconds, figures)
                 on_progress(
                     Progress(self.iteration, config.iterations, steps, self.seconds, figures)
@@ -175,7 +184,7 @@ class Training:
             batch["next", "reward"] *= config.reward_scale
             self.advantages(batch)
         flat = batch.select(
-            "observation", "action", "action_log_prob", "advantage", "value_target"
+            "observation", "action", "action_log_prob", "loc", "scale", "advantage", "value_target"
         ).reshape(-1)
         remaining = 1 - self.iteration / config.iterations
         figures |= self.algorithm.update(flat, remaining)
@@ -235,7 +244,7 @@ class Training:
             self._running = {k: v.numpy().copy() for k, v in tensors["running"].items()}
             self._generator_state = tensors["generator"]
             self.iteration, self.seconds = int(numbers["iteration"]), float(numbers["seconds"])
-        except (KeyError, RuntimeError, ValueError) as error:
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             raise RunError(f"{path} does not fit its run: {error}") from error
 
 
