@@ -153,7 +153,8 @@ class Environment:
         else:
             _put(self.fields, rows, fields)
             _put(self._measures, rows, measures)
-            self._steps[rows] = 0
+            steps: Any = self._steps
+            steps[rows] = 0
             self._error_sum[rows] = self._final_sum[rows] = 0.0
         return observation
 
@@ -289,8 +290,8 @@ class Environment:
         self._error_sum = self._error_sum + error
         settling = self._steps > self.horizon_steps - self._settle_steps
         self._final_sum = self._final_sum + error * settling
-        over = terminated | truncated
-        if not np.any(over):
+        over: Any = terminated | truncated
+        if not over.any():
             return over
         errors = Errors(
             final=self._final_sum / self._settle_steps, mean=self._error_sum / self._steps
