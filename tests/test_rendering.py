@@ -197,6 +197,19 @@ def test_the_rotors_turn(renderer):
     assert changed(still, turned).sum() > 20
 
 
+def test_the_rotors_turn_in_a_flight_as_fast_as_they_do(model):
+    # 31.4 rad/s are a quarter of a turn from one state to the next, 0.05 s later.
+    still = dataclasses.replace(
+        make_flight(2), qpos=np.stack([POSE, POSE]), rotor_speed=np.zeros((2, 4))
+    )
+    quarter = dataclasses.replace(still, rotor_speed=np.full((2, 4), math.pi / 2 / 0.05))
+    options = dict(width=640, height=480, fps=20, overlay=False, camera="track")
+    standing, turning = (list(render_flight(f, model, **options)) for f in (still, quarter))
+    assert changed(standing[0], turning[0]).sum() == 0
+    assert changed(standing[1], standing[0]).sum() == 0
+    assert changed(turning[1], turning[0]).sum() > 20
+
+
 def test_unknown_cameras_and_sizes_are_refused(model, renderer):
     with pytest.raises(OptionError, match="unknown camera 'sky'.*follow, fixed, track, chase"):
         renderer.frame(POSE, camera="sky")

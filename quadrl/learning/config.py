@@ -350,7 +350,13 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in ("mujoco", "torch", "torchrl", "numpy")}
 
 
-RECIPES: dict[str, dict[str, Any]] = {}
+RECIPES: dict[str, dict[str, Any]] = {
+    "static_waypoint": {"gamma": 0.93, "steps": 1_015_808},
+    "random_waypoint": {"gamma": 0.93, "steps": 1_015_808},
+    "straight_and_level": {"gamma": 0.94, "steps": 1_015_808},
+    "landing": {"gamma": 0.95, "steps": 1_310_720},
+    "target_following": {"gamma": 0.93, "steps": 655_360},
+}
 """What a task trains with where the defaults are not its best."""
 
 
