@@ -10,6 +10,8 @@ Importing it registers the Gymnasium ids; dm_control, torch and rendering come w
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import importlib
 import os
 import sys
@@ -19,8 +21,14 @@ from typing import TYPE_CHECKING, Any
 if sys.platform == "linux" and not any(
     os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
 ):
-    # Without a screen mujoco would choose GLFW at its import and fail at the first picture.
-    os.environ["MUJOCO_GL"] = "egl"
+    # Without a screen mujoco would choose GLFW at its import and fail at the first picture; asked
+    # for a library that is not there, it would not even be imported.
+    os.environ["MUJOCO_GL"] = "disabled"
+    for _backend, _library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8")):
+        with contextlib.suppress(OSError):
+            ctypes.CDLL(_library)
+            os.environ["MUJOCO_GL"] = _backend
+            break
     if "mujoco" in sys.modules:
         warnings.warn(
             "mujoco was imported before quadrl on a machine without a screen; to render, import "

@@ -27,17 +27,22 @@ def namespace(array: Array) -> Any:
 
 def square_norm(vector: Array) -> Array:
     """Sum of squares over the last axis, (..., k) to (...), added from left to right."""
-    if isinstance(vector, np.ndarray) and vector.ndim == 1:
+    if _is_single(vector):
         return np.float64(_sum_of_squares(vector.tolist()))
     return _sum_of_squares([vector[..., k] for k in range(vector.shape[-1])])
 
 
 def norm(vector: Array) -> Array:
     """Euclidean norm over the last axis, (..., k) to (...)."""
-    if isinstance(vector, np.ndarray) and vector.ndim == 1:
+    if _is_single(vector):
         # Python's numbers are the same doubles, and ten times faster than arrays without axes.
         return np.float64(math.sqrt(_sum_of_squares(vector.tolist())))
     return namespace(vector).sqrt(square_norm(vector))
+
+
+def _is_single(vector: Array) -> bool:
+    """Whether it is one NumPy vector of doubles."""
+    return isinstance(vector, np.ndarray) and vector.ndim == 1 and vector.dtype.char == "d"
 
 
 def _sum_of_squares(parts: list[Array]) -> Array:

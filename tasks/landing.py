@@ -32,9 +32,9 @@ class Touchdown(Fields):
 
 @dataclasses.dataclass(slots=True)
 class LandingMeasures(Measures):
-    """The common measures, and the touchdown."""
+    """The common measures, and how much too fast the approach is."""
 
-    impact: Array  # (...) [m/s], speed of a touchdown that has just been, else 0
+    haste: Array  # (...) [m/s], speed over that of a gentle approach at this height, else 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +59,12 @@ class Landing(Task[Touchdown]):
     """Reward for each step: none, or it would hover over the pad rather than come to rest."""
     speed_weight: float = 5.0
     """Reward for a m/s of speed lost."""
-    touchdown_weight: float = 200.0
-    """Cost of a m/s of the speed of the touchdown."""
+    haste_weight: float = 12.0
+    """Cost of a m/s over the speed of a gentle approach, at each step: more than its progress."""
+    gentle_speed: float = 0.2
+    """Speed of a gentle approach at the pad [m/s]."""
+    gentle_rate: float = 0.8
+    """What each metre of height adds to it [1/s]."""
     success_weight: float = 300.0
     """Reward for coming to rest on the pad."""
     failure_weight: float = 300.0
@@ -102,13 +106,14 @@ class Landing(Task[Touchdown]):
         return start, Touchdown(goal=rest, down=zero, speed=zero, rest=zero)
 
     def measure(self, state: State, fields: Touchdown) -> LandingMeasures:
-        """The common measures, and the speed of the touchdown when it has just been."""
+        """The common measures, and the haste of the approach."""
         common = super().measure(state, fields)
         xp = namespace(common.distance)
-        now = (state.position[..., 2] < CONTACT_HEIGHT) & (fields.down == 0)
-        impact = xp.where(now, fields.speed, 0.0 * common.speed)
+        gentle = self.gentle_speed + self.gentle_rate * abs(state.position[..., 2])
+        excess = common.speed - gentle
+        haste = xp.where(excess > 0, excess, 0.0 * excess)
         values = {f.name: getattr(common, f.name) for f in dataclasses.fields(common)}
-        return LandingMeasures(**values, impact=impact)
+        return LandingMeasures(**values, haste=haste)
 
     def terminated(
         self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
@@ -155,7 +160,7 @@ class Landing(Task[Touchdown]):
     ) -> dict[str, Array]:
         """The common terms, and what the end is worth."""
         terms = super().reward(before, now, rotor_command, outcome, vehicle)
-        terms["touchdown"] = -self.touchdown_weight * now.impact
+        terms["haste"] = -self.haste_weight * now.haste
         xp, zero = namespace(now.distance), 0.0 * now.distance
         terms["success"] = xp.where(outcome.succeeded, zero + self.success_weight, zero)
         terms["failure"] = xp.where(outcome.failed, zero - self.failure_weight, zero)

@@ -442,3 +442,26 @@ def test_without_a_compiler_it_says_what_to_install(run, tmp_path):
 def test_the_traceback_can_be_had(tmp_path):
     done = in_a_process("evaluate", tmp_path, QUADRL_TRACEBACK="1")
     assert done.returncode == 1 and "Traceback" in done.stderr and "PolicyError" in done.stderr
+
+
+NO_EGL = """
+import ctypes, ctypes.util
+load, find = ctypes.CDLL.__init__, ctypes.util.find_library
+def no_egl(self, name, *rest, **options):
+    if "EGL" in str(name) or "OSMesa" in str(name):
+        raise OSError(f"{name}: cannot open shared object file")
+    load(self, name, *rest, **options)
+ctypes.CDLL.__init__ = no_egl
+ctypes.util.find_library = lambda name: None if name in ("EGL", "OSMesa") else find(name)
+"""
+
+
+def test_without_libegl_it_is_as_without_graphics(run, tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text(NO_EGL)  # as on a machine without the library
+    for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    path = os.pathsep.join((str(tmp_path), str(REPOSITORY)))
+    done = in_a_process("evaluate", run, "--episodes", "2", "--json", PYTHONPATH=path)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = in_a_process("render", run, "--out", tmp_path / "a.mp4", PYTHONPATH=path)
+    assert done.returncode == 2 and "apt install libegl1" in done.stderr

@@ -668,7 +668,7 @@ def test_flight_of_a_record_is_in_the_world_frame():
         ({"reward_scale": 0.0}, "reward_scale = 0.0: a positive number is allowed"),
         ({"algo": "sac"}, "unknown algorithm 'sac'; choices: ppo"),
         ({"vehicle": "paprr"}, "unknown vehicle 'paprr' .did you mean paper"),
-        ({"task": "hovver"}, "unknown task 'hovver' .did you mean hover.*choices: hover"),
+        ({"task": "hovver"}, "unknown task 'hovver' .did you mean hover.*choices: .*hover"),
         ({"task_options": ("horizn=5",)}, "unknown hover option 'horizn' .did you mean horizon"),
         ({"task_options": ("horizon",)}, "option 'horizon': NAME=VALUE is expected"),
         ({"task_options": ("horizon=long",)}, "horizon = 'long': a number is expected"),
