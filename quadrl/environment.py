@@ -148,7 +148,8 @@ class Environment:
         observation = self.task.observe(state, measures, fields, self.vehicle)
         if everyone or rows is None:
             self.fields, self._measures = fields, measures
-            self._steps = np.zeros(self.shape, dtype=np.int64)
+            # For one aircraft a number of Python's own: cheaper than an array without axes.
+            self._steps = np.zeros(self.shape, dtype=np.int64) if self.shape else 0
             self._error_sum, self._final_sum = np.zeros(self.shape), np.zeros(self.shape)
         else:
             _put(self.fields, rows, fields)
@@ -274,7 +275,7 @@ class Environment:
             self.simulation.restore(
                 {k.removeprefix(prefix): v for k, v in saved.items() if k.startswith(prefix)}
             )
-        self._steps = saved["steps"].copy()
+        self._steps = saved["steps"].copy() if self.shape else int(saved["steps"])
         self._error_sum, self._final_sum = saved["error"].copy(), saved["final"].copy()
         for name in ("fields", "measures"):
             record = getattr(self, "fields" if name == "fields" else "_measures")

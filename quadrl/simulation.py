@@ -81,7 +81,7 @@ class Simulation(abc.ABC):
         if not self._fill(None):
             return None
         table, last = (frame.table for frame in self._frames)
-        broken = ~(np.abs(table[: ROWS["time"].start]) < mujoco.mjMAXVAL).all(axis=0)
+        broken = ~(np.abs(table[: ROWS["time"]]) < mujoco.mjMAXVAL).all(axis=0)
         if self.shape:
             rows = np.flatnonzero(broken)
             table[:, rows] = last[:, rows]
@@ -109,7 +109,7 @@ class Simulation(abc.ABC):
         if rows is None:
             self._frames[0].table[ROWS["time"]] = 0.0
             return self.state
-        self._frames[0].table[ROWS["time"].start, rows] = 0.0
+        self._frames[0].table[ROWS["time"], rows] = 0.0
         return State.of_table(self._frames[0].table[:, rows])
 
     def save(self) -> dict[str, np.ndarray]:

@@ -6,7 +6,14 @@ import dataclasses
 
 import numpy as np
 
-from quadrl.rotation import Array, namespace, rotation_matrix, sin_cos_attitude, to_body
+from quadrl.rotation import (
+    Array,
+    namespace,
+    norm,
+    rotation_matrix,
+    sin_cos_attitude,
+    to_body,
+)
 
 ROWS = {
     "position": slice(0, 3),
@@ -18,10 +25,14 @@ ROWS = {
     "body_velocity": slice(25, 28),
     "body_rate": slice(28, 31),
     "rotor_speed": slice(31, 35),
-    "time": slice(35, 36),
+    "speed": 35,
+    "spin": 36,
+    "level_error": 37,
+    "east_error": 38,
+    "time": 39,
 }
 """Where each quantity stands in the table that `native/state.c` fills (time is not its)."""
-TABLE_ROWS = 36
+TABLE_ROWS = 40
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -40,6 +51,10 @@ class State:
     body_velocity: Array  # (..., 3) [m/s], body frame
     body_rate: Array  # (..., 3) [rad/s], angular velocity in the body frame
     rotor_speed: Array  # (..., 4) [rad/s]
+    speed: Array  # (...) [m/s]
+    spin: Array  # (...) [rad/s]
+    level_error: Array  # (...) |sin zeta| + |cos zeta - 1| of roll and pitch
+    east_error: Array  # (...) the same of roll, pitch and yaw
     time: Array  # (...) [s], since the start of the episode
 
     @classmethod
@@ -48,9 +63,14 @@ class State:
 
         Rows are contiguous over the aircraft, so that NumPy's loops run over all of them at once.
         """
-        parts = {name: np.moveaxis(table[rows], 0, -1) for name, rows in ROWS.items()}
+        # A row alone is an array without axes for one aircraft, hence the ellipsis.
+        parts = {
+            name: np.moveaxis(table[rows, ...], 0, -1)
+            if isinstance(rows, slice)
+            else table[rows, ...]
+            for name, rows in ROWS.items()
+        }
         matrix = table[ROWS["rotation"]].reshape(3, 3, *table.shape[1:])
-        parts["time"] = table[ROWS["time"].start, ...]
         parts["rotation"] = np.moveaxis(matrix, (0, 1), (-2, -1))
         return cls(**parts)
 
@@ -78,6 +98,10 @@ class State:
             body_velocity=to_body(rotation, velocity),
             body_rate=body_rate,
             rotor_speed=rotor_speed,
+            speed=norm(velocity),
+            spin=norm(body_rate),
+            level_error=norm(sines[..., :2]) + norm(cosines[..., :2] - 1),
+            east_error=norm(sines) + norm(cosines - 1),
             time=time,
         )
 

@@ -117,7 +117,7 @@ class Errors:
     mean: Array  # (...) [m], over all of it
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(slots=True)
 class Outcome:
     """How an episode ends, if it ends now."""
 
@@ -272,16 +272,16 @@ class Task(abc.ABC, Generic[FieldsT]):
         """The distances that the reward is made of."""
         to_goal = self.goal(state, fields) - state.position
         target_velocity = self.target_velocity(state, fields)
-        velocity = state.velocity if target_velocity is None else state.velocity - target_velocity
-        sine, cosine = state.sin_attitude, state.cos_attitude - 1.0
-        if not self.heading_matters:
-            sine, cosine = sine[..., :2], cosine[..., :2]
+        if target_velocity is None:
+            speed = state.speed + 0.0  # a number of its own: the state is overwritten
+        else:
+            speed = norm(state.velocity - target_velocity)
         return Measures(
             to_goal=to_goal,
             distance=norm(to_goal),
-            attitude=norm(sine) + norm(cosine),
-            speed=norm(velocity),
-            spin=norm(state.body_rate),
+            attitude=(state.east_error if self.heading_matters else state.level_error) + 0.0,
+            speed=speed,
+            spin=state.spin + 0.0,
         )
 
     def observe(

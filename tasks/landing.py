@@ -59,7 +59,7 @@ class Landing(Task[Touchdown]):
     """Reward for each step: none, or it would hover over the pad rather than come to rest."""
     speed_weight: float = 5.0
     """Reward for a m/s of speed lost."""
-    haste_weight: float = 12.0
+    haste_weight: float = 30.0
     """Cost of a m/s over the speed of a gentle approach, at each step: more than its progress."""
     gentle_speed: float = 0.2
     """Speed of a gentle approach at the pad [m/s]."""

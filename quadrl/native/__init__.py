@@ -171,6 +171,12 @@ def check_installed() -> None:
         NativeError: One of them was removed or replaced: the physics would be wrong.
     """
     ours = library()
+    if (
+        mujoco.get_mjcb_act_dyn() is ours.act_dyn
+        and mujoco.get_mjcb_act_gain() is ours.act_gain
+        and mujoco.get_mjcb_passive() is ours.passive
+    ):
+        return
     missing = [name for name in CALLBACKS if _current(name) != getattr(ours, name)]
     if missing:
         raise NativeError(

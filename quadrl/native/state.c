@@ -10,10 +10,17 @@
 
 enum {  // rows of the output, one column an aircraft; quadrl/state.py slices them by name
   POSITION = 0, QUATERNION = 3, ROTATION = 7, SIN_ATTITUDE = 16, COS_ATTITUDE = 19,
-  VELOCITY = 22, BODY_VELOCITY = 25, BODY_RATE = 28, ROTOR_SPEED = 31, ROWS = 35
+  VELOCITY = 22, BODY_VELOCITY = 25, BODY_RATE = 28, ROTOR_SPEED = 31, SPEED = 35,
+  SPIN = 36, LEVEL_ERROR = 37, EAST_ERROR = 38, ROWS = 39
 };
 
 static int is_sound(double x) { return fabs(x) < 1e10; }  // mjMAXVAL; false for NaN
+
+static double norm(const double* vector, int size) {
+  double sum = vector[0] * vector[0];
+  for (int k = 1; k < size; ++k) sum += vector[k] * vector[k];
+  return sqrt(sum);
+}
 
 QUADRL_EXPORT int quadrl_state_rows(void) { return ROWS; }
 
@@ -52,12 +59,18 @@ QUADRL_EXPORT int64_t quadrl_state(int64_t n, const int64_t* ids, const double* 
       sound &= is_sound(p[3 + k]) & is_sound(speed[k]);
     }
     for (int k = 0; k < 9; ++k) OUT(ROTATION + k) = r[k];
-    OUT(SIN_ATTITUDE) = r[7] / cos_pitch;
-    OUT(SIN_ATTITUDE + 1) = -r[6];
-    OUT(SIN_ATTITUDE + 2) = r[3] / cos_pitch;
-    OUT(COS_ATTITUDE) = r[8] / cos_pitch;
-    OUT(COS_ATTITUDE + 1) = horizontal;
-    OUT(COS_ATTITUDE + 2) = r[0] / cos_pitch;
+    const double sine[3] = {r[7] / cos_pitch, -r[6], r[3] / cos_pitch};
+    const double cosine[3] = {r[8] / cos_pitch, horizontal, r[0] / cos_pitch};
+    double off[3];
+    for (int k = 0; k < 3; ++k) {
+      OUT(SIN_ATTITUDE + k) = sine[k];
+      OUT(COS_ATTITUDE + k) = cosine[k];
+      off[k] = cosine[k] - 1;
+    }
+    OUT(SPEED) = norm(v, 3);
+    OUT(SPIN) = norm(v + 3, 3);
+    OUT(LEVEL_ERROR) = norm(sine, 2) + norm(off, 2);
+    OUT(EAST_ERROR) = norm(sine, 3) + norm(off, 3);
 #undef OUT
     broken += !sound;
   }
