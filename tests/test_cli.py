@@ -465,3 +465,51 @@ def test_without_libegl_it_is_as_without_graphics(run, tmp_path, monkeypatch):
     assert (done.returncode, done.stderr) == (0, "")
     done = in_a_process("render", run, "--out", tmp_path / "a.mp4", PYTHONPATH=path)
     assert done.returncode == 2 and "apt install libegl1" in done.stderr
+
+
+OWN = """
+import dataclasses
+
+import quadrl
+from quadrl.tasks.hover import Hover
+from quadrl.vehicle import Vehicle
+
+
+@quadrl.register
+@dataclasses.dataclass(frozen=True)
+class NearHover(Hover):
+    name = "near_hover"
+    radius: float = 0.1
+
+
+quadrl.VEHICLES["heavy"] = Vehicle(name="heavy", mass=0.8)
+"""
+
+
+def test_a_file_brings_in_tasks_and_aircraft(tmp_path):
+    """In its own process: what it registers would stay in this one."""
+    (tmp_path / "own.py").write_text(OWN)
+    command = [sys.executable, "-m", "quadrl", "evaluate", "--import", "own.py", "--json"]
+    command += ["--controller", "geometric", "--task", "near_hover", "--vehicle", "heavy"]
+    command += ["--episodes", "2"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
+    outcome = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert outcome.returncode == 0, outcome.stderr
+    judged = json.loads(outcome.stdout)
+    assert judged["task"] == "near_hover" and judged["success_rate"] == 1.0
+
+
+def test_an_import_of_nothing_is_refused(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--import", "nowhere.py", "tasks"])
+    assert stop.value.code == 2
+    assert "--import nowhere.py: the path of a Python file" in capsys.readouterr().err
+
+
+def test_a_flight_needs_one_pilot(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["evaluate"])
+    assert stop.value.code == 2
+    assert "--controller geometric or lqr with --task" in capsys.readouterr().err
