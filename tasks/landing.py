@@ -59,14 +59,14 @@ class Landing(Task[Touchdown]):
     """Reward for each step: none, or it would hover over the pad rather than come to rest."""
     speed_weight: float = 5.0
     """Reward for a m/s of speed lost."""
-    haste_weight: float = 30.0
+    haste_weight: float = 20.0
     """Cost of a m/s over the speed of a gentle approach, at each step: more than its progress."""
     gentle_speed: float = 0.2
     """Speed of a gentle approach at the pad [m/s]."""
     gentle_rate: float = 0.8
     """What each metre of height adds to it [1/s]."""
-    success_weight: float = 300.0
-    """Reward for coming to rest on the pad."""
+    success_weight: float = 100.0
+    """Reward for coming to rest on the pad; a larger one makes it hurry."""
     failure_weight: float = 300.0
     """Cost of a crash: more than the progress of a dive to the ground."""
     start_height: float = 3.0

@@ -354,7 +354,7 @@ RECIPES: dict[str, dict[str, Any]] = {
     "static_waypoint": {"gamma": 0.93, "steps": 1_015_808},
     "random_waypoint": {"gamma": 0.93, "steps": 1_015_808},
     "straight_and_level": {"gamma": 0.94, "steps": 1_015_808},
-    "landing": {"gamma": 0.95, "steps": 1_310_720},
+    "landing": {"gamma": 0.97, "steps": 1_310_720},
     "target_following": {"gamma": 0.93, "steps": 655_360},
 }
 """What a task trains with where the defaults are not its best."""
