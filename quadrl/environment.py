@@ -100,6 +100,7 @@ class Environment:
             simulation = _simulation(self.task, self.vehicle, num_envs, num_threads)
         self.simulation = simulation
         self.shape = simulation.shape
+        self._action_shape = (*self.shape, ROTORS)
         self.num_envs = self.shape[0] if self.shape else 1
         self.horizon_steps = max(1, round(self.task.horizon / self.vehicle.control_step))
         settle_steps = round(self.task.settle / self.vehicle.control_step)
@@ -181,12 +182,16 @@ class Environment:
         if self._steps is None:
             raise RuntimeError("call reset before the first step")
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != (*self.shape, ROTORS):
+        if action.shape != self._action_shape:
             raise ActionError(
-                f"an action of shape {action.shape} was given; {(*self.shape, ROTORS)} is expected"
+                f"an action of shape {action.shape} was given; {self._action_shape} is expected"
             )
-        # One number that is not finite makes the sum so, and a sum is cheaper than a test of each.
-        if not math.isfinite(np.add.reduce(action, axis=None)) and not np.isfinite(action).all():
+        if self.shape:
+            # One number that is not finite makes the sum so: cheaper than a test of each.
+            sound = math.isfinite(np.add.reduce(action, axis=None)) or np.isfinite(action).all()
+        else:
+            sound = all(map(math.isfinite, action.tolist()))
+        if not sound:
             where = np.argwhere(~np.isfinite(action))[0]
             raise ActionError(
                 f"action{where.tolist()} is {action[tuple(where)]}: every number must be finite"
@@ -290,9 +295,10 @@ class Environment:
         """Add up the errors, and decide on the episodes that end now."""
         self._error_sum = self._error_sum + error
         settling = self._steps > self.horizon_steps - self._settle_steps
-        self._final_sum = self._final_sum + error * settling
+        if settling is not False:
+            self._final_sum = self._final_sum + error * settling
         over: Any = terminated | truncated
-        if not over.any():
+        if not (over.any() if self.shape else over):
             return over
         errors = Errors(
             final=self._final_sum / self._settle_steps, mean=self._error_sum / self._steps

@@ -66,7 +66,10 @@ def rotation_matrix(quaternion: Array) -> Array:
 
 def to_body(rotation: Array, vector: Array) -> Array:
     """World vector (..., 3) in the body frame: the transposed rotation times the vector."""
-    return (rotation * vector[..., :, None]).sum(-2)
+    product = rotation * vector[..., :, None]
+    if isinstance(product, np.ndarray):
+        return np.add.reduce(product, axis=-2)  # what sum ends up in, by a shorter way
+    return product.sum(-2)
 
 
 def to_world(rotation: Array, vector: Array) -> Array:

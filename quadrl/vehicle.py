@@ -157,7 +157,11 @@ class Vehicle:
 
         Omega_c = clip(Omega_hover + action_scale * clip(action, -1, 1), 0, Omega_max).
         """
-        command = self.hover_speed + self.action_scale * action.clip(-1.0, 1.0)
+        if isinstance(action, np.ndarray):
+            within = np.minimum(np.maximum(action, -1.0), 1.0)  # half the time of clip
+        else:
+            within = action.clip(-1.0, 1.0)
+        command = self.hover_speed + self.action_scale * within
         if self._always_within:
             return command
         return command.clip(0.0, self.max_speed)

@@ -351,7 +351,7 @@ def versions() -> dict[str, str]:
 
 
 RECIPES: dict[str, dict[str, Any]] = {
-    "static_waypoint": {"gamma": 0.93, "steps": 1_015_808},
+    "static_waypoint": {"steps": 1_310_720},
     "random_waypoint": {"gamma": 0.93, "steps": 1_015_808},
     "straight_and_level": {"gamma": 0.94, "steps": 1_015_808},
     "landing": {"gamma": 0.97, "steps": 1_310_720},
