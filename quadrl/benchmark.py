@@ -1,7 +1,8 @@
 """The speed of every layer and the memory of a large batch, measured in one process.
 
-The yardstick is bare `mj_step`: the same lean model with the same rotor callbacks, and nothing of
-Python between two control steps. Everything is counted in control steps a second.
+The yardstick is bare `mj_step`: the same lean model with the same callbacks under random commands,
+which move it as random actions do (a step at rest is an eighth shorter). Everything is counted in
+control steps a second.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ Work = Callable[[], int]
 ALL_CORES, ONE_CORE = "all cores", "one core"
 CHUNK = 200
 """Control steps of one aircraft between two looks at the clock."""
+FLIGHT = 16
+"""Control steps from hover under random commands, until bare aircraft are put back."""
 HEIGHT = 3.0
-"""At which the aircraft of bare mj_step hover, clear of everything [m]."""
+"""At which the aircraft of bare mj_step begin; in a FLIGHT they come near nothing [m]."""
 MEMORY_ENVS = 4096
 MEMORY_STEPS = 3
 MEMORY_TARGET = 500.0  # [MB]
@@ -61,7 +64,7 @@ environment = Environment(task, num_envs=count, seed=0)
 environment.reset()
 for _ in range(steps):
     environment.flatten(environment.step(np.zeros((count, 4))).observation)
-print((resident() - before) / 1e6)
+sys.stdout.write(str((resident() - before) / 1e6))
 """
 
 
@@ -197,6 +200,11 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
             bare=True,
         ),
         Layer(
+            "the same with mujoco's own stage clock, its default",
+            ALL_CORES,
+            _with_clock(_batched_mj_step(task, num_envs)),
+        ),
+        Layer(
             f"Environment of {num_envs:,}: observation, reward, resets",
             ALL_CORES,
             _environment(task, num_envs),
@@ -250,39 +258,52 @@ def _actions(*shape: int) -> Iterator[np.ndarray]:
     )
 
 
-def _hovering(model: mujoco.MjModel, vehicle: Vehicle) -> mujoco.MjData:
-    data = mujoco.MjData(model)
+def _commands(vehicle: Vehicle, *shape: int) -> Iterator[np.ndarray]:
+    """The rotor commands (*shape, 4) [rad/s] of random actions, over and over."""
+    return itertools.cycle(
+        vehicle.rotor_command(np.random.default_rng(0).uniform(-1, 1, (64, *shape, ROTORS)))
+    )
+
+
+def _hover(model: mujoco.MjModel, data: mujoco.MjData, vehicle: Vehicle) -> None:
+    mujoco.mj_resetData(model, data)
     data.qpos[2] = HEIGHT
     data.act[:] = data.ctrl[:] = vehicle.hover_speed
-    return data
 
 
 def _mj_step(task: Task) -> Work:
     vehicle = Vehicle()
     model = vehicle.compile_lean(contact=task.contact)
-    data = _hovering(model, vehicle)
+    data = mujoco.MjData(model)
+    commands = _commands(vehicle)
 
     def work() -> int:
-        for _ in range(CHUNK):
+        _hover(model, data, vehicle)
+        for _ in range(FLIGHT):
+            data.ctrl[:] = next(commands)
             mujoco.mj_step(model, data, vehicle.substeps)
-        return CHUNK
+        return FLIGHT
 
     return work
 
 
 def _threaded_mj_step(task: Task, stack: contextlib.ExitStack) -> Work:
-    """As `mj_step` can be at its best: each core an aircraft, and Python only every CHUNK steps."""
+    """As `mj_step` can be at its best: each core an aircraft, a command a flight."""
     vehicle, cores = Vehicle(), _cores()
     model = vehicle.compile_lean(contact=task.contact)
-    aircraft = [_hovering(model, vehicle) for _ in range(cores)]
+    aircraft = [mujoco.MjData(model) for _ in range(cores)]
+    commands = _commands(vehicle)
     pool = stack.enter_context(ThreadPoolExecutor(cores))
 
     def fly(data: mujoco.MjData) -> None:
-        mujoco.mj_step(model, data, CHUNK * vehicle.substeps)
+        for _ in range(8):
+            _hover(model, data, vehicle)
+            data.ctrl[:] = next(commands)
+            mujoco.mj_step(model, data, FLIGHT * vehicle.substeps)
 
     def work() -> int:
         list(pool.map(fly, aircraft))
-        return CHUNK * cores
+        return 8 * FLIGHT * cores
 
     return work
 
@@ -292,13 +313,33 @@ def _batched_mj_step(task: Task, num_envs: int) -> Work:
     batch = Batch(vehicle.compile_lean(contact=task.contact), num_envs)
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
     batch.bind("qpos")[:, 2] = HEIGHT
-    batch.bind("act")[:] = batch.bind("ctrl")[:] = vehicle.hover_speed
+    batch.bind("act")[:] = vehicle.hover_speed
+    hovering, ctrl = batch.state.copy(), batch.bind("ctrl")
+    commands = _commands(vehicle, num_envs)
+    steps = itertools.count()
 
     def work() -> int:
+        if next(steps) % FLIGHT == 0:
+            batch.state[:] = hovering
+        ctrl[:] = next(commands)
         batch.step(nstep=vehicle.substeps)
         return num_envs
 
     return work
+
+
+def _with_clock(work: Work) -> Work:
+    """The same as mujoco comes: it reads the clock at every stage of a step."""
+
+    def timed() -> int:
+        ours = mujoco.get_mjcb_time()
+        mujoco.set_mjcb_time(None)
+        try:
+            return work()
+        finally:
+            mujoco.set_mjcb_time(ours)
+
+    return timed
 
 
 def _environment(task: Task, num_envs: int) -> Work:
@@ -368,7 +409,7 @@ def _collector(task: Task, num_envs: int, stack: contextlib.ExitStack) -> Work:
     from quadrl.envs.torchrl import QuadrotorEnv
     from quadrl.learning.config import recipe
     from quadrl.learning.policy import make_actor_critic
-    from quadrl.learning.train import Collector
+    from quadrl.learning.train import make_collector
 
     config = recipe(task.name)
     env = QuadrotorEnv(task, num_envs, seed=0)
@@ -380,16 +421,7 @@ def _collector(task: Task, num_envs: int, stack: contextlib.ExitStack) -> Work:
         initial_deviation=config.initial_deviation,
     )
     frames = num_envs * config.rollout
-    collector = Collector(
-        env,
-        actor,
-        frames_per_batch=frames,
-        total_frames=-1,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-        use_buffers=False,
-        trust_policy=True,
-    )
+    collector = make_collector(env, actor, frames)
     stack.callback(collector.shutdown)
     stack.callback(torch.set_num_threads, torch.get_num_threads())
     batches = iter(collector)

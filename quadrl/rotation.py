@@ -25,6 +25,19 @@ def namespace(array: Array) -> Any:
     return array_namespace(array)
 
 
+def stack(*parts: Array) -> Array:
+    """Components (...) of vectors as one array (..., k)."""
+    first = parts[0]
+    if isinstance(first, np.ndarray) and first.ndim:
+        whole = np.empty((*first.shape, len(parts)), np.result_type(*parts))
+        for k, part in enumerate(parts):
+            whole[..., k] = part
+        return whole
+    if isinstance(first, (np.ndarray, np.generic)):
+        return np.array(parts)
+    return namespace(first).stack(parts, axis=-1)
+
+
 def square_norm(vector: Array) -> Array:
     """Sum of squares over the last axis, (..., k) to (...), added from left to right."""
     if _is_single(vector):
@@ -66,10 +79,10 @@ def rotation_matrix(quaternion: Array) -> Array:
 
 def to_body(rotation: Array, vector: Array) -> Array:
     """World vector (..., 3) in the body frame: the transposed rotation times the vector."""
-    product = rotation * vector[..., :, None]
-    if isinstance(product, np.ndarray):
-        return np.add.reduce(product, axis=-2)  # what sum ends up in, by a shorter way
-    return product.sum(-2)
+    if _is_single(vector):
+        return np.add.reduce(rotation * vector[:, None], axis=-2)  # what sum does, sooner
+    rows = [rotation[..., k, :] * vector[..., k, None] for k in range(3)]
+    return rows[0] + rows[1] + rows[2]
 
 
 def to_world(rotation: Array, vector: Array) -> Array:
@@ -88,22 +101,18 @@ def sin_cos_attitude(rotation: Array) -> tuple[Array, Array]:
     cos_pitch = xp.where(horizontal > 1e-9, horizontal, xp.full_like(horizontal, 1e-9))
     sines = (r[..., 2, 1] / cos_pitch, -r[..., 2, 0], r[..., 1, 0] / cos_pitch)
     cosines = (r[..., 2, 2] / cos_pitch, horizontal, r[..., 0, 0] / cos_pitch)
-    return xp.stack(sines, axis=-1), xp.stack(cosines, axis=-1)
+    return stack(*sines), stack(*cosines)
 
 
 def quaternion_product(first: Array, second: Array) -> Array:
     """Hamilton product (..., 4): the rotation `second` followed by `first`."""
-    xp = namespace(first)
     a, b, c, d = (first[..., k] for k in range(4))
     w, x, y, z = (second[..., k] for k in range(4))
-    return xp.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ],
-        axis=-1,
+    return stack(
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
     )
 
 
@@ -117,9 +126,7 @@ def quaternion_from_heading_and_tilt(heading: Array, tilt: Array, direction: Arr
     """
     xp = namespace(heading)
     zero = xp.zeros_like(heading)
-    turn = xp.stack([xp.cos(heading / 2), zero, zero, xp.sin(heading / 2)], axis=-1)
+    turn = stack(xp.cos(heading / 2), zero, zero, xp.sin(heading / 2))
     half = xp.sin(tilt / 2)
-    lean = xp.stack(
-        [xp.cos(tilt / 2), half * xp.cos(direction), half * xp.sin(direction), zero], axis=-1
-    )
+    lean = stack(xp.cos(tilt / 2), half * xp.cos(direction), half * xp.sin(direction), zero)
     return quaternion_product(turn, lean)

@@ -37,7 +37,7 @@ class Simulation(abc.ABC):
         self.shape = shape
         self.origin = np.array([0.0, 0.0, altitude])  # (3,) [m], world
         # Two frames in turn: the last state stays whole while the next one is computed.
-        self._frames = [_Frame(np.zeros((TABLE_ROWS, *shape))) for _ in range(2)]
+        self._frames = [_Frame(shape) for _ in range(2)]
         self._kernel = native.library().quadrl_state
         self._count = shape[0] if shape else 1
         self._bind()
@@ -136,18 +136,21 @@ class Simulation(abc.ABC):
     def _fill(self, rows: Rows) -> int:
         """Run the C kernel; how many aircraft hold numbers that are not finite or too large."""
         count, address = (self._count, None) if rows is None else (len(rows), rows.ctypes.data)
-        return self._kernel(
-            count, address, *self._coordinates, self._frames[0].address, self._count
-        )
+        frame = self._frames[0]
+        return self._kernel(count, address, *self._coordinates, frame.address, frame.columns)
 
 
 class _Frame:
     """One table of state with its named views and its address."""
 
-    def __init__(self, table: np.ndarray) -> None:
-        self.table = table
-        self.state = State.of_table(table)
-        self.address = table.ctypes.data
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        count = shape[0] if shape else 1
+        # A cache line more than a round number of them: rows a power of two apart evict each other.
+        self.columns = count + 8 * (1 + count // 8 % 2) if shape else 1
+        whole = np.zeros((TABLE_ROWS, self.columns))
+        self.table = whole[:, :count] if shape else whole[:, 0]
+        self.state = State.of_table(self.table)
+        self.address = self.table.ctypes.data
 
 
 class BatchSimulation(Simulation):
@@ -177,6 +180,7 @@ class BatchSimulation(Simulation):
 
     def _bind(self) -> None:
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._fresh = self.batch.state[0].copy()
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
 
@@ -191,7 +195,9 @@ class BatchSimulation(Simulation):
 
     def clear(self, rows: Rows) -> None:
         """Reset the warm starts and the warnings of some aircraft."""
-        self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        # What Batch.reset does, in a tenth of its time: a row is all that it keeps of an aircraft.
+        self.batch.state[rows] = self._fresh
+        self.batch.warning[rows] = 0
 
     def _save(self) -> dict[str, np.ndarray]:
         return {"rows": self.batch.state.copy()}

@@ -64,14 +64,9 @@ class State:
         Rows are contiguous over the aircraft, so that NumPy's loops run over all of them at once.
         """
         # A row alone is an array without axes for one aircraft, hence the ellipsis.
-        parts = {
-            name: np.moveaxis(table[rows, ...], 0, -1)
-            if isinstance(rows, slice)
-            else table[rows, ...]
-            for name, rows in ROWS.items()
-        }
+        parts = {name: table[rows, ...].T for name, rows in ROWS.items()}
         matrix = table[ROWS["rotation"]].reshape(3, 3, *table.shape[1:])
-        parts["rotation"] = np.moveaxis(matrix, (0, 1), (-2, -1))
+        parts["rotation"] = matrix.transpose(2, 0, 1) if table.ndim > 1 else matrix
         return cls(**parts)
 
     @classmethod

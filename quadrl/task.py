@@ -25,6 +25,7 @@ from quadrl.rotation import (
     norm,
     quaternion_from_heading_and_tilt,
     square_norm,
+    stack,
     to_body,
 )
 from quadrl.state import Start, State
@@ -72,7 +73,7 @@ class Draw:
         heading = self.uniform(0.0, FULL_TURN)
         xp = namespace(height)
         level = xp.sqrt(1 - height * height)
-        return xp.stack([level * xp.cos(heading), level * xp.sin(heading), height], axis=-1)
+        return stack(level * xp.cos(heading), level * xp.sin(heading), height)
 
     def vector(self, length: float, shortest: float = 0.0) -> Array:
         """Vectors (..., 3) of any direction, their length uniform in [shortest, length)."""

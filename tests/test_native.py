@@ -368,3 +368,39 @@ def test_a_spawned_process_flies_the_same():
     here = fly_hover(3)
     assert (here[:, 2] > 2.0).all()  # without callbacks it would be on the ground by now
     np.testing.assert_array_equal(elsewhere, here)
+
+
+# ------------------------------------------------------------------------------ the stage clock
+
+
+def run_alone(script: str) -> str:
+    """What a script prints in a process of its own: the clock is stopped once in a process."""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+FLY = """
+import quadrl, mujoco
+from quadrl.vehicle import Vehicle
+{before}
+model = Vehicle().compile_lean()
+data = mujoco.MjData(model)
+{after}
+mujoco.mj_step(model, data)
+timer = data.timer[mujoco.mjtTimer.mjTIMER_STEP]
+print(timer.number, timer.duration > 0)
+"""
+
+
+def test_the_clock_stands_still_and_can_be_brought_back():
+    assert run_alone(FLY.format(before="", after="")) == "1 False\n"
+    brought_back = "mujoco.set_mjcb_time(None); Vehicle().compile_lean()"
+    assert run_alone(FLY.format(before="", after=brought_back)) == "1 True\n"
+
+
+def test_a_clock_of_somebody_else_is_left_alone():
+    ticks = (
+        "import itertools; clock = itertools.count(1.0); mujoco.set_mjcb_time(lambda: next(clock))"
+    )
+    assert run_alone(FLY.format(before=ticks, after="")) == "1 True\n"

@@ -43,6 +43,20 @@ SEED_STRIDE = 1 << 20
 ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "gae": PolicyGradient}
 
 
+def make_collector(env: QuadrotorEnv, actor: torch.nn.Module, frames: int) -> Collector:
+    """TorchRL's collector without what a training does not use: batches of `frames` steps."""
+    return Collector(
+        env,
+        actor,
+        frames_per_batch=frames,
+        total_frames=-1,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+        use_buffers=False,
+        trust_policy=True,
+    )
+
+
 @dataclasses.dataclass
 class Progress:
     """Where a training stands, for whoever shows it."""
@@ -114,16 +128,7 @@ class Training:
         config = self.config
         if self.iteration >= config.iterations and (self.folder / POLICY_FILE).exists():
             return Policy.load(self.folder)
-        collector = Collector(
-            self.env,
-            self.actor,
-            frames_per_batch=config.num_envs * config.rollout,
-            total_frames=-1,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-            use_buffers=False,
-            trust_policy=True,
-        )
+        collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
         if self._generator_state is not None:
             torch.set_rng_state(self._generator_state)
         # Nets this small gain nothing from a second thread and lose a lot when a core is taken, and

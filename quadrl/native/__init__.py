@@ -35,6 +35,7 @@ _ACTUATOR_CALLBACK = ctypes.CFUNCTYPE(
     ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int
 )
 _GENERIC_CALLBACK = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+_CLOCK = ctypes.CFUNCTYPE(ctypes.c_double)
 
 
 class NativeError(QuadrlError, RuntimeError):
@@ -123,6 +124,7 @@ def load(path: Path) -> ctypes.CDLL:
     for name in CALLBACKS:
         kind = _GENERIC_CALLBACK if name == "passive" else _ACTUATOR_CALLBACK
         setattr(opened, name, ctypes.cast(getattr(opened, f"quadrl_{name}"), kind))
+    opened.time = ctypes.cast(opened.quadrl_time, _CLOCK)
     opened.quadrl_state.restype = ctypes.c_int64
     pointer, integer = ctypes.c_void_p, ctypes.c_int64
     opened.quadrl_state.argtypes = [integer] + [pointer] * 4 + [integer, pointer, pointer, integer]
@@ -133,6 +135,17 @@ def load(path: Path) -> ctypes.CDLL:
 def library() -> ctypes.CDLL:
     """The library for this process, built when needed."""
     return load(build())
+
+
+@functools.cache
+def _stop_clock() -> None:
+    """Spare every step MuJoCo's readings of the clock, unless somebody has installed one.
+
+    Once in a process: whoever wants the durations of `mjData.timer` after that, of any model, calls
+    `mujoco.set_mjcb_time(None)`, which brings MuJoCo's own clock back. No physics depends on it.
+    """
+    if mujoco.get_mjcb_time() is None:
+        mujoco.set_mjcb_time(library().time)
 
 
 def install(replace: bool = False) -> None:
@@ -162,6 +175,7 @@ def install(replace: bool = False) -> None:
         warnings.warn(f"quadrl replaces the callback {_names(foreign)}", stacklevel=2)
     for name in CALLBACKS:
         getattr(mujoco, f"set_mjcb_{name}")(getattr(ours, name))
+    _stop_clock()
 
 
 def check_installed() -> None:

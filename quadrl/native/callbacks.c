@@ -45,3 +45,7 @@ QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
     add_quadratic_drag(parameters[2], d->qvel + dof + 3, d->qfrc_passive + dof + 3);
   }
 }
+
+// MuJoCo reads the clock at both ends of every stage, for mjData.timer: a quarter of a step of so
+// small a model. This clock stands still.
+QUADRL_EXPORT mjtNum quadrl_time(void) { return 0; }
