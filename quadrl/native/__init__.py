@@ -31,11 +31,14 @@ FLAGS = ("-std=c11", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-con
 CALLBACKS = ("act_dyn", "act_gain", "passive")
 
 _FOLDER = Path(__file__).parent
-_ACTUATOR_CALLBACK = ctypes.CFUNCTYPE(
-    ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int
-)
-_GENERIC_CALLBACK = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
-_CLOCK = ctypes.CFUNCTYPE(ctypes.c_double)
+_POINTER = ctypes.c_void_p
+_ACTUATOR_CALLBACK = ctypes.CFUNCTYPE(ctypes.c_double, _POINTER, _POINTER, ctypes.c_int)
+_KINDS = {
+    "act_dyn": _ACTUATOR_CALLBACK,
+    "act_gain": _ACTUATOR_CALLBACK,
+    "passive": ctypes.CFUNCTYPE(None, _POINTER, _POINTER),
+    "time": ctypes.CFUNCTYPE(ctypes.c_double),
+}
 
 
 class NativeError(QuadrlError, RuntimeError):
@@ -121,13 +124,14 @@ def load(path: Path) -> ctypes.CDLL:
             f"{path} was compiled against mujoco {built}, but mujoco {running} is running; "
             "delete it, and it is compiled again at the next use"
         )
-    for name in CALLBACKS:
-        kind = _GENERIC_CALLBACK if name == "passive" else _ACTUATOR_CALLBACK
+    for name, kind in _KINDS.items():
         setattr(opened, name, ctypes.cast(getattr(opened, f"quadrl_{name}"), kind))
-    opened.time = ctypes.cast(opened.quadrl_time, _CLOCK)
     opened.quadrl_state.restype = ctypes.c_int64
-    pointer, integer = ctypes.c_void_p, ctypes.c_int64
-    opened.quadrl_state.argtypes = [integer] + [pointer] * 4 + [integer, pointer, pointer, integer]
+    integer = ctypes.c_int64
+    opened.quadrl_state.argtypes = [
+        *(integer, _POINTER, _POINTER, _POINTER, _POINTER),
+        *(integer, _POINTER, _POINTER, integer),
+    ]
     return opened
 
 
