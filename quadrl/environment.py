@@ -18,7 +18,14 @@ import numpy as np
 from quadrl import tasks
 from quadrl.errors import QuadrlError
 from quadrl.rotation import Array
-from quadrl.simulation import BatchSimulation, Rows, Simulation, SingleSimulation
+from quadrl.simulation import (
+    ENGINES,
+    BatchSimulation,
+    Engine,
+    Rows,
+    Simulation,
+    SingleSimulation,
+)
 from quadrl.state import State
 from quadrl.task import (
     EPISODE_DRAWS,
@@ -30,6 +37,7 @@ from quadrl.task import (
     OptionError,
     Outcome,
     Task,
+    check_choices,
     total,
 )
 from quadrl.vehicle import ROTORS, Vehicle
@@ -78,6 +86,7 @@ class Environment:
         seed: int | None = None,
         vehicle: Vehicle | None = None,
         num_threads: int = 0,
+        engine: Engine = "mujoco",
         simulation: Simulation | None = None,
     ) -> None:
         """Make the simulation and seed the generators.
@@ -88,6 +97,7 @@ class Environment:
             seed: Aircraft i is seeded with seed + i; None draws one from the system.
             vehicle: The aircraft; None for the paper's.
             num_threads: Threads of a batch; 0 for every core.
+            engine: "mujoco", or "flight": free flight wherever there is nothing to touch.
             simulation: Use this one instead of making one (then N is its own).
 
         Raises:
@@ -97,7 +107,8 @@ class Environment:
         self.task = tasks.make(task)
         self.vehicle = vehicle or (simulation.vehicle if simulation else Vehicle())
         if simulation is None:
-            simulation = _simulation(self.task, self.vehicle, num_envs, num_threads)
+            check_choices([engine], ENGINES, "engine")
+            simulation = _simulation(self.task, self.vehicle, num_envs, num_threads, engine)
         self.simulation = simulation
         self.shape = simulation.shape
         self._action_shape = (*self.shape, ROTORS)
@@ -328,10 +339,13 @@ class Environment:
         return block
 
 
-def _simulation(task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int) -> Simulation:
+def _simulation(
+    task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int, engine: Engine
+) -> Simulation:
     if num_envs is None:
         model = vehicle.compile_lean(contact=task.contact)
-        return SingleSimulation(vehicle, model, mujoco.MjData(model), altitude=task.altitude)
+        data = mujoco.MjData(model)
+        return SingleSimulation(vehicle, model, data, altitude=task.altitude, engine=engine)
     if not isinstance(num_envs, (int, np.integer)) or not 1 <= num_envs <= MAX_ENVS:
         raise OptionError(
             f"num_envs = {num_envs!r}: a whole number from 1 to {MAX_ENVS} is allowed"
@@ -342,6 +356,7 @@ def _simulation(task: Task, vehicle: Vehicle, num_envs: int | None, num_threads:
         altitude=task.altitude,
         contact=task.contact,
         num_threads=num_threads,
+        engine=engine,
     )
 
 

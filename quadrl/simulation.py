@@ -1,23 +1,27 @@
 """Aircraft advanced together: the engines behind one interface.
 
 A simulation has a leading shape, () for one aircraft or (N,) for a batch, and a State of that
-shape. It takes rotor commands, advances one control step, and says which aircraft diverged.
+shape. It takes rotor commands, advances some physics steps, and says which aircraft diverged. The
+engine is MuJoCo; with "flight" the aircraft that can touch nothing are flown by `quadrl.flight`.
 """
 
 from __future__ import annotations
 
 import abc
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
 from quadrl import native
+from quadrl.flight import FIELDS, Flight
 from quadrl.state import ROWS, TABLE_ROWS, Start, State
 from quadrl.vehicle import Vehicle
 
 COORDINATES = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
+Engine = Literal["mujoco", "flight"]
+ENGINES: tuple[Engine, ...] = ("mujoco", "flight")
 Rows = np.ndarray | None
 """Numbers (n,) of aircraft in a batch; None for all of them, or for the one."""
 
@@ -62,9 +66,14 @@ class Simulation(abc.ABC):
     act: np.ndarray
     ctrl: np.ndarray
 
+    @property
     @abc.abstractmethod
-    def advance(self) -> None:
-        """One control step with the commands in `ctrl`."""
+    def wind(self) -> np.ndarray:
+        """Velocity of the air (..., 3) [m/s], world frame; live, zero unless it is written."""
+
+    @abc.abstractmethod
+    def advance(self, steps: int | None = None) -> None:
+        """Some physics steps with the commands in `ctrl`; None for those of a control step."""
 
     @abc.abstractmethod
     def clear(self, rows: Rows) -> None:
@@ -164,6 +173,7 @@ class BatchSimulation(Simulation):
         altitude: float,
         contact: bool = False,
         num_threads: int = 0,
+        engine: Engine = "mujoco",
     ) -> None:
         """Compile the lean model and make the batch.
 
@@ -173,10 +183,15 @@ class BatchSimulation(Simulation):
             altitude: Height of the origin of the task's frame above the ground [m].
             contact: Whether the aircraft can touch the ground.
             num_threads: Threads to step on; 0 for every core.
+            engine: One of ENGINES.
         """
         self.model = vehicle.compile_lean(contact=contact)
         self.batch = Batch(self.model, num_envs, nthread=num_threads)
         super().__init__(vehicle, (num_envs,), altitude)
+        self._flight: Flight | None = None
+        if engine == "flight":
+            fields = {name: self.batch.bind(name) for name in FIELDS}
+            self._flight = Flight(self.model, fields, self.batch.nthread)
 
     def _bind(self) -> None:
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -184,14 +199,26 @@ class BatchSimulation(Simulation):
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
 
-    def advance(self) -> None:
-        """One control step of every aircraft.
+    @property
+    def wind(self) -> np.ndarray:
+        """Velocity of the air (N, 3) [m/s], world frame; live, zero unless it is written."""
+        wind = self.batch.expand("opt.wind")
+        if self._flight:
+            self._flight.wind = wind
+        return wind
+
+    def advance(self, steps: int | None = None) -> None:
+        """Some physics steps of every aircraft; None for those of a control step.
 
         Raises:
             NativeError: The rotor callbacks were taken away.
         """
+        steps = steps or self.vehicle.substeps
+        near = None
+        if self._flight and (near := self._flight.advance(steps)) is None:
+            return
         native.check_installed()
-        self.batch.step(nstep=self.vehicle.substeps)
+        self.batch.step(near, nstep=steps)
 
     def clear(self, rows: Rows) -> None:
         """Reset the warm starts and the warnings of some aircraft."""
@@ -210,24 +237,44 @@ class SingleSimulation(Simulation):
     """One aircraft in an MjData, stepped by `mj_step` or by whoever owns the data."""
 
     def __init__(
-        self, vehicle: Vehicle, model: mujoco.MjModel, data: mujoco.MjData, *, altitude: float
+        self,
+        vehicle: Vehicle,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        *,
+        altitude: float,
+        engine: Engine = "mujoco",
     ) -> None:
         """Wrap a model of the vehicle and its data."""
         self.model, self.data = model, data
         super().__init__(vehicle, (), altitude)
+        self._flight: Flight | None = None
+        if engine == "flight":
+            fields = {name: getattr(data, name) for name in FIELDS if name != "time"}
+            self._flight = Flight(model, fields, 1)
+            self._flight.wind = model.opt.wind
 
     def _bind(self) -> None:
         data = self.data
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
 
-    def advance(self) -> None:
-        """One control step.
+    @property
+    def wind(self) -> np.ndarray:
+        """Velocity of the air (3,) [m/s], world frame; live, zero unless it is written."""
+        return self.model.opt.wind
+
+    def advance(self, steps: int | None = None) -> None:
+        """Some physics steps; None for those of a control step.
 
         Raises:
             NativeError: The rotor callbacks were taken away.
         """
+        steps = steps or self.vehicle.substeps
+        if self._flight and self._flight.advance(steps) is None:
+            self.data.time += steps * self.model.opt.timestep
+            return
         native.check_installed()
-        mujoco.mj_step(self.model, self.data, self.vehicle.substeps)
+        mujoco.mj_step(self.model, self.data, steps)
 
     def clear(self, rows: Rows) -> None:
         """Reset the data: warm start, warnings, time."""

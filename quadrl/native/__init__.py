@@ -24,10 +24,18 @@ import mujoco
 
 from quadrl.errors import QuadrlError
 
-SOURCES = ("callbacks.c", "state.c")
+SOURCES = ("callbacks.c", "flight.c", "state.c")
 HEADERS = ("equations.h",)
 # No contraction: a fused multiply-add would round otherwise than NumPy does.
-FLAGS = ("-std=c11", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off")
+FLAGS = (
+    "-std=c11",
+    "-O3",
+    "-fPIC",
+    "-shared",
+    "-fvisibility=hidden",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+)
 CALLBACKS = ("act_dyn", "act_gain", "passive")
 
 _FOLDER = Path(__file__).parent
@@ -131,6 +139,11 @@ def load(path: Path) -> ctypes.CDLL:
     opened.quadrl_state.argtypes = [
         *(integer, _POINTER, _POINTER, _POINTER, _POINTER),
         *(integer, _POINTER, _POINTER, integer),
+    ]
+    opened.quadrl_flight.restype = opened.quadrl_aircraft_size.restype = integer
+    opened.quadrl_flight.argtypes = [
+        *(integer, integer, integer, *[_POINTER] * 5),
+        *(integer, _POINTER, _POINTER, integer, _POINTER),
     ]
     return opened
 
