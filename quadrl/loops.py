@@ -31,6 +31,10 @@ INTEGRATORS: dict[Controlled, tuple[int, int, int]] = {
 
 Beside a velocity goes the rate of the heading, beside body rates the thrust.
 """
+ROOM = {1: 4, 2: 3, 3: 1, 4: 1}
+"""By integrators: the square of the bandwidth, over the largest angular acceleration by the largest
+angle, at which the inner loops ask for no more than that: they multiply the largest rate by p / 2
+(of one integrator), the largest angle by p^2 / 3 (of two) or p^2 (of three)."""
 
 
 class Motion(Protocol):
@@ -122,7 +126,9 @@ class Loops:
         self.max_body_rate = np.sqrt(self._max_turn * angles)
         """(3,) [rad/s], largest that is asked for."""
         # As fast as the lag allows, if the moments suffice for the largest errors.
-        fastest = np.sqrt(self._max_turn / angles * np.array([1, 1, 3]))  # (3,) [rad/s]
+        sideways, upwards, turning = INTEGRATORS[controlled]
+        room = np.array([ROOM[sideways], ROOM[sideways], ROOM[turning]])
+        fastest = np.sqrt(self._max_turn / angles * room)  # (3,) [rad/s]
         unit = 1 / vehicle.lag_rate + step  # [s]
         bandwidths = (
             min(gains.level / unit, *fastest[:2]),
@@ -133,7 +139,7 @@ class Loops:
             # Loops further out than what is controlled have a rate of zero.
             np.append(np.zeros(most - n), cascade(vehicle, bandwidth, n, step))
             for bandwidth, most, n in zip(
-                bandwidths, INTEGRATORS["position"], INTEGRATORS[controlled], strict=True
+                bandwidths, INTEGRATORS["position"], (sideways, upwards, turning), strict=True
             )
         )
         self._level_rate, self._height_rate = level[0], height[0]  # [1/s]

@@ -63,8 +63,8 @@ class Simulation(abc.ABC):
     ctrl: np.ndarray
 
     @abc.abstractmethod
-    def advance(self) -> None:
-        """One control step with the commands in `ctrl`."""
+    def advance(self, steps: int | None = None) -> None:
+        """Some physics steps with the commands in `ctrl`; None for those of a control step."""
 
     @abc.abstractmethod
     def clear(self, rows: Rows) -> None:
@@ -180,14 +180,14 @@ class BatchSimulation(Simulation):
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
 
-    def advance(self) -> None:
-        """One control step of every aircraft.
+    def advance(self, steps: int | None = None) -> None:
+        """Some physics steps of every aircraft; None for those of a control step.
 
         Raises:
             NativeError: The rotor callbacks were taken away.
         """
         native.check_installed()
-        self.batch.step(nstep=self.vehicle.substeps)
+        self.batch.step(nstep=steps or self.vehicle.substeps)
 
     def clear(self, rows: Rows) -> None:
         """Reset the warm starts and the warnings of some aircraft."""
@@ -214,14 +214,14 @@ class SingleSimulation(Simulation):
         data = self.data
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
 
-    def advance(self) -> None:
-        """One control step.
+    def advance(self, steps: int | None = None) -> None:
+        """Some physics steps; None for those of a control step.
 
         Raises:
             NativeError: The rotor callbacks were taken away.
         """
         native.check_installed()
-        mujoco.mj_step(self.model, self.data, self.vehicle.substeps)
+        mujoco.mj_step(self.model, self.data, steps or self.vehicle.substeps)
 
     def clear(self, rows: Rows) -> None:
         """Reset the data: warm start, warnings, time."""

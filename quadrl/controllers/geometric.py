@@ -121,6 +121,9 @@ def guidance(task: Task | None) -> Guidance:
 class GeometricController:
     """Flat observations of a task to actions, for aircraft of any leading shape."""
 
+    action = "rotor"
+    """The action interface that it flies with."""
+
     def __init__(
         self, vehicle: Vehicle, task: Task | None = None, gains: Gains | None = None
     ) -> None:

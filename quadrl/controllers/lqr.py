@@ -74,6 +74,9 @@ def linear_model(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
 class LQRController:
     """Observations of a task to actions, for aircraft of any leading shape."""
 
+    action = "rotor"
+    """The action interface that it flies with."""
+
     def __init__(
         self, vehicle: Vehicle, task: Task | None = None, weights: Weights | None = None
     ) -> None:
