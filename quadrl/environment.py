@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from quadrl import tasks
+from quadrl import interfaces, tasks
 from quadrl.errors import QuadrlError
 from quadrl.rotation import Array
 from quadrl.simulation import (
@@ -40,7 +40,7 @@ from quadrl.task import (
     check_choices,
     total,
 )
-from quadrl.vehicle import ROTORS, Vehicle
+from quadrl.vehicle import Vehicle
 
 Observation = dict[str, Array]
 MAX_ENVS = 1 << 20
@@ -88,6 +88,7 @@ class Environment:
         num_threads: int = 0,
         engine: Engine = "mujoco",
         simulation: Simulation | None = None,
+        action: str = "rotor",
     ) -> None:
         """Make the simulation and seed the generators.
 
@@ -99,9 +100,10 @@ class Environment:
             num_threads: Threads of a batch; 0 for every core.
             engine: "mujoco", or "flight": free flight wherever there is nothing to touch.
             simulation: Use this one instead of making one (then N is its own).
+            action: What actions mean, a name of `interfaces.INTERFACES`.
 
         Raises:
-            ValueError: Unknown task, or a number of aircraft that cannot be.
+            ValueError: Unknown task or interface, or a number of aircraft that cannot be.
             NativeError: The rotor callbacks cannot be built or installed.
         """
         self.task = tasks.make(task)
@@ -111,7 +113,8 @@ class Environment:
             simulation = _simulation(self.task, self.vehicle, num_envs, num_threads, engine)
         self.simulation = simulation
         self.shape = simulation.shape
-        self._action_shape = (*self.shape, ROTORS)
+        self.interface = interfaces.make(action, self.vehicle)
+        self._action_shape = (*self.shape, self.interface.size)
         self.num_envs = self.shape[0] if self.shape else 1
         self.horizon_steps = max(1, round(self.task.horizon / self.vehicle.control_step))
         settle_steps = round(self.task.settle / self.vehicle.control_step)
@@ -128,6 +131,9 @@ class Environment:
         self.fields: Fields
         self._measures: Measures
         self._command: np.ndarray
+        self._setpoint: np.ndarray
+        self._flown = 0  # physics steps of this control step that the interface's loops have flown
+        self._diverged: np.ndarray | None = None  # in them
 
     def seed(self, seed: int | None = None) -> int:
         """Give every aircraft a new generator; returns the seed of the first."""
@@ -175,7 +181,7 @@ class Environment:
         """Fly one control step.
 
         Args:
-            action: (..., 4); clipped to [-1, 1].
+            action: (..., 4), what it means is the interface's; clipped to [-1, 1].
 
         Returns:
             The transition. An aircraft whose episode is over flies on until it is reset.
@@ -185,11 +191,16 @@ class Environment:
             RuntimeError: There was no reset before.
         """
         self.begin(action)
-        self.simulation.advance()
+        if self.interface.has_loops:
+            for _ in range(self.vehicle.substeps):
+                self.control()
+                self.simulation.advance(1)
+        else:
+            self.simulation.advance()
         return self.finish()
 
     def begin(self, action: Array) -> None:
-        """First half of a step: the commands to the rotors."""
+        """First half of a step: the commands to the rotors, or the setpoint of the loops."""
         if self._steps is None:
             raise RuntimeError("call reset before the first step")
         action = np.asarray(action, dtype=np.float64)
@@ -207,13 +218,32 @@ class Environment:
             raise ActionError(
                 f"action{where.tolist()} is {action[tuple(where)]}: every number must be finite"
             )
+        if self.interface.has_loops:
+            self._setpoint = self.interface.setpoint(self.simulation.state, action)
+            self._command = np.zeros_like(self.simulation.ctrl)
+            self._flown, self._diverged = 0, None
+            return
         self._command = self.vehicle.rotor_command(action)
         self.simulation.ctrl[...] = self._command
+
+    def control(self) -> None:
+        """Before each physics step of an interface with loops: the commands to the rotors.
+
+        The reward sees their mean over the control step.
+        """
+        if self._flown and (diverged := self.simulation.read()) is not None:
+            self._diverged = diverged if self._diverged is None else self._diverged | diverged
+        command = self.interface.rotor_command(self.simulation.state, self._setpoint)
+        self.simulation.ctrl[...] = command
+        self._command += command / self.vehicle.substeps
+        self._flown += 1
 
     def finish(self) -> Transition:
         """Second half of a step, after the simulation has advanced."""
         task, vehicle = self.task, self.vehicle
         diverged = self.simulation.read()
+        if self._diverged is not None:
+            diverged = self._diverged if diverged is None else self._diverged | diverged
         self._steps = self._steps + 1
         state = self.simulation.state
         state.time[...] = self._steps * vehicle.control_step

@@ -52,6 +52,11 @@ class Policy:
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
     """How it was made: algorithm, seed, steps, vehicle, action interface."""
 
+    @property
+    def action(self) -> str:
+        """The action interface that it was trained with."""
+        return str(self.metadata.get("action", "rotor"))
+
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """The mean action.
 

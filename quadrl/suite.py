@@ -14,7 +14,7 @@ import contextlib
 import dataclasses
 import functools
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import mujoco as _mujoco
@@ -26,11 +26,11 @@ from dm_control.suite import base
 from dm_control.utils import containers
 from dm_env import specs
 
-from quadrl import native, tasks
+from quadrl import interfaces, native, tasks
 from quadrl.environment import Environment, Transition
 from quadrl.simulation import SingleSimulation
 from quadrl.task import Task, check_choices
-from quadrl.vehicle import ROTORS, Vehicle
+from quadrl.vehicle import Vehicle
 
 DOMAIN = "quadrotor"
 SUITE = containers.TaggedTasks()
@@ -53,6 +53,9 @@ BENCHMARKING: tuple[tuple[str, str], ...] = ()
 class Physics(mujoco.Physics):
     """The complete model of the aircraft, drawn parts included."""
 
+    inner_loop: Callable[[], None] | None = None
+    """Commands the rotors before each physics step, where the action interface has loops."""
+
     def step(self, nstep: int = 1) -> None:
         """Advance by physics steps.
 
@@ -60,7 +63,12 @@ class Physics(mujoco.Physics):
             NativeError: The rotor callbacks were taken away.
         """
         native.check_installed()
-        super().step(nstep)
+        if self.inner_loop is None:
+            super().step(nstep)
+            return
+        for _ in range(nstep):
+            self.inner_loop()
+            super().step()
 
     @contextlib.contextmanager
     def check_invalid_state(self) -> Generator[None]:
@@ -71,7 +79,13 @@ class Physics(mujoco.Physics):
 class QuadrotorTask(base.Task):
     """A task of the catalogue in dm_control's terms."""
 
-    def __init__(self, task: Task, vehicle: Vehicle, random: Any = None) -> None:  # noqa: ANN401
+    def __init__(
+        self,
+        task: Task,
+        vehicle: Vehicle,
+        random: Any = None,  # noqa: ANN401
+        action: str = "rotor",
+    ) -> None:
         """Wrap a task.
 
         Args:
@@ -79,11 +93,13 @@ class QuadrotorTask(base.Task):
             vehicle: The aircraft.
             random: Seed, RandomState or None, as dm_control has it. A seed gives the episodes
                 that every other door gives with it.
+            action: What actions mean, a name of `quadrl.interfaces.INTERFACES`.
         """
         super().__init__(random)
         is_seed = isinstance(random, (int, np.integer))
         self._seed = int(random) if is_seed else int(self.random.randint(2**31))
         self._task, self._vehicle = task, vehicle
+        self._interface = interfaces.make(action, vehicle)
         self._environment: Any = None  # an Environment from the first episode on
         self._physics: Physics | None = None
         self._observation = {name: np.zeros(p.size) for name, p in task.observation.items()}
@@ -91,10 +107,10 @@ class QuadrotorTask(base.Task):
         """The last step with its named reward terms and success; None after a reset."""
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
-        """Four rotors, -1 to 1."""
-        names = "\t".join(f"rotor_{k + 1}" for k in range(ROTORS))
-        bound = np.ones(ROTORS)
-        return specs.BoundedArray((ROTORS,), np.float64, -bound, bound, name=names)
+        """The entries of the action interface, -1 to 1."""
+        names = "\t".join(entry.name for entry in self._interface.entries)
+        bound = np.ones(self._interface.size)
+        return specs.BoundedArray(bound.shape, np.float64, -bound, bound, name=names)
 
     def initialize_episode(self, physics: Physics) -> None:
         """Begin an episode."""
@@ -102,7 +118,11 @@ class QuadrotorTask(base.Task):
             simulation = SingleSimulation(
                 self._vehicle, physics.model.ptr, physics.data.ptr, altitude=self._task.altitude
             )
-            environment = Environment(self._task, seed=self._seed, simulation=simulation)
+            environment = Environment(
+                self._task, seed=self._seed, simulation=simulation, action=self._interface.name
+            )
+            if environment.interface.has_loops:
+                physics.inner_loop = environment.control
             if self._environment is not None:
                 environment.generators = self._environment.generators
             self._environment, self._physics = environment, physics
@@ -110,7 +130,7 @@ class QuadrotorTask(base.Task):
         super().after_step(physics)  # colours the reward
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
-        """Hand the action to the rotors."""
+        """Hand the action to the rotors, or to the loops."""
         self._environment.begin(action)
 
     def after_step(self, physics: Physics) -> None:
@@ -141,6 +161,7 @@ def make(
     random: Any = None,  # noqa: ANN401 - what dm_control takes
     environment_kwargs: dict[str, Any] | None = None,
     vehicle: Vehicle | None = None,
+    action: str = "rotor",
     **options: Any,  # noqa: ANN401
 ) -> control.Environment:
     """Build the environment of a task.
@@ -151,10 +172,11 @@ def make(
         random: Seed, RandomState or None.
         environment_kwargs: As `load` has them.
         vehicle: The aircraft; None for the paper's.
+        action: What actions mean, a name of `quadrl.interfaces.INTERFACES`.
         **options: Fields of the task.
 
     Raises:
-        OptionError: Unknown task or option; the message lists the choices.
+        OptionError: Unknown task, interface or option; the message lists the choices.
         ValueError: Both control_timestep and n_sub_steps are given.
     """
     settings = dict(environment_kwargs or {})
@@ -175,7 +197,7 @@ def make(
     model.opt.disableflags |= int(_mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     return control.Environment(
         Physics.from_model(wrapper.MjModel(model)),
-        QuadrotorTask(task, vehicle, random),
+        QuadrotorTask(task, vehicle, random, action),
         n_sub_steps=vehicle.substeps,
         **settings,
     )
@@ -193,7 +215,8 @@ def load(
     Args:
         domain_name: "quadrotor".
         task_name: A name of the catalogue.
-        task_kwargs: `random` (seed), `time_limit` [s], `vehicle`, and any field of the task.
+        task_kwargs: `random` (seed), `time_limit` [s], `vehicle`, `action` (what actions mean, a
+            name of `quadrl.interfaces.INTERFACES`), and any field of the task.
         environment_kwargs: `time_limit` and `control_timestep` [s], `n_sub_steps`,
             `flat_observation`, `legacy_step`: those of `dm_control.rl.control.Environment`.
         visualize_reward: Colour the aircraft by its reward, clipped to [0, 1].

@@ -24,7 +24,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from quadrl import tasks
+from quadrl import interfaces, tasks
 from quadrl.environment import Environment
 from quadrl.rotation import Array
 from quadrl.simulation import BatchSimulation
@@ -230,7 +230,7 @@ def check_torchrl(task: Task) -> None:
 # ---------------------------------------------------------------------------------------- flights
 
 
-def fly(door: str, task: Task, seed: int, actions: np.ndarray) -> Flight:
+def fly(door: str, task: Task, seed: int, actions: np.ndarray, action: str = "rotor") -> Flight:
     """Fly N aircraft through a door; aircraft i is seeded with seed + i.
 
     Args:
@@ -238,6 +238,7 @@ def fly(door: str, task: Task, seed: int, actions: np.ndarray) -> Flight:
         task: The task.
         seed: Of the first aircraft.
         actions: (T, N, 4) float32; aircraft i takes actions[t, i] at its step t (no reset counts).
+        action: What they mean, a name of `quadrl.interfaces.INTERFACES`.
 
     Returns:
         Arrays (T, N, ...): the state (17,) [qpos, qvel, act] and the observation that each action
@@ -245,10 +246,10 @@ def fly(door: str, task: Task, seed: int, actions: np.ndarray) -> Flight:
     """
     steps, count = actions.shape[:2]
     if door in SINGLE:
-        logs = [list(SINGLE[door](task, seed + i, actions[:, i])) for i in range(count)]
+        logs = [list(SINGLE[door](task, seed + i, actions[:, i], action)) for i in range(count)]
     else:
         logs = [[] for _ in range(count)]
-        for flown, *columns in VECTOR[door](task, seed, actions):
+        for flown, *columns in VECTOR[door](task, seed, actions, action):
             for i in np.flatnonzero(flown):
                 logs[i].append([column[i] for column in columns])
     return {
@@ -257,11 +258,12 @@ def fly(door: str, task: Task, seed: int, actions: np.ndarray) -> Flight:
     }
 
 
-def _mj_step(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
+def _mj_step(task: Task, seed: int, actions: np.ndarray, kind: str) -> Generator[tuple]:
     """Bare mj_step and the task's own functions: the numbers that every door has to give."""
     generator, origin = np.random.default_rng(seed), np.array([0.0, 0.0, task.altitude])
     model = VEHICLE.compile(contact=task.contact)
     data = mujoco.MjData(model)
+    interface = interfaces.make(kind, VEHICLE)
     settle = round(min(task.settle, task.horizon) / VEHICLE.control_step)
     errors: list[float] = []
 
@@ -288,10 +290,14 @@ def _mj_step(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
     fields, measures, observation = begin()
     for action in actions:
         met = np.concatenate([data.qpos, data.qvel, data.act]), observation
-        command = VEHICLE.rotor_command(action.astype(np.float64))
-        data.ctrl[:] = command
+        setpoint = interface.setpoint(seen(), action.astype(np.float64))
+        command = np.zeros(ROTORS)
         for _ in range(VEHICLE.substeps):
+            data.ctrl[:] = interface.rotor_command(seen(), setpoint)
+            command += data.ctrl / VEHICLE.substeps
             mujoco.mj_step(model, data)
+        if not interface.has_loops:
+            command = setpoint
         errors.append(0.0)  # counts the step: `seen` tells the time
         state = seen()
         now = task.measure(state, fields)
@@ -312,10 +318,10 @@ def _mj_step(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
             fields, measures, observation = begin()
 
 
-def _dm_control(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
+def _dm_control(task: Task, seed: int, actions: np.ndarray, kind: str) -> Generator[tuple]:
     from quadrl import suite
 
-    environment = suite.make(task, random=seed)
+    environment = suite.make(task, random=seed, action=kind)
     now = environment.reset()
     for action in actions:
         met = environment.physics.get_state(), _flat(now.observation)
@@ -327,10 +333,10 @@ def _dm_control(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
             now = environment.step(action)  # begins the next episode
 
 
-def _gymnasium(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
+def _gymnasium(task: Task, seed: int, actions: np.ndarray, kind: str) -> Generator[tuple]:
     from quadrl.envs.gymnasium import QuadrotorEnv
 
-    door = QuadrotorEnv(task)
+    door = QuadrotorEnv(task, action=kind)
     observation, _ = door.reset(seed=seed)
     for action in actions:
         met = _state(door.environment), observation
@@ -340,11 +346,13 @@ def _gymnasium(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
             observation, _ = door.reset()
 
 
-def _gymnasium_vector(mode: str, task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
+def _gymnasium_vector(
+    mode: str, task: Task, seed: int, actions: np.ndarray, kind: str
+) -> Generator[tuple]:
     from quadrl.envs.gymnasium import QuadrotorVectorEnv
 
     steps, count = actions.shape[:2]
-    door = QuadrotorVectorEnv(task, count, autoreset_mode=mode)
+    door = QuadrotorVectorEnv(task, count, autoreset_mode=mode, action=kind)
     observation, _ = door.reset(seed=seed)
     turn, flown = np.zeros(count, dtype=int), np.ones(count, dtype=bool)
     while turn.min() < steps:
@@ -364,12 +372,12 @@ def _gymnasium_vector(mode: str, task: Task, seed: int, actions: np.ndarray) -> 
             observation, _ = door.reset(options={"reset_mask": over})
 
 
-def _torchrl(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
+def _torchrl(task: Task, seed: int, actions: np.ndarray, kind: str) -> Generator[tuple]:
     import torch
 
     from quadrl.envs.torchrl import QuadrotorEnv
 
-    door = QuadrotorEnv(task, actions.shape[1], seed=seed)
+    door = QuadrotorEnv(task, actions.shape[1], seed=seed, action=kind)
     met, everyone = door.reset(), np.ones(actions.shape[1], dtype=bool)
     for action in actions:
         state = _state(door.environment)

@@ -1,6 +1,5 @@
 """The controllers: they fly every task of the paper, and are what their derivation says."""
 
-import dataclasses
 import math
 
 import mujoco
@@ -10,22 +9,20 @@ from scipy.spatial.transform import Rotation
 
 from quadrl import tasks
 from quadrl.controllers import CONTROLLERS, Gains, GeometricController, LQRController, make
-from quadrl.controllers.geometric import (
+from quadrl.controllers.geometric import Reading, rotation_of_angles, towards_east
+from quadrl.controllers.lqr import STATES, Weights, linear_model
+from quadrl.environment import Environment
+from quadrl.learning.evaluate import fly, judge
+from quadrl.loops import (
     MAX_TURN,
-    Reading,
     approach_velocity,
     attitude_error,
     cascade,
     limited,
     mix,
     mixer,
-    rotation_of_angles,
     sampled,
-    towards_east,
 )
-from quadrl.controllers.lqr import STATES, Weights, linear_model
-from quadrl.environment import Environment
-from quadrl.learning.evaluate import fly, judge
 from quadrl.rotation import (
     quaternion_from_heading_and_tilt,
     rotation_matrix,
@@ -294,7 +291,7 @@ def test_lqr_solves_its_riccati_equation_and_is_stable(vehicle):
 def test_cascade_places_every_pole(integrators):
     """The closed loop's characteristic polynomial is (z - exp(-p T))^(n + 1)."""
     bandwidth, size = 5.0, integrators + 1
-    rates = cascade(VEHICLE, bandwidth, integrators)
+    rates = cascade(VEHICLE, bandwidth, integrators, VEHICLE.control_step)
     # Nested: command = now + lead (rate_n (... rate_1 (0 - x_1) - x_2 ...) - now).
     gain = np.zeros(size)
     for k, rate in enumerate(rates[:-1]):
@@ -309,8 +306,7 @@ def test_cascade_places_every_pole(integrators):
     np.testing.assert_allclose(np.poly(a - b * gain), np.poly(np.full(size, pole)), atol=1e-9)
     # Where sampling and lag are fast these are the textbook's: p / 3 and p for three poles.
     if integrators == 2:
-        swift = dataclasses.replace(VEHICLE, physics_step=1e-4, control_step=1e-4)
-        np.testing.assert_allclose(cascade(swift, 5.0, 2)[:2], [5 / 3, 5.0], rtol=1e-3)
+        np.testing.assert_allclose(cascade(VEHICLE, 5.0, 2, 1e-4)[:2], [5 / 3, 5.0], rtol=1e-3)
 
 
 def test_mixer_is_equation_7_and_what_fits_is_given_exactly():

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from quadrl import tasks
-from quadrl.controllers.geometric import Gains, GeometricController
+from quadrl.controllers.geometric import GeometricController
 from quadrl.controllers.lqr import LQRController, Weights
+from quadrl.loops import Gains
 from quadrl.task import Task, check_choices
 from quadrl.vehicle import Vehicle
 

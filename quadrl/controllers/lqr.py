@@ -11,7 +11,8 @@ import dataclasses
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from quadrl.controllers.geometric import MAX_TURN, Reading, guidance, limited, mix, mixer, sampled
+from quadrl.controllers.geometric import Reading, guidance
+from quadrl.loops import MAX_TURN, limited, mix, mixer, sampled
 from quadrl.rotation import to_body, to_world
 from quadrl.task import OptionError, Task
 from quadrl.vehicle import GRAVITY, ROTORS, Vehicle
@@ -72,6 +73,9 @@ def linear_model(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
 
 class LQRController:
     """Observations of a task to actions, for aircraft of any leading shape."""
+
+    action = "rotor"
+    """The action interface that it flies with."""
 
     def __init__(
         self, vehicle: Vehicle, task: Task | None = None, weights: Weights | None = None

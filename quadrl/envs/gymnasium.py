@@ -1,7 +1,7 @@
 """Door two: Gymnasium, one aircraft or a native vector of them.
 
 The observation is the flat float32 vector of the task's parts (`environment.layout` says which
-entry is what); the action is Box(-1, 1, (4,)). `info` of a step carries `reward_terms`,
+entry is what); the action is Box(-1, 1, (4,)), what it means is the option `action`'s. `info` of a step carries `reward_terms`,
 `is_success`, `error` [m] and `diverged`. A new version of an id (-vN) means other numbers.
 """
 
@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from quadrl import tasks
 from quadrl.environment import Environment, Transition
 from quadrl.task import OptionError, Task, check_choices
-from quadrl.vehicle import ROTORS, Vehicle
+from quadrl.vehicle import Vehicle
 
 Info = dict[str, Any]
 
@@ -33,6 +33,7 @@ class _Door:
         num_envs: int | None,
         *,
         vehicle: Vehicle | None = None,
+        action: str = "rotor",
         max_episode_steps: int | None = None,
         num_threads: int = 0,
         render_mode: str | None = None,
@@ -49,7 +50,11 @@ class _Door:
         if max_episode_steps is not None:
             options["horizon"] = max_episode_steps * vehicle.control_step
         self.environment = Environment(
-            tasks.make(task, **options), num_envs=num_envs, vehicle=vehicle, num_threads=num_threads
+            tasks.make(task, **options),
+            num_envs=num_envs,
+            vehicle=vehicle,
+            num_threads=num_threads,
+            action=action,
         )
         self.render_mode, self._terms_wanted = render_mode, reward_terms
         self.metadata = self.metadata | {"render_fps": round(1 / vehicle.control_step)}
@@ -57,7 +62,7 @@ class _Door:
         self._renderer: Any = None
         return (
             gym.spaces.Box(-np.inf, np.inf, (self.environment.size,), np.float32),
-            gym.spaces.Box(-1.0, 1.0, (ROTORS,), np.float32),
+            gym.spaces.Box(-1.0, 1.0, (self.environment.interface.size,), np.float32),
         )
 
     def _frame(self, row: int = 0) -> np.ndarray:
@@ -94,13 +99,13 @@ class QuadrotorEnv(_Door, gym.Env):
 
         Args:
             task: A name of the catalogue or a task.
-            **settings: `vehicle` (None: the paper's); `max_episode_steps` (None: the task's
-                horizon); `render_mode` (None or "rgb_array"), `width` and `height` [pixels] and
+            **settings: `vehicle` (None: the paper's); `action` ("rotor", or another name of
+                `quadrl.interfaces.INTERFACES`); `max_episode_steps` (None: the task's horizon); `render_mode` (None or "rgb_array"), `width` and `height` [pixels] and
                 `camera` (a camera of `quadrl.rendering`) of a picture; `reward_terms` (True: in
                 `info`); any field of the task.
 
         Raises:
-            OptionError: Unknown task, option or render mode; the message lists the choices.
+            OptionError: Unknown task, interface, option or render mode; the message lists the choices.
         """
         self.observation_space, self.action_space = self._make(task, None, **settings)
 
@@ -170,7 +175,7 @@ class QuadrotorVectorEnv(_Door, VectorEnv):
             **settings: As `QuadrotorEnv` has them, and `num_threads` (0: every core).
 
         Raises:
-            OptionError: Unknown task, option or mode, or an impossible number of environments.
+            OptionError: Unknown task, interface, option or mode, or an impossible number of environments.
         """
         modes = {mode.value: mode for mode in AutoresetMode} | dict(AutoresetMode.__members__)
         if not isinstance(autoreset_mode, AutoresetMode):

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from quadrl import tasks
 from quadrl.environment import Environment
 from quadrl.task import Task
-from quadrl.vehicle import ROTORS, Vehicle
+from quadrl.vehicle import Vehicle
 
 FLAGS = ("done", "terminated", "truncated", "is_success")
 
@@ -36,6 +36,7 @@ class QuadrotorEnv(EnvBase):
         device: str | torch.device = "cpu",
         *,
         vehicle: Vehicle | None = None,
+        action: str = "rotor",
         num_threads: int = 0,
         reward_terms: bool = False,
         **options: Any,  # noqa: ANN401 - of the task's own types
@@ -48,12 +49,13 @@ class QuadrotorEnv(EnvBase):
             seed: Aircraft i is seeded with seed + i.
             device: Of the tensors.
             vehicle: The aircraft; None for the paper's.
+            action: What actions mean, a name of `quadrl.interfaces.INTERFACES`.
             num_threads: Threads of the simulation; 0 for every core.
             reward_terms: Whether to give the named terms of the reward (they cost time).
             **options: Fields of the task.
 
         Raises:
-            ValueError: Unknown task or option, or an impossible number of environments.
+            ValueError: Unknown task, interface or option, or an impossible number of environments.
         """
         self.environment = Environment(
             tasks.make(task, **options),
@@ -61,11 +63,13 @@ class QuadrotorEnv(EnvBase):
             seed=seed,
             vehicle=vehicle,
             num_threads=num_threads,
+            action=action,
         )
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._terms = self.environment.term_names if reward_terms else ()
         shape, column = torch.Size([num_envs]), torch.Size([num_envs, 1])
-        vector, action = (torch.Size([num_envs, k]) for k in (self.environment.size, ROTORS))
+        vector = torch.Size([num_envs, self.environment.size])
+        actions = torch.Size([num_envs, self.environment.interface.size])
         parts: dict[str, Any] = {
             "observation": Unbounded(vector, dtype=torch.float32),
             "is_success": Binary(shape=column, dtype=torch.bool),
@@ -75,7 +79,7 @@ class QuadrotorEnv(EnvBase):
             terms = {name: Unbounded(column) for name in self._terms}
             parts["reward_terms"] = Composite(terms, shape=shape)
         self.observation_spec = Composite(parts, shape=shape).to(self.device)
-        self.action_spec = Bounded(-1.0, 1.0, action, dtype=torch.float32).to(self.device)
+        self.action_spec = Bounded(-1.0, 1.0, actions, dtype=torch.float32).to(self.device)
         self.reward_spec = Unbounded(column, dtype=torch.float32).to(self.device)
         self.done_spec = Composite(
             {flag: Binary(shape=column, dtype=torch.bool) for flag in FLAGS[:3]}, shape=shape

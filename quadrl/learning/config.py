@@ -13,6 +13,7 @@ import tyro
 from quadrl import tasks
 from quadrl.environment import MAX_ENVS
 from quadrl.errors import QuadrlError
+from quadrl.interfaces import INTERFACES
 from quadrl.policy import write_whole
 from quadrl.task import OptionError, Task, check_choices
 from quadrl.vehicle import VEHICLES
@@ -173,6 +174,8 @@ class TrainConfig:
     """Of the networks, the exploration and the episodes."""
     vehicle: str = "paper"
     """Name of the aircraft."""
+    action: str = "rotor"
+    """What actions mean: rotor (the paper's), thrust_body_rate, velocity or position."""
     task_options: tuple[str, ...] = ()
     """Fields of the task that differ from its defaults, such as horizon=5."""
     num_envs: int = 256
@@ -235,6 +238,7 @@ class TrainConfig:
         for width in (*self.hidden, *self.critic_hidden):
             _check_number("width of a hidden layer", width, 1, 1 << 16)
         check_choices([self.vehicle], VEHICLES, "vehicle")
+        check_choices([self.action], INTERFACES, "action interface")
         check_choices([self.algo], ALGORITHMS, "algorithm")
         make_task(self.task, self.options)
 

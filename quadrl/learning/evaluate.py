@@ -10,14 +10,15 @@ import numpy as np
 
 from quadrl.environment import Environment
 from quadrl.state import State
-from quadrl.task import Task
+from quadrl.task import OptionError, Task
 from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadrl.rendering import Flight
 
 Controller = Callable[[np.ndarray], np.ndarray]
-"""Flat observations (N, size) float32 to actions (N, 4)."""
+"""Flat observations (N, size) float32 to actions (N, 4); its attribute `action` names the interface
+that they are for."""
 
 EVALUATION_SEED = 2_000_000_000
 """Beyond the seeds of every training (1000 * 2**20), so that evaluation episodes are fresh ones."""
@@ -76,6 +77,7 @@ def fly(
     episodes: int,
     seed: int = EVALUATION_SEED,
     vehicle: Vehicle | None = None,
+    action: str | None = None,
 ) -> Record:
     """One episode of each of N aircraft.
 
@@ -85,8 +87,20 @@ def fly(
         episodes: N.
         seed: Aircraft i is seeded with seed + i.
         vehicle: The aircraft; None for the paper's.
+        action: What actions mean; None for what the controller says, or "rotor".
+
+    Raises:
+        OptionError: The controller's actions are for another interface.
     """
-    environment = Environment(task, num_envs=episodes, seed=seed, vehicle=vehicle)
+    own = getattr(controller, "action", None)
+    if None not in (action, own) and action != own:
+        raise OptionError(
+            f"{type(controller).__name__} gives actions for the interface {own!r}, not for "
+            f"{action!r}: fly it with action={own!r}"
+        )
+    environment = Environment(
+        task, num_envs=episodes, seed=seed, vehicle=vehicle, action=action or own or "rotor"
+    )
     observation = environment.flatten(environment.reset())
     names = [f.name for f in dataclasses.fields(Record)][:9]
     history: dict[str, list[np.ndarray]] = {name: [] for name in names}
@@ -95,12 +109,12 @@ def fly(
     ends = {name: np.zeros(episodes, bool) for name in ("terminated", "is_success", "diverged")}
     markers = tuple(environment.markers())
     while alive.any() and len(history["error"]) < environment.horizon_steps:
-        action = np.clip(controller(observation), -1.0, 1.0)
-        now = environment.step(action)
+        taken = np.clip(controller(observation), -1.0, 1.0)
+        now = environment.step(taken)
         observation = environment.flatten(now.observation)
         state: State = environment.simulation.state
         goal = environment.task.goal(state, environment.fields)
-        moment = {"goal": goal, "action": action, "error": now.error, "reward": now.reward}
+        moment = {"goal": goal, "action": taken, "error": now.error, "reward": now.reward}
         for name in names:
             value = np.array(moment[name] if name in moment else getattr(state, name), dtype=float)
             value[~alive] = np.nan

@@ -28,7 +28,7 @@ from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.policy import FILE as POLICY_FILE
 from quadrl.policy import Policy
-from quadrl.vehicle import ROTORS, VEHICLES
+from quadrl.vehicle import VEHICLES
 
 with warnings.catch_warnings():
     # TorchRL 0.14 warns about its own classes at this import.
@@ -84,12 +84,13 @@ class Training:
             config.num_envs,
             seed=config.seed * SEED_STRIDE,
             vehicle=VEHICLES[config.vehicle],
+            action=config.action,
             num_threads=config.num_threads,
             **config.options,
         )
         self.actor, self.critic, self.normaliser = make_actor_critic(
             self.env.environment.size,
-            ROTORS,
+            self.env.environment.interface.size,
             hidden=config.hidden,
             critic_hidden=config.critic_hidden,
             initial_deviation=config.initial_deviation,
@@ -174,6 +175,7 @@ class Training:
             "seed": config.seed,
             "steps": self.iteration * config.num_envs * config.rollout,
             "vehicle": config.vehicle,
+            "action": config.action,
             "task_options": config.options,
         }
         return export(self.actor, config.task, metadata)
@@ -234,12 +236,22 @@ class Training:
             "running": self._running,
             "generator": torch.get_rng_state(),
         }
-        numbers = {"iteration": self.iteration, "seconds": self.seconds}
+        numbers = {
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "action": self.config.action,
+        }
         checkpoint.save(self.folder / checkpoint.CHECKPOINT, tensors, numbers)
 
     def _restore(self) -> None:
         path = self.folder / checkpoint.CHECKPOINT
         tensors, numbers = checkpoint.load(path)
+        trained = numbers.get("action", "rotor")  # older ones know no other
+        if trained != self.config.action:
+            raise RunError(
+                f"{path} was trained with the action interface {trained!r}, and its run's is "
+                f"{self.config.action!r}: it would fly wrongly; start a new run"
+            )
         try:
             self.actor.load_state_dict(tensors["actor"])
             self.critic.load_state_dict(tensors["critic"])
