@@ -329,9 +329,10 @@ class Environment:
 
 
 def _simulation(task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int) -> Simulation:
+    altitude = task.origin_height(vehicle)
     if num_envs is None:
         model = vehicle.compile_lean(contact=task.contact)
-        return SingleSimulation(vehicle, model, mujoco.MjData(model), altitude=task.altitude)
+        return SingleSimulation(vehicle, model, mujoco.MjData(model), altitude=altitude)
     if not isinstance(num_envs, (int, np.integer)) or not 1 <= num_envs <= MAX_ENVS:
         raise OptionError(
             f"num_envs = {num_envs!r}: a whole number from 1 to {MAX_ENVS} is allowed"
@@ -339,7 +340,7 @@ def _simulation(task: Task, vehicle: Vehicle, num_envs: int | None, num_threads:
     return BatchSimulation(
         vehicle,
         int(num_envs),
-        altitude=task.altitude,
+        altitude=altitude,
         contact=task.contact,
         num_threads=num_threads,
     )

@@ -109,7 +109,8 @@ def check_functions(task: Task) -> None:
     Tensors come with a gradient asked for, which NumPy's functions refuse, as they would on a GPU.
     """
     block = np.random.default_rng(1).random((AIRCRAFT, EPISODE_DRAWS))
-    simulation = BatchSimulation(VEHICLE, AIRCRAFT, altitude=task.altitude, contact=task.contact)
+    altitude = task.origin_height(VEHICLE)
+    simulation = BatchSimulation(VEHICLE, AIRCRAFT, altitude=altitude, contact=task.contact)
     start, fields = task.sample(Draw(block), VEHICLE)
     with _blame(task, "measure"):
         state = simulation.place(np.arange(AIRCRAFT), start)
@@ -259,7 +260,8 @@ def fly(door: str, task: Task, seed: int, actions: np.ndarray) -> Flight:
 
 def _mj_step(task: Task, seed: int, actions: np.ndarray) -> Generator[tuple]:
     """Bare mj_step and the task's own functions: the numbers that every door has to give."""
-    generator, origin = np.random.default_rng(seed), np.array([0.0, 0.0, task.altitude])
+    generator = np.random.default_rng(seed)
+    origin = np.array([0.0, 0.0, task.origin_height(VEHICLE)])
     model = VEHICLE.compile(contact=task.contact)
     data = mujoco.MjData(model)
     settle = round(min(task.settle, task.horizon) / VEHICLE.control_step)

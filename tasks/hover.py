@@ -51,12 +51,8 @@ class Hover(Task[Fields]):
         self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
     ) -> Array:
         """Away, on the ground or on its back."""
-        upside_down = state.rotation[..., 2, 2] < 0
-        return (
-            (measures.distance > self.max_distance)
-            | self.touches_ground(state, vehicle)
-            | upside_down
-        )
+        away = measures.distance > self.max_distance
+        return away | self.touches_ground(state, vehicle) | (state.cos_tilt < 0)
 
     def success(
         self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array

@@ -29,13 +29,5 @@ class RandomWaypoint(WaypointTask[Fields]):
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Fields]:
         """At rest at the origin, level, any heading."""
         goal = draw.vector(self.farthest, shortest=self.nearest)
-        xp = namespace(goal)
-        rest = xp.zeros_like(goal)
-        start = Start(
-            position=rest,
-            quaternion=draw.attitude(tilt=0.0),
-            velocity=rest,
-            body_rate=rest,
-            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
-        )
-        return start, Fields(goal=goal)
+        origin = namespace(goal).zeros_like(goal)
+        return draw.level_start(origin, vehicle), Fields(goal=goal)
