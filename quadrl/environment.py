@@ -235,11 +235,7 @@ class Environment:
     @property
     def term_names(self) -> tuple[str, ...]:
         """Names of the reward's terms, in their order."""
-        start, fields = self.task.sample(Draw(np.full(EPISODE_DRAWS, 0.5)), self.vehicle)
-        state = State.of_coordinates(**vars(start), time=np.zeros(()))
-        measures = self.task.measure(state, fields)
-        outcome = Outcome(np.False_, np.False_)
-        return tuple(self.task.reward(measures, measures, start.rotor_speed, outcome, self.vehicle))
+        return self.task.term_names(self.vehicle)
 
     def flatten(self, observation: Observation, out: np.ndarray | None = None) -> np.ndarray:
         """The parts of an observation as one vector (..., size), float32 unless `out` is given."""

@@ -351,6 +351,13 @@ class Task(abc.ABC, Generic[FieldsT]):
             "survival": self.survival_weight + 0.0 * effort,
         }
 
+    def term_names(self, vehicle: Vehicle) -> tuple[str, ...]:
+        """Names of the reward's terms, in their order."""
+        start, fields = self.sample(Draw(np.full(EPISODE_DRAWS, 0.5)), vehicle)
+        measures = self.measure(State.of_coordinates(**vars(start), time=np.zeros(())), fields)
+        outcome = Outcome(np.False_, np.False_)
+        return tuple(self.reward(measures, measures, start.rotor_speed, outcome, vehicle))
+
     @abc.abstractmethod
     def terminated(
         self, state: State, measures: Measures, fields: FieldsT, vehicle: Vehicle

@@ -72,7 +72,7 @@ class Landing(Task[Touchdown]):
     max_distance: float = 5.0
     """Distance from the pad that ends the episode [m]."""
     pad_radius: float = 0.5
-    """[m]"""
+    """Radius of the pad [m]."""
     rest_time: float = 0.25
     """How long the aircraft has to be at rest [s]."""
 

@@ -17,7 +17,7 @@ class RandomWaypoint(WaypointTask[Fields]):
 
     name = "random_waypoint"
     asks = "fly to a waypoint drawn 1 to 2.5 m away, then hover on it until the end"
-    starts = "at rest at the origin, any heading"
+    starts = "at rest and level at the origin, any heading"
     ends = "more than 5 m from the waypoint, on the ground"
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
 

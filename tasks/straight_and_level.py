@@ -33,7 +33,7 @@ class StraightAndLevel(MovingGoalTask[Line]):
 
     name = "straight_and_level"
     asks = "fly in a constant direction at constant altitude and 2 m/s for as long as possible"
-    starts = "on the line, at rest or up to the set speed along it, any heading"
+    starts = "on a line in any direction, level, at 0 to 2 m/s along it, any heading"
     ends = "more than 0.7 m off the altitude or 3 m off the line, on the ground"
     solved = "in the air, on altitude and near the line to the end"
 

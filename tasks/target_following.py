@@ -37,7 +37,7 @@ class TargetFollowing(MovingGoalTask[Path]):
 
     name = "target_following"
     asks = "keep 1 m from a target that moves along a smooth random path at up to 1.5 m/s"
-    starts = "1 m from the target, at rest, any heading"
+    starts = "1 m beside the target, at rest and level, any heading"
     ends = "more than 5 m from the target, on the ground"
     solved = "in the air to the end, distance within 0.3 m of 1 m on average"
 
