@@ -8,14 +8,17 @@ import json
 import os
 import sys
 import time
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from quadrl import tasks
+from quadrl.description import describe, observation_rows, option_rows, reward_rows
 from quadrl.errors import QuadrlError
 from quadrl.learning.config import (
     CONFIG,
@@ -46,21 +49,38 @@ class Tasks:
     """List the tasks, or one of them in full."""
 
     task: tyro.conf.Positional[str] = ""
-    """Name of a task; none for the list."""
+    """Name of a task, to show it alone and with its options; none for all."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
 
     def run(self) -> None:
-        """Print them."""
-        if self.task:
-            _describe(tasks.make(self.task))
+        """Print what they ask, start from, end with, show, take and reward."""
+        chosen = [self.task] if self.task else list(tasks.TASKS)
+        described = [describe(tasks.make(name)) for name in chosen]
+        if self.json:
+            whole = {task.name: dataclasses.asdict(task) for task in described}
+            sys.stdout.write(json.dumps(whole[self.task] if self.task else whole) + "\n")
             return
-        table = Table(box=None, header_style="bold", padding=(0, 2, 1, 0))
-        for column in ("task", "asks", "ends early", "success", "horizon"):
-            table.add_column(column, no_wrap=column in ("task", "horizon"))
-        for name, task in tasks.TASKS.items():
-            horizon = f"{tasks.make(name).horizon:g} s"
-            table.add_row(name, task.asks, task.ends, task.solved, horizon)
+        table = _table(("task", "", ""))
+        for task in described:
+            said = {
+                "asks": task.asks,
+                "start": task.starts,
+                "ends early": task.ends,
+                "solved": task.solved,
+                "horizon": f"{task.horizon:g} s",
+            }
+            for row, (what, text) in enumerate(said.items()):
+                table.add_row("" if row else task.name, what, text)
+            table.add_row()
         console.print(table)
-        console.print("[dim]quadrl tasks NAME shows one in full[/dim]")
+        console.print(_table(*observation_rows(described)))
+        console.print(f"\n[bold]action[/bold]  {escape(described[0].action)}\n", highlight=False)
+        console.print(_table(*reward_rows(described)))
+        if self.task:
+            console.print("", _table(*option_rows(described[0])))
+        else:
+            _say("\nquadrl tasks NAME shows the options of one")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -533,26 +553,11 @@ def _sum_up(folder: Path, config: TrainConfig, judged: dict[str, Any]) -> None:
     )
 
 
-def _describe(task: Task) -> None:
-    """One task in full."""
-    console.print(f"[bold]{task.name}[/bold]: {task.asks}")
-    console.print(f"ends early: {task.ends}; time limit {task.horizon:g} s")
-    console.print(f"success: {task.solved}\n")
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]] = ()) -> Table:
+    """A table without lines; its texts are no markup."""
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for column in ("observation", "entries", "unit", "meaning"):
-        table.add_column(column)
-    first = 0
-    for name, part in task.observation.items():
-        last = first + part.size
-        table.add_row(name, f"{first}..{last - 1}", part.unit, part.meaning)
-        first = last
-    console.print(table)
-    console.print(
-        "\naction: four numbers in -1..1, change of the rotor speed commands from hover\n"
-    )
-    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for column in ("option", "default"):
-        table.add_column(column)
-    for field in dataclasses.fields(task):
-        table.add_row(field.name, str(getattr(task, field.name)))
-    console.print(table)
+    for k, column in enumerate(head):
+        table.add_column(column, no_wrap=k == 0)
+    for row in rows:
+        table.add_row(*(escape(cell) for cell in row))
+    return table

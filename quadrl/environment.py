@@ -276,11 +276,7 @@ class Environment:
     @property
     def term_names(self) -> tuple[str, ...]:
         """Names of the reward's terms, in their order."""
-        start, fields = self.task.sample(Draw(np.full(EPISODE_DRAWS, 0.5)), self.vehicle)
-        state = State.of_coordinates(**vars(start), time=np.zeros(()))
-        measures = self.task.measure(state, fields)
-        outcome = Outcome(np.False_, np.False_)
-        return tuple(self.task.reward(measures, measures, start.rotor_speed, outcome, self.vehicle))
+        return self.task.term_names(self.vehicle)
 
     def flatten(self, observation: Observation, out: np.ndarray | None = None) -> np.ndarray:
         """The parts of an observation as one vector (..., size), float32 unless `out` is given."""
@@ -372,10 +368,11 @@ class Environment:
 def _simulation(
     task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int, engine: Engine
 ) -> Simulation:
+    altitude = task.origin_height(vehicle)
     if num_envs is None:
         model = vehicle.compile_lean(contact=task.contact)
         data = mujoco.MjData(model)
-        return SingleSimulation(vehicle, model, data, altitude=task.altitude, engine=engine)
+        return SingleSimulation(vehicle, model, data, altitude=altitude, engine=engine)
     if not isinstance(num_envs, (int, np.integer)) or not 1 <= num_envs <= MAX_ENVS:
         raise OptionError(
             f"num_envs = {num_envs!r}: a whole number from 1 to {MAX_ENVS} is allowed"
@@ -383,7 +380,7 @@ def _simulation(
     return BatchSimulation(
         vehicle,
         int(num_envs),
-        altitude=task.altitude,
+        altitude=altitude,
         contact=task.contact,
         num_threads=num_threads,
         engine=engine,

@@ -33,6 +33,7 @@ ROWS = {
 }
 """Where each quantity stands in the table that `native/state.c` fills (time is not its)."""
 TABLE_ROWS = 40
+REST_SPEED, REST_SPIN = 0.05, 0.1  # [m/s], [rad/s]: slower is at rest
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -56,6 +57,16 @@ class State:
     level_error: Array  # (...) |sin zeta| + |cos zeta - 1| of roll and pitch
     east_error: Array  # (...) the same of roll, pitch and yaw
     time: Array  # (...) [s], since the start of the episode
+
+    @property
+    def cos_tilt(self) -> Array:
+        """Cosine of the angle between the body's z axis and the vertical, (...)."""
+        return self.rotation[..., 2, 2]
+
+    @property
+    def at_rest(self) -> Array:
+        """Whether it neither moves nor turns, (...) bool."""
+        return (self.speed < REST_SPEED) & (self.spin < REST_SPIN)
 
     @classmethod
     def of_table(cls, table: np.ndarray) -> State:

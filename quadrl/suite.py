@@ -115,8 +115,9 @@ class QuadrotorTask(base.Task):
     def initialize_episode(self, physics: Physics) -> None:
         """Begin an episode."""
         if self._environment is None or self._physics is not physics:
+            altitude = self._task.origin_height(self._vehicle)
             simulation = SingleSimulation(
-                self._vehicle, physics.model.ptr, physics.data.ptr, altitude=self._task.altitude
+                self._vehicle, physics.model.ptr, physics.data.ptr, altitude=altitude
             )
             environment = Environment(
                 self._task, seed=self._seed, simulation=simulation, action=self._interface.name

@@ -29,7 +29,7 @@ from quadrl.rotation import (
     to_body,
 )
 from quadrl.state import Start, State
-from quadrl.vehicle import Vehicle
+from quadrl.vehicle import ROTORS, Vehicle
 
 if TYPE_CHECKING:
     from quadrl.learning.evaluate import Record
@@ -38,6 +38,7 @@ EPISODE_DRAWS = 64
 """Uniform numbers that every episode takes from its aircraft's generator, used or not."""
 
 FULL_TURN = 2 * math.pi
+CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing
 
 
 class OptionError(QuadrlError, ValueError):
@@ -75,6 +76,12 @@ class Draw:
         level = xp.sqrt(1 - height * height)
         return stack(level * xp.cos(heading), level * xp.sin(heading), height)
 
+    def level_direction(self) -> Array:
+        """Unit vectors (..., 3), evenly around the horizon."""
+        bearing = self.uniform(0.0, FULL_TURN)
+        xp = namespace(bearing)
+        return xp.stack([xp.cos(bearing), xp.sin(bearing), xp.zeros_like(bearing)], axis=-1)
+
     def vector(self, length: float, shortest: float = 0.0) -> Array:
         """Vectors (..., 3) of any direction, their length uniform in [shortest, length)."""
         return self.uniform(shortest, length)[..., None] * self.direction()
@@ -85,6 +92,26 @@ class Draw:
             heading=self.uniform(0.0, heading),
             tilt=self.uniform(0.0, tilt),
             direction=self.uniform(0.0, FULL_TURN),
+        )
+
+    def level_start(
+        self, position: Array, vehicle: Vehicle, velocity: Array | None = None
+    ) -> Start:
+        """A start (..., k) at a position: level, any heading, the rotors at hover speed.
+
+        Args:
+            position: (..., 3) [m], task frame.
+            vehicle: The aircraft.
+            velocity: (..., 3) [m/s], world frame; None for at rest.
+        """
+        xp = namespace(position)
+        rest = xp.zeros_like(position)
+        return Start(
+            position=position,
+            quaternion=self.attitude(tilt=0.0),
+            velocity=rest if velocity is None else velocity,
+            body_rate=rest,
+            rotor_speed=xp.full_like(self.uniform(0, 1, ROTORS), vehicle.hover_speed),
         )
 
 
@@ -220,7 +247,8 @@ class Task(abc.ABC, Generic[FieldsT]):
     settle: float = 2.0
     """Length of the stretch before the horizon over which the final error is taken [s]."""
     altitude: float = 3.0
-    """Height of the origin of the task's frame above the ground [m]."""
+    """Height of the origin of the task's frame above the ground [m]; at least that of the
+    aircraft's centre when it stands on its feet."""
     progress_weight: float = 100.0
     """Reward for a metre of distance gained."""
     attitude_weight: float = 10.0
@@ -243,9 +271,10 @@ class Task(abc.ABC, Generic[FieldsT]):
             flat = np.asarray(numbers, dtype=float) if numbers else np.zeros(1)
             if not np.all(np.isfinite(flat)):
                 raise OptionError(f"{self.name}: {field.name} = {value!r} is not finite")
-        for positive in ("horizon", "altitude"):
-            if (value := getattr(self, positive)) <= 0:
-                raise OptionError(f"{self.name}: {positive} = {value} must be positive")
+        if self.horizon <= 0:
+            raise OptionError(f"{self.name}: horizon = {self.horizon} must be positive")
+        if self.altitude < 0:
+            raise OptionError(f"{self.name}: altitude = {self.altitude} must not be negative")
 
     @abc.abstractmethod
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, FieldsT]:
@@ -323,6 +352,13 @@ class Task(abc.ABC, Generic[FieldsT]):
             "survival": self.survival_weight + 0.0 * effort,
         }
 
+    def term_names(self, vehicle: Vehicle) -> tuple[str, ...]:
+        """Names of the reward's terms, in their order."""
+        start, fields = self.sample(Draw(np.full(EPISODE_DRAWS, 0.5)), vehicle)
+        measures = self.measure(State.of_coordinates(**vars(start), time=np.zeros(())), fields)
+        outcome = Outcome(np.False_, np.False_)
+        return tuple(self.reward(measures, measures, start.rotor_speed, outcome, vehicle))
+
     @abc.abstractmethod
     def terminated(
         self, state: State, measures: Measures, fields: FieldsT, vehicle: Vehicle
@@ -339,9 +375,25 @@ class Task(abc.ABC, Generic[FieldsT]):
         """What to draw of the task in one aircraft's episode; the goal is drawn anyway."""
         return ()
 
+    def origin_height(self, vehicle: Vehicle) -> float:
+        """Height of the origin of the task's frame above the ground [m]."""
+        return max(self.altitude, vehicle.ground_clearance)
+
+    def height(self, state: State, vehicle: Vehicle) -> Array:
+        """Height of the aircraft's centre above the ground, (...) [m]."""
+        return state.position[..., 2] + self.origin_height(vehicle)
+
     def touches_ground(self, state: State, vehicle: Vehicle) -> Array:
-        """Whether the aircraft has come down to the ground, (...) bool."""
-        return state.position[..., 2] < vehicle.ground_clearance - self.altitude
+        """Whether an aircraft that should fly has come down to the ground, (...) bool."""
+        return state.position[..., 2] < vehicle.ground_clearance - self.origin_height(vehicle)
+
+    def stands(self, state: State, vehicle: Vehicle) -> Array:
+        """Whether a foot is on the ground, (...) bool."""
+        return self.height(state, vehicle) - vehicle.foot_depth(state.rotation) < CONTACT_HEIGHT
+
+    def strikes_ground(self, state: State, vehicle: Vehicle) -> Array:
+        """Whether the hull or a rotor has hit the ground, (...) bool."""
+        return self.height(state, vehicle) < vehicle.strike_depth(state.rotation)
 
     def figures(self, record: Record) -> dict[str, float]:
         """The task's own figures of an evaluation, with their units in their names."""

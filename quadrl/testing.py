@@ -9,13 +9,10 @@ are installed. `fly` flies a task through one of DOORS, and through bare `mj_ste
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
 import functools
 import importlib.util
-import inspect
-import textwrap
 import unittest
 import warnings
 from collections.abc import Callable, Generator
@@ -25,6 +22,7 @@ import mujoco
 import numpy as np
 
 from quadrl import interfaces, tasks
+from quadrl.description import docstrings
 from quadrl.environment import Environment
 from quadrl.rotation import Array
 from quadrl.simulation import BatchSimulation
@@ -72,9 +70,10 @@ def check_declaration(task: Task) -> None:
     for name, part in task.observation.items():
         said = part.size >= 1 and part.unit and part.meaning
         _require(said, f"{task.name}: the part {name!r} lacks a size, a unit or a meaning: {part}")
-    documented = set().union(*(_documented(c) for c in kind.__mro__ if issubclass(c, Task)))
+    documented = docstrings(kind)
     for field in dataclasses.fields(task):
-        _require(field.name in documented, f"{task.name}: the option {field.name} has no docstring")
+        text = documented.get(field.name)
+        _require(text, f"{task.name}: the option {field.name} has no docstring")
 
 
 def check_sample(task: Task) -> None:
@@ -109,7 +108,8 @@ def check_functions(task: Task) -> None:
     Tensors come with a gradient asked for, which NumPy's functions refuse, as they would on a GPU.
     """
     block = np.random.default_rng(1).random((AIRCRAFT, EPISODE_DRAWS))
-    simulation = BatchSimulation(VEHICLE, AIRCRAFT, altitude=task.altitude, contact=task.contact)
+    altitude = task.origin_height(VEHICLE)
+    simulation = BatchSimulation(VEHICLE, AIRCRAFT, altitude=altitude, contact=task.contact)
     start, fields = task.sample(Draw(block), VEHICLE)
     with _blame(task, "measure"):
         state = simulation.place(np.arange(AIRCRAFT), start)
@@ -260,7 +260,8 @@ def fly(door: str, task: Task, seed: int, actions: np.ndarray, action: str = "ro
 
 def _mj_step(task: Task, seed: int, actions: np.ndarray, kind: str) -> Generator[tuple]:
     """Bare mj_step and the task's own functions: the numbers that every door has to give."""
-    generator, origin = np.random.default_rng(seed), np.array([0.0, 0.0, task.altitude])
+    generator = np.random.default_rng(seed)
+    origin = np.array([0.0, 0.0, task.origin_height(VEHICLE)])
     model = VEHICLE.compile(contact=task.contact)
     data = mujoco.MjData(model)
     interface = interfaces.make(kind, VEHICLE)
@@ -480,21 +481,6 @@ def _state(environment: Environment) -> np.ndarray:
 
 def _flat(observation: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate(list(observation.values()))
-
-
-def _documented(kind: type) -> set[str]:
-    """The fields of a class that a docstring follows."""
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
-    assert isinstance(definition, ast.ClassDef)
-    return {
-        field.target.id
-        for field, text in zip(definition.body, definition.body[1:], strict=False)
-        if isinstance(field, ast.AnnAssign)
-        and isinstance(field.target, ast.Name)
-        and isinstance(text, ast.Expr)
-        and isinstance(text.value, ast.Constant)
-        and isinstance(text.value.value, str)
-    }
 
 
 def _optional(module: str) -> Any:  # noqa: ANN401 - a module

@@ -16,7 +16,7 @@ class Hover(Task[Fields]):
 
     name = "hover"
     asks = "hold a static waypoint for the whole episode, heading east"
-    starts = "within 0.5 m of it, any heading, slightly tilted, moving and turning"
+    starts = "within 0.5 m of it, any heading, tilted up to 0.2 rad, at up to 0.3 m/s and 0.3 rad/s"
     ends = "more than 3 m away, on the ground, tilted past 90 degrees"
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
     heading_matters = True
@@ -51,12 +51,8 @@ class Hover(Task[Fields]):
         self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
     ) -> Array:
         """Away, on the ground or on its back."""
-        upside_down = state.rotation[..., 2, 2] < 0
-        return (
-            (measures.distance > self.max_distance)
-            | self.touches_ground(state, vehicle)
-            | upside_down
-        )
+        away = measures.distance > self.max_distance
+        return away | self.touches_ground(state, vehicle) | (state.cos_tilt < 0)
 
     def success(
         self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array

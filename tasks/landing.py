@@ -5,20 +5,17 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from quadrl.rotation import Array, namespace, norm, square_norm
+from quadrl.rotation import Array, namespace, square_norm
 from quadrl.state import Start, State
 from quadrl.task import Draw, Errors, Fields, Marker, Measures, Outcome, Task
 from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadrl.learning.evaluate import Record
-
-REST_SPEED, REST_SPIN = 0.05, 0.1  # [m/s], [rad/s]: slower is at rest
-CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which it counts as down
 
 
 @dataclasses.dataclass
@@ -30,20 +27,13 @@ class Touchdown(Fields):
     rest: Array  # (...) control steps at rest on the pad, without a break
 
 
-@dataclasses.dataclass(slots=True)
-class LandingMeasures(Measures):
-    """The common measures, and how much too fast the approach is."""
-
-    haste: Array  # (...) [m/s], speed over that of a gentle approach at this height, else 0
-
-
 @dataclasses.dataclass(frozen=True)
 class Landing(Task[Touchdown]):
     """Land on the pad; the origin of the frame is where the aircraft's centre comes to rest."""
 
     name = "landing"
     asks = "touch down smoothly on a pad, without a crash and without sinking into its own wash"
-    starts = "3 m up, within 1.5 m sideways"
+    starts = "3 m up, within 1.5 m sideways, at rest, any heading"
     ends = (
         "at rest on the pad (success); sinking faster than 2 m/s along the body's axis; rotor or "
         "hull strikes, touchdown faster than 0.5 m/s or tilted more than 15 degrees; more than "
@@ -53,8 +43,8 @@ class Landing(Task[Touchdown]):
     heading_matters = True
     contact = True
 
-    altitude: float = 0.07
-    """Height of the origin above the ground: of the paper's aircraft on its feet [m]."""
+    altitude: float = 0.0
+    """Height of the origin above the ground [m]; that of the aircraft on its feet at least."""
     survival_weight: float = 0.0
     """Reward for each step: none, or it would hover over the pad rather than come to rest."""
     speed_weight: float = 5.0
@@ -82,102 +72,75 @@ class Landing(Task[Touchdown]):
     max_distance: float = 5.0
     """Distance from the pad that ends the episode [m]."""
     pad_radius: float = 0.5
-    """[m]"""
+    """Radius of the pad [m]."""
     rest_time: float = 0.25
     """How long the aircraft has to be at rest [s]."""
 
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Touchdown]:
         """Level and at rest, high over the pad and beside its axis."""
         offset = draw.uniform(0.0, self.start_offset)
-        bearing = draw.uniform(0.0, 2 * math.pi)
-        xp = namespace(offset)
-        height = xp.full_like(offset, self.start_height)
-        east, north = offset * xp.cos(bearing), offset * xp.sin(bearing)
-        position = xp.stack([east, north, height], axis=-1)
-        rest = xp.zeros_like(position)
-        start = Start(
-            position=position,
-            quaternion=draw.attitude(tilt=0.0),
-            velocity=rest,
-            body_rate=rest,
-            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
-        )
-        zero = xp.zeros_like(offset)
-        return start, Touchdown(goal=rest, down=zero, speed=zero, rest=zero)
-
-    def measure(self, state: State, fields: Touchdown) -> LandingMeasures:
-        """The common measures, and the haste of the approach."""
-        common = super().measure(state, fields)
-        xp = namespace(common.distance)
-        gentle = self.gentle_speed + self.gentle_rate * abs(state.position[..., 2])
-        excess = common.speed - gentle
-        haste = xp.where(excess > 0, excess, 0.0 * excess)
-        values = {f.name: getattr(common, f.name) for f in dataclasses.fields(common)}
-        return LandingMeasures(**values, haste=haste)
+        xp, zero = namespace(offset), namespace(offset).zeros_like(offset)
+        up = xp.stack([zero, zero, zero + self.start_height], axis=-1)
+        position = up + offset[..., None] * draw.level_direction()
+        fields = Touchdown(goal=xp.zeros_like(position), down=zero, speed=zero, rest=zero)
+        return draw.level_start(position, vehicle), fields
 
     def terminated(
         self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
     ) -> Array:
         """Crashed, in its own wash, away, or at rest for long enough."""
-        height = state.position[..., 2] + self.altitude
-        touches = height - vehicle.foot_depth(state.rotation) < CONTACT_HEIGHT
-        strikes = height < vehicle.strike_depth(state.rotation)
-        tilted = state.rotation[..., 2, 2] < math.cos(self.max_tilt)
+        strikes, stands = self.strikes_ground(state, vehicle), self.stands(state, vehicle)
+        tilted = state.cos_tilt < math.cos(self.max_tilt)
         # The speed of a touchdown is that of the last control step in the air.
         hard = (fields.down == 0) & (fields.speed > self.max_touchdown)
         sinks = state.body_velocity[..., 2] < -self.max_sink
-        rested = self._rested(state, fields, vehicle) * vehicle.control_step >= self.rest_time
         away = measures.distance > self.max_distance
-        return strikes | (touches & (tilted | hard)) | sinks | away | rested
+        rested = self._rest(state, fields, vehicle) * vehicle.control_step >= self.rest_time
+        return strikes | (stands & (tilted | hard)) | sinks | away | rested
 
     def success(
         self, state: State, fields: Touchdown, errors: Errors, terminated: Array, truncated: Array
     ) -> Array:
         """At rest on the pad: the only way in which a soft, upright, unmoving end comes about."""
-        return terminated & _is_slow(state) & (fields.down > 0) & self._over_pad(state)
+        return terminated & state.at_rest & (fields.down > 0) & self._over_pad(state)
 
     def update(
         self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
     ) -> Touchdown:
         """Remember the touchdown, the speed and how long the aircraft has been at rest."""
-        height = state.position[..., 2] + self.altitude
-        xp = namespace(height)
-        touches = height - vehicle.foot_depth(state.rotation) < CONTACT_HEIGHT
+        stands, xp = self.stands(state, vehicle), namespace(fields.down)
         return Touchdown(
             goal=fields.goal,
-            down=xp.where(touches, xp.ones_like(height), fields.down),
+            down=xp.where(stands, xp.ones_like(fields.down), fields.down),
             speed=measures.speed,
-            rest=self._rested(state, fields, vehicle),
+            rest=self._rest(state, fields, vehicle),
         )
 
     def reward(
         self,
         before: Measures,
-        now: Any,
+        now: Measures,
         rotor_command: Array,
         outcome: Outcome,
         vehicle: Vehicle,
     ) -> dict[str, Array]:
-        """The common terms, and what the end is worth."""
+        """The common terms, the haste of the approach, and what the end is worth."""
         terms = super().reward(before, now, rotor_command, outcome, vehicle)
-        terms["haste"] = -self.haste_weight * now.haste
         xp, zero = namespace(now.distance), 0.0 * now.distance
+        height = abs(now.to_goal[..., 2])
+        haste = now.speed - (self.gentle_speed + self.gentle_rate * height)
+        terms["haste"] = -self.haste_weight * xp.where(haste > 0, haste, 0.0 * haste)
         terms["success"] = xp.where(outcome.succeeded, zero + self.success_weight, zero)
         terms["failure"] = xp.where(outcome.failed, zero - self.failure_weight, zero)
         return terms
 
     def markers(self, fields: Touchdown) -> Sequence[Marker]:
-        """The pad, and the column of air over it."""
-        ground = (0.0, 0.0, -self.altitude)
-        return [
-            Marker("pad", ground, self.pad_radius, (0.95, 0.95, 0.95, 1.0)),
-            Marker("ring", (0.0, 0.0, 0.002 - self.altitude), 0.8 * self.pad_radius),
-        ]
+        """The pad."""
+        return [Marker("pad", size=self.pad_radius, rgba=(0.95, 0.95, 0.95, 1.0))]
 
     def figures(self, record: Record) -> dict[str, float]:
         """Speed of the touchdowns, the crashes, and the time that a landing takes."""
-        height = record.position[..., 2] + self.altitude
-        down = height < self.altitude + 0.01
+        down = record.position[..., 2] < 0.01
         first = down.argmax(0)
         flights = np.flatnonzero(down.any(0) & (first > 0))
         speed = np.linalg.norm(record.velocity[first[flights] - 1, flights], axis=-1)
@@ -189,17 +152,11 @@ class Landing(Task[Touchdown]):
             "landing_time_mean_s": float(landed.mean()) if len(landed) else math.nan,
         }
 
-    def _rested(self, state: State, fields: Touchdown, vehicle: Vehicle) -> Array:
+    def _rest(self, state: State, fields: Touchdown, vehicle: Vehicle) -> Array:
         """Control steps at rest on the pad, this one included."""
-        height = state.position[..., 2] + self.altitude
-        stands = height - vehicle.foot_depth(state.rotation) < CONTACT_HEIGHT
-        at_rest = stands & _is_slow(state) & self._over_pad(state)
-        xp = namespace(height)
-        return xp.where(at_rest, fields.rest + 1, xp.zeros_like(height))
+        rests = self.stands(state, vehicle) & state.at_rest & self._over_pad(state)
+        xp = namespace(fields.rest)
+        return xp.where(rests, fields.rest + 1, xp.zeros_like(fields.rest))
 
     def _over_pad(self, state: State) -> Array:
         return square_norm(state.position[..., :2]) < self.pad_radius**2
-
-
-def _is_slow(state: State) -> Array:
-    return (norm(state.velocity) < REST_SPEED) & (norm(state.body_rate) < REST_SPIN)

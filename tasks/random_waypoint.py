@@ -17,7 +17,7 @@ class RandomWaypoint(WaypointTask[Fields]):
 
     name = "random_waypoint"
     asks = "fly to a waypoint drawn 1 to 2.5 m away, then hover on it until the end"
-    starts = "at rest at the origin, any heading"
+    starts = "at rest and level at the origin, any heading"
     ends = "more than 5 m from the waypoint, on the ground"
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
 
@@ -29,13 +29,5 @@ class RandomWaypoint(WaypointTask[Fields]):
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Fields]:
         """At rest at the origin, level, any heading."""
         goal = draw.vector(self.farthest, shortest=self.nearest)
-        xp = namespace(goal)
-        rest = xp.zeros_like(goal)
-        start = Start(
-            position=rest,
-            quaternion=draw.attitude(tilt=0.0),
-            velocity=rest,
-            body_rate=rest,
-            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
-        )
-        return start, Fields(goal=goal)
+        origin = namespace(goal).zeros_like(goal)
+        return draw.level_start(origin, vehicle), Fields(goal=goal)

@@ -28,8 +28,11 @@ class StaticWaypoint(WaypointTask[Route]):
     """Fly to a list of waypoints in order, heading east, and hold the last."""
 
     name = "static_waypoint"
-    asks = "fly to fixed waypoints in order, then hover on the last until the end, heading east"
-    starts = "at rest at the origin, slightly disturbed"
+    asks = (
+        "fly to fixed waypoints in order (one, 1.5 m away, unless others are given), then hover on "
+        "the last until the end, heading east"
+    )
+    starts = "at rest at the origin, heading east, disturbed by up to 0.05 rad, m/s and rad/s"
     ends = "more than 5 m from the current waypoint, on the ground"
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m, on the last waypoint"
     heading_matters = True

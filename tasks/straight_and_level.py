@@ -10,17 +10,8 @@ import numpy as np
 
 from quadrl.rotation import Array, namespace, norm
 from quadrl.state import Start, State
-from quadrl.task import (
-    FULL_TURN,
-    OBSERVATION,
-    TARGET_VELOCITY,
-    Draw,
-    Errors,
-    Fields,
-    Marker,
-    Measures,
-    Task,
-)
+from quadrl.task import Draw, Errors, Fields, Marker, Measures
+from quadrl.tasks.moving_goal import MovingGoalTask
 from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -37,20 +28,15 @@ class Line(Fields):
 
 
 @dataclasses.dataclass(frozen=True)
-class StraightAndLevel(Task[Line]):
+class StraightAndLevel(MovingGoalTask[Line]):
     """Fly along a line at a set speed; the goal runs ahead of the aircraft on the line."""
 
     name = "straight_and_level"
     asks = "fly in a constant direction at constant altitude and 2 m/s for as long as possible"
-    starts = "on the line, at rest or up to the set speed along it, any heading"
+    starts = "on a line in any direction, level, at 0 to 2 m/s along it, any heading"
     ends = "more than 0.7 m off the altitude or 3 m off the line, on the ground"
     solved = "in the air, on altitude and near the line to the end"
-    observation = OBSERVATION | TARGET_VELOCITY
 
-    horizon: float = 20.0
-    """Time limit of an episode [s]."""
-    speed_weight: float = 20.0
-    """Reward for a m/s gained towards the line's velocity."""
     line_speed: float = 2.0
     """Speed along the line [m/s]."""
     lead: float = 1.0
@@ -62,19 +48,10 @@ class StraightAndLevel(Task[Line]):
 
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Line]:
         """On a line of any heading, at rest or up to the set speed along it."""
-        bearing = draw.uniform(0.0, FULL_TURN)
-        speed = draw.uniform(0.0, self.line_speed)
-        xp = namespace(bearing)
-        level = xp.zeros_like(bearing)
-        direction = xp.stack([xp.cos(bearing), xp.sin(bearing), level], axis=-1)
-        rest = xp.zeros_like(direction)
-        start = Start(
-            position=rest,
-            quaternion=draw.attitude(tilt=0.0),
-            velocity=speed[..., None] * direction,
-            body_rate=rest,
-            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
-        )
+        direction = draw.level_direction()
+        velocity = draw.uniform(0.0, self.line_speed)[..., None] * direction
+        origin = namespace(direction).zeros_like(direction)
+        start = draw.level_start(origin, vehicle, velocity)
         return start, Line(goal=direction * self.lead, direction=direction)
 
     def goal(self, state: State, fields: Line) -> Array:

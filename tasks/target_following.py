@@ -10,17 +10,8 @@ import numpy as np
 
 from quadrl.rotation import Array, namespace
 from quadrl.state import Start, State
-from quadrl.task import (
-    FULL_TURN,
-    OBSERVATION,
-    TARGET_VELOCITY,
-    Draw,
-    Errors,
-    Fields,
-    Marker,
-    Measures,
-    Task,
-)
+from quadrl.task import FULL_TURN, Draw, Errors, Fields, Marker, Measures
+from quadrl.tasks.moving_goal import MovingGoalTask
 from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -41,20 +32,15 @@ class Path(Fields):
 
 
 @dataclasses.dataclass(frozen=True)
-class TargetFollowing(Task[Path]):
+class TargetFollowing(MovingGoalTask[Path]):
     """Stay 1 m from a target on a smooth random path; from which side is free."""
 
     name = "target_following"
     asks = "keep 1 m from a target that moves along a smooth random path at up to 1.5 m/s"
-    starts = "1 m from the target, at rest, any heading"
+    starts = "1 m beside the target, at rest and level, any heading"
     ends = "more than 5 m from the target, on the ground"
     solved = "in the air to the end, distance within 0.3 m of 1 m on average"
-    observation = OBSERVATION | TARGET_VELOCITY
 
-    horizon: float = 20.0
-    """Time limit of an episode [s]."""
-    speed_weight: float = 20.0
-    """Reward for a m/s lost of the speed relative to the target."""
     keep: float = 1.0
     """Distance to keep [m]."""
     target_speed: float = 1.5
@@ -72,10 +58,8 @@ class TargetFollowing(Task[Path]):
 
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Path]:
         """At rest, beside the target, level, any heading."""
-        bearing = draw.uniform(0.0, FULL_TURN)
-        xp = namespace(bearing)
-        level = xp.zeros_like(bearing)
-        side = xp.stack([xp.cos(bearing), xp.sin(bearing), level], axis=-1)
+        side = draw.level_direction()
+        xp = namespace(side)
         frequency = draw.uniform(self.slowest, self.fastest, AXES * WAVES)
         # The speeds of the sines of an axis add up to its limit at most, and the axes together
         # (east and north alike) to `target_speed`.
@@ -83,22 +67,14 @@ class TargetFollowing(Task[Path]):
         along = ((self.target_speed**2 - climb**2) / 2) ** 0.5
         limit = xp.asarray(np.repeat([along, along, climb], WAVES) / WAVES)
         amplitude = draw.uniform(0.3, 1.0, AXES * WAVES) * limit / frequency
-        rest = xp.zeros_like(side)
-        start = Start(
-            position=self.keep * side,
-            quaternion=draw.attitude(tilt=0.0),
-            velocity=rest,
-            body_rate=rest,
-            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
-        )
+        start = draw.level_start(self.keep * side, vehicle)
         phase = draw.uniform(0.0, FULL_TURN, AXES * WAVES)
-        return start, Path(goal=rest, amplitude=amplitude, frequency=frequency, phase=phase)
+        origin = xp.zeros_like(side)
+        return start, Path(goal=origin, amplitude=amplitude, frequency=frequency, phase=phase)
 
     def goal(self, state: State, fields: Path) -> Array:
         """The target itself."""
-        xp = namespace(fields.phase)
-        angle = fields.frequency * state.time[..., None] + fields.phase
-        return _by_axis(fields.amplitude * (xp.sin(angle) - xp.sin(fields.phase)))
+        return _position(fields, state.time)
 
     def target_velocity(self, state: State, fields: Path) -> Array:
         """Of the target."""
@@ -124,14 +100,19 @@ class TargetFollowing(Task[Path]):
 
     def markers(self, fields: Path) -> Sequence[Marker]:
         """The path of the target."""
-        time = np.linspace(0.0, self.horizon, 160)[:, None]
-        angle = fields.frequency * time + fields.phase
-        points = _by_axis(fields.amplitude * (np.sin(angle) - np.sin(fields.phase)))
+        points = _position(fields, np.linspace(0.0, self.horizon, 160))
         return [Marker("path", size=0.008, rgba=PATH, points=points)]
 
     def figures(self, record: Record) -> dict[str, float]:
         """How well the distance is kept over the flight."""
         return {"distance_rms_m": float(np.sqrt(np.nanmean(record.error**2)))}
+
+
+def _position(fields: Path, time: Array) -> Array:
+    """Where the target is at a time (...) [s], (..., 3) [m], task frame."""
+    xp = namespace(fields.phase)
+    angle = fields.frequency * time[..., None] + fields.phase
+    return _by_axis(fields.amplitude * (xp.sin(angle) - xp.sin(fields.phase)))
 
 
 def _by_axis(waves: Array) -> Array:

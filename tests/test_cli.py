@@ -87,8 +87,20 @@ def test_tasks(capsys):
         assert name in listed
     assert quadrl_command("tasks", "hover") == 0
     shown = " ".join(capsys.readouterr().out.split())  # wherever the lines break
-    for word in ("rotor_speed", "rad/s", "horizon", "10.0", "tilt", "0.2", "time limit 10 s"):
-        assert word in shown
+    for words in ("horizon 10 s", "rotor_speed 15..18 1", "35 rad/s at 1", "tilt 0.2 Largest tilt"):
+        assert words in shown
+    assert "target_velocity" in listed and "target_velocity" not in shown
+
+
+def test_tasks_for_a_program_to_read(capsys):
+    assert quadrl_command("tasks", "--json") == 0
+    read = json.loads(capsys.readouterr().out)
+    assert list(read) == list(tasks.TASKS)
+    assert quadrl_command("tasks", "landing", "--json") == 0
+    landing = json.loads(capsys.readouterr().out)
+    assert landing == read["landing"]
+    weights = {term["name"]: term["weight"] for term in landing["reward"]}
+    assert (weights["progress"], weights["survival"], weights["failure"]) == (100, 0, 300)
 
 
 def test_every_task_has_defaults_to_train_with(capsys):

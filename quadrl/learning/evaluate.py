@@ -54,7 +54,7 @@ class Record:
         from quadrl.rendering import Flight
 
         steps = slice(0, int(self.length[episode]))
-        origin = np.array([0.0, 0.0, self.task.altitude])
+        origin = np.array([0.0, 0.0, self.task.origin_height(vehicle)])
         position = self.position[steps, episode] + origin
         return Flight(
             time=np.arange(1, len(position) + 1) * self.control_step,
