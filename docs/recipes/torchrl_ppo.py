@@ -8,6 +8,7 @@ quadrl's own. What a native batch changes: 64 aircraft of 32 steps make the batc
 """
 
 import json
+import logging
 import time
 import warnings
 from dataclasses import dataclass
@@ -74,6 +75,7 @@ def layers(size: int, outputs: int, gain: float) -> MLP:
 
 def main(args: Args) -> None:
     """Train, evaluate the mean action, print one JSON object."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it talks on standard output
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)  # nets this small only lose by a second thread
     seed = args.seed * args.num_envs  # aircraft i gets this + i
