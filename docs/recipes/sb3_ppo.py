@@ -4,7 +4,7 @@
 
 `PPO("MlpPolicy", "quadrl/Hover-v0")` works as it stands, one aircraft at a time. Stable-Baselines3
 has an interface of its own for several; `QuadrotorVecEnv` gives it the whole batch at once, which
-is many times faster than its DummyVecEnv. Settings: its PPO's defaults, but that 64 aircraft of 32
+is about twice as fast as its DummyVecEnv. Settings: its PPO's defaults, but that 64 aircraft of 32
 steps make the 2,048 transitions of a batch; VecNormalize, as its model zoo has it for MuJoCo.
 """
 

@@ -125,11 +125,8 @@ def main(args: Args) -> None:
         batch_size=args.minibatch,
     )
 
-    steps, began = 0, time.perf_counter()
+    steps, spent, began = 0, 0.0, time.perf_counter()
     for data in collector:
-        spent = max(steps / args.total_steps, (time.perf_counter() - began) / args.seconds)
-        if spent >= 1:
-            break
         steps += data.numel()
         for optimiser in optimisers:
             optimiser.param_groups[0]["lr"] = args.learning_rate * (1 - spent)
@@ -144,7 +141,9 @@ def main(args: Args) -> None:
                 for optimiser in optimisers:
                     optimiser.step()
                     optimiser.zero_grad()
-    seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - began
+        if (spent := max(steps / args.total_steps, seconds / args.seconds)) >= 1:
+            break
     collector.shutdown()
 
     statistics = normalise.to_observation_norm()
