@@ -360,6 +360,14 @@ RECIPES: dict[str, dict[str, Any]] = {
 """What a task trains with where the defaults are not its best."""
 
 
-def recipe(task: str) -> TrainConfig:
-    """The configuration that a task is trained with by default."""
-    return TrainConfig(task=task, **RECIPES.get(task, {}))
+ALGO_RECIPES: dict[str, dict[str, Any]] = {"gae": {"num_envs": 128, "rollout": 8}}
+"""What an algorithm trains with where the defaults are not its best."""
+
+
+def recipe(task: str, algo: str = "ppo") -> TrainConfig:
+    """The configuration that a task is trained with by default by an algorithm.
+
+    Raises:
+        ConfigError: Unknown task or algorithm.
+    """
+    return TrainConfig(task=task, algo=algo, **RECIPES.get(task, {}), **ALGO_RECIPES.get(algo, {}))

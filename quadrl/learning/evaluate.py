@@ -1,16 +1,19 @@
-"""Fly a controller through fresh episodes and judge it."""
+"""Fly a controller through fresh episodes, calm or in gusts, and judge it."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.signal import lfilter, welch
 
 from quadrl.environment import Environment
+from quadrl.simulation import BatchSimulation
 from quadrl.state import State
-from quadrl.task import Task
+from quadrl.task import OptionError, Task
 from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -22,6 +25,9 @@ Controller = Callable[[np.ndarray], np.ndarray]
 EVALUATION_SEED = 2_000_000_000
 """Beyond the seeds of every training (1000 * 2**20), so that evaluation episodes are fresh ones."""
 FINAL_STRETCH = 2.0  # [s], over which position_error_m is the mean
+GUST_TIME = 1.0  # [s], correlation time of the gusts
+SEGMENT = 40  # control steps in a segment of a spectrum
+WOBBLE_HZ = 2.0  # body rates above it are wobble, not flight: a position loop is slower
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +82,7 @@ def fly(
     episodes: int,
     seed: int = EVALUATION_SEED,
     vehicle: Vehicle | None = None,
+    gusts: float = 0.0,
 ) -> Record:
     """One episode of each of N aircraft.
 
@@ -85,9 +92,15 @@ def fly(
         episodes: N.
         seed: Aircraft i is seeded with seed + i.
         vehicle: The aircraft; None for the paper's.
+        gusts: Standard deviation of the wind in each direction [m/s]; see `make_gusts`. The
+            aircraft does not see it, and each flies in one of its own, which its seed gives.
+
+    Raises:
+        OptionError: The gusts are no speed.
     """
     environment = Environment(task, num_envs=episodes, seed=seed, vehicle=vehicle)
     observation = environment.flatten(environment.reset())
+    blow = _wind(environment, gusts, seed) if gusts else None
     names = [f.name for f in dataclasses.fields(Record)][:9]
     history: dict[str, list[np.ndarray]] = {name: [] for name in names}
     alive = np.ones(episodes, dtype=bool)
@@ -96,6 +109,8 @@ def fly(
     markers = tuple(environment.markers())
     while alive.any() and len(history["error"]) < environment.horizon_steps:
         action = np.clip(controller(observation), -1.0, 1.0)
+        if blow is not None:
+            blow(len(history["error"]))
         now = environment.step(action)
         observation = environment.flatten(now.observation)
         state: State = environment.simulation.state
@@ -119,13 +134,52 @@ def fly(
     )
 
 
+def make_gusts(
+    deviation: float, steps: int, control_step: float, seed: int | Sequence[int]
+) -> np.ndarray:
+    """Wind (steps, 3) [m/s], world: three processes of Ornstein and Uhlenbeck without a mean.
+
+    The spectrum is that of the longitudinal gusts of Dryden's model (MIL-F-8785C, 3.7.2.2) with
+    `GUST_TIME` for length over airspeed, in every direction.
+
+    Args:
+        deviation: Of each component, at any time [m/s].
+        steps: Control steps.
+        control_step: [s].
+        seed: Of the noise.
+    """
+    keep = np.exp(-control_step / GUST_TIME)
+    noise = np.random.default_rng(seed).normal(size=(steps, 3))
+    noise[1:] *= np.sqrt(1 - keep**2)  # the first is drawn from the distribution itself
+    return deviation * np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
+
+
+def _wind(environment: Environment, deviation: float, seed: int) -> Callable[[int], None]:
+    """A function that sets the wind of a control step for each aircraft of a batch."""
+    if not (deviation >= 0 and np.isfinite(deviation)):
+        raise OptionError(f"gusts = {deviation}: a speed in m/s, at least 0, is allowed")
+    simulation = environment.simulation
+    assert isinstance(simulation, BatchSimulation)
+    models = [copy.copy(simulation.model) for _ in range(environment.num_envs)]
+    settings = (deviation, environment.horizon_steps, environment.vehicle.control_step)
+    # Other streams than those of the episodes, which have one word of entropy.
+    wind = [make_gusts(*settings, seed=[seed + i, 1]) for i in range(len(models))]
+
+    def blow(step: int) -> None:
+        for model, speed in zip(models, wind, strict=True):
+            model.opt.wind = speed[step]
+        simulation.batch.set_models(models)  # it reads them anew only when it is given them
+
+    return blow
+
+
 def judge(record: Record) -> dict[str, Any]:
     """The figures of an evaluation.
 
     Returns:
-        episodes; success_rate and survival_rate (shares); position_error_m: mean of the error over
-        the last 2 s of the episodes [m]; return_mean and return_std; length_mean_s; diverged; and
-        the task's own.
+        episodes; success_rate and survival_rate (shares); position_error_m and
+        position_error_std_m: mean, and deviation over the episodes, of the error over the last 2 s
+        [m]; return_mean and return_std; length_mean_s; diverged; and the task's own.
     """
     steps = max(1, round(FINAL_STRETCH / record.control_step))
     number = np.arange(len(record.error))[:, None]
@@ -137,8 +191,59 @@ def judge(record: Record) -> dict[str, Any]:
         "success_rate": float(record.is_success.mean()),
         "survival_rate": float(1 - (record.terminated & ~record.is_success).mean()),
         "position_error_m": float(final.mean()),
+        "position_error_std_m": float(final.std()),
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
         "length_mean_s": float(record.length.mean() * record.control_step),
         "diverged": int(record.diverged.sum()),
     } | record.task.figures(record)
+
+
+def smoothness(record: Record, flights: np.ndarray | None = None) -> dict[str, Any]:
+    """How smoothly some flights were flown, means over them; not a number where there are none.
+
+    Args:
+        record: The flights.
+        flights: Mask (N,); None for those that succeed, since a fall is no flight.
+
+    Returns:
+        flights: how many. action_variation_1_s: sum of |change of an action|, mean of the rotors,
+        over the time [1/s]. Root mean squares: body_rate_rad_s, angular_acceleration_rad_s2,
+        jerk_m_s3 (from differences of the velocity). hold_body_rate_rad_s: the body rate's over
+        the last 2 s. wobble_share: share of the body rate's power above `WOBBLE_HZ`. frequency_hz,
+        body_rate_spectrum [rad^2/s^2/Hz], jerk_spectrum [m^2/s^6/Hz]: by Welch's method, summed
+        over the axes.
+    """
+    step = record.control_step
+    chosen = np.flatnonzero(record.is_success if flights is None else flights)
+    hold = round(FINAL_STRETCH / step)
+    names = (
+        "action_variation_1_s", "body_rate_rad_s", "angular_acceleration_rad_s2", "jerk_m_s3",
+        "hold_body_rate_rad_s",
+    )  # fmt: skip
+    rows, spectra = [], []
+    for i in chosen:
+        flown = slice(0, int(record.length[i]))
+        rate, velocity = record.body_rate[flown, i], record.velocity[flown, i]
+        variation = np.abs(np.diff(record.action[flown, i], axis=0)) / step
+        jerk = np.diff(velocity, n=2, axis=0) / step**2
+        if len(jerk) < SEGMENT:
+            continue
+        square = (rate, np.diff(rate, axis=0) / step, jerk, rate[-hold:])
+        rows.append([variation.mean(), *(np.sqrt((x**2).sum(-1).mean()) for x in square)])
+        welched = [
+            welch(x, fs=1 / step, nperseg=SEGMENT, axis=0)[1].sum(-1) for x in (rate, jerk)
+        ]
+        spectra.append(welched)
+    means = np.mean(rows, axis=0) if rows else np.full(len(names), np.nan)
+    frequency = np.fft.rfftfreq(SEGMENT, step)
+    spectrum = np.mean(spectra, axis=0) if spectra else np.full((2, len(frequency)), np.nan)
+    fast = spectrum[0][frequency > WOBBLE_HZ].sum() / spectrum[0].sum()
+    return {
+        "flights": len(rows),
+        **{name: float(value) for name, value in zip(names, means, strict=True)},
+        "wobble_share": float(fast),
+        "frequency_hz": frequency.tolist(),
+        "body_rate_spectrum": spectrum[0].tolist(),
+        "jerk_spectrum": spectrum[1].tolist(),
+    }
