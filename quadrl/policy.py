@@ -125,8 +125,8 @@ class Policy:
         file = path / FILE if path.is_dir() else path
         if not file.is_file():
             raise PolicyError(
-                f"no policy at {file}; give a run folder (quadrl train ... --out FOLDER makes one), "
-                "a .safetensors file, or a task that a policy comes with quadrl for"
+                f"no policy at {file}; give a run folder (quadrl train ... --out FOLDER makes one) "
+                "or a .safetensors file"
             )
         try:
             with safe_open(file, framework="numpy") as opened:

@@ -231,9 +231,7 @@ def smoothness(record: Record, flights: np.ndarray | None = None) -> dict[str, A
             continue
         square = (rate, np.diff(rate, axis=0) / step, jerk, rate[-hold:])
         rows.append([variation.mean(), *(np.sqrt((x**2).sum(-1).mean()) for x in square)])
-        welched = [
-            welch(x, fs=1 / step, nperseg=SEGMENT, axis=0)[1].sum(-1) for x in (rate, jerk)
-        ]
+        welched = [welch(x, fs=1 / step, nperseg=SEGMENT, axis=0)[1].sum(-1) for x in (rate, jerk)]
         spectra.append(welched)
     means = np.mean(rows, axis=0) if rows else np.full(len(names), np.nan)
     frequency = np.fft.rfftfreq(SEGMENT, step)
