@@ -236,7 +236,8 @@ def smoothness(record: Record, flights: np.ndarray | None = None) -> dict[str, A
     means = np.mean(rows, axis=0) if rows else np.full(len(names), np.nan)
     frequency = np.fft.rfftfreq(SEGMENT, step)
     spectrum = np.mean(spectra, axis=0) if spectra else np.full((2, len(frequency)), np.nan)
-    fast = spectrum[0][frequency > WOBBLE_HZ].sum() / spectrum[0].sum()
+    still = np.finfo(float).tiny  # no power at all: none of it is wobble
+    fast = spectrum[0][frequency > WOBBLE_HZ].sum() / np.maximum(spectrum[0].sum(), still)
     return {
         "flights": len(rows),
         **{name: float(value) for name, value in zip(names, means, strict=True)},

@@ -126,7 +126,7 @@ def learning_curves(
                 band = spread(runs, panel, clock)
                 if band is None:
                     continue
-                drawn = True
+                drawn = drawn or panel == "return"
                 x, (low, median, high) = band[0] * CLOCKS[clock][1], band[1]
                 axis = axes[row, column]
                 axis.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
@@ -206,7 +206,20 @@ def lines(
         if logarithmic:
             axis.set_yscale("log")
     axes[0].set_ylabel(labels[1])
-    axes[-1].legend(frameon=False, fontsize=8)
+    handles = {  # a line that one panel lacks is in another
+        label: handle
+        for axis in axes
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    if handles:
+        figure.legend(
+            handles.values(),
+            handles,
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+            fontsize=8,
+        )
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
     return _write(figure, path)
 
