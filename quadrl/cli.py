@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import itertools
 import json
 import os
 import sys
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -21,6 +22,7 @@ from quadrl import tasks
 from quadrl.description import describe, observation_rows, option_rows, reward_rows
 from quadrl.errors import QuadrlError
 from quadrl.learning.config import (
+    ALGORITHMS,
     CONFIG,
     RunError,
     TrainConfig,
@@ -133,8 +135,11 @@ class Train:
 class _Pilot:
     """Who flies what: common to the commands that fly without learning."""
 
-    policy: tyro.conf.Positional[Path | None] = None
-    """A run folder or a .safetensors file."""
+    policy: tyro.conf.Positional[str] = ""
+    """A run folder, a .safetensors file, or the name of a task: then the policy that comes with
+    quadrl flies it (a folder with the name of a task is written ./NAME)."""
+    algo: str = ""
+    """Of the policy that comes with quadrl, the algorithm that trained it; ppo by default."""
     controller: str = ""
     """A controller instead of a policy: geometric or lqr."""
     task: str = ""
@@ -155,13 +160,24 @@ class _Pilot:
         from quadrl import controllers
 
         _check_seed(self.seed)
-        if (self.policy is None) == (self.controller == ""):
+        if bool(self.policy) == bool(self.controller):
             raise OptionError(
-                "one of both is needed: a policy (a run folder or a .safetensors file), or "
+                "one of both is needed: a policy (a run folder, a .safetensors file, or a task for "
+                "which one comes with quadrl), or "
                 f"--controller {' or '.join(controllers.CONTROLLERS)} with --task"
             )
-        if self.policy is not None:
-            policy = Policy.load(self.policy)
+        if self.algo and self.policy not in tasks.TASKS:
+            raise OptionError(
+                f"--algo {self.algo} chooses among the policies that come with quadrl: give the "
+                "name of a task, or leave it out"
+            )
+        if self.policy:
+            shipped = self.policy in tasks.TASKS
+            policy = (
+                Policy.pretrained(self.policy, self.algo or "ppo")
+                if shipped
+                else Policy.load(self.policy)
+            )
             name, options, vehicle = _setting(policy, self.task, self.task_options)
             if self.vehicle:
                 check_choices([self.vehicle], VEHICLES, "vehicle")
@@ -240,19 +256,33 @@ class Render(_Pilot):
 
 @dataclasses.dataclass(frozen=True)
 class Plot:
-    """Draw the learning curve of a run again."""
+    """Draw the learning curve of a run again, or those of several runs over each other."""
 
-    run_folder: tyro.conf.Positional[Path]
-    """The run folder."""
+    run_folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders. Several are overlaid: a picture for each task, a curve for each algorithm with
+    the spread over its runs."""
     out: Path | None = None
-    """The picture; by default learning_curve.png in the run folder."""
+    """The picture; by default learning_curve.png in the run folder, or, of several runs,
+    learning_curves_TASK.png here."""
+    format: Literal["png", "pdf", "svg"] | None = None
+    """Kind of the picture; png by default, or what the name in --out ends in."""
 
     def run(self) -> None:
-        """Write the picture."""
-        out = self.out or self.run_folder / CURVE
-        if self.out:
-            _check_out(self.out)
-        _say(f"wrote {_draw_curve(self.run_folder, out)}")
+        """Write the pictures."""
+        out = self.out
+        if self.format and out and out.suffix != f".{self.format}":
+            raise OptionError(f"--out {out} is no .{self.format}: leave out --out or --format")
+        if not self.run_folders:
+            raise OptionError("which run? Give a run folder, or several: quadrl plot runs/*")
+        if out:
+            _check_out(out)
+        kind = f".{self.format or 'png'}"
+        if len(self.run_folders) == 1:
+            (folder,) = self.run_folders
+            _say(f"wrote {_draw_curve(folder, out or (folder / CURVE).with_suffix(kind))}")
+            return
+        for path in _draw_curves(self.run_folders, out, kind):
+            _say(f"wrote {path}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -398,9 +428,12 @@ class _ProgressBar:
 
 
 def _commands(arguments: list[str]) -> Any:
-    """The commands; a task has its own defaults for `train`."""
+    """The commands; a task and an algorithm have their own defaults for `train`."""
     named = [argument for argument in arguments if argument in tasks.TASKS]
-    train = Train(config=recipe(named[0] if named else "hover"))
+    algo = [second for first, second in itertools.pairwise(arguments) if first == "--algo"]
+    algo += [word.partition("=")[2] for word in arguments if word.startswith("--algo=")]
+    known = [name for name in algo if name in ALGORITHMS]  # others are refused by the configuration
+    train = Train(config=recipe(named[0] if named else "hover", known[-1] if known else "ppo"))
     annotated = [
         Annotated[
             kind,
@@ -480,12 +513,43 @@ def _evaluate(
     return {"task": task.name, "seed": seed} | judge(record), record
 
 
-def _draw_curve(folder: Path, path: Path) -> Path:
-    from quadrl.learning.figures import learning_curve, read_metrics
-
+def _read_run(folder: Path) -> dict[str, Any]:
     config = read_config(folder)
     if missing := {"task", "algo", "seed"} - set(config):
         raise RunError(f"{folder / CONFIG} does not say the run's {', '.join(sorted(missing))}")
+    return config
+
+
+def _draw_curves(folders: tuple[Path, ...], out: Path | None, kind: str) -> list[Path]:
+    """A picture for each task of several runs; what is no run yet is left out and said so.
+
+    Raises:
+        RunError: None of the folders holds a run that has begun.
+    """
+    from quadrl.learning.figures import FigureError, learning_curves, read_metrics
+
+    runs: dict[str, dict[str, list[Any]]] = {}
+    for folder in folders:
+        try:
+            config = _read_run(folder)
+            metrics = read_metrics(folder / "metrics.csv")
+        except (RunError, FigureError) as error:
+            _say(f"left out: {error}")
+            continue
+        runs.setdefault(config["task"], {}).setdefault(config["algo"], []).append(metrics)
+    if not runs:
+        raise RunError(f"none of the {len(folders)} folders holds a run to plot")
+    base = out or Path(f"learning_curves{kind}")
+    paths = {task: base.with_name(f"{base.stem}_{task}{base.suffix}") for task in runs}
+    if out and len(runs) == 1:
+        paths = dict.fromkeys(runs, out)
+    return [learning_curves(groups, task, paths[task]) for task, groups in runs.items()]
+
+
+def _draw_curve(folder: Path, path: Path) -> Path:
+    from quadrl.learning.figures import learning_curve, read_metrics
+
+    config = _read_run(folder)
     title = f"{config['task']}, {str(config['algo']).upper()}, seed {config['seed']}"
     return learning_curve(read_metrics(folder / "metrics.csv"), title, path)
 

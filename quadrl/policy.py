@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,10 @@ FORMAT = "quadrl-policy-1"
 FILE = "policy.safetensors"
 CLIP = 10.0
 """Normalised observations are held within +-CLIP."""
-
+LOG_VARIANCE = (-12.0, 2.0)
+"""Within which the log-variance of the actions is held."""
+SHIPPED = Path(__file__).parent / "assets" / "policies"
+"""The policies that come with the package: TASK_ALGO.safetensors, with a .json beside each."""
 
 HEADER = "quadrl"
 """The one entry of the file's table, JSON: of several, safetensors writes the order at random."""
@@ -69,6 +73,27 @@ class Policy:
         Raises:
             ValueError: The observation has another size.
         """
+        return np.clip(self._outputs(observation)[0], -1.0, 1.0)
+
+    def sampled(self, seed: int) -> Callable[[np.ndarray], np.ndarray]:
+        """The stochastic policy: observations as for the mean action to actions drawn anew.
+
+        They are drawn as in training: from a normal distribution, and clipped to [-1, 1].
+
+        Args:
+            seed: Of the draws.
+        """
+        generator = np.random.default_rng(seed)
+
+        def act(observation: np.ndarray) -> np.ndarray:
+            mean, log_variance = self._outputs(observation)
+            deviation = np.exp(0.5 * np.clip(log_variance, *LOG_VARIANCE))
+            return np.clip(mean + deviation * generator.standard_normal(mean.shape), -1.0, 1.0)
+
+        return act
+
+    def _outputs(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and log-variance (..., 4) of the actions."""
         observation = np.asarray(observation, dtype=np.float32)
         if observation.shape[-1:] != self.mean.shape:
             raise ValueError(
@@ -79,7 +104,8 @@ class Policy:
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = np.tanh(hidden @ weight.T + bias)
         output = hidden @ self.weights[-1].T + self.biases[-1]
-        return np.clip(output[..., : output.shape[-1] // 2], -1.0, 1.0)
+        half = output.shape[-1] // 2
+        return output[..., :half], output[..., half:]
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
@@ -122,6 +148,26 @@ class Policy:
         return cls._of_arrays(file, arrays, header)
 
     @classmethod
+    def pretrained(cls, task: str, algo: str = "ppo") -> Policy:
+        """A policy that comes with the package; how it was made stands in the .json beside it.
+
+        Args:
+            task: The task that it was trained for.
+            algo: The algorithm that it was trained with.
+
+        Raises:
+            PolicyError: There is none; the message lists those that there are.
+        """
+        file = SHIPPED / f"{task}_{algo}.safetensors"
+        if file not in (there := shipped()):
+            names = ", ".join("{} with {}".format(*known.stem.rsplit("_", 1)) for known in there)
+            raise PolicyError(
+                f"no policy comes with quadrl for {task} with {algo}; choices: {names or 'none'}; "
+                f"or train one with quadrl train {task} --algo {algo}"
+            )
+        return cls.load(file)
+
+    @classmethod
     def _of_arrays(
         cls, file: Path, arrays: dict[str, np.ndarray], header: dict[str, Any]
     ) -> Policy:
@@ -146,6 +192,11 @@ class Policy:
         if not known or not isinstance(metadata.get("task_options", {}), dict):
             raise PolicyError(f"{file} does not say what the policy was trained for")
         return cls(weights, biases, mean, deviation, task, metadata)
+
+
+def shipped() -> list[Path]:
+    """The files of the policies that come with the package, by name."""
+    return sorted(SHIPPED.glob("*.safetensors"))
 
 
 def write_whole(path: Path, content: bytes) -> None:

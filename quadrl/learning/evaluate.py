@@ -1,12 +1,13 @@
-"""Fly a controller through fresh episodes and judge it."""
+"""Fly a controller through fresh episodes, calm or in gusts, and judge it."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.signal import lfilter, welch
 
 from quadrl.environment import Environment
 from quadrl.state import State
@@ -23,6 +24,9 @@ that they are for."""
 EVALUATION_SEED = 2_000_000_000
 """Beyond the seeds of every training (1000 * 2**20), so that evaluation episodes are fresh ones."""
 FINAL_STRETCH = 2.0  # [s], over which position_error_m is the mean
+GUST_TIME = 1.0  # [s], correlation time of the gusts
+SEGMENT = 40  # control steps in a segment of a spectrum
+WOBBLE_HZ = 2.0  # body rates above it are wobble, not flight: a position loop is slower
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +82,7 @@ def fly(
     seed: int = EVALUATION_SEED,
     vehicle: Vehicle | None = None,
     action: str | None = None,
+    gusts: float = 0.0,
 ) -> Record:
     """One episode of each of N aircraft.
 
@@ -88,9 +93,11 @@ def fly(
         seed: Aircraft i is seeded with seed + i.
         vehicle: The aircraft; None for the paper's.
         action: What actions mean; None for what the controller says, or "rotor".
+        gusts: Standard deviation of the wind in each direction [m/s]; see `make_gusts`. The
+            aircraft does not see it, and each flies in one of its own, which its seed gives.
 
     Raises:
-        OptionError: The controller's actions are for another interface.
+        OptionError: The controller's actions are for another interface, or the gusts are no speed.
     """
     own = getattr(controller, "action", None)
     if None not in (action, own) and action != own:
@@ -102,6 +109,7 @@ def fly(
         task, num_envs=episodes, seed=seed, vehicle=vehicle, action=action or own or "rotor"
     )
     observation = environment.flatten(environment.reset())
+    winds = _wind(environment, gusts, seed) if gusts else None
     names = [f.name for f in dataclasses.fields(Record)][:9]
     history: dict[str, list[np.ndarray]] = {name: [] for name in names}
     alive = np.ones(episodes, dtype=bool)
@@ -110,6 +118,8 @@ def fly(
     markers = tuple(environment.markers())
     while alive.any() and len(history["error"]) < environment.horizon_steps:
         taken = np.clip(controller(observation), -1.0, 1.0)
+        if winds is not None:
+            environment.simulation.wind[:] = winds[len(history["error"])]
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         state: State = environment.simulation.state
@@ -133,13 +143,43 @@ def fly(
     )
 
 
+def make_gusts(
+    deviation: float, steps: int, control_step: float, seed: int | Sequence[int]
+) -> np.ndarray:
+    """Wind (steps, 3) [m/s], world: three processes of Ornstein and Uhlenbeck without a mean.
+
+    The spectrum is that of the longitudinal gusts of Dryden's model (MIL-F-8785C, 3.7.2.2) with
+    `GUST_TIME` for length over airspeed, in every direction.
+
+    Args:
+        deviation: Of each component, at any time [m/s].
+        steps: Control steps.
+        control_step: [s].
+        seed: Of the noise.
+    """
+    keep = np.exp(-control_step / GUST_TIME)
+    noise = np.random.default_rng(seed).normal(size=(steps, 3))
+    noise[1:] *= np.sqrt(1 - keep**2)  # the first is drawn from the distribution itself
+    return deviation * np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
+
+
+def _wind(environment: Environment, deviation: float, seed: int) -> np.ndarray:
+    """The wind of each control step for each aircraft of a batch, (steps, N, 3) [m/s]."""
+    if not (deviation >= 0 and np.isfinite(deviation)):
+        raise OptionError(f"gusts = {deviation}: a speed in m/s, at least 0, is allowed")
+    settings = (deviation, environment.horizon_steps, environment.vehicle.control_step)
+    # Other streams than those of the episodes, which have one word of entropy.
+    each = [make_gusts(*settings, seed=[seed + i, 1]) for i in range(environment.num_envs)]
+    return np.stack(each, axis=1)
+
+
 def judge(record: Record) -> dict[str, Any]:
     """The figures of an evaluation.
 
     Returns:
-        episodes; success_rate and survival_rate (shares); position_error_m: mean of the error over
-        the last 2 s of the episodes [m]; return_mean and return_std; length_mean_s; diverged; and
-        the task's own.
+        episodes; success_rate and survival_rate (shares); position_error_m and
+        position_error_std_m: mean, and deviation over the episodes, of the error over the last 2 s
+        [m]; return_mean and return_std; length_mean_s; diverged; and the task's own.
     """
     steps = max(1, round(FINAL_STRETCH / record.control_step))
     number = np.arange(len(record.error))[:, None]
@@ -151,8 +191,58 @@ def judge(record: Record) -> dict[str, Any]:
         "success_rate": float(record.is_success.mean()),
         "survival_rate": float(1 - (record.terminated & ~record.is_success).mean()),
         "position_error_m": float(final.mean()),
+        "position_error_std_m": float(final.std()),
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
         "length_mean_s": float(record.length.mean() * record.control_step),
         "diverged": int(record.diverged.sum()),
     } | record.task.figures(record)
+
+
+def smoothness(record: Record, flights: np.ndarray | None = None) -> dict[str, Any]:
+    """How smoothly some flights were flown, means over them; not a number where there are none.
+
+    Args:
+        record: The flights.
+        flights: Mask (N,); None for those that succeed, since a fall is no flight.
+
+    Returns:
+        flights: how many. action_variation_1_s: sum of |change of an action|, mean of the rotors,
+        over the time [1/s]. Root mean squares: body_rate_rad_s, angular_acceleration_rad_s2,
+        jerk_m_s3 (from differences of the velocity). hold_body_rate_rad_s: the body rate's over
+        the last 2 s. wobble_share: share of the body rate's power above `WOBBLE_HZ`. frequency_hz,
+        body_rate_spectrum [rad^2/s^2/Hz], jerk_spectrum [m^2/s^6/Hz]: by Welch's method, summed
+        over the axes.
+    """
+    step = record.control_step
+    chosen = np.flatnonzero(record.is_success if flights is None else flights)
+    hold = round(FINAL_STRETCH / step)
+    names = (
+        "action_variation_1_s", "body_rate_rad_s", "angular_acceleration_rad_s2", "jerk_m_s3",
+        "hold_body_rate_rad_s",
+    )  # fmt: skip
+    rows, spectra = [], []
+    for i in chosen:
+        flown = slice(0, int(record.length[i]))
+        rate, velocity = record.body_rate[flown, i], record.velocity[flown, i]
+        variation = np.abs(np.diff(record.action[flown, i], axis=0)) / step
+        jerk = np.diff(velocity, n=2, axis=0) / step**2
+        if len(jerk) < SEGMENT:
+            continue
+        square = (rate, np.diff(rate, axis=0) / step, jerk, rate[-hold:])
+        rows.append([variation.mean(), *(np.sqrt((x**2).sum(-1).mean()) for x in square)])
+        welched = [welch(x, fs=1 / step, nperseg=SEGMENT, axis=0)[1].sum(-1) for x in (rate, jerk)]
+        spectra.append(welched)
+    means = np.mean(rows, axis=0) if rows else np.full(len(names), np.nan)
+    frequency = np.fft.rfftfreq(SEGMENT, step)
+    spectrum = np.mean(spectra, axis=0) if spectra else np.full((2, len(frequency)), np.nan)
+    still = np.finfo(float).tiny  # no power at all: none of it is wobble
+    fast = spectrum[0][frequency > WOBBLE_HZ].sum() / np.maximum(spectrum[0].sum(), still)
+    return {
+        "flights": len(rows),
+        **{name: float(value) for name, value in zip(names, means, strict=True)},
+        "wobble_share": float(fast),
+        "frequency_hz": frequency.tolist(),
+        "body_rate_spectrum": spectrum[0].tolist(),
+        "jerk_spectrum": spectrum[1].tolist(),
+    }

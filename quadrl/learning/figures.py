@@ -1,12 +1,13 @@
-"""Plots of runs and flights, in the manner of the paper's figures 3 and 6."""
+"""Plots of runs and flights, in the manner of the paper's figures 3 to 7."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -29,6 +30,14 @@ PANELS = {
     "error": ("error [m]", "orange"),
 }
 """Of a learning curve: column of metrics.csv, label and colour."""
+COLOURS = {"ppo": "blue", "trpo": "orange", "gae": "green"}
+"""Of the algorithms; another gets one that is left."""
+CLOCKS = {
+    "steps": ("control steps [thousands]", 1e-3),
+    "seconds": ("wall clock of the training [s]", 1.0),
+}
+"""What learning curves are drawn over: column of metrics.csv, label and factor."""
+CURVE_POINTS = 200
 
 
 class FigureError(QuadrlError):
@@ -77,6 +86,141 @@ def learning_curve(metrics: dict[str, np.ndarray], title: str, path: Path) -> Pa
     axes[-1].set_xlabel("control steps [thousands], actions sampled from the policy")
     top = axes[0].secondary_xaxis("top", functions=_steps_to_seconds(steps, metrics["seconds"]))
     top.set_xlabel("wall clock [s]")
+    return _write(figure, path)
+
+
+def learning_curves(
+    groups: Mapping[str, Sequence[dict[str, np.ndarray]]],
+    title: str,
+    path: Path,
+    clocks: Sequence[str] = ("steps", "seconds"),
+) -> Path:
+    """Return and success of several trainings over each other; figures 3 to 5 of the paper.
+
+    Of each algorithm the median over its runs is drawn, and the band from the worst to the best.
+
+    Args:
+        groups: The metrics of the runs of each algorithm.
+        title: Of the picture.
+        path: The picture.
+        clocks: Of CLOCKS, a column each.
+
+    Raises:
+        FigureError: No episode has ended in any of the runs.
+    """
+    figure = Figure(figsize=(4.6 * max(len(clocks), 2), 5.4), layout="constrained")
+    panels = ("return", "success")
+    # With one clock the panels stand side by side.
+    shape = (len(panels), len(clocks)) if len(clocks) > 1 else (1, len(panels))
+    axes = figure.subplots(*shape, squeeze=False)
+    if len(clocks) == 1:
+        figure.set_size_inches(9.2, 3.2)
+        axes = axes.T
+    spare = iter(name for name in STYLE if name not in COLOURS.values())
+    drawn = False
+    for algo, runs in groups.items():
+        colour = STYLE[COLOURS[algo] if algo in COLOURS else next(spare, "grey")]
+        number = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
+        for column, clock in enumerate(clocks):
+            for row, panel in enumerate(panels):
+                band = spread(runs, panel, clock)
+                if band is None:
+                    continue
+                drawn = drawn or panel == "return"
+                x, (low, median, high) = band[0] * CLOCKS[clock][1], band[1]
+                axis = axes[row, column]
+                axis.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
+                axis.plot(x, median, color=colour, lw=1.8, label=f"{algo.upper()}, {number}")
+                axis.set_ylabel("return of an episode" if panel == "return" else "success [share]")
+                axis.set_xlabel(CLOCKS[clock][0])
+    if not drawn:
+        raise FigureError(f"nothing to plot yet for {title}: no episode has ended")
+    for axis in axes.flat:
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.set_xlim(left=0)
+    for axis in axes[1]:
+        axis.set_ylim(-0.03, 1.03)
+    axes[0, 0].legend(frameon=False, loc="lower right")
+    figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
+    return _write(figure, path)
+
+
+def spread(
+    runs: Sequence[dict[str, np.ndarray]], name: str, clock: str
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Worst, median and best (3, n) of a column over runs, and where (n,); None without any.
+
+    The points lie where every run has been; between the batches in which episodes ended a run is
+    interpolated.
+    """
+    curves = []
+    for run in runs:
+        ended = np.isfinite(run[name])
+        if ended.any():
+            curves.append((run[clock][ended], run[name][ended]))
+    if not curves:
+        return None
+    low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+    if high < low:  # one was stopped before another's first episode ended
+        return None
+    points = np.linspace(low, high, CURVE_POINTS)
+    values = np.array([np.interp(points, x, y) for x, y in curves])
+    return points, np.quantile(values, (0.0, 0.5, 1.0), axis=0)
+
+
+def lines(
+    panels: Mapping[str, Mapping[str, tuple[Sequence[float], np.ndarray]]],
+    labels: tuple[str, str],
+    title: str,
+    path: Path,
+    *,
+    logarithmic: bool = False,
+) -> Path:
+    """Figures over something, with the spread over seeds, a panel each.
+
+    Args:
+        panels: Of each panel by its title, by the name of the line: where (n,), and the values of
+            the seeds (seeds, n). The name begins with the algorithm; dashed if it ends in
+            "sampled", in grey if it is no algorithm.
+        labels: Of the axes.
+        title: Of the picture.
+        path: The picture.
+        logarithmic: Whether the values are.
+    """
+    figure = Figure(figsize=(3.6 * len(panels), 3.3), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (name, drawn) in zip(axes, panels.items(), strict=True):
+        for label, (x, values) in drawn.items():
+            colour = STYLE[COLOURS.get(label.split()[0].lower(), "grey")]
+            dashes = "--" if label.endswith("sampled") else "-"
+            known = values[np.isfinite(values).all(axis=1)]
+            if len(known):
+                low, median, high = np.quantile(known, (0.0, 0.5, 1.0), axis=0)
+                axis.fill_between(x, low, high, color=colour, alpha=0.12, lw=0)
+                axis.plot(x, median, dashes, color=colour, lw=1.6, label=label)
+        axis.set_title(name, fontsize=10)
+        axis.set_xlabel(labels[0])
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+        if logarithmic:
+            axis.set_yscale("log")
+    axes[0].set_ylabel(labels[1])
+    handles = {  # a line that one panel lacks is in another
+        label: handle
+        for axis in axes
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    if handles:
+        figure.legend(
+            handles.values(),
+            handles,
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+            fontsize=8,
+        )
+    figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
     return _write(figure, path)
 
 
@@ -149,7 +293,10 @@ def _write(figure: Figure, path: Path) -> Path:
     if kind not in kinds:
         raise FigureError(f"{path}: a picture's name ends in one of .{', .'.join(sorted(kinds))}")
     picture = io.BytesIO()
-    figure.savefig(picture, dpi=DPI, format=kind)
+    # Neither the date nor names drawn at random: the same figures make the same file.
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    with matplotlib.rc_context({"svg.hashsalt": "quadrl"}):
+        figure.savefig(picture, dpi=DPI, format=kind, metadata=undated)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, picture.getvalue())
     return path

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 
-from quadrl.policy import CLIP, Policy
+from quadrl.policy import CLIP, LOG_VARIANCE, Policy
 
 
 class Normaliser(nn.Module):
@@ -55,7 +55,7 @@ class MeanAndDeviation(nn.Module):
     def forward(self, output: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and standard deviation (..., actions) from outputs (..., 2 * actions)."""
         mean, log_variance = output.chunk(2, -1)
-        return mean, (0.5 * log_variance.clamp(-12.0, 2.0)).exp()
+        return mean, (0.5 * log_variance.clamp(*LOG_VARIANCE)).exp()
 
 
 def make_layers(size: int, hidden: tuple[int, ...], outputs: int, gain: float) -> list[nn.Linear]:
