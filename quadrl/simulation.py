@@ -270,11 +270,16 @@ class SingleSimulation(Simulation):
             NativeError: The rotor callbacks were taken away.
         """
         steps = steps or self.vehicle.substeps
-        if self._flight and self._flight.advance(steps) is None:
-            self.data.time += steps * self.model.opt.timestep
-            return
-        native.check_installed()
-        mujoco.mj_step(self.model, self.data, steps)
+        if not self.fly(steps):
+            native.check_installed()
+            mujoco.mj_step(self.model, self.data, steps)
+
+    def fly(self, steps: int) -> bool:
+        """Advance in free flight, if that is the engine and there is nothing to touch; whether."""
+        if self._flight is None or self._flight.advance(steps) is not None:
+            return False
+        self.data.time += steps * self.model.opt.timestep
+        return True
 
     def clear(self, rows: Rows) -> None:
         """Reset the data: warm start, warnings, time."""

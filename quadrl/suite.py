@@ -28,7 +28,7 @@ from dm_env import specs
 
 from quadrl import interfaces, native, tasks
 from quadrl.environment import Environment, Transition
-from quadrl.simulation import SingleSimulation
+from quadrl.simulation import ENGINES, Engine, SingleSimulation
 from quadrl.task import Task, check_choices
 from quadrl.vehicle import Vehicle
 
@@ -53,6 +53,8 @@ BENCHMARKING: tuple[tuple[str, str], ...] = ()
 class Physics(mujoco.Physics):
     """The complete model of the aircraft, drawn parts included."""
 
+    simulation: SingleSimulation | None = None
+    """Flies it, where free flight is the engine; None before the first episode."""
     inner_loop: Callable[[], None] | None = None
     """Commands the rotors before each physics step, where the action interface has loops."""
 
@@ -62,13 +64,19 @@ class Physics(mujoco.Physics):
         Raises:
             NativeError: The rotor callbacks were taken away.
         """
-        native.check_installed()
         if self.inner_loop is None:
-            super().step(nstep)
+            self._advance(nstep)
             return
         for _ in range(nstep):
             self.inner_loop()
-            super().step()
+            self._advance(1)
+
+    def _advance(self, steps: int) -> None:
+        if self.simulation is not None and self.simulation.fly(steps):
+            self.forward()  # what is drawn and measured belongs to the new state
+            return
+        native.check_installed()
+        super().step(steps)
 
     @contextlib.contextmanager
     def check_invalid_state(self) -> Generator[None]:
@@ -85,6 +93,7 @@ class QuadrotorTask(base.Task):
         vehicle: Vehicle,
         random: Any = None,  # noqa: ANN401
         action: str = "rotor",
+        engine: Engine = "mujoco",
     ) -> None:
         """Wrap a task.
 
@@ -94,11 +103,13 @@ class QuadrotorTask(base.Task):
             random: Seed, RandomState or None, as dm_control has it. A seed gives the episodes
                 that every other door gives with it.
             action: What actions mean, a name of `quadrl.interfaces.INTERFACES`.
+            engine: "mujoco", or "flight": free flight wherever there is nothing to touch.
         """
         super().__init__(random)
         is_seed = isinstance(random, (int, np.integer))
         self._seed = int(random) if is_seed else int(self.random.randint(2**31))
-        self._task, self._vehicle = task, vehicle
+        check_choices([engine], ENGINES, "engine")
+        self._task, self._vehicle, self._engine = task, vehicle, engine
         self._interface = interfaces.make(action, vehicle)
         self._environment: Any = None  # an Environment from the first episode on
         self._physics: Physics | None = None
@@ -116,8 +127,12 @@ class QuadrotorTask(base.Task):
         """Begin an episode."""
         if self._environment is None or self._physics is not physics:
             altitude = self._task.origin_height(self._vehicle)
-            simulation = SingleSimulation(
-                self._vehicle, physics.model.ptr, physics.data.ptr, altitude=altitude
+            simulation = physics.simulation = SingleSimulation(
+                self._vehicle,
+                physics.model.ptr,
+                physics.data.ptr,
+                altitude=altitude,
+                engine=self._engine,
             )
             environment = Environment(
                 self._task, seed=self._seed, simulation=simulation, action=self._interface.name
@@ -163,6 +178,7 @@ def make(
     environment_kwargs: dict[str, Any] | None = None,
     vehicle: Vehicle | None = None,
     action: str = "rotor",
+    engine: Engine = "mujoco",
     **options: Any,  # noqa: ANN401
 ) -> control.Environment:
     """Build the environment of a task.
@@ -174,6 +190,7 @@ def make(
         environment_kwargs: As `load` has them.
         vehicle: The aircraft; None for the paper's.
         action: What actions mean, a name of `quadrl.interfaces.INTERFACES`.
+        engine: "mujoco", or "flight": free flight wherever there is nothing to touch.
         **options: Fields of the task.
 
     Raises:
@@ -198,7 +215,7 @@ def make(
     model.opt.disableflags |= int(_mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     return control.Environment(
         Physics.from_model(wrapper.MjModel(model)),
-        QuadrotorTask(task, vehicle, random, action),
+        QuadrotorTask(task, vehicle, random, action, engine),
         n_sub_steps=vehicle.substeps,
         **settings,
     )
@@ -217,7 +234,8 @@ def load(
         domain_name: "quadrotor".
         task_name: A name of the catalogue.
         task_kwargs: `random` (seed), `time_limit` [s], `vehicle`, `action` (what actions mean, a
-            name of `quadrl.interfaces.INTERFACES`), and any field of the task.
+            name of `quadrl.interfaces.INTERFACES`), `engine` ("mujoco" or "flight"), and any field
+            of the task.
         environment_kwargs: `time_limit` and `control_timestep` [s], `n_sub_steps`,
             `flat_observation`, `legacy_step`: those of `dm_control.rl.control.Environment`.
         visualize_reward: Colour the aircraft by its reward, clipped to [0, 1].

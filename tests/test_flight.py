@@ -1,17 +1,25 @@
 """The free-flight engine: against the exact solution, against MuJoCo, and where it hands over."""
 
 import dataclasses
+import json
 import math
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 import reference
+import torch
 from scipy.spatial.transform import Rotation
 
+import quadrl
 from quadrl import tasks
 from quadrl.environment import Environment
+from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.flight import EngineError, parameters
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.train import Training
+from quadrl.policy import Policy
 from quadrl.simulation import BatchSimulation, SingleSimulation
 from quadrl.task import OptionError
 from quadrl.vehicle import VEHICLES, Vehicle
@@ -223,6 +231,71 @@ def test_an_aircraft_that_breaks_down_is_counted_and_leaves_the_others_alone():
     assert now.terminated[4] and np.isfinite(now.reward).all()
     others = np.arange(9) != 4
     np.testing.assert_array_equal(now.reward[others], sound.reward[others])
+
+
+# ---------------------------------------------------------------------------------------- the doors
+
+
+def through_dm_control(task, actions):
+    door = quadrl.load(task, {"random": 7, "engine": "flight"})
+    door.reset()
+    for action in actions[:, 0]:
+        door.step(action)
+    data = door.physics.data
+    np.testing.assert_array_equal(data.body("aircraft").xpos, data.qpos[:3])  # drawn where it is
+    return data.qpos
+
+
+def through_gymnasium(task, actions):
+    door = gym.make(gymnasium_id(task), engine="flight")
+    door.reset(seed=7)
+    for action in actions[:, 0]:
+        door.step(action)
+    return door.unwrapped.environment.simulation.qpos
+
+
+def through_gymnasium_vector(task, actions):
+    door = gym.make_vec(gymnasium_id(task), num_envs=3, engine="flight")
+    door.reset(seed=7)
+    for action in actions:
+        door.step(action)
+    return door.unwrapped.environment.simulation.qpos[0]
+
+
+def through_torchrl(task, actions):
+    door = QuadrotorEnv(task, 3, seed=7, engine="flight")
+    state = door.reset()
+    for action in actions:
+        state = door.step(state.set("action", torch.from_numpy(action)))["next"]
+    return door.environment.simulation.qpos[0]
+
+
+def gymnasium_id(task):
+    return f"quadrl/{''.join(word.capitalize() for word in task.split('_'))}-v0"
+
+
+@pytest.mark.parametrize("task", ["hover", "landing"])
+@pytest.mark.parametrize(
+    "door", [through_dm_control, through_gymnasium, through_gymnasium_vector, through_torchrl]
+)
+def test_every_door_flies_it_bit_by_bit(task, door):
+    # Landing's aircraft comes down from 3 m: from free flight into MuJoCo's hands.
+    actions = np.random.default_rng(1).uniform(-1, -0.2, (12, 3, 4)).astype(np.float32)
+    environment = Environment(task, num_envs=2, seed=7, engine="flight")
+    environment.reset()
+    for action in actions:
+        environment.step(action[:2])
+    np.testing.assert_array_equal(door(task, actions), environment.simulation.qpos[0])
+
+
+def test_training_in_it_is_judged_in_mujoco(tmp_path):
+    # What the run records of itself; its evaluation has no option for another engine.
+    config = TrainConfig(engine="flight", num_envs=8, rollout=4, steps=64)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    Training(config, folder).run()
+    assert json.loads((folder / "config.json").read_text())["engine"] == "flight"
+    assert Policy.load(folder)(np.zeros(22, np.float32)).shape == (4,)
 
 
 # ---------------------------------------------------------------------------------- what it refuses

@@ -16,6 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from quadrl import tasks
 from quadrl.environment import Environment, Transition
+from quadrl.simulation import Engine
 from quadrl.task import OptionError, Task, check_choices
 from quadrl.vehicle import Vehicle
 
@@ -36,6 +37,7 @@ class _Door:
         action: str = "rotor",
         max_episode_steps: int | None = None,
         num_threads: int = 0,
+        engine: Engine = "mujoco",
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
@@ -54,6 +56,7 @@ class _Door:
             num_envs=num_envs,
             vehicle=vehicle,
             num_threads=num_threads,
+            engine=engine,
             action=action,
         )
         self.render_mode, self._terms_wanted = render_mode, reward_terms

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from quadrl import tasks
 from quadrl.environment import Environment
+from quadrl.simulation import Engine
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle
 
@@ -38,6 +39,7 @@ class QuadrotorEnv(EnvBase):
         vehicle: Vehicle | None = None,
         action: str = "rotor",
         num_threads: int = 0,
+        engine: Engine = "mujoco",
         reward_terms: bool = False,
         **options: Any,  # noqa: ANN401 - of the task's own types
     ) -> None:
@@ -51,6 +53,7 @@ class QuadrotorEnv(EnvBase):
             vehicle: The aircraft; None for the paper's.
             action: What actions mean, a name of `quadrl.interfaces.INTERFACES`.
             num_threads: Threads of the simulation; 0 for every core.
+            engine: "mujoco", or "flight": free flight wherever there is nothing to touch.
             reward_terms: Whether to give the named terms of the reward (they cost time).
             **options: Fields of the task.
 
@@ -63,6 +66,7 @@ class QuadrotorEnv(EnvBase):
             seed=seed,
             vehicle=vehicle,
             num_threads=num_threads,
+            engine=engine,
             action=action,
         )
         super().__init__(device=device, batch_size=torch.Size([num_envs]))

@@ -15,6 +15,7 @@ from quadrl.environment import MAX_ENVS
 from quadrl.errors import QuadrlError
 from quadrl.interfaces import INTERFACES
 from quadrl.policy import write_whole
+from quadrl.simulation import ENGINES, Engine
 from quadrl.task import OptionError, Task, check_choices
 from quadrl.vehicle import VEHICLES
 
@@ -184,6 +185,9 @@ class TrainConfig:
     """Name of the aircraft."""
     action: str = "rotor"
     """What actions mean: rotor (the paper's), thrust_body_rate, velocity or position."""
+    engine: Engine = "mujoco"
+    """What the training flies in: mujoco, or flight (free flight wherever there is nothing to
+    touch). Evaluations fly in mujoco."""
     task_options: tuple[str, ...] = ()
     """Fields of the task that differ from its defaults, such as horizon=5."""
     num_envs: int = 256
@@ -247,6 +251,7 @@ class TrainConfig:
             _check_number("width of a hidden layer", width, 1, 1 << 16)
         check_choices([self.vehicle], VEHICLES, "vehicle")
         check_choices([self.action], INTERFACES, "action interface")
+        check_choices([self.engine], ENGINES, "engine")
         check_choices([self.algo], ALGORITHMS, "algorithm")
         make_task(self.task, self.options)
 

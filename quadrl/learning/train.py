@@ -86,6 +86,7 @@ class Training:
             vehicle=VEHICLES[config.vehicle],
             action=config.action,
             num_threads=config.num_threads,
+            engine=config.engine,
             **config.options,
         )
         self.actor, self.critic, self.normaliser = make_actor_critic(
