@@ -548,7 +548,8 @@ def _describe(task: Task) -> None:
         first = last
     console.print(table)
     console.print(
-        "\naction: four numbers in -1..1, change of the rotor speed commands from hover\n"
+        "\naction: four numbers in -1..1, change of the rotor speed commands from hover "
+        "(--action has others)\n"
     )
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
     for column in ("option", "default"):
