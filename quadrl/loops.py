@@ -92,7 +92,7 @@ class Gains:
 class Loops:
     """Nested loops for aircraft of any leading shape, without a memory.
 
-    From the outermost: `approach`, `specific_force`, `attitude_rate`, `rotor_command`.
+    From the outermost: `approach`, `specific_force`, `attitude_rate` and `thrust`, `rotor_command`.
     """
 
     def __init__(
@@ -205,7 +205,7 @@ class Loops:
         vehicle, omega = self.vehicle, motion.body_rate
         turn = -self._spin_rate * (omega - body_rate)
         turn = np.clip(turn, -self._max_turn, self._max_turn)
-        moment = self._inertia * turn + np.cross(omega, self._inertia * omega)
+        moment = self._inertia * turn + cross(omega, self._inertia * omega)
         moment = moment + vehicle.moment_coefficient * norm(omega)[..., None] * omega
         now = to_world(self._mixer, motion.rotor_speed**2)
         command = now + self._lead * (np.concatenate([thrust, moment], axis=-1) - now)
@@ -294,9 +294,9 @@ def desired_rotation(force: np.ndarray, heading: np.ndarray) -> np.ndarray:
     """R_d (..., 3, 3): b3 along a force (..., 3), b1 over a heading (..., 2)."""
     b1 = np.concatenate([heading, np.zeros_like(heading[..., :1])], axis=-1)
     b3 = force / norm(force)[..., None]
-    b2 = np.cross(b3, b1)
+    b2 = cross(b3, b1)
     b2 = b2 / norm(b2)[..., None]
-    return np.stack([np.cross(b2, b3), b2, b3], axis=-1)
+    return np.stack([cross(b2, b3), b2, b3], axis=-1)
 
 
 def approach_velocity(offset: np.ndarray, rate: float, brake: float, fastest: float) -> np.ndarray:
@@ -314,3 +314,9 @@ def approach_velocity(offset: np.ndarray, rate: float, brake: float, fastest: fl
 def limited(vector: np.ndarray, largest: float) -> np.ndarray:
     """The vectors (..., k), shortened to a length of at most `largest`."""
     return vector * (largest / np.maximum(norm(vector), largest))[..., None]
+
+
+def cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Cross product (..., 3): NumPy's own takes four times as long for one aircraft."""
+    ahead, back = [1, 2, 0], [2, 0, 1]
+    return first[..., ahead] * second[..., back] - first[..., back] * second[..., ahead]

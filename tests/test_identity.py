@@ -59,6 +59,19 @@ def test_door_gives_the_numbers_of_a_plain_mj_step_loop(name, door, plain_loop):
         assert flight["observation"].dtype == flight["reward"].dtype == np.float64
 
 
+@pytest.mark.parametrize("action", [name for name in INTERFACES if name != "rotor"])
+@pytest.mark.parametrize("name", ["hover", "landing"])  # in free flight, and with contact
+def test_every_interface_gives_the_same_numbers_through_every_door(name, action):
+    task, actions = make(name, horizon=1.0), ACTIONS[:50]
+    expected = testing.fly("mj_step", task, SEED, actions, action)
+    assert expected["truncated"].sum() >= 2  # several episodes
+    for door in testing.DOORS[1:]:
+        flight = testing.fly(door, task, SEED, actions, action)
+        for column in testing.COLUMNS:
+            cast = expected[column].astype(flight[column].dtype)
+            np.testing.assert_array_equal(flight[column], cast, err_msg=f"{door}: {column}")
+
+
 @dataclasses.dataclass(frozen=True)
 class Dropped(Hover):
     """Falls to the ground, bounces and lies there."""

@@ -1,9 +1,7 @@
 """Geometric tracking control on SE(3), with the lag of the rotors in the design.
 
-Lee, Leok and McClamroch, "Geometric Tracking Control of a Quadrotor UAV on SE(3)", CDC 2010. Their
-force and moment act at once; here they come through rotors that lag, once a control step, from a
-narrow range of commands. So the gains place the poles of the whole chain from moment to position,
-sampled as it is flown, and each loop asks of the next one only what the rotors can give.
+Lee, Leok and McClamroch, "Geometric Tracking Control of a Quadrotor UAV on SE(3)", CDC 2010. The
+loops are those of `quadrl.loops`, flown at the control step; here stands how each task is flown.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Door two: Gymnasium, one aircraft or a native vector of them.
 
 The observation is the flat float32 vector of the task's parts (`environment.layout` says which
-entry is what); the action is Box(-1, 1, (4,)), what it means is the option `action`'s. `info` of a step carries `reward_terms`,
-`is_success`, `error` [m] and `diverged`. A new version of an id (-vN) means other numbers.
+entry is what); the action is Box(-1, 1, (4,)), and the option `action` says what it means. `info`
+of a step carries `reward_terms`, `is_success`, `error` [m] and `diverged`. A new version of an id
+(-vN) means other numbers.
 """
 
 from __future__ import annotations
@@ -102,13 +103,15 @@ class QuadrotorEnv(_Door, gym.Env):
 
         Args:
             task: A name of the catalogue or a task.
-            **settings: `vehicle` (None: the paper's); `action` ("rotor", or another name of
-                `quadrl.interfaces.INTERFACES`); `max_episode_steps` (None: the task's horizon); `render_mode` (None or "rgb_array"), `width` and `height` [pixels] and
-                `camera` (a camera of `quadrl.rendering`) of a picture; `reward_terms` (True: in
-                `info`); any field of the task.
+            **settings: `vehicle` (None: the paper's); `action` (what actions mean: "rotor", or
+                another name of `quadrl.interfaces.INTERFACES`); `max_episode_steps` (None: the
+                task's horizon); `render_mode` (None or "rgb_array"), `width` and `height`
+                [pixels] and `camera` (a camera of `quadrl.rendering`) of a picture;
+                `reward_terms` (True: in `info`); any field of the task.
 
         Raises:
-            OptionError: Unknown task, interface, option or render mode; the message lists the choices.
+            OptionError: Unknown task, interface, option or render mode; the message lists what
+                there is.
         """
         self.observation_space, self.action_space = self._make(task, None, **settings)
 
@@ -178,7 +181,8 @@ class QuadrotorVectorEnv(_Door, VectorEnv):
             **settings: As `QuadrotorEnv` has them, and `num_threads` (0: every core).
 
         Raises:
-            OptionError: Unknown task, interface, option or mode, or an impossible number of environments.
+            OptionError: Unknown task, interface, option or mode, or an impossible number of
+                environments.
         """
         modes = {mode.value: mode for mode in AutoresetMode} | dict(AutoresetMode.__members__)
         if not isinstance(autoreset_mode, AutoresetMode):
