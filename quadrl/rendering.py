@@ -25,17 +25,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadrl.errors import QuadrlError
 from quadrl.task import GOAL_RGBA, Marker, OptionError, check_choices
+from quadrl.vehicle import DRAWN_ARM_LENGTH
 
 Array = NDArray[np.floating[Any]]
 
 # The camera of videos: moves with the aircraft, keeps the goal in view, never turns or rolls.
 FOLLOW = "follow"
 FOLLOW_AZIMUTH, FOLLOW_ELEVATION = 30.0, -21.0  # [deg]
-FOLLOW_DISTANCE = (1.8, 7.0)  # [m]
+FOLLOW_DISTANCE = (1.35, 7.0)  # [m]; the nearer one of the paper's aircraft
+FOLLOW_ROOM = np.array([2.0, 2.0, 3.0])  # [m] back for each metre east, north and up of the centre
 FOLLOW_SMOOTHING = 0.4  # [s], standard deviation of the low pass
 TRAIL_SEGMENTS = 120
 TRAIL_SECONDS = 4.0
 TRAIL_WIDTH = 0.008  # [m]
+PAD_RGBA = (0.10, 0.13, 0.17, 1.0)
 TRAIL_OLD, TRAIL_NEW = np.array([0.35, 0.55, 0.80, 1.0]), np.array([1.0, 0.72, 0.30, 1.0])
 GOAL_RADIUS = 0.08  # [m]
 FASTEST_GOAL = 10.0  # [m/s]; one that moves faster has jumped
@@ -113,6 +116,7 @@ class Renderer:
         _check_size(model, width, height)
         self.model = model
         self._data = mujoco.MjData(model)
+        self._scale = aircraft_scale(model)
         with _current_context_kept():
             self._renderer = _open(model, width, height)
         self._blades = [  # (blade, its hub, index of its rotor)
@@ -164,15 +168,15 @@ class Renderer:
         position = data.qpos[:3].copy()
         target = position if goal is None else np.asarray(goal, dtype=float)
         if camera == FOLLOW:
-            camera = follow_cameras(position[None], target[None])[0]
+            camera = follow_cameras(position[None], [in_view(target, markers)], 0.0, self._scale)[0]
         self._renderer.update_scene(data, camera)
         if trail is not None:
             self._draw_trail(np.asarray(trail, dtype=float))
         if goal is not None:
             # It fades as the aircraft comes near, so as not to veil it.
-            nearness = np.clip(np.linalg.norm(target - position) / 0.4, 0.25, 1.0)
-            rgba = (*GOAL_RGBA[:3], GOAL_RGBA[3] * float(nearness))
-            self._draw_marker(Marker("goal", tuple(target), GOAL_RADIUS, rgba))
+            away = np.linalg.norm(target - position) / self._scale
+            rgba = (*GOAL_RGBA[:3], GOAL_RGBA[3] * float(np.clip(away / 0.4, 0.1, 1.0)))
+            self._draw_marker(Marker("goal", tuple(target), GOAL_RADIUS * self._scale, rgba))
         for marker in markers:
             self._draw_marker(marker)
         with _current_context_kept():
@@ -247,7 +251,7 @@ class Renderer:
         colours = TRAIL_OLD + youth[:, None] * (TRAIL_NEW - TRAIL_OLD)
         # Boxes are the cheapest shape: a trail of capsules took 40 ms a frame.
         box = mujoco.mjtGeom.mjGEOM_BOX
-        self._draw_chain(box, points[shown], colours, TRAIL_WIDTH * youth**0.7)
+        self._draw_chain(box, points[shown], colours, self._scale * TRAIL_WIDTH * youth**0.7)
 
     def _draw_marker(self, marker: Marker) -> None:
         shape, size, rgba = mujoco.mjtGeom, marker.size, marker.rgba
@@ -259,20 +263,26 @@ class Renderer:
         mujoco.mju_quat2Mat(axes, quaternion)
         axes = axes.reshape(3, 3)
         if marker.kind in ("goal", "sphere"):
-            self._add(shape.mjGEOM_SPHERE, rgba, (size,) * 3, position, axes)
+            ball = self._add(shape.mjGEOM_SPHERE, rgba, (size,) * 3, position, axes)
+            ball.label = marker.label
         if marker.kind == "goal":
             foot = np.array([position[0], position[1], 0.004])  # [m], clear of the ground
             self._add(shape.mjGEOM_SPHERE, solid, (0.22 * size,) * 3, position, axes)
             self._connect(shape.mjGEOM_CYLINDER, (*rgba[:3], 0.55), 0.004, foot, position)
             self._draw_marker(Marker("ring", tuple(foot), 1.8 * size, (*rgba[:3], 0.7)))
-        elif marker.kind in ("ring", "pad"):
-            angle = np.linspace(0, 2 * np.pi, 49)
-            circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
-            width = np.full(49, 0.02 * size + 0.003)
-            edge, colours = position + size * circle @ axes.T, np.tile((*rgba[:3], 1), (49, 1))
-            self._draw_chain(shape.mjGEOM_CAPSULE, edge, colours, width)
-            if marker.kind == "pad":
-                self._add(shape.mjGEOM_CYLINDER, rgba, (size, 0.002, 0), position, axes)
+        elif marker.kind == "ring":
+            self._draw_circle(position, axes, size, rgba)
+        elif marker.kind == "pad":
+            if marker.end is None:
+                position = np.array([position[0], position[1], 0.0])
+            self._add(shape.mjGEOM_CYLINDER, PAD_RGBA, (size, 0.002, 0), position, axes)
+            for share in (1.0, 0.62):
+                self._draw_circle(position, axes, share * size, rgba)
+            # The letter H: where its two posts and its bar are, and half of their extents.
+            for x, width, height in ((-0.17, 0.045, 0.29), (0.17, 0.045, 0.29), (0, 0.17, 0.04)):
+                centre = position + axes @ (size * x, 0.0, 0.003)
+                extent = (size * width, size * height, 0.001)
+                self._add(shape.mjGEOM_BOX, rgba, extent, centre, axes)
         elif marker.kind == "path":
             points = np.asarray(marker.points, dtype=float)
             colours, width = np.tile(rgba, (len(points), 1)), np.full(len(points), size)
@@ -282,25 +292,53 @@ class Renderer:
             kind = shape.mjGEOM_ARROW if arrow else shape.mjGEOM_CYLINDER
             self._connect(kind, rgba, size, position, end)
 
+    def _draw_circle(
+        self, centre: Array, axes: Array, radius: float, rgba: Sequence[float]
+    ) -> None:
+        angle = np.linspace(0, 2 * np.pi, 49)
+        circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+        width, colours = np.full(49, 0.02 * radius + 0.003), np.tile((*rgba[:3], 1), (49, 1))
+        edge = centre + radius * circle @ axes.T
+        self._draw_chain(mujoco.mjtGeom.mjGEOM_CAPSULE, edge, colours, width)
 
-def follow_cameras(position: Array, goal: Array, smoothing: float = 0.0) -> list[mujoco.MjvCamera]:
-    """Cameras that follow a flight smoothly and step back to keep the goal in view.
+
+def aircraft_scale(model: mujoco.MjModel) -> float:
+    """Size of a model's aircraft, as a multiple of the paper's."""
+    return float(np.linalg.norm(model.site("rotor_1").pos[:2])) / DRAWN_ARM_LENGTH
+
+
+def in_view(goal: Array, markers: Sequence[Marker]) -> Array:
+    """What a camera should not lose, (n, 3) [m]: the goal and the spheres, goals to come."""
+    return np.array([goal, *(m.position for m in markers if m.kind == "sphere")])
+
+
+def follow_cameras(
+    position: Array, shown: Sequence[Array], smoothing: float = 0.0, scale: float = 1.0
+) -> list[mujoco.MjvCamera]:
+    """Cameras that follow a flight smoothly and step back to keep some points in view.
 
     Args:
         position: (T, 3) [m], of the aircraft, world frame.
-        goal: (T, 3) [m], world frame.
+        shown: T arrays (n, 3) [m], world frame, n at least 1.
         smoothing: Standard deviation of the low pass [states]; it looks both ways, so nothing lags.
+        scale: Size of the aircraft, as a multiple of the paper's.
 
     Returns:
         T cameras.
     """
     from scipy.ndimage import gaussian_filter1d
 
-    away = goal - position
-    separation = np.linalg.norm(away, axis=-1, keepdims=True)
-    away = away * np.minimum(1.0, FOLLOW_DISTANCE[1] / 2 / np.maximum(separation, 1e-9))
-    distance = np.clip(1.2 + 1.3 * separation, *FOLLOW_DISTANCE)
-    path = np.concatenate([position + 0.5 * away, distance], axis=1)
+    boxes = [np.vstack([at, points]) for at, points in zip(position, shown, strict=True)]
+    half = np.array([(box.max(0) - box.min(0)) / 2 for box in boxes])
+    aside = np.array([box.min(0) for box in boxes]) + half - position
+    nearest, farthest = FOLLOW_DISTANCE
+    radius = np.linalg.norm(half, axis=-1, keepdims=True)
+    # Pictures are wider than high, and what is deep takes little of either.
+    room = np.linalg.norm(half * FOLLOW_ROOM, axis=-1, keepdims=True)
+    distance = np.clip(0.75 * scale + room, nearest * scale, farthest)
+    # The aircraft itself stays in view whatever is far away.
+    aside = aside * np.minimum(1.0, farthest / 4 / np.maximum(radius, 1e-9))
+    path = np.concatenate([position + aside, distance], axis=1)
     if smoothing > 0:
         path = np.asarray(gaussian_filter1d(path, smoothing, axis=0, mode="nearest"))
     cameras = [mujoco.MjvCamera() for _ in path]
@@ -331,9 +369,13 @@ def render_flight(
     speed = np.zeros(len(position))
     if len(position) > 1:
         speed = np.linalg.norm(np.gradient(position, flight.time, axis=0), axis=1)
+    markers = flight.markers
+    if len(markers) == 1:
+        markers = [markers[0]] * len(position)
     cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
     if camera == FOLLOW:
-        cameras = follow_cameras(position, flight.goal, FOLLOW_SMOOTHING * fps)
+        shown = [in_view(*seen) for seen in zip(flight.goal, markers, strict=True)]
+        cameras = follow_cameras(position, shown, FOLLOW_SMOOTHING * fps, aircraft_scale(model))
     panel = _Panel(height, flight.task) if overlay else None
     with Renderer(model, width, height) as renderer:
         for k in range(len(position)):
@@ -343,7 +385,7 @@ def render_flight(
                 rotor_angles=angles[k],
                 goal=flight.goal[k],
                 trail=position[max(0, k - round(TRAIL_SECONDS * fps)) : k + 1] if trail else None,
-                markers=flight.markers[k if len(flight.markers) > 1 else 0],
+                markers=markers[k],
             )
             if panel is not None:
                 lines = (
@@ -572,7 +614,7 @@ def _between(
     before: tuple[Marker, ...], after: tuple[Marker, ...], share: float
 ) -> tuple[Marker, ...]:
     """Markers on their way from one state to the next; those with an end stay until they jump."""
-    if [marker.kind for marker in before] != [marker.kind for marker in after]:
+    if before is after or [m.kind for m in before] != [m.kind for m in after]:
         return before
     moved = [
         (1 - share) * np.array(a.position) + share * np.array(b.position)

@@ -189,8 +189,9 @@ class Marker:
     """Something to be drawn, in the task's frame; an environment hands it out in the world's."""
 
     kind: Kind
-    """goal: a sphere with a core and a drop line to the ground. ring, pad: circles that lie flat
-    unless `end` is a point on their axis."""
+    """goal: a sphere with a core and a drop line to the ground. ring: a circle that lies flat. pad:
+    a landing pad on the ground below its position. Both turn where `end` is a point on their axis;
+    a pad then has its place there."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre, or where a line or an arrow begins [m]."""
     size: float = 0.1
@@ -201,6 +202,8 @@ class Marker:
     """Where a line or an arrow ends [m]."""
     points: Sequence[Sequence[float]] | np.ndarray = ()
     """(n, 3) corners of a path [m]."""
+    label: str = ""
+    """Written beside a goal or a sphere."""
 
     def moved(self, offset: np.ndarray) -> Marker:
         """The same marker elsewhere; offset (3,) [m]."""

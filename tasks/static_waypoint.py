@@ -90,11 +90,13 @@ class StaticWaypoint(WaypointTask[Route]):
         return close & (fields.leg == len(self.waypoints) - 1)
 
     def markers(self, fields: Route) -> Sequence[Marker]:
-        """The route, and the waypoints that are still to come."""
+        """The route, and the waypoints that are still to come, by number."""
         route = np.array([(0.0, 0.0, 0.0), *self.waypoints])
-        later = self.waypoints[int(fields.leg) + 1 :]
-        spheres = [Marker("sphere", waypoint, 0.06, WAITING) for waypoint in later]
-        return [Marker("path", size=0.006, rgba=WAITING, points=route), *spheres]
+        later = [k for k in range(len(self.waypoints)) if k > fields.leg]
+        spheres = [
+            Marker("sphere", self.waypoints[k], 0.06, WAITING, label=str(k + 1)) for k in later
+        ]
+        return [Marker("path", size=0.004, rgba=WAITING, points=route), *spheres]
 
 
 def _point(waypoint: tuple[float, float, float], like: Array) -> Array:

@@ -86,9 +86,12 @@ class StraightAndLevel(MovingGoalTask[Line]):
         return truncated
 
     def markers(self, fields: Line) -> Sequence[Marker]:
-        """The line at its altitude."""
-        end = np.asarray(fields.direction) * (self.line_speed * self.horizon + 5.0)
-        return [Marker("line", tuple(-0.05 * end), 0.012, LINE, end=tuple(end))]
+        """The line, and posts that show its altitude."""
+        direction, length = np.asarray(fields.direction), self.line_speed * self.horizon + 5.0
+        line = Marker("line", tuple(-10.0 * direction), 0.008, LINE, end=tuple(length * direction))
+        feet = [tuple(k * direction - (0, 0, self.altitude)) for k in range(0, int(length), 2)]
+        posts = [Marker("line", foot, 0.004, LINE, end=(*foot[:2], 0.0)) for foot in feet]
+        return [line, *posts]
 
     def figures(self, record: Record) -> dict[str, float]:
         """Altitude and cross-track error over the flight, speed error over its second half."""

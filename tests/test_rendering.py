@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 
 import quadrl
+from quadrl import VEHICLES
 from quadrl.rendering import (
     Flight,
     Renderer,
     RenderingUnavailable,
+    aircraft_scale,
     follow_cameras,
+    in_view,
     render_flight,
     write_video,
 )
@@ -137,14 +140,49 @@ def test_follow_keeps_the_goal_in_view(renderer):
     near = renderer.frame(POSE, goal=[1, 1, 3])
     far = renderer.frame(POSE, goal=[-4, 3, 4])
     assert changed(near, far).any()
-    # It looks half way to the goal, from 1.2 m + 1.3 times the separation: 1.2 + 1.3 * 3 = 5.1.
-    (camera,) = follow_cameras(POSE[None, :3], np.array([[3.0, 0.0, 3.0]]))
+    # It looks half way to the goal, from 0.75 m + twice half of the separation: 0.75 + 3 = 3.75.
+    (camera,) = follow_cameras(POSE[None, :3], [np.array([[3.0, 0.0, 3.0]])])
     np.testing.assert_allclose(camera.lookat, [1.5, 0.0, 3.0])
-    assert camera.distance == pytest.approx(5.1)
-    # No further than 7 m away, and then the aircraft stays within 3.5 / 2 m of the middle.
-    (camera,) = follow_cameras(POSE[None, :3], np.array([[0.0, 0.0, 10.0]]))
+    assert camera.distance == pytest.approx(3.75)
+    # No further than 7 m away, and then the aircraft stays within 7 / 4 m of the middle.
+    (camera,) = follow_cameras(POSE[None, :3], [np.array([[0.0, 0.0, 10.0]])])
     np.testing.assert_allclose(camera.lookat, [0.0, 0.0, 4.75])
     assert camera.distance == 7.0
+
+
+def test_follow_keeps_goals_to_come_in_view_and_comes_nearer_to_a_small_aircraft(renderer):
+    ahead, later = np.array([1.0, 0.0, 3.0]), Marker("sphere", (0.0, 2.0, 3.0))
+    points = in_view(ahead, [later, Marker("line", end=(9.0, 0.0, 3.0))])
+    np.testing.assert_array_equal(points, [ahead, later.position])
+    # A box of 1 m by 2 m: half of its diagonal, twice, is sqrt(5).
+    (camera,) = follow_cameras(POSE[None, :3], [points])
+    np.testing.assert_allclose(camera.lookat, [0.5, 1.0, 3.0])
+    assert camera.distance == pytest.approx(0.75 + math.sqrt(5))
+    small = aircraft_scale(VEHICLES["crazyflie"].compile())
+    assert small == pytest.approx(0.2)  # arms of 0.046 m, and the paper's of 0.23 m
+    (camera,) = follow_cameras(POSE[None, :3], [POSE[None, :3]], scale=small)
+    assert camera.distance == pytest.approx(0.27)  # a fifth of 1.35 m
+
+
+def test_a_pad_lies_on_the_ground(model):
+    # Seen from above, at 4 m: 65.1 pixels a metre, as for the goal. A radius of 0.5 m reaches 32.5
+    # pixels to each side, and the edge 0.02 * 0.5 + 0.003 = 0.013 m farther; on the ground, 3 m
+    # below its position, it is not nearer.
+    camera = look_north([0, 0, 0], 4.0)
+    camera.elevation = -90.0
+    with Renderer(model, 200, 200) as square:
+        without = square.frame(ELSEWHERE, camera=camera)
+        pad = square.frame(ELSEWHERE, camera=camera, markers=[Marker("pad", (0, 0, 3), 0.5)])
+    rows, columns = np.nonzero(changed(without, pad))
+    assert np.ptp(columns) == pytest.approx(2 * 0.513 * 65.1, abs=2.5)
+    assert np.ptp(rows) == pytest.approx(2 * 0.513 * 65.1, abs=2.5)
+
+
+def test_goals_are_labelled(renderer):
+    camera = look_north([0, 0, 3], 4.0)
+    plain, seven = (Marker("sphere", (0, 0, 3), label=label) for label in ("", "7"))
+    pictures = [renderer.frame(ELSEWHERE, camera=camera, markers=[m]) for m in (plain, seven)]
+    assert 5 < changed(*pictures).sum() < 400
 
 
 def test_a_trail_shows_where_it_has_been(model):
@@ -165,7 +203,7 @@ def test_a_trail_shows_where_it_has_been(model):
         Marker("goal", (0, 0, 3)),
         Marker("sphere", (0, 0, 3)),
         Marker("ring", (0, 0, 3), size=0.4, end=(0, 1, 3)),
-        Marker("pad", (0, 0, 3), size=0.4),
+        Marker("pad", (0, 0, 3), size=0.4, end=(0, 1, 3)),
         Marker("line", (-0.5, 0, 3), size=0.02, end=(0.5, 0, 3)),
         Marker("arrow", (-0.5, 0, 3), size=0.02, end=(0.5, 0, 3)),
         Marker("path", size=0.02, points=((-0.5, 0, 3), (0, 0, 3.2), (0.5, 0, 3))),

@@ -49,7 +49,7 @@ class Record:
     terminated: np.ndarray  # (N,) bool
     is_success: np.ndarray  # (N,) bool
     diverged: np.ndarray  # (N,) bool
-    markers: tuple[Any, ...]  # what the task asks to be drawn, of the first aircraft
+    markers: tuple[Any, ...]  # (T,) of what the task asks to be drawn, of the first aircraft
     control_step: float  # [s]
     task: Task
 
@@ -70,7 +70,7 @@ class Record:
             control_step=self.control_step,
             max_rotor_speed=vehicle.max_speed,
             task=self.task.name,
-            markers=(self.markers,),
+            markers=self.markers[steps],
         )
 
 
@@ -115,7 +115,7 @@ def fly(
     alive = np.ones(episodes, dtype=bool)
     length = np.zeros(episodes, dtype=int)
     ends = {name: np.zeros(episodes, bool) for name in ("terminated", "is_success", "diverged")}
-    markers = tuple(environment.markers())
+    fields, drawn, markers = None, (), []
     while alive.any() and len(history["error"]) < environment.horizon_steps:
         taken = np.clip(controller(observation), -1.0, 1.0)
         if winds is not None:
@@ -123,6 +123,9 @@ def fly(
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         state: State = environment.simulation.state
+        if environment.fields is not fields:  # else nothing has changed
+            fields, drawn = environment.fields, environment.markers()
+        markers.append(drawn)
         goal = environment.task.goal(state, environment.fields)
         moment = {"goal": goal, "action": taken, "error": now.error, "reward": now.reward}
         for name in names:
@@ -137,7 +140,7 @@ def fly(
         **{name: np.stack(values) for name, values in history.items()},
         length=length,
         **ends,
-        markers=markers,
+        markers=tuple(markers),
         control_step=environment.vehicle.control_step,
         task=environment.task,
     )
