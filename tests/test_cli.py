@@ -201,6 +201,64 @@ def test_plot(copy, capsys):
     assert b"<svg" in (copy / "new" / "curve.svg").read_bytes()
 
 
+def test_plot_of_several_runs(run, tmp_path, capsys):
+    folders = [tmp_path / name for name in ("a", "b", "c")]
+    for folder, task, algo in zip(folders, ("hover", "hover", "landing"), ("ppo", "gae", "ppo"),
+                                  strict=True):  # fmt: skip
+        shutil.copytree(run, folder)
+        config = json.loads((folder / "config.json").read_text()) | {"task": task, "algo": algo}
+        (folder / "config.json").write_text(json.dumps(config))
+    (tmp_path / "no run").mkdir()
+    assert quadrl_command("plot", *folders, tmp_path / "no run", "--format", "svg") == 0
+    said = capsys.readouterr().out
+    assert f"left out: {tmp_path / 'no run'} holds no run" in said
+    names = ("learning_curves_hover.svg", "learning_curves_landing.svg")
+    for name, shown in zip(names, (("PPO, 1 seed", "GAE, 1 seed"), ("PPO, 1 seed",)), strict=True):
+        assert f"wrote {name}" in said
+        assert all(label in (tmp_path / name).read_text() for label in shown)
+    assert quadrl_command("plot", *folders[:2], "--out", "new/x.pdf") == 0
+    assert (tmp_path / "new" / "x.pdf").read_bytes().startswith(b"%PDF")
+    assert quadrl_command("plot", *folders, "--out", "new/x.png") == 0
+    assert {p.name for p in (tmp_path / "new").iterdir()} == {
+        "x.pdf", "x_hover.png", "x_landing.png",
+    }  # fmt: skip
+    assert quadrl_command("plot", folders[0], "--format", "pdf") == 0
+    assert (folders[0] / "learning_curve.pdf").read_bytes().startswith(b"%PDF")
+    assert "which run?" in refusal(capsys, "plot")
+    assert "is no .svg" in refusal(capsys, "plot", *folders, "--out", "a.png", "--format", "svg")
+    nothing = [tmp_path / "no run", tmp_path / "nowhere"]
+    assert quadrl_command("plot", *nothing) == 2
+    assert "none of the 2 folders holds a run to plot" in capsys.readouterr().err
+
+
+def test_the_name_of_a_task_flies_the_policy_that_ships(capsys):
+    assert quadrl_command("evaluate", "hover", "--episodes", "5", "--json") == 0
+    shipped = capsys.readouterr().out
+    file = quadrl.policy.SHIPPED / "hover_ppo.safetensors"
+    assert quadrl_command("evaluate", file, "--episodes", "5", "--json") == 0
+    assert capsys.readouterr().out == shipped
+    # A folder of that name is written otherwise, and the name itself still means the task.
+    shutil.copytree(quadrl.policy.SHIPPED, "hover")
+    assert quadrl_command("evaluate", "hover", "--episodes", "5", "--json") == 0
+    assert capsys.readouterr().out == shipped
+    assert "no policy at hover/policy.safetensors" in refusal(capsys, "evaluate", "./hover")
+    said = refusal(capsys, "evaluate", "hover", "--algo", "sac")
+    assert "no policy comes with quadrl for hover with sac; choices: " in said
+    assert "--algo ppo chooses among" in refusal(capsys, "evaluate", "./hover", "--algo", "ppo")
+    size = ["--width", "64", "--height", "48", "--fps", "1", "--out", "a.mp4"]
+    assert quadrl_command("render", "hover", *size) == 0
+    assert imageio_ffmpeg.count_frames_and_secs("a.mp4")[0] == 10
+
+
+def test_an_algorithm_has_its_own_defaults(capsys):
+    batches = []
+    for words in ([], ["--algo", "gae"], ["--algo=gae"], ["--algo", "gae", "--algo", "ppo"]):
+        assert quadrl_command("train", "hover", *words, "--help") == 0
+        text = " ".join(capsys.readouterr().out.split())
+        batches.append(text.partition("Aircraft flown together. (default: ")[2].partition(")")[0])
+    assert batches == ["256", "128", "128", "256"]
+
+
 def test_resume_of_a_finished_run(copy, capsys):
     before = contents(copy)
     assert quadrl_command("train", "--resume", copy, "--no-video", "--episodes", "2") == 0

@@ -27,6 +27,10 @@ for _ in range(10):
     step = environment.step(action)
 assert all(np.isfinite(part).all() for part in step.observation.values()), step.observation
 
+policy = quadrl.Policy.pretrained("hover")
+flat = np.concatenate(list(step.observation.values()))
+assert np.isfinite(policy(flat)).all(), flat
+
 import quadrl.tasks
 assert pathlib.Path(quadrl.tasks.__file__).is_relative_to(sys.prefix), quadrl.tasks.__file__
 assert "tasks" not in sys.modules, "tasks was imported under a second name"
@@ -105,7 +109,12 @@ def test_wheel_has_every_file_of_the_package_and_no_other(wheel):
     assert files == expected
     for needed in ("quadrl/py.typed", "quadrl/tasks/__init__.py", "quadrl/tasks/hover.py"):
         assert needed in files
-    for folder, suffix in (("native", ".c"), ("native", ".h"), ("assets", ".xml")):
+    kinds = (("native", ".c"), ("native", ".h"), ("assets", ".xml"))
+    for folder, suffix in (
+        *kinds,
+        ("assets/policies", ".safetensors"),
+        ("assets/policies", ".json"),
+    ):
         assert any(name.startswith(f"quadrl/{folder}/") and name.endswith(suffix) for name in files)
 
 

@@ -353,8 +353,8 @@ def make_measured(**of_algo):
     ]
     machine = {"cpu": "a", "cores": 2, "system": "b", "python": "3"}
     return {
-        "command": "scripts/paper_figures", "machine": machine, "seeds": [0, 1, 2, 3, 4],
-        "episodes": 100, "wall_clock_s": 60.0, "runs": runs,
+        "quick": False, "command": "scripts/paper_figures", "machine": machine,
+        "seeds": [0, 1, 2, 3, 4], "episodes": 100, "wall_clock_s": 60.0, "runs": runs,
         "geometric": dict.fromkeys(paper.TASKS, geometric),
     }  # fmt: skip
 
@@ -436,7 +436,9 @@ def test_a_gae_that_fails_is_said_to(tmp_path):
     page = paper.written(paper.rounded(measured))
     for sentence, rule, _ in paper.SENTENCES:
         assert sentence in page and rule in page
-    assert "| hover | GAE | 0 of 5 | 0 % (0 to 20) % |".replace(" % (", " (") in page
+    assert "| hover | GAE | 0 of 5 | 0 (0 to 20) % | 100 % |" in page
+    assert "too short" not in page
+    assert "too short to learn from" in paper.written(measured | {"quick": True})
     assert "5/5 collapsed" in page
     assert paper.written(paper.rounded(make_measured())) != page
 

@@ -11,10 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import save
+from scipy import stats
 
 import quadrl
 from quadrl.errors import QuadrlError
-from quadrl.policy import FORMAT, Policy, PolicyError
+from quadrl.learning import study
+from quadrl.learning.config import make_task
+from quadrl.learning.evaluate import EVALUATION_SEED, fly, judge
+from quadrl.policy import FORMAT, SHIPPED, Policy, PolicyError, shipped
 
 SIZE, HIDDEN = 3, 2
 
@@ -256,6 +260,72 @@ def test_what_it_was_trained_for_must_be_readable(tmp_path, header):
     path = write(tmp_path / "policy.safetensors", parts(make_policy()), HEADER | header)
     with pytest.raises(PolicyError, match="does not say what the policy was trained for"):
         Policy.load(path)
+
+
+# The policies that come with the package.
+
+
+def test_pretrained_is_the_file_that_ships():
+    policy = Policy.pretrained("hover")
+    assert (policy.task, policy.metadata["algo"]) == ("hover", "ppo")
+    loaded = Policy.load(SHIPPED / "hover_ppo.safetensors")
+    for name, array in parts(loaded).items():
+        np.testing.assert_array_equal(parts(policy)[name], array)
+
+
+@pytest.mark.parametrize(("task", "algo"), [("hovr", "ppo"), ("hover", "sac"), ("../hover", "ppo")])
+def test_a_policy_that_does_not_ship(task, algo):
+    with pytest.raises(PolicyError) as caught:
+        Policy.pretrained(task, algo)
+    message = str(caught.value)
+    assert f"no policy comes with quadrl for {task} with {algo}; choices: " in message
+    assert "hover with ppo" in message and f"quadrl train {task} --algo {algo}" in message
+
+
+FRESH_SEED, FRESH_EPISODES = EVALUATION_SEED + 1_000_000, 100
+
+
+@pytest.mark.parametrize("file", shipped(), ids=lambda file: file.stem)
+def test_a_shipped_policy_still_reaches_its_figures(file):
+    """On episodes of its own, with what chance allows between two samples of the same policy.
+
+    Success: the recorded share of n episodes leaves, at one in a hundred, a true share as low as
+    the lower bound of Clopper and Pearson; with that one the 100 episodes here must not be worse
+    than one in a thousand would be. Recorded 500 of 500: at least 0.01^(1/500) = 0.991, so 94.
+    Error: the means of two samples differ by less than 4 standard errors of their difference but
+    in one of 30,000 cases, if they are normal. The seeds are fixed, so a policy either passes here
+    or does not; the margins are for other episodes, not for luck.
+    """
+    beside = json.loads(file.with_suffix(".json").read_text())
+    policy, recorded = Policy.load(file), beside["evaluation"]
+    config, metadata = beside["config"], policy.metadata
+    assert file.stem == f"{policy.task}_{metadata['algo']}" == f"{config['task']}_{config['algo']}"
+    for name in ("seed", "vehicle"):
+        assert config[name] == metadata[name]
+    assert beside["command"].split()[:2] == ["quadrl", "train"]
+    task = make_task(policy.task, metadata["task_options"])
+    record = fly(
+        policy,
+        task,
+        episodes=FRESH_EPISODES,
+        seed=FRESH_SEED,
+        vehicle=quadrl.VEHICLES[metadata["vehicle"]],
+    )
+    judged = judge(record)
+    n, share = recorded["episodes"], recorded["success_rate"]
+    hits = round(n * share)
+    lowest = stats.beta.ppf(0.01, hits, n - hits + 1)
+    assert judged["success_rate"] * FRESH_EPISODES >= stats.binom.ppf(0.001, FRESH_EPISODES, lowest)
+    deviation, error = recorded["position_error_std_m"], recorded["position_error_m"]
+    standard_error = deviation * (1 / n + 1 / FRESH_EPISODES) ** 0.5
+    assert judged["position_error_m"] <= error + 4 * standard_error
+
+
+def test_a_policy_that_got_worse_would_not_reach_them(monkeypatch):
+    worse = study.with_noisy_weights(Policy.pretrained("hover"), 0.5, seed=0)
+    monkeypatch.setattr(Policy, "load", lambda path: worse)
+    with pytest.raises(AssertionError):
+        test_a_shipped_policy_still_reaches_its_figures(SHIPPED / "hover_ppo.safetensors")
 
 
 def test_errors_are_the_users_to_mend():

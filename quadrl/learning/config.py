@@ -151,12 +151,12 @@ class TRPOConfig(_Settings):
 class GAEConfig(_Settings):
     """What is the plain policy gradient's own."""
 
-    # Tried on hover at PPO's number of control steps, as aircraft x steps of a batch, learning rate:
+    # Tried on hover with the control steps of PPO, as aircraft x steps of a batch, learning rate:
     # share of 100 fresh episodes that succeed with the mean action, a number a seed from 100 on.
     # Critic at 0.003, 4 epochs: 256 x 16 (PPO's batch), 0.01: 0; 64 x 16, 0.003 and 0.01: 0, 0;
     # 32 x 16, 0.005 and 0.01: 0, 0; 64 x 8, 0.005: 0.01.
     # Critic at 0.003, 8 epochs: 256 x 16, 0.05: 0; 256 x 8, 0.007: 0.87, 1, 0; 0.01: 0.30; 0.03: 0;
-    # 256 x 4, 0.003: 0.79; 0.01: 0; seed 101 alone, 0.005: 0.04; 64 x 16, 0.005: 0;
+    # 256 x 4, 0.003: 0.79; 0.01: 0; with seed 101 alone: 256 x 4, 0.005: 0.04; 64 x 16, 0.005: 0;
     # 128 x 8, 0.003: 0.66, 1, 1; 0.005: 0.99, 0.27.
     # Critic at 0.006, 8 epochs: 256 x 8, 0.005: 1, not tried, 0; 128 x 8, 0.003: 1, 1, 1.
     learning_rate: float = 3e-3
