@@ -109,7 +109,8 @@ class QuadrotorTask(base.Task):
         is_seed = isinstance(random, (int, np.integer))
         self._seed = int(random) if is_seed else int(self.random.randint(2**31))
         check_choices([engine], ENGINES, "engine")
-        self._task, self._vehicle, self._engine = task, vehicle, engine
+        self._task, self._vehicle = task, vehicle
+        self._engine: Engine = engine
         self._interface = interfaces.make(action, vehicle)
         self._environment: Any = None  # an Environment from the first episode on
         self._physics: Physics | None = None

@@ -9,6 +9,7 @@ import pytest
 import quadrl
 from quadrl import testing
 from quadrl.environment import Environment
+from quadrl.interfaces import INTERFACES
 from quadrl.tasks import TASKS, make
 from quadrl.tasks.hover import Hover
 
