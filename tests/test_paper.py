@@ -130,7 +130,7 @@ def test_smoothness_by_hand():
     # The root mean square of a sine is its amplitude over sqrt(2): 0.2121; 4 Hz are 20 whole
     # periods in 5 s.
     assert figures["body_rate_rad_s"] == pytest.approx(0.3 / math.sqrt(2))
-    assert figures["hold_body_rate_rad_s"] == pytest.approx(0.3 / math.sqrt(2))
+    assert figures["wobble_rad_s"] == pytest.approx(0.3 / math.sqrt(2))
     # a = 7 t, so the jerk is 7.
     assert figures["jerk_m_s3"] == pytest.approx(7.0)
     # Differences of a sine of frequency f: amplitude times 2 sin(pi f dt) / dt = 23.51 per second.
@@ -150,7 +150,8 @@ def test_a_slow_turn_is_no_wobble_and_no_flight_is_no_number():
     assert smoothness(dataclasses.replace(record, body_rate=rate))["wobble_share"] < 1e-3
     nobody = smoothness(dataclasses.replace(record, is_success=np.zeros(3, bool)))
     assert nobody["flights"] == 0 and math.isnan(nobody["jerk_m_s3"])
-    assert smoothness(record, np.ones(3, bool))["flights"] == 2  # the second lasts a second
+    everybody = smoothness(dataclasses.replace(record, is_success=np.ones(3, bool)))
+    assert everybody["flights"] == 2  # the second lasts a second
 
 
 # A study.
@@ -299,7 +300,7 @@ def test_overlaid_curves_are_pictures_and_the_same_every_time(tmp_path):
 def make_run(task, algo, seed, **changes):
     """A run of an algorithm of which only some figures matter; others are the same for all."""
     smooth = {name: 1.0 for name in paper.ROUGHNESS} | {
-        "hold_body_rate_rad_s": 0.1, "wobble_share": 0.1,
+        "wobble_rad_s": 0.1, "wobble_share": 0.1,
         "frequency_hz": [0.0, 1.0], "body_rate_spectrum": [1.0, 1.0],
     }  # fmt: skip
     way = {
@@ -310,7 +311,7 @@ def make_run(task, algo, seed, **changes):
         "return_mean": 2000.0 + seed,
         "smoothness": smooth,
     }
-    wobbly = smooth | {name: 2.0 for name in ("action_variation_1_s", "hold_body_rate_rad_s")}
+    wobbly = smooth | {name: 2.0 for name in ("action_variation_1_s", "wobble_rad_s")}
     values = {
         "task": task,
         "algo": algo,

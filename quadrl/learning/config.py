@@ -158,7 +158,8 @@ class GAEConfig(_Settings):
     # Critic at 0.003, 8 epochs: 256 x 16, 0.05: 0; 256 x 8, 0.007: 0.87, 1, 0; 0.01: 0.30; 0.03: 0;
     # 256 x 4, 0.003: 0.79; 0.01: 0; with seed 101 alone: 256 x 4, 0.005: 0.04; 64 x 16, 0.005: 0;
     # 128 x 8, 0.003: 0.66, 1, 1; 0.005: 0.99, 0.27.
-    # Critic at 0.006, 8 epochs: 256 x 8, 0.005: 1, not tried, 0; 128 x 8, 0.003: 1, 1, 1.
+    # Critic at 0.006, 8 epochs: 256 x 8, 0.005: 1, not tried, 0; 128 x 8, 0.003: 1, 1, 1
+    # (and with seed 100, where nothing was tuned: static waypoint 1, landing 0).
     learning_rate: float = 3e-3
     """Of the policy's one step on a batch, at the start; it falls linearly to zero."""
     critic_rate: float = 6e-3

@@ -202,37 +202,35 @@ def judge(record: Record) -> dict[str, Any]:
     } | record.task.figures(record)
 
 
-def smoothness(record: Record, flights: np.ndarray | None = None) -> dict[str, Any]:
-    """How smoothly some flights were flown, means over them; not a number where there are none.
+def smoothness(record: Record) -> dict[str, Any]:
+    """How smoothly the flights that succeed were flown; not a number where there are none.
 
-    Args:
-        record: The flights.
-        flights: Mask (N,); None for those that succeed, since a fall is no flight.
+    A fall is no flight: its figures would say nothing of the flying. Figures are means over the
+    flights that last for at least a segment of the spectrum.
 
     Returns:
         flights: how many. action_variation_1_s: sum of |change of an action|, mean of the rotors,
         over the time [1/s]. Root mean squares: body_rate_rad_s, angular_acceleration_rad_s2,
-        jerk_m_s3 (from differences of the velocity). hold_body_rate_rad_s: the body rate's over
-        the last 2 s. wobble_share: share of the body rate's power above `WOBBLE_HZ`. frequency_hz,
-        body_rate_spectrum [rad^2/s^2/Hz], jerk_spectrum [m^2/s^6/Hz]: by Welch's method, summed
-        over the axes.
+        jerk_m_s3 (from differences of the velocity), wobble_rad_s (of the body rate less its mean,
+        over the last 2 s). wobble_share: of the body rate's power, that above `WOBBLE_HZ`.
+        frequency_hz, body_rate_spectrum [rad^2/s^2/Hz], jerk_spectrum [m^2/s^6/Hz]: by Welch's
+        method, summed over the axes.
     """
     step = record.control_step
-    chosen = np.flatnonzero(record.is_success if flights is None else flights)
     hold = round(FINAL_STRETCH / step)
     names = (
         "action_variation_1_s", "body_rate_rad_s", "angular_acceleration_rad_s2", "jerk_m_s3",
-        "hold_body_rate_rad_s",
+        "wobble_rad_s",
     )  # fmt: skip
     rows, spectra = [], []
-    for i in chosen:
+    for i in np.flatnonzero(record.is_success):
         flown = slice(0, int(record.length[i]))
         rate, velocity = record.body_rate[flown, i], record.velocity[flown, i]
         variation = np.abs(np.diff(record.action[flown, i], axis=0)) / step
         jerk = np.diff(velocity, n=2, axis=0) / step**2
         if len(jerk) < SEGMENT:
             continue
-        square = (rate, np.diff(rate, axis=0) / step, jerk, rate[-hold:])
+        square = (rate, np.diff(rate, axis=0) / step, jerk, rate[-hold:] - rate[-hold:].mean(0))
         rows.append([variation.mean(), *(np.sqrt((x**2).sum(-1).mean()) for x in square)])
         welched = [welch(x, fs=1 / step, nperseg=SEGMENT, axis=0)[1].sum(-1) for x in (rate, jerk)]
         spectra.append(welched)

@@ -26,7 +26,7 @@ EVALUATION = "evaluation.json"
 POLL_SECONDS = 0.2
 SMOOTHING = 0.05  # share of a training over which its curve is averaged for best and final
 NOISE_SEED = 0  # of sampled actions and of noise on the weights
-WEIGHT_NOISE = 0.1  # of each neuron's weights, over their own length
+WEIGHT_NOISE = 0.2  # of each neuron's weights, over their own length
 WEIGHT_DRAWS = 5
 CURVE_POINTS = 50
 
