@@ -45,6 +45,7 @@ FASTEST_GOAL = 10.0  # [m/s]; one that moves faster has jumped
 FRONT, SIDE, BACK = (255, 122, 41), (205, 212, 222), (66, 148, 255)
 ROTOR_COLOURS = (FRONT, SIDE, BACK, SIDE)  # rotors 1 to 4: ahead, left, behind, right
 MAX_FPS = 240
+LEAST_RATE = 20.0  # [1/s], at which a flight is followed
 SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # about body z; the reaction torque of (7) is opposite
 
 
@@ -363,7 +364,10 @@ def render_flight(
     """Draw a flight: pictures (height, width, 3) one at a time, arguments as for `write_video`."""
     from scipy.integrate import cumulative_trapezoid
 
-    flight = flight.resampled(fps)
+    # Speed, trail and camera are those of the flight however few pictures are drawn of it.
+    every = math.ceil(LEAST_RATE / fps)
+    rate = every * fps
+    flight = flight.resampled(rate)
     position = flight.qpos[:, :3]
     angles = SPIN * cumulative_trapezoid(flight.rotor_speed, flight.time, axis=0, initial=0)
     speed = np.zeros(len(position))
@@ -375,16 +379,16 @@ def render_flight(
     cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
     if camera == FOLLOW:
         shown = [in_view(*seen) for seen in zip(flight.goal, markers, strict=True)]
-        cameras = follow_cameras(position, shown, FOLLOW_SMOOTHING * fps, aircraft_scale(model))
+        cameras = follow_cameras(position, shown, FOLLOW_SMOOTHING * rate, aircraft_scale(model))
     panel = _Panel(height, flight.task) if overlay else None
     with Renderer(model, width, height) as renderer:
-        for k in range(len(position)):
+        for k in range(0, len(position), every):
             picture = renderer.frame(
                 flight.qpos[k],
                 camera=cameras[k],
                 rotor_angles=angles[k],
                 goal=flight.goal[k],
-                trail=position[max(0, k - round(TRAIL_SECONDS * fps)) : k + 1] if trail else None,
+                trail=position[max(0, k - round(TRAIL_SECONDS * rate)) : k + 1] if trail else None,
                 markers=markers[k],
             )
             if panel is not None:

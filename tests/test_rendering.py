@@ -299,6 +299,16 @@ def test_a_flight_of_one_state_is_one_frame(model):
     assert frame.std() > 10
 
 
+def test_few_pictures_of_a_flight_show_what_many_do(model):
+    # Ten pictures a second are every other one of twenty: with the same speed, trail and camera.
+    flight = dataclasses.replace(make_flight(7), goal=np.tile([6.0, 6.0, 3.0], (7, 1)))
+    options = dict(width=320, height=240)
+    few, many = (list(render_flight(flight, model, fps=fps, **options)) for fps in (10, 20))
+    assert (len(few), len(many)) == (4, 7)
+    for picture, other in zip(few, many[::2], strict=True):
+        assert same(picture, other)
+
+
 def test_overlay_is_in_its_corner_alone(model):
     options = dict(width=320, height=240, fps=20, trail=False)
     plain = next(render_flight(make_flight(2), model, overlay=False, **options))
