@@ -54,8 +54,8 @@ class Physics(mujoco.Physics):
     """The complete model of the aircraft, drawn parts included."""
 
     inner_loop: Callable[[], None] | None = None
-    """Commands the rotors before each physics step of a control step, where the action interface has
-    loops."""
+    """Commands the rotors before each physics step, during the control steps of an action interface
+    with loops."""
 
     def step(self, nstep: int = 1) -> None:
         """Advance by physics steps.
