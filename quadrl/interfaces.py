@@ -28,6 +28,9 @@ from quadrl.vehicle import GRAVITY, ROTORS, Vehicle
 HASTE = 1.0
 """[s] in which the largest acceleration that the loops ask for reaches the velocity at action 1;
 the offset at action 1 is where half of it stops from there."""
+PACE = 0.5
+"""Share of the bandwidth at which positions are flown to. With all of it the rotors are at their
+limits for every setpoint that an exploring policy draws, and hover was learned to 61 cm only."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,11 +110,13 @@ class _Looped(Interface):
     """What is flown by loops at the physics step."""
 
     controlled: ClassVar[Controlled]
+    pace: ClassVar[float] = 1.0
 
     def __init__(self, vehicle: Vehicle) -> None:
         """Place the poles for the physics step."""
         super().__init__(vehicle)
-        self._loops = loops = Loops(vehicle, vehicle.physics_step, self.controlled)
+        loops = Loops(vehicle, vehicle.physics_step, self.controlled, pace=self.pace)
+        self._loops = loops
         climb = min(loops.max_climb, loops.max_sink)
         self._acceleration = np.array([loops.max_level, loops.max_level, climb])  # [m/s^2]
 
@@ -196,6 +201,7 @@ class Position(_Looped):
 
     name = "position"
     controlled = "position"
+    pace = PACE
     entries = (
         Entry("forward", "m", "offset, level, along the heading"),
         Entry("left", "m", "offset, level, across the heading"),

@@ -96,7 +96,12 @@ class Loops:
     """
 
     def __init__(
-        self, vehicle: Vehicle, step: float, controlled: Controlled, gains: Gains | None = None
+        self,
+        vehicle: Vehicle,
+        step: float,
+        controlled: Controlled,
+        gains: Gains | None = None,
+        pace: float = 1.0,
     ) -> None:
         """Place the poles.
 
@@ -105,6 +110,7 @@ class Loops:
             step: Time between two commands to the rotors [s].
             controlled: What the outermost loop controls.
             gains: Bandwidths and limits; None for the defaults.
+            pace: Share of the bandwidths that gains, lag and moments allow.
         """
         self.vehicle, self.gains = vehicle, (gains := gains or Gains())
         self._mixer, self._inertia = mixer(vehicle), np.array(vehicle.inertia)
@@ -137,7 +143,7 @@ class Loops:
         )
         level, height, heading = (
             # Loops further out than what is controlled have a rate of zero.
-            np.append(np.zeros(most - n), cascade(vehicle, bandwidth, n, step))
+            np.append(np.zeros(most - n), cascade(vehicle, pace * bandwidth, n, step))
             for bandwidth, most, n in zip(
                 bandwidths, INTEGRATORS["position"], (sideways, upwards, turning), strict=True
             )

@@ -56,7 +56,8 @@ class Physics(mujoco.Physics):
     simulation: SingleSimulation | None = None
     """Flies it, where free flight is the engine; None before the first episode."""
     inner_loop: Callable[[], None] | None = None
-    """Commands the rotors before each physics step, where the action interface has loops."""
+    """Commands the rotors before each physics step, during the control steps of an action interface
+    with loops."""
 
     def step(self, nstep: int = 1) -> None:
         """Advance by physics steps.
@@ -138,8 +139,6 @@ class QuadrotorTask(base.Task):
             environment = Environment(
                 self._task, seed=self._seed, simulation=simulation, action=self._interface.name
             )
-            if environment.interface.has_loops:
-                physics.inner_loop = environment.control
             if self._environment is not None:
                 environment.generators = self._environment.generators
             self._environment, self._physics = environment, physics
@@ -149,9 +148,12 @@ class QuadrotorTask(base.Task):
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Hand the action to the rotors, or to the loops."""
         self._environment.begin(action)
+        if self._interface.has_loops:
+            physics.inner_loop = self._environment.control
 
     def after_step(self, physics: Physics) -> None:
         """Work out the transition."""
+        physics.inner_loop = None  # outside of a control step there is no setpoint
         now = self.transition = self._environment.finish()
         self._observation = now.observation
         super().after_step(physics)

@@ -289,16 +289,16 @@ def test_a_position_is_reached_and_held(vehicle):
 def test_a_far_position_is_flown_to_without_overshoot_and_no_action_brakes(vehicle):
     flyer = Flyer("position", vehicle)
     distances = []
-    for _ in range(round(9 / vehicle.control_step)):
-        action = towards(flyer.interface, np.array([12.0, 0.0, 0.0]), 0.0)(flyer.state)
-        flyer.step(action)
-        distances.append(12.0 - flyer.state.position[0, 0])
+    for _ in range(round(12 / vehicle.control_step)):
+        flyer.step(towards(flyer.interface, np.array([8.0, 0.0, 0.0]), 0.0)(flyer.state))
+        distances.append(8.0 - flyer.state.position[0, 0])
     assert distances[-1] == pytest.approx(0.0, abs=0.02)
     assert min(distances) > -0.05
     flyer = Flyer("position", vehicle, velocity=np.array([[2.0, 0.0, 0.0]]))
     flyer.fly(np.zeros(4), 5.0)
     assert flyer.state.speed[0] < 0.01
-    assert 0 < flyer.state.position[0, 0] < 4.0  # 2 m/s by 0.8 / s and more takes 2.5 m at most
+    # Without lag 2 m/s over the rate of the velocity loop, 1.7 / s for the slowest aircraft: 1.2 m.
+    assert 0.2 < flyer.state.position[0, 0] < 2.4
 
 
 # ----------------------------------------------------------------------------------------- limits
