@@ -9,7 +9,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -428,12 +428,12 @@ class _ProgressBar:
 
 
 def _commands(arguments: list[str]) -> Any:
-    """The commands; a task and an algorithm have their own defaults for `train`."""
+    """The commands; task, algorithm and aircraft have their own defaults for `train`."""
     named = [argument for argument in arguments if argument in tasks.TASKS]
-    algo = [second for first, second in itertools.pairwise(arguments) if first == "--algo"]
-    algo += [word.partition("=")[2] for word in arguments if word.startswith("--algo=")]
-    known = [name for name in algo if name in ALGORITHMS]  # others are refused by the configuration
-    train = Train(config=recipe(named[0] if named else "hover", known[-1] if known else "ppo"))
+    # Others than those known are refused by the configuration, which names the choices.
+    algo = _given(arguments, "--algo", ALGORITHMS) or "ppo"
+    vehicle = _given(arguments, "--vehicle", VEHICLES) or "paper"
+    train = Train(config=recipe(named[0] if named else "hover", algo, vehicle))
     annotated = [
         Annotated[
             kind,
@@ -447,6 +447,13 @@ def _commands(arguments: list[str]) -> Any:
     for kind in annotated[1:]:
         union = union | kind
     return union
+
+
+def _given(arguments: list[str], option: str, known: Container[str]) -> str | None:
+    """The last known value of an option."""
+    values = [second for first, second in itertools.pairwise(arguments) if first == option]
+    values += [w.partition("=")[2] for w in arguments if w.startswith(f"{option}=")]
+    return next((value for value in reversed(values) if value in known), None)
 
 
 def _say(text: str) -> None:

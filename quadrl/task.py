@@ -38,6 +38,7 @@ EPISODE_DRAWS = 64
 """Uniform numbers that every episode takes from its aircraft's generator, used or not."""
 
 FULL_TURN = 2 * math.pi
+REWARD_TIME = 0.05  # [s], the control step of the paper's aircraft
 CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing
 
 
@@ -262,9 +263,9 @@ class Task(abc.ABC, Generic[FieldsT]):
     spin_weight: float = 1.0
     """Reward for a rad/s of body rate lost (gym-aero: 0.1)."""
     control_weight: float = 1.0
-    """Cost of sum((Omega_c - Omega_hover)^2) / Omega_max^2 at each step."""
+    """Cost of sum((Omega_c - Omega_hover)^2) / Omega_max^2, for each 0.05 s."""
     survival_weight: float = 10.0
-    """Reward for each step in the air."""
+    """Reward for each 0.05 s in the air."""
 
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
@@ -345,14 +346,15 @@ class Task(abc.ABC, Generic[FieldsT]):
         vehicle: Vehicle,
     ) -> dict[str, Array]:
         """Named terms (...) of the reward of one control step; it is their sum, in this order."""
+        share = reward_share(vehicle)
         effort = square_norm((rotor_command - vehicle.hover_speed) / vehicle.max_speed)
         return {
             "progress": self.progress_weight * (before.distance - now.distance),
             "attitude": self.attitude_weight * (before.attitude - now.attitude),
             "speed": self.speed_weight * (before.speed - now.speed),
             "spin": self.spin_weight * (before.spin - now.spin),
-            "control": -self.control_weight * effort,
-            "survival": self.survival_weight + 0.0 * effort,
+            "control": -self.control_weight * share * effort,
+            "survival": self.survival_weight * share + 0.0 * effort,
         }
 
     def term_names(self, vehicle: Vehicle) -> tuple[str, ...]:
@@ -410,6 +412,14 @@ class Task(abc.ABC, Generic[FieldsT]):
         """
         check_choices(options, [f.name for f in dataclasses.fields(self)], f"{self.name} option")
         return dataclasses.replace(self, **options)
+
+
+def reward_share(vehicle: Vehicle) -> float:
+    """What a control step counts of the 0.05 s that weights of running rewards are for.
+
+    Progress adds up to the same whatever the step is; what is paid by the step is paid by time.
+    """
+    return vehicle.control_step / REWARD_TIME
 
 
 def total(terms: dict[str, Array]) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 
 from quadrl.rotation import Array, namespace, square_norm
 from quadrl.state import Start, State
-from quadrl.task import Draw, Errors, Fields, Marker, Measures, Outcome, Task
+from quadrl.task import Draw, Errors, Fields, Marker, Measures, Outcome, Task, reward_share
 from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -129,7 +129,8 @@ class Landing(Task[Touchdown]):
         xp, zero = namespace(now.distance), 0.0 * now.distance
         height = abs(now.to_goal[..., 2])
         haste = now.speed - (self.gentle_speed + self.gentle_rate * height)
-        terms["haste"] = -self.haste_weight * xp.where(haste > 0, haste, 0.0 * haste)
+        weight = self.haste_weight * reward_share(vehicle)
+        terms["haste"] = -weight * xp.where(haste > 0, haste, 0.0 * haste)
         terms["success"] = xp.where(outcome.succeeded, zero + self.success_weight, zero)
         terms["failure"] = xp.where(outcome.failed, zero - self.failure_weight, zero)
         return terms

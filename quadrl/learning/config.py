@@ -17,7 +17,7 @@ from quadrl.interfaces import INTERFACES
 from quadrl.policy import write_whole
 from quadrl.simulation import ENGINES, Engine
 from quadrl.task import OptionError, Task, check_choices
-from quadrl.vehicle import VEHICLES
+from quadrl.vehicle import VEHICLES, Vehicle
 
 CONFIG = "config.json"
 ALGORITHMS = ("ppo", "trpo", "gae")
@@ -382,10 +382,22 @@ ALGO_RECIPES: dict[str, dict[str, Any]] = {"gae": {"num_envs": 128, "rollout": 8
 """What an algorithm trains with where the defaults are not its best."""
 
 
-def recipe(task: str, algo: str = "ppo") -> TrainConfig:
+def recipe(task: str, algo: str = "ppo", vehicle: str = "paper") -> TrainConfig:
     """The configuration that a task is trained with by default by an algorithm.
 
+    An aircraft that is controlled more often sees as far ahead in seconds as the paper's, collects
+    as many seconds in a batch, and trains for as many.
+
     Raises:
-        ConfigError: Unknown task or algorithm.
+        ConfigError: Unknown task, algorithm or aircraft.
     """
-    return TrainConfig(task=task, algo=algo, **RECIPES.get(task, {}), **ALGO_RECIPES.get(algo, {}))
+    usual = TrainConfig(task=task, algo=algo, **RECIPES.get(task, {}), **ALGO_RECIPES.get(algo, {}))
+    check_choices([vehicle], VEHICLES, "vehicle")
+    often = round(Vehicle().control_step / VEHICLES[vehicle].control_step, 9)
+    return dataclasses.replace(
+        usual,
+        vehicle=vehicle,
+        gamma=usual.gamma if often == 1 else round(usual.gamma ** (1 / often), 4),
+        rollout=max(1, round(usual.rollout * often)),
+        steps=round(usual.steps * often),
+    )
