@@ -27,24 +27,26 @@ def test_measures_every_layer(measured):
         assert layer in named
 
 
-def test_the_fastest_repeat_counts(measured):
+def test_the_fastest_repeat_is_the_rate(measured):
     for row in measured["rates"]:
         assert len(row["repeats"]) == TINY["repeats"]
         assert row["rate"] == max(row["repeats"]) > 0
 
 
-def test_shares_are_of_the_fastest_bare_mj_step(measured):
+def test_shares_are_of_the_fastest_bare_mj_step_within_one_turn(measured):
     for of in (benchmark.ALL_CORES, benchmark.ONE_CORE):
         group = [row for row in measured["rates"] if row["of"] == of]
-        bare = max(row["rate"] for row in group if row["what"].startswith("mj_step"))
+        bare = [row for row in group if row["what"].startswith("mj_step")]
+        yardstick = max(bare, key=lambda row: np.median(row["repeats"]))
+        assert yardstick["share"] == 1.0
         for row in group:
-            assert row["share"] == row["rate"] / bare
-        assert max(row["share"] for row in group if row["what"].startswith("mj_step")) == 1.0
+            ratios = np.array(row["repeats"]) / yardstick["repeats"]
+            assert row["share"] == pytest.approx(np.median(ratios))
 
 
 def test_targets_stand_beside_the_figures(measured):
     targets = [row["target_share"] or row["target_rate"] for row in measured["rates"]]
-    assert sorted(filter(None, targets)) == [0.60, 0.90, 15_000]
+    assert sorted(filter(None, targets)) == [0.60, 0.90, 15_000, 1_000_000]
     assert measured["memory_target_mb"] == 500.0
 
 
