@@ -253,7 +253,8 @@ class Environment:
             diverged = np.zeros(self.shape, dtype=bool) if self.shape else np.False_
         else:
             terminated = terminated | diverged
-        truncated = (self._steps >= self.horizon_steps) & ~terminated
+        late = self._steps >= self.horizon_steps
+        truncated = late & ~terminated if self.shape else np.bool_(late and not terminated)
         error = task.error(state, measures, self.fields)
         is_success = self._judge(state, error, terminated, truncated) & ~diverged
         outcome = Outcome(failed=terminated & ~is_success, succeeded=is_success)

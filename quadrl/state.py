@@ -61,7 +61,7 @@ class State:
     @property
     def cos_tilt(self) -> Array:
         """Cosine of the angle between the body's z axis and the vertical, (...)."""
-        return self.rotation[..., 2, 2]
+        return self.rotation[..., 2, 2][()]  # a scalar, of one aircraft
 
     @property
     def at_rest(self) -> Array:

@@ -21,6 +21,7 @@ import numpy as np
 from quadrl.errors import QuadrlError
 from quadrl.rotation import (
     Array,
+    held,
     namespace,
     norm,
     quaternion_from_heading_and_tilt,
@@ -307,15 +308,15 @@ class Task(abc.ABC, Generic[FieldsT]):
         to_goal = self.goal(state, fields) - state.position
         target_velocity = self.target_velocity(state, fields)
         if target_velocity is None:
-            speed = state.speed + 0.0  # a number of its own: the state is overwritten
+            speed = held(state.speed)
         else:
             speed = norm(state.velocity - target_velocity)
         return Measures(
             to_goal=to_goal,
             distance=norm(to_goal),
-            attitude=(state.east_error if self.heading_matters else state.level_error) + 0.0,
+            attitude=held(state.east_error if self.heading_matters else state.level_error),
             speed=speed,
-            spin=state.spin + 0.0,
+            spin=held(state.spin),
         )
 
     def observe(
@@ -390,7 +391,8 @@ class Task(abc.ABC, Generic[FieldsT]):
 
     def touches_ground(self, state: State, vehicle: Vehicle) -> Array:
         """Whether an aircraft that should fly has come down to the ground, (...) bool."""
-        return state.position[..., 2] < vehicle.ground_clearance - self.origin_height(vehicle)
+        lowest = vehicle.ground_clearance - self.origin_height(vehicle)
+        return state.position[..., 2][()] < lowest  # a scalar, of one aircraft
 
     def stands(self, state: State, vehicle: Vehicle) -> Array:
         """Whether a foot is on the ground, (...) bool."""

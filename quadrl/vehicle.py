@@ -125,7 +125,7 @@ class Vehicle:
         """Whether no action commands a speed below zero or past the largest."""
         return self.action_scale <= min(self.hover_speed, self.max_speed - self.hover_speed)
 
-    @property
+    @functools.cached_property
     def ground_clearance(self) -> float:
         """Height of the centre of mass above the ground when it stands on its feet [m]."""
         return -FEET[0][2] * self._scale
