@@ -225,8 +225,9 @@ def test_a_study_goes_on_with_what_is_half_done_and_leaves_alone_what_is_done(tm
 def test_a_new_run_begins_with_the_command_that_anybody_would_give(tmp_path):
     (run,) = small(tmp_path)
     assert run.command(7) == [
-        "train", "hover", "--algo", "ppo", "--seed", "0", "--steps", "1", "--num-threads", "1",
-        "--out", str(tmp_path / "hover-ppo-0"), "--no-video", "--episodes", "7",
+        "train", "hover", "--algo", "ppo", "--seed", "0", "--steps", "1",
+        "--vehicle", "paper", "--engine", "mujoco", "--num-threads", "1", "--out",
+        str(tmp_path / "hover-ppo-0"), "--no-video", "--episodes", "7",
     ]  # fmt: skip
 
 

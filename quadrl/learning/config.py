@@ -109,11 +109,11 @@ class _Settings:
 class PPOConfig(_Settings):
     """What is PPO's own."""
 
-    learning_rate: float = 3e-3
+    learning_rate: float = 5e-3
     """Of Adam, at the start; it falls linearly to zero over the training."""
     epochs: int = 8
     """Passes over each batch."""
-    minibatch: int = 1024
+    minibatch: int = 2048
     """Transitions in one gradient step: few and large, since each step costs milliseconds."""
     clip: float = 0.2
     """Of the probability ratio."""

@@ -100,6 +100,7 @@ def make_actor_critic(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
+        distribution_kwargs={"validate_args": False},
         return_log_prob=True,
     )
     critic_layers = make_layers(size, critic_hidden, 1, gain=1.0)

@@ -26,6 +26,7 @@ class PPO:
             entropy_coeff=config.entropy,
             critic_coeff=config.critic,
             loss_critic_type="l2",
+            log_explained_variance=False,
             functional=False,  # nothing needs the parameters as arguments, and that costs time
         )
         self.parameters = list(self.loss.parameters())

@@ -19,6 +19,7 @@ from quadrl.learning.config import RunError, TrainConfig, make_task, recipe
 from quadrl.learning.evaluate import EVALUATION_SEED, Controller, fly, judge, smoothness
 from quadrl.learning.figures import read_metrics
 from quadrl.policy import Policy
+from quadrl.simulation import Engine
 from quadrl.vehicle import VEHICLES
 
 EVALUATION = "evaluation.json"
@@ -40,8 +41,8 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Task, algorithm and seed."""
-        return f"{self.config.task}-{self.config.algo}-{self.config.seed}"
+        """That of its folder."""
+        return self.folder.name
 
     @property
     def done(self) -> bool:
@@ -71,6 +72,8 @@ class Run:
             "--algo": config.algo,
             "--seed": config.seed,
             "--steps": config.steps,
+            "--vehicle": config.vehicle,
+            "--engine": config.engine,
             "--num-threads": config.num_threads,
             "--out": self.folder,
         }
@@ -85,6 +88,7 @@ def plan(
     seeds: Iterable[int],
     *,
     steps: int | None = None,
+    engine: Engine = "mujoco",
     num_threads: int = 0,
 ) -> list[Run]:
     """The runs of a study, seed by seed, so that a study that is stopped has whole seeds.
@@ -95,6 +99,7 @@ def plan(
         algorithms: Names of algorithms.
         seeds: Of the trainings.
         steps: Control steps of each; None for what the task trains with by default.
+        engine: What they fly in; evaluations fly in MuJoCo.
         num_threads: Of each simulation; 0 for every core.
     """
     runs = []
@@ -103,7 +108,11 @@ def plan(
             for algo in algorithms:
                 config = recipe(task, algo)
                 config = dataclasses.replace(
-                    config, seed=seed, steps=steps or config.steps, num_threads=num_threads
+                    config,
+                    seed=seed,
+                    steps=steps or config.steps,
+                    engine=engine,
+                    num_threads=num_threads,
                 )
                 runs.append(Run(config, out / f"{task}-{algo}-{seed}"))
     return runs
