@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import reprlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -136,7 +137,6 @@ class Environment:
         self._measures: Measures
         self._command: np.ndarray
         self._setpoint: np.ndarray
-        self._known = False  # whether the task has been seen to give the right shapes
         self._flown = 0  # physics steps of this control step that the interface's loops have flown
         self._diverged: np.ndarray | None = None  # in them
 
@@ -163,7 +163,8 @@ class Environment:
 
         Raises:
             OptionError: A number of an aircraft that is not there, or one twice.
-            TaskError: The task's start or observation has the wrong shape, or is not finite.
+            TaskError: The task gives arrays of the wrong shape, or a start that no aircraft can
+                have.
         """
         rows = None if rows is None else self._checked(rows)
         if self._steps is None and rows is not None and len(rows) < self.num_envs:
@@ -172,13 +173,12 @@ class Environment:
         if self.shape and rows is None:
             rows = np.arange(self.num_envs)
         start, fields = self.task.sample(Draw(self._draw_block(rows)), self.vehicle)
-        shape = () if rows is None else (len(rows),)
-        self._check_start(start, shape)
+        self._check_start(start, () if rows is None else (len(rows),))
         state = self.simulation.place(rows, start)
         measures = self.task.measure(state, fields)
-        observation = self.task.observe(state, measures, fields, self.vehicle)
         if self._steps is None:
-            self._check_observation(observation, shape)
+            self._check_task(start, state, measures, fields)
+        observation = self.task.observe(state, measures, fields, self.vehicle)
         if everyone or rows is None:
             self.fields, self._measures = fields, measures
             # For one aircraft a number of Python's own: cheaper than an array without axes.
@@ -203,7 +203,7 @@ class Environment:
 
         Raises:
             ActionError: Wrong shape or kind, or a number that is not finite.
-            TaskError: The task gave arrays of the wrong shape, or a reward that is not finite.
+            TaskError: The task gave a reward that is not finite.
             RuntimeError: There was no reset before.
         """
         self.begin(action)
@@ -279,14 +279,14 @@ class Environment:
             self.fields, measures = fields, task.measure(state, fields)
         self._measures = measures
         reward, observation = total(terms), task.observe(state, measures, fields, vehicle)
-        if not self._known:
-            self._check_observation(observation, self.shape)
-            self._check_outputs(terms, terminated, is_success, error)
-            self._known = True
         # One number that is not finite makes the sum so: cheaper than a test of each.
         if not math.isfinite(np.add.reduce(reward) if self.shape else reward):
             name = next(k for k, term in terms.items() if not np.isfinite(term).all())
-            raise TaskError(f"{task.name}: the reward's term {name!r} is not finite: {terms[name]}")
+            row = np.flatnonzero(~np.isfinite(terms[name]))[0]
+            raise TaskError(
+                f"{task.name}: the reward's term {name!r} is not finite: "
+                f"{np.ravel(terms[name])[row]} for aircraft {row}"
+            )
         return Transition(
             observation=observation,
             reward=reward,
@@ -388,30 +388,43 @@ class Environment:
         length = np.square(start.quaternion).sum(-1)
         if not (np.abs(length - 1) < 1e-6).all():
             raise TaskError(
-                f"{self.task.name}: sample gives quaternion = {start.quaternion}, of a length that "
-                "is not 1"
+                f"{self.task.name}: sample gives a quaternion of length {np.max(length) ** 0.5:g}; "
+                "1 is expected"
             )
 
-    def _check_observation(self, observation: Observation, shape: tuple[int, ...]) -> None:
-        """Refuse parts that are not those declared; done once, at the first reset and step."""
-        name, declared = self.task.name, self.task.observation
-        if list(observation) != list(declared):
+    def _check_task(self, start: Start, state: State, measures: Measures, fields: Fields) -> None:
+        """Refuse a task whose functions give other shapes or kinds of numbers than they should.
+
+        Done once, at the first reset: they are pure, so a call more changes nothing.
+        """
+        task, vehicle = self.task, self.vehicle
+        terminated = task.terminated(state, measures, fields, vehicle)
+        self._check_array("terminated", terminated, self.shape, "b")
+        error = task.error(state, measures, fields)
+        self._check_array("error", error, self.shape, "fiu")
+        errors = Errors(final=error, mean=error)
+        success = task.success(state, fields, errors, terminated, np.logical_not(terminated))
+        self._check_array("success", success, self.shape, "b")
+        outcome = Outcome(failed=terminated, succeeded=success)
+        terms = task.reward(measures, measures, start.rotor_speed, outcome, vehicle)
+        for name, term in terms.items():
+            self._check_array(f"the reward's term {name!r}", term, self.shape, "fiu")
+        observation = task.observe(state, measures, fields, vehicle)
+        if list(observation) != list(task.observation):
             raise TaskError(
-                f"{name}: observe gives {', '.join(observation)}; declared are "
-                f"{', '.join(declared)}, in this order"
+                f"{task.name}: observe gives {', '.join(observation)}; declared are "
+                f"{', '.join(task.observation)}, in this order"
             )
-        for part, value in observation.items():
-            _check_array(name, f"part {part!r}", value, (*shape, declared[part].size), "fiu")
+        for name, part in task.observation.items():
+            self._check_array(f"part {name!r}", observation[name], (*self.shape, part.size), "fiu")
 
-    def _check_outputs(
-        self, terms: dict[str, Array], terminated: Array, is_success: Array, error: Array
-    ) -> None:
-        """Refuse other shapes than the environment's; done once, at the first step."""
-        for what, value in (("terminated", terminated), ("success", is_success)):
-            _check_array(self.task.name, what, value, self.shape, "b")
-        for term, value in terms.items():
-            _check_array(self.task.name, f"reward term {term!r}", value, self.shape, "fiu")
-        _check_array(self.task.name, "error", error, self.shape, "fiu")
+    def _check_array(self, what: str, value: Any, shape: tuple[int, ...], kinds: str) -> None:
+        array = np.asarray(value)
+        if array.shape != shape or array.dtype.kind not in kinds:
+            raise TaskError(
+                f"{self.task.name}: {what} has shape {array.shape} and dtype {array.dtype}; "
+                f"{'bool' if kinds == 'b' else 'numbers'} of shape {shape} are expected"
+            )
 
     def _checked(self, rows: np.ndarray) -> np.ndarray:
         """Numbers of aircraft, in order, from numbers or a mask."""
@@ -423,8 +436,8 @@ class Environment:
         within = len(numbers) == 0 or (numbers[0] >= 0 and numbers[-1] < self.num_envs)
         if not self.shape or not whole or len(numbers) != len(given) or not within:
             raise OptionError(
-                f"rows = {rows}: different numbers from 0 to {self.num_envs - 1} are allowed, or a "
-                f"mask of shape {self.shape}"
+                f"rows = {reprlib.repr(given.tolist())}: different numbers from 0 to "
+                f"{self.num_envs - 1} are allowed, or a mask of shape {self.shape}"
             )
         return numbers.astype(np.int64)
 
@@ -489,17 +502,6 @@ def _as_numbers(action: Any) -> np.ndarray:
             "float32 or float64"
         )
     return array.astype(np.float64, copy=False)
-
-
-def _check_array(task: str, what: str, value: Any, shape: tuple[int, ...], kinds: str) -> None:
-    """Refuse an output of a task of another shape or kind of number."""
-    array = np.asarray(value)
-    if array.shape != shape or array.dtype.kind not in kinds:
-        expected = "bool" if kinds == "b" else "numbers"
-        raise TaskError(
-            f"{task}: {what} has shape {array.shape} and dtype {array.dtype}; {expected} of shape "
-            f"{shape} are expected"
-        )
 
 
 def _fields(record: Any) -> Sequence[dataclasses.Field]:

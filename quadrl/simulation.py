@@ -120,9 +120,11 @@ class Simulation(abc.ABC):
         self.clear(rows)
         self._write(rows, start)
         if self._fill(rows):
+            sound = {k: (np.abs(part) < mujoco.mjMAXVAL).all() for k, part in vars(start).items()}
+            names = [name for name, good in sound.items() if not good] or ["position"]
             raise TaskError(
-                "an episode was to begin with a number that is not finite, or larger than "
-                f"{mujoco.mjMAXVAL:g}: {start}"
+                f"the task's sample gives {' and '.join(names)} that is not finite, or larger than "
+                f"{mujoco.mjMAXVAL:g}"
             )
         if rows is None:
             self._frames[0].table[ROWS["time"]] = 0.0
