@@ -281,11 +281,10 @@ class Environment:
         reward, observation = total(terms), task.observe(state, measures, fields, vehicle)
         # One number that is not finite makes the sum so: cheaper than a test of each.
         if not math.isfinite(np.add.reduce(reward) if self.shape else reward):
-            name = next(k for k, term in terms.items() if not np.isfinite(term).all())
-            row = np.flatnonzero(~np.isfinite(terms[name]))[0]
+            row = np.flatnonzero(~np.isfinite(np.ravel(reward)))[:1]
+            values = {k: float(np.ravel(term)[row][0]) for k, term in terms.items()}
             raise TaskError(
-                f"{task.name}: the reward's term {name!r} is not finite: "
-                f"{np.ravel(terms[name])[row]} for aircraft {row}"
+                f"{task.name}: the reward of aircraft {row[0]} is not finite; its terms are {values}"
             )
         return Transition(
             observation=observation,

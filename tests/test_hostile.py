@@ -630,8 +630,8 @@ HOSTILE = {
     "start that is NaN": (changed_start(velocity=lambda s: s.velocity * np.nan), "not finite"),
     "start that is far": (changed_start(position=lambda s: s.position + 1e11), "not finite"),
     "quaternion of length 2": (changed_start(quaternion=lambda s: 2 * s.quaternion), "quaternion"),
-    "reward that is NaN": (changed_reward(lambda p: p * np.nan), "term 'own' is not finite"),
-    "reward that is infinite": (changed_reward(lambda p: p + np.inf), "term 'own' is not finite"),
+    "reward that is NaN": (changed_reward(lambda p: p * np.nan), "not finite.*'own'"),
+    "reward that is infinite": (changed_reward(lambda p: p + np.inf), "not finite.*'own'"),
     "reward of another shape": (changed_reward(lambda p: np.zeros((3, 1))), "own"),
     "reward that is text": (changed_reward(lambda p: np.full(np.shape(p), "a")), "own"),
     "a part missing": (changed_parts(lambda p: dict(list(p.items())[1:])), "observe gives"),
@@ -667,7 +667,7 @@ def test_a_reward_that_is_nan_later_is_refused_too(num_envs):
 
     environment = Environment(hostile_task(reward=late), num_envs=num_envs, seed=0)
     environment.reset()
-    with pytest.raises(TaskError, match="'late' is not finite"):
+    with pytest.raises(TaskError, match="not finite.*'late': nan"):
         for _ in range(40):  # four rotors at full command: more than 0.5 m/s within a second
             environment.step(np.ones((*environment.shape, 4)))
 
