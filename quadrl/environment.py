@@ -284,7 +284,8 @@ class Environment:
             row = np.flatnonzero(~np.isfinite(np.ravel(reward)))[:1]
             values = {k: float(np.ravel(term)[row][0]) for k, term in terms.items()}
             raise TaskError(
-                f"{task.name}: the reward of aircraft {row[0]} is not finite; its terms are {values}"
+                f"{task.name}: the reward of aircraft {row[0]} is not finite; its terms are "
+                f"{values}"
             )
         return Transition(
             observation=observation,
