@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import reprlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,7 +27,7 @@ from quadrl.simulation import (
     Simulation,
     SingleSimulation,
 )
-from quadrl.state import State
+from quadrl.state import Start, State
 from quadrl.task import (
     EPISODE_DRAWS,
     Draw,
@@ -37,17 +38,21 @@ from quadrl.task import (
     OptionError,
     Outcome,
     Task,
+    TaskError,
     check_choices,
     total,
 )
-from quadrl.vehicle import Vehicle
+from quadrl.vehicle import ROTORS, Vehicle, resolve
 
 Observation = dict[str, Array]
 MAX_ENVS = 1 << 20
 
 
+MAX_THREADS = 1024
+
+
 class ActionError(QuadrlError, ValueError):
-    """An action of the wrong shape, or with a number that is not finite."""
+    """An action of the wrong shape or kind, or with a number that is not finite."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -107,7 +112,7 @@ class Environment:
             NativeError: The rotor callbacks cannot be built or installed.
         """
         self.task = tasks.make(task)
-        self.vehicle = vehicle or (simulation.vehicle if simulation else Vehicle())
+        self.vehicle = simulation.vehicle if simulation and vehicle is None else resolve(vehicle)
         if simulation is None:
             check_choices([engine], ENGINES, "engine")
             simulation = _simulation(self.task, self.vehicle, num_envs, num_threads, engine)
@@ -136,9 +141,14 @@ class Environment:
         self._diverged: np.ndarray | None = None  # in them
 
     def seed(self, seed: int | None = None) -> int:
-        """Give every aircraft a new generator; returns the seed of the first."""
+        """Give every aircraft a new generator; returns the seed of the first.
+
+        Raises:
+            OptionError: The seed is no whole number, or a negative one.
+        """
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
+        check_seed(seed)
         self.generators = [np.random.default_rng(seed + i) for i in range(self.num_envs)]
         return seed
 
@@ -153,6 +163,8 @@ class Environment:
 
         Raises:
             OptionError: A number of an aircraft that is not there, or one twice.
+            TaskError: The task gives arrays of the wrong shape, or a start that no aircraft can
+                have.
         """
         rows = None if rows is None else self._checked(rows)
         if self._steps is None and rows is not None and len(rows) < self.num_envs:
@@ -161,8 +173,11 @@ class Environment:
         if self.shape and rows is None:
             rows = np.arange(self.num_envs)
         start, fields = self.task.sample(Draw(self._draw_block(rows)), self.vehicle)
+        self._check_start(start, () if rows is None else (len(rows),))
         state = self.simulation.place(rows, start)
         measures = self.task.measure(state, fields)
+        if self._steps is None:
+            self._check_task(start, state, measures, fields)
         observation = self.task.observe(state, measures, fields, self.vehicle)
         if everyone or rows is None:
             self.fields, self._measures = fields, measures
@@ -187,7 +202,8 @@ class Environment:
             The transition. An aircraft whose episode is over flies on until it is reset.
 
         Raises:
-            ActionError: Wrong shape, or a number that is not finite.
+            ActionError: Wrong shape or kind, or a number that is not finite.
+            TaskError: The task gave a reward that is not finite.
             RuntimeError: There was no reset before.
         """
         self.begin(action)
@@ -203,14 +219,13 @@ class Environment:
         """First half of a step: the commands to the rotors, or the setpoint of the loops."""
         if self._steps is None:
             raise RuntimeError("call reset before the first step")
-        action = np.asarray(action, dtype=np.float64)
+        action = _as_numbers(action)
         if action.shape != self._action_shape:
             raise ActionError(
                 f"an action of shape {action.shape} was given; {self._action_shape} is expected"
             )
         if self.shape:
-            # One number that is not finite makes the sum so: cheaper than a test of each.
-            sound = math.isfinite(np.add.reduce(action, axis=None)) or np.isfinite(action).all()
+            sound = np.isfinite(action).all()
         else:
             sound = all(map(math.isfinite, action.tolist()))
         if not sound:
@@ -263,9 +278,18 @@ class Environment:
         if fields is not self.fields:
             self.fields, measures = fields, task.measure(state, fields)
         self._measures = measures
+        reward, observation = total(terms), task.observe(state, measures, fields, vehicle)
+        # One number that is not finite makes the sum so: cheaper than a test of each.
+        if not math.isfinite(np.add.reduce(reward) if self.shape else reward):
+            row = np.flatnonzero(~np.isfinite(np.ravel(reward)))[:1]
+            values = {k: float(np.ravel(term)[row][0]) for k, term in terms.items()}
+            raise TaskError(
+                f"{task.name}: the reward of aircraft {row[0]} is not finite; its terms are "
+                f"{values}"
+            )
         return Transition(
-            observation=task.observe(state, measures, fields, vehicle),
-            reward=total(terms),
+            observation=observation,
+            reward=reward,
             reward_terms=terms,
             terminated=terminated,
             truncated=truncated,
@@ -308,16 +332,25 @@ class Environment:
         return {name: np.array(value) for name, value in saved.items()}
 
     def restore(self, saved: dict[str, np.ndarray]) -> Observation:
-        """Take up what `save` gave; returns the observation of that moment."""
+        """Take up what `save` gave; returns the observation of that moment.
+
+        Raises:
+            OptionError: It is not of such an environment.
+        """
+        if self._steps is None:
+            self.reset()  # makes the records, which are filled below
+        for name, own in self.save().items():
+            kept = saved.get(name)
+            if kept is None or (kept.shape, kept.dtype) != (own.shape, own.dtype):
+                found = "nothing" if kept is None else f"{kept.dtype} of shape {kept.shape}"
+                raise OptionError(
+                    f"what was saved is of another environment: {name} is {found}, and {own.dtype} "
+                    f"of shape {own.shape} is expected"
+                )
         prefix = "simulation."
         self.simulation.restore(
             {k.removeprefix(prefix): v for k, v in saved.items() if k.startswith(prefix)}
         )
-        if self._steps is None:
-            self.reset()  # makes the records, which are filled below
-            self.simulation.restore(
-                {k.removeprefix(prefix): v for k, v in saved.items() if k.startswith(prefix)}
-            )
         self._steps = saved["steps"].copy() if self.shape else int(saved["steps"])
         self._error_sum, self._final_sum = saved["error"].copy(), saved["final"].copy()
         for name in ("fields", "measures"):
@@ -343,17 +376,68 @@ class Environment:
         )
         return over & self.task.success(state, self.fields, errors, terminated, truncated)
 
+    def _check_start(self, start: Start, shape: tuple[int, ...]) -> None:
+        """Refuse a start of other shapes (NumPy would repeat it), or that no aircraft can have."""
+        for name, columns in _START.items():
+            value = np.asarray(getattr(start, name))
+            if value.shape != (*shape, columns):
+                raise TaskError(
+                    f"{self.task.name}: sample gives {name} of shape {value.shape}, "
+                    f"{(*shape, columns)} is expected"
+                )
+        length = np.square(start.quaternion).sum(-1)
+        if not (np.abs(length - 1) < 1e-6).all():
+            raise TaskError(
+                f"{self.task.name}: sample gives a quaternion of length {np.max(length) ** 0.5:g}; "
+                "1 is expected"
+            )
+
+    def _check_task(self, start: Start, state: State, measures: Measures, fields: Fields) -> None:
+        """Refuse a task whose functions give other shapes or kinds of numbers than they should.
+
+        Done once, at the first reset: they are pure, so a call more changes nothing.
+        """
+        task, vehicle = self.task, self.vehicle
+        terminated = task.terminated(state, measures, fields, vehicle)
+        self._check_array("terminated", terminated, self.shape, "b")
+        error = task.error(state, measures, fields)
+        self._check_array("error", error, self.shape, "fiu")
+        errors = Errors(final=error, mean=error)
+        success = task.success(state, fields, errors, terminated, np.logical_not(terminated))
+        self._check_array("success", success, self.shape, "b")
+        outcome = Outcome(failed=terminated, succeeded=success)
+        terms = task.reward(measures, measures, start.rotor_speed, outcome, vehicle)
+        for name, term in terms.items():
+            self._check_array(f"the reward's term {name!r}", term, self.shape, "fiu")
+        observation = task.observe(state, measures, fields, vehicle)
+        if list(observation) != list(task.observation):
+            raise TaskError(
+                f"{task.name}: observe gives {', '.join(observation)}; declared are "
+                f"{', '.join(task.observation)}, in this order"
+            )
+        for name, part in task.observation.items():
+            self._check_array(f"part {name!r}", observation[name], (*self.shape, part.size), "fiu")
+
+    def _check_array(self, what: str, value: Any, shape: tuple[int, ...], kinds: str) -> None:
+        array = np.asarray(value)
+        if array.shape != shape or array.dtype.kind not in kinds:
+            raise TaskError(
+                f"{self.task.name}: {what} has shape {array.shape} and dtype {array.dtype}; "
+                f"{'bool' if kinds == 'b' else 'numbers'} of shape {shape} are expected"
+            )
+
     def _checked(self, rows: np.ndarray) -> np.ndarray:
         """Numbers of aircraft, in order, from numbers or a mask."""
         given = np.asarray(rows)
         if given.dtype == bool and given.shape == self.shape:
             return np.flatnonzero(given)
-        numbers = np.unique(given)
+        whole = given.ndim == 1 and (given.dtype.kind in "iu" or len(given) == 0)
+        numbers = np.unique(given) if whole else np.zeros(0, dtype=np.int64)
         within = len(numbers) == 0 or (numbers[0] >= 0 and numbers[-1] < self.num_envs)
-        if not self.shape or given.ndim != 1 or len(numbers) != len(given) or not within:
+        if not self.shape or not whole or len(numbers) != len(given) or not within:
             raise OptionError(
-                f"rows = {rows}: different numbers from 0 to {self.num_envs - 1} are allowed, or a "
-                f"mask of shape {self.shape}"
+                f"rows = {reprlib.repr(given.tolist())}: different numbers from 0 to "
+                f"{self.num_envs - 1} are allowed, or a mask of shape {self.shape}"
             )
         return numbers.astype(np.int64)
 
@@ -378,6 +462,10 @@ def _simulation(
         raise OptionError(
             f"num_envs = {num_envs!r}: a whole number from 1 to {MAX_ENVS} is allowed"
         )
+    if not isinstance(num_threads, (int, np.integer)) or not 0 <= num_threads <= MAX_THREADS:
+        raise OptionError(
+            f"num_threads = {num_threads!r}: a whole number from 0 to {MAX_THREADS} is allowed"
+        )
     return BatchSimulation(
         vehicle,
         int(num_envs),
@@ -386,6 +474,34 @@ def _simulation(
         num_threads=num_threads,
         engine=engine,
     )
+
+
+def check_seed(seed: object) -> None:
+    """Refuse what no generator can be seeded with.
+
+    Raises:
+        OptionError: It is no whole number, or a negative one.
+    """
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise OptionError(f"seed = {seed!r}: a whole number from 0 on is allowed")
+
+
+_START = {"position": 3, "quaternion": 4, "velocity": 3, "body_rate": 3, "rotor_speed": ROTORS}
+"""What `Start` holds, and its numbers an aircraft."""
+
+
+def _as_numbers(action: Any) -> np.ndarray:
+    """An action in double precision; what NumPy would only convert with a loss is refused."""
+    try:
+        array = np.asarray(action)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ActionError(f"an action that is no array of numbers was given: {error}") from error
+    if array.dtype.char not in "fd" and not np.can_cast(array.dtype, np.float64):
+        raise ActionError(
+            f"an action of dtype {array.dtype} was given; real numbers are expected, such as "
+            "float32 or float64"
+        )
+    return array.astype(np.float64, copy=False)
 
 
 def _fields(record: Any) -> Sequence[dataclasses.Field]:

@@ -31,6 +31,9 @@ LOG_VARIANCE = (-12.0, 2.0)
 SHIPPED = Path(__file__).parent / "assets" / "policies"
 """The policies that come with the package: TASK_ALGO.safetensors, with a .json beside each."""
 
+UNREADABLE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError,
+              RecursionError)  # fmt: skip
+"""What reading a damaged safetensors file and its header can raise."""
 HEADER = "quadrl"
 """The one entry of the file's table, JSON: of several, safetensors writes the order at random."""
 
@@ -138,7 +141,7 @@ class Policy:
                 header = read_header(opened.metadata())
                 names = opened.keys() if header.get("format") == FORMAT else ()
                 arrays = {name: opened.get_tensor(name) for name in names}
-        except (SafetensorError, OSError, ValueError, TypeError) as error:
+        except UNREADABLE as error:
             raise PolicyError(f"{file} is damaged or no safetensors file: {error}") from error
         if header.get("format") != FORMAT:
             raise PolicyError(
@@ -188,10 +191,23 @@ class Policy:
         numbers = all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values())
         if not sound or not numbers or width != 2 * ROTORS or not (deviation > 0).all():
             raise PolicyError(f"{file}: the arrays in it do not make a policy network")
+        if not _stays_finite(weights, biases):
+            raise PolicyError(f"{file}: its weights are so large that its actions are no numbers")
         known = isinstance(task, str) and isinstance(metadata, dict)
         if not known or not isinstance(metadata.get("task_options", {}), dict):
             raise PolicyError(f"{file} does not say what the policy was trained for")
         return cls(weights, biases, mean, deviation, task, metadata)
+
+
+def _stays_finite(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...]) -> bool:
+    """Whether no observation makes a sum in the network larger than single precision holds."""
+    largest = CLIP
+    for weight, bias in zip(weights, biases, strict=True):
+        sums = largest * np.abs(weight, dtype=np.float64).sum(axis=1) + np.abs(bias)
+        if not (sums < np.finfo(np.float32).max / 2).all():
+            return False
+        largest = 1.0  # of tanh
+    return True
 
 
 def shipped() -> list[Path]:

@@ -15,9 +15,10 @@ import numpy as np
 from mujoco.batch import Batch
 
 from quadrl import native
-from quadrl.flight import FIELDS, Flight
+from quadrl.flight import FIELDS, EngineError, Flight
 from quadrl.state import ROWS, TABLE_ROWS, Start, State
-from quadrl.vehicle import Vehicle
+from quadrl.task import TaskError
+from quadrl.vehicle import MARK, MARK_SLOT, ROTORS, Vehicle
 
 COORDINATES = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
 Engine = Literal["mujoco", "flight"]
@@ -111,10 +112,20 @@ class Simulation(abc.ABC):
 
         Returns:
             The state of those aircraft.
+
+        Raises:
+            TaskError: The start holds a number that is not finite, or past what MuJoCo itself calls
+                unstable.
         """
         self.clear(rows)
         self._write(rows, start)
-        self._fill(rows)
+        if self._fill(rows):
+            sound = {k: (np.abs(part) < mujoco.mjMAXVAL).all() for k, part in vars(start).items()}
+            names = [name for name, good in sound.items() if not good] or ["position"]
+            raise TaskError(
+                f"the task's sample gives {' and '.join(names)} that is not finite, or larger than "
+                f"{mujoco.mjMAXVAL:g}"
+            )
         if rows is None:
             self._frames[0].table[ROWS["time"]] = 0.0
             return self.state
@@ -245,7 +256,12 @@ class SingleSimulation(Simulation):
         altitude: float,
         engine: Engine = "mujoco",
     ) -> None:
-        """Wrap a model of the vehicle and its data."""
+        """Wrap a model of the vehicle and its data.
+
+        Raises:
+            EngineError: The model is not one that `Vehicle.compile` makes, or could make.
+        """
+        _check_model(model, vehicle)
         self.model, self.data = model, data
         super().__init__(vehicle, (), altitude)
         self._flight: Flight | None = None
@@ -294,3 +310,21 @@ class SingleSimulation(Simulation):
     def _restore(self, saved: dict[str, np.ndarray]) -> None:
         spec = mujoco.mjtState.mjSTATE_INTEGRATION
         mujoco.mj_setState(self.model, self.data, saved["rows"], spec)
+
+
+def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:
+    """Refuse a model whose coordinates are not the aircraft's alone, or that would fly wrongly."""
+    sizes = (model.nq, model.nv, model.na, model.nu) == (7, 6, ROTORS, ROTORS)
+    marked = model.nuser_body >= 3 and model.nbody > 1 and (model.body_user[:, 0] == MARK).any()
+    rotors = sizes and (model.actuator_dynprm[:, MARK_SLOT] == MARK).all()
+    step = model.opt.timestep
+    for right, what in (
+        (sizes, "7 positions, 6 velocities and four rotors, and nothing else that moves"),
+        (marked and rotors, "the parameters of an aircraft: begin with Vehicle.spec"),
+        (
+            step == vehicle.physics_step,
+            f"the vehicle's step, {vehicle.physics_step} s (not {step})",
+        ),
+    ):
+        if not right:
+            raise EngineError(f"a model to fly needs {what}")

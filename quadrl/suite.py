@@ -30,7 +30,7 @@ from quadrl import interfaces, native, tasks
 from quadrl.environment import Environment, Transition
 from quadrl.simulation import ENGINES, Engine, SingleSimulation
 from quadrl.task import Task, check_choices
-from quadrl.vehicle import Vehicle
+from quadrl.vehicle import Vehicle, resolve
 
 DOMAIN = "quadrotor"
 SUITE = containers.TaggedTasks()
@@ -205,7 +205,7 @@ def make(
     # The task keeps the clock, not dm_control: there a time limit hides a crash on the last step.
     if (limit := settings.pop("time_limit", time_limit)) is not None:
         options["horizon"] = limit
-    task, vehicle = tasks.make(task, **options), vehicle or Vehicle()
+    task, vehicle = tasks.make(task, **options), resolve(vehicle)
     control_step = settings.pop("control_timestep", None)
     if (substeps := settings.pop("n_sub_steps", None)) is not None:
         if control_step is not None:

@@ -12,7 +12,9 @@ import dataclasses
 import difflib
 import functools
 import math
+import numbers
 import operator
+import reprlib
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
@@ -40,11 +42,17 @@ EPISODE_DRAWS = 64
 
 FULL_TURN = 2 * math.pi
 REWARD_TIME = 0.05  # [s], the control step of the paper's aircraft
+MAX_OPTION = 1e9
+"""Larger options would take the digits from what is added to them."""
 CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing
 
 
 class OptionError(QuadrlError, ValueError):
     """A name or a value that is not among the choices."""
+
+
+class TaskError(QuadrlError, ValueError):
+    """A task that gives what no task may; `quadrl.testing.check_task` looks more closely."""
 
 
 class Draw:
@@ -271,11 +279,8 @@ class Task(abc.ABC, Generic[FieldsT]):
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            numbers = value if isinstance(value, tuple) else (value,)
-            flat = np.asarray(numbers, dtype=float) if numbers else np.zeros(1)
-            if not np.all(np.isfinite(flat)):
-                raise OptionError(f"{self.name}: {field.name} = {value!r} is not finite")
+            if field.default is not dataclasses.MISSING:
+                check_option(self.name, field.name, getattr(self, field.name), field.default)
         if self.horizon <= 0:
             raise OptionError(f"{self.name}: horizon = {self.horizon} must be positive")
         if self.altitude < 0:
@@ -427,6 +432,38 @@ def reward_share(vehicle: Vehicle) -> float:
 def total(terms: dict[str, Array]) -> Array:
     """The sum of reward terms, from the first to the last."""
     return functools.reduce(operator.add, terms.values())
+
+
+def check_option(task: str, option: str, value: object, default: object) -> None:
+    """Refuse a value of another kind than the default's, or with a number that is none.
+
+    Raises:
+        OptionError: The message names the option, the value and what is expected.
+    """
+    if _kind(value) != _kind(default):
+        raise OptionError(
+            f"{task} option {option} = {reprlib.repr(value)}: a {_kind(default)} is expected, such "
+            f"as {default!r}"
+        )
+    if isinstance(value, (str, bool)):
+        return
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    # Whole numbers past 64 bits are objects to NumPy.
+    if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        raise OptionError(f"{task}: {option} = {reprlib.repr(value)} is not finite")
+    if not (np.abs(array) <= MAX_OPTION).all():
+        raise OptionError(
+            f"{task}: {option} = {reprlib.repr(value)}: at most {MAX_OPTION:g} is allowed"
+        )
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, (bool, str, dict)) or value is None:
+        return type(value).__name__
+    return "number" if isinstance(value, numbers.Real) else "list"
 
 
 def check_choices(given: Iterable[str], choices: Iterable[str], what: str) -> None:

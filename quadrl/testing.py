@@ -139,12 +139,14 @@ def check_functions(task: Task) -> None:
 def check_episodes(task: Task) -> None:
     """Whole episodes: finite numbers that vary, flags that agree, and an end."""
     environment = Environment(task, num_envs=AIRCRAFT, seed=1)
-    observations = [environment.flatten(environment.reset())]
+    with _blame(task, "a reset"):
+        observations = [environment.flatten(environment.reset())]
     with _blame(task, "markers"):
         environment.markers()
     ended = np.zeros(AIRCRAFT, dtype=bool)
     for action in varied_actions(environment.horizon_steps, AIRCRAFT):
-        now = environment.step(action)
+        with _blame(task, "a flight"):
+            now = environment.step(action)
         observations.append(environment.flatten(now.observation))
         for name, value in (*now.reward_terms.items(), ("error", now.error)):
             _require(np.isfinite(value).all(), f"{task.name}: {name} = {value} in flight")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import reprlib
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -30,6 +32,11 @@ ROTOR_HEIGHT = 0.030
 # As in native/equations.h.
 MARK = 1903518052.0
 MARK_SLOT = 9
+
+
+MIN, MAX = mujoco.mjMINVAL, mujoco.mjMAXVAL  # what MuJoCo takes for zero, and for unstable
+LENGTHS = (1e-3, 1e3)  # [m]; the meshes of a smaller one have no volume to MuJoCo
+MAX_SUBSTEPS = 10_000
 
 
 class VehicleError(QuadrlError, ValueError):
@@ -71,23 +78,19 @@ class Vehicle:
 
     def __post_init__(self) -> None:
         """Refuse what cannot fly."""
+        if not isinstance(self.name, str):
+            raise VehicleError(f"name = {self.name!r}: a text is allowed")
         try:
-            object.__setattr__(self, "inertia", tuple(float(moment) for moment in self.inertia))
-        except (TypeError, ValueError) as error:
+            object.__setattr__(self, "inertia", tuple(self.inertia))
+        except TypeError as error:
             raise VehicleError(f"inertia = {self.inertia!r}: three numbers are allowed") from error
-        for field in dataclasses.fields(self):
+        for field in dataclasses.fields(self)[1:]:
             value = getattr(self, field.name)
-            numbers = value if isinstance(value, tuple) else (value,)
-            if field.name == "name":
-                continue
-            zero_allowed = field.name in ("drag_coefficient", "moment_coefficient")
-            if not all(
-                isinstance(v, (int, float))
-                and math.isfinite(v)
-                and (v > 0 or (zero_allowed and v == 0))
-                for v in numbers
-            ):
-                raise VehicleError(f"{field.name} = {value!r}: positive and finite is allowed")
+            if field.name == "inertia":
+                checked: Any = tuple(_checked(field.name, moment) for moment in value)
+            else:
+                checked = _checked(field.name, value)
+            object.__setattr__(self, field.name, checked)
         if len(self.inertia) != 3 or 2 * max(self.inertia) > sum(self.inertia) * (1 + 1e-9):
             raise VehicleError(
                 f"inertia = {self.inertia}: three principal moments are allowed, "
@@ -95,6 +98,17 @@ class Vehicle:
             )
         if self.max_thrust_ratio <= 1:
             raise VehicleError(f"max_thrust_ratio = {self.max_thrust_ratio}: it must exceed 1")
+        if self.max_speed > MAX:
+            raise VehicleError(
+                f"mass = {self.mass}, thrust_coefficient = {self.thrust_coefficient}, "
+                f"max_thrust_ratio = {self.max_thrust_ratio}: the rotors would turn at "
+                f"{self.max_speed:.3g} rad/s, and at most {MAX:g} is allowed"
+            )
+        if self.control_step > MAX_SUBSTEPS * self.physics_step:
+            raise VehicleError(
+                f"control_step = {self.control_step} s holds more than {MAX_SUBSTEPS} physics "
+                f"steps of {self.physics_step} s"
+            )
         if not math.isclose(self.substeps * self.physics_step, self.control_step, rel_tol=1e-9):
             raise VehicleError(
                 f"control_step = {self.control_step} s is no whole number of physics steps "
@@ -246,6 +260,33 @@ class Vehicle:
             actuator.ctrlrange = (0, self.max_speed)
             actuator.dynprm[0], actuator.dynprm[MARK_SLOT] = self.lag_rate, MARK
             actuator.gainprm[0] = self.thrust_coefficient
+
+
+def resolve(vehicle: Vehicle | None) -> Vehicle:
+    """A vehicle, or the paper's for None.
+
+    Raises:
+        VehicleError: It is something else.
+    """
+    if not isinstance(vehicle, (Vehicle, type(None))):
+        raise VehicleError(
+            f"vehicle = {vehicle!r}: a quadrl.vehicle.Vehicle is allowed, such as "
+            f"quadrl.vehicle.VEHICLES[{vehicle if vehicle in tuple(VEHICLES) else 'paper'!r}]"
+        )
+    return vehicle or Vehicle()
+
+
+def _checked(name: str, value: Any) -> float:
+    """A parameter as a float."""
+    low, high = LENGTHS if name in ("arm_length", "rotor_radius") else (MIN, MAX)
+    kinds = (int, float, np.integer, np.floating)
+    number = isinstance(value, kinds) and not isinstance(value, bool)
+    zero = number and value == 0 and name in ("drag_coefficient", "moment_coefficient")
+    if not (number and (zero or low <= value <= high)):
+        raise VehicleError(
+            f"{name} = {reprlib.repr(value)}: a number from {low:g} to {high:g} is allowed"
+        )
+    return float(value)
 
 
 def _along(up: Array, point: tuple[float, ...]) -> Array:

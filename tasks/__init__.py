@@ -30,8 +30,11 @@ def register(task: type[Task]) -> type[Task]:
     """Add a task to the catalogue, so that every door knows it by its name.
 
     Raises:
-        ValueError: Another task has the name.
+        OptionError: It is no class of a task with a name, or another task has the name.
     """
+    named = isinstance(task, type) and issubclass(task, Task) and hasattr(task, "name")
+    if not named or not isinstance(task.name, str) or not task.name.isidentifier():
+        raise OptionError(f"{task!r} is no class of a task with a name such as 'my_task'")
     if TASKS.get(task.name, task) is not task:
         raise OptionError(f"a task named {task.name!r} is registered already")
     TASKS[task.name] = task

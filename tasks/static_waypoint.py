@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import reprlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -46,11 +47,16 @@ class StaticWaypoint(WaypointTask[Route]):
 
     def __post_init__(self) -> None:
         """Refuse a route that is none."""
-        object.__setattr__(self, "waypoints", tuple(tuple(w) for w in self.waypoints))
-        if not self.waypoints or any(len(w) != 3 for w in self.waypoints):
+        try:
+            points = tuple(tuple(map(float, point)) for point in self.waypoints)
+        except (TypeError, ValueError, OverflowError):
+            points = ()
+        if not points or any(len(point) != 3 for point in points):
             raise OptionError(
-                f"waypoints = {self.waypoints}: at least one point of three coordinates is expected"
+                f"waypoints = {reprlib.repr(self.waypoints)}: at least one point of three "
+                "coordinates is expected"
             )
+        object.__setattr__(self, "waypoints", points)
         super().__post_init__()
 
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Route]:

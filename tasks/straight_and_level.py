@@ -10,7 +10,7 @@ import numpy as np
 
 from quadrl.rotation import Array, namespace, norm
 from quadrl.state import Start, State
-from quadrl.task import Draw, Errors, Fields, Marker, Measures
+from quadrl.task import Draw, Errors, Fields, Marker, Measures, OptionError
 from quadrl.tasks.moving_goal import MovingGoalTask
 from quadrl.vehicle import Vehicle
 
@@ -45,6 +45,12 @@ class StraightAndLevel(MovingGoalTask[Line]):
     """Altitude error that ends the episode [m]."""
     max_offset: float = 3.0
     """Distance off the line that ends the episode [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse a line that is not flown."""
+        super().__post_init__()
+        if self.line_speed <= 0:
+            raise OptionError(f"{self.name}: line_speed = {self.line_speed} must be positive")
 
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Line]:
         """On a line of any heading, at rest or up to the set speed along it."""

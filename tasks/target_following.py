@@ -10,7 +10,7 @@ import numpy as np
 
 from quadrl.rotation import Array, namespace
 from quadrl.state import Start, State
-from quadrl.task import FULL_TURN, Draw, Errors, Fields, Marker, Measures
+from quadrl.task import FULL_TURN, Draw, Errors, Fields, Marker, Measures, OptionError
 from quadrl.tasks.moving_goal import MovingGoalTask
 from quadrl.vehicle import Vehicle
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 WAVES = 2  # sines in each coordinate of the target's path
 AXES = 3
+SLOWEST = 1e-6  # [rad/s]; the slower, the longer the waves, and the fewer digits are left
 PATH: tuple[float, float, float, float] = (0.95, 0.55, 0.20, 0.35)
 
 
@@ -55,6 +56,17 @@ class TargetFollowing(MovingGoalTask[Path]):
     """Distance from the target that ends the episode [m]."""
     tolerance: float = 0.3
     """Largest mean error of the distance that counts as success [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse a path that is none."""
+        super().__post_init__()
+        if not SLOWEST <= self.slowest <= self.fastest:
+            raise OptionError(
+                f"{self.name}: slowest = {self.slowest}, fastest = {self.fastest}: at least "
+                f"{SLOWEST:g}, in this order, is allowed"
+            )
+        if not 0 <= self.climb_share <= 1:
+            raise OptionError(f"{self.name}: climb_share = {self.climb_share}: 0 to 1 is allowed")
 
     def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Path]:
         """At rest, beside the target, level, any heading."""

@@ -16,10 +16,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from quadrl import tasks
-from quadrl.environment import Environment, Transition
+from quadrl.environment import Environment, Transition, check_seed
 from quadrl.simulation import Engine
-from quadrl.task import OptionError, Task, check_choices
-from quadrl.vehicle import Vehicle
+from quadrl.task import OptionError, Task, check_choices, check_option
+from quadrl.vehicle import Vehicle, resolve
 
 Info = dict[str, Any]
 
@@ -49,8 +49,9 @@ class _Door:
         """Make the environment; returns the spaces of one aircraft."""
         if render_mode not in (None, "rgb_array"):
             raise OptionError(f"unknown render_mode {render_mode!r}; choices: None, 'rgb_array'")
-        vehicle = vehicle or Vehicle()
+        vehicle = resolve(vehicle)
         if max_episode_steps is not None:
+            check_option("environment", "max_episode_steps", max_episode_steps, 200)
             options["horizon"] = max_episode_steps * vehicle.control_step
         self.environment = Environment(
             tasks.make(task, **options),
@@ -207,6 +208,7 @@ class QuadrotorVectorEnv(_Door, VectorEnv):
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
             raise OptionError(f"reset_mask: bool of shape ({self.num_envs},), some of it True")
         if seed is not None:
+            check_seed(seed)
             for i in np.flatnonzero(mask):
                 self.environment.generators[i] = np.random.default_rng(seed + int(i))
         if mask.all():

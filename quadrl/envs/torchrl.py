@@ -108,7 +108,7 @@ class QuadrotorEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._restored = False
-        now = self.environment.step(tensordict["action"].detach().cpu().numpy())
+        now = self.environment.step(tensordict["action"].detach().cpu())
         self._observation = self.environment.flatten(now.observation)
         columns = {
             "reward": now.reward.astype(np.float32),

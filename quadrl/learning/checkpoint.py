@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save as to_bytes
 
 from quadrl.learning.config import RunError
-from quadrl.policy import HEADER, read_header, write_whole
+from quadrl.policy import HEADER, UNREADABLE, read_header, write_whole
 
 FORMAT = "quadrl-checkpoint-1"
 CHECKPOINT = "checkpoint.safetensors"
@@ -48,7 +48,7 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             header = read_header(opened.metadata())
             names = opened.keys() if header.get("format") == FORMAT else ()
             flat = {name: opened.get_tensor(name) for name in names}
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
+    except UNREADABLE as error:
         raise RunError(f"{path} is damaged or no checkpoint: {error}") from error
     if header.get("format") != FORMAT:
         raise RunError(
@@ -60,9 +60,13 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         *folders, last = name.split("/")
         into = tensors
         for folder in folders:
-            into = into.setdefault(folder, {})
+            into = into.setdefault(folder, {}) if isinstance(into, dict) else None
+        if not isinstance(into, dict) or last in into:
+            raise RunError(f"{path} is damaged: it holds {name!r} twice, or within a tensor")
         into[last] = tensor
-    return tensors, header["numbers"]
+    if not isinstance(numbers := header.get("numbers"), dict):
+        raise RunError(f"{path} is damaged: its header lacks the numbers")
+    return tensors, numbers
 
 
 def _flatten(tensors: dict[str, Any], prefix: str = "") -> list[tuple[str, torch.Tensor]]:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import reprlib
+import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
 import tyro
 
 from quadrl import tasks
-from quadrl.environment import MAX_ENVS
+from quadrl.environment import MAX_ENVS, MAX_THREADS
 from quadrl.errors import QuadrlError
 from quadrl.interfaces import INTERFACES
 from quadrl.policy import write_whole
@@ -96,7 +98,7 @@ class _Settings:
             for field in dataclasses.fields(self):
                 value = getattr(self, field.name)
                 if isinstance(field.default, int):
-                    _check_number(field.name, value, 1)
+                    _check_count(field.name, value, 1)
                 elif field.name in self.MAY_BE_ZERO:
                     _check_number(field.name, value, 0)
                 else:
@@ -234,8 +236,8 @@ class TrainConfig:
 
     def _check(self) -> None:
         for name in ("rollout", "steps"):
-            _check_number(name, getattr(self, name), 1)
-        _check_number("num_envs", self.num_envs, 1, MAX_ENVS)
+            _check_count(name, getattr(self, name), 1)
+        _check_count("num_envs", self.num_envs, 1, MAX_ENVS)
         if not 2 <= self.num_envs * self.rollout <= MAX_BATCH:  # one advantage has no deviation
             raise OptionError(
                 f"num_envs = {self.num_envs} with rollout = {self.rollout}: 2 to {MAX_BATCH} "
@@ -243,13 +245,23 @@ class TrainConfig:
             )
         for name in ("gamma", "gae_lambda"):
             _check_number(name, getattr(self, name), 0, 1)
-        _check_number("seed", self.seed, 0, 999)
+        _check_count("seed", self.seed, 0, 999)
         _check_number("initial_deviation", self.initial_deviation, 0.01, math.e)
-        _check_number("num_threads", self.num_threads, 0, 1024)
+        _check_count("num_threads", self.num_threads, 0, MAX_THREADS)
         _check_number("checkpoint_seconds", self.checkpoint_seconds, 0)
         _check_positive("reward_scale", self.reward_scale)
+        for name in ("hidden", "critic_hidden", "task_options"):
+            if not isinstance(getattr(self, name), (tuple, list)):
+                raise OptionError(
+                    f"{name} = {reprlib.repr(getattr(self, name))}: a list is allowed"
+                )
         for width in (*self.hidden, *self.critic_hidden):
-            _check_number("width of a hidden layer", width, 1, 1 << 16)
+            _check_count("width of a hidden layer", width, 1, 1 << 16)
+        for name, kind in (("ppo", PPOConfig), ("trpo", TRPOConfig), ("gae", GAEConfig)):
+            if not isinstance(getattr(self, name), kind):
+                raise OptionError(
+                    f"{name} = {reprlib.repr(getattr(self, name))}: a {kind.__name__} is allowed"
+                )
         check_choices([self.vehicle], VEHICLES, "vehicle")
         check_choices([self.action], INTERFACES, "action interface")
         check_choices([self.engine], ENGINES, "engine")
@@ -309,9 +321,11 @@ def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
     """
     options: dict[str, Any] = {}
     for pair in pairs:
-        name, equals, text = pair.partition("=")
+        name, equals, text = pair.partition("=") if isinstance(pair, str) else ("", "", "")
         if not equals:
-            raise OptionError(f"option {pair!r}: NAME=VALUE is expected, such as horizon=5")
+            raise OptionError(
+                f"option {reprlib.repr(pair)}: NAME=VALUE is expected, such as horizon=5"
+            )
         try:
             options[name] = _tuples(json.loads(text))
         except (ValueError, RecursionError):
@@ -326,24 +340,10 @@ def make_task(name: str, options: dict[str, Any]) -> Task:
         OptionError: Unknown task or option, or a value of another kind than the default's.
     """
     task = tasks.make(name)
-    check_choices(options, [f.name for f in dataclasses.fields(task)], f"{name} option")
-    for option, value in options.items():
-        default = getattr(task, option)
-        if _kind(value) != _kind(default):
-            raise OptionError(
-                f"{name} option {option} = {value!r}: a {_kind(default)} is expected, such as "
-                f"{default!r}"
-            )
     try:
         return task.replace(**options)
-    except (TypeError, ArithmeticError) as error:
+    except (TypeError, ArithmeticError) as error:  # of a check that is the task's own
         raise OptionError(f"{name} options {options}: {error}") from error
-
-
-def _kind(value: object) -> str:
-    if isinstance(value, (bool, str)):
-        return type(value).__name__
-    return "number" if isinstance(value, (int, float)) else "list"
 
 
 def _tuples(value: Any) -> Any:
@@ -351,14 +351,25 @@ def _tuples(value: Any) -> Any:
 
 
 def _check_positive(name: str, value: float) -> None:
-    if not (value > 0 and math.isfinite(value)):
-        raise OptionError(f"{name} = {value}: a positive number is allowed")
+    if not (_is_number(value) and 0 < value <= sys.float_info.max):
+        raise OptionError(f"{name} = {reprlib.repr(value)}: a positive number is allowed")
 
 
 def _check_number(name: str, value: float, low: float, high: float = math.inf) -> None:
-    if not (low <= value <= high and math.isfinite(value)):
+    if not (_is_number(value) and low <= value <= min(high, sys.float_info.max)):
         allowed = f"at least {low:g}" if math.isinf(high) else f"{low:g} to {high:.10g}"
-        raise OptionError(f"{name} = {value}: {allowed} is allowed")
+        raise OptionError(f"{name} = {reprlib.repr(value)}: {allowed} is allowed")
+
+
+def _check_count(name: str, value: int, low: int, high: float = math.inf) -> None:
+    """The same of a whole number."""
+    _check_number(name, value, low, high)
+    if not isinstance(value, int):
+        raise OptionError(f"{name} = {value}: a whole number is allowed")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def versions() -> dict[str, str]:

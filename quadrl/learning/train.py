@@ -262,7 +262,14 @@ class Training:
             self._running = {k: v.numpy().copy() for k, v in tensors["running"].items()}
             self._generator_state = tensors["generator"]
             self.iteration, self.seconds = int(numbers["iteration"]), float(numbers["seconds"])
-        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        except (
+            ArithmeticError,
+            AttributeError,
+            KeyError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:
             raise RunError(f"{path} does not fit its run: {error}") from error
 
 

@@ -3,7 +3,8 @@
 The C sources beside this file are compiled at first use with the machine's own compiler against
 the headers of the installed mujoco, because they read the structs of exactly that version. The
 library is kept in a cache folder (`$QUADRL_CACHE`, else the user's cache folder), one for each
-version of mujoco, of the sources and of the flags.
+version of mujoco, of the sources and of the flags; `$QUADRL_CFLAGS` adds flags at the end of
+these (`scripts/sanitize` does).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import functools
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -62,6 +64,11 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "quadrl"
 
 
+def flags() -> tuple[str, ...]:
+    """What the compiler is given: FLAGS, and those of `$QUADRL_CFLAGS`."""
+    return (*FLAGS, *shlex.split(os.environ.get("QUADRL_CFLAGS", "")))
+
+
 def compiler() -> str:
     """Path of the C compiler: `$CC`, cc, gcc or clang.
 
@@ -91,7 +98,7 @@ def build(include: Path | None = None) -> Path:
         NativeError: There is no compiler, or it refused the sources.
     """
     include = include or Path(mujoco.__file__).parent / "include"
-    digest = hashlib.sha256(" ".join((*FLAGS, platform.machine(), str(include))).encode())
+    digest = hashlib.sha256(" ".join((*flags(), platform.machine(), str(include))).encode())
     for name in HEADERS + SOURCES:
         digest.update((_FOLDER / name).read_bytes())
     digest.update((include / "mujoco" / "mujoco.h").read_bytes())
@@ -106,7 +113,7 @@ def build(include: Path | None = None) -> Path:
         folder = Path(tempfile.mkdtemp(prefix="quadrl-"))
         scratch = tempfile.mkdtemp(dir=folder)
     try:
-        command = [compiler(), *FLAGS, f"-I{include}", "-o", f"{scratch}/{name}"]
+        command = [compiler(), *flags(), f"-I{include}", "-o", f"{scratch}/{name}"]
         command += [str(_FOLDER / source) for source in SOURCES] + ["-lm"]
         outcome = subprocess.run(command, capture_output=True, text=True)
         if outcome.returncode != 0:

@@ -15,7 +15,9 @@ enum { ROTORS = 4 };
 // Aircraft are flown LANES at a time, so that the compiler makes vector instructions of them: the
 // same operations, each rounded as IEEE 754 says, so that no bit depends on the machine's vectors.
 enum { LANES = 8 };
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+// The clones are chosen while the library is loaded, before a sanitizer is ready for its own calls.
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__) && \
+    !defined(__SANITIZE_ADDRESS__)
 #define VECTORISED __attribute__((target_clones("default", "avx2", "avx512f")))
 #else
 #define VECTORISED
