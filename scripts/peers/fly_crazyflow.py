@@ -9,6 +9,7 @@ from typing import Any
 
 from measure import CHUNK, FLIGHT, Facts, Row, Work, actions, arguments, cycle, serve
 
+# isort: split
 import crazyflow.envs  # noqa: F401 - registers the ids
 import gymnasium as gym
 import jax

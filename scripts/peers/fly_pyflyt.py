@@ -6,6 +6,7 @@ import os
 
 from measure import Facts, Row, Work, arguments, fly_batch, fly_one, serve
 
+# isort: split
 import gymnasium as gym
 import numpy as np
 import PyFlyt.gym_envs  # noqa: F401 - registers the ids

@@ -7,9 +7,13 @@ from functools import partial
 
 from measure import FLIGHT, Facts, Row, Work, arguments, cycle, fly_batch, fly_one, serve
 
-import quadrl  # isort: skip - before anything that imports mujoco
+# isort: split
+import quadrl  # noqa: F401 - before anything that imports mujoco
+
+# isort: split
 import gymnasium as gym
 import mujoco
+
 from quadrl.environment import Environment
 from quadrl.simulation import Engine, Simulation
 from quadrl.vehicle import ROTORS

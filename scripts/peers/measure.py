@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-# Some peers write to standard output, from C too: the answers keep it, all else goes to stderr.
+# Some peers write to standard output, from C too and when they are imported: so the programs import
+# this first, the answers keep standard output, and all else goes to standard error.
 ANSWERS = os.fdopen(os.dup(1), "w", buffering=1)
 os.dup2(2, 1)
 
