@@ -95,6 +95,12 @@ class Vehicle:
             )
         if self.max_thrust_ratio <= 1:
             raise VehicleError(f"max_thrust_ratio = {self.max_thrust_ratio}: it must exceed 1")
+        # Runge and Kutta's method is unstable from 2.785 on, and inexact before.
+        if self.lag_rate * self.physics_step > 1 + 1e-9:
+            raise VehicleError(
+                f"lag_rate = {self.lag_rate} with physics_step = {self.physics_step}: a product of "
+                "at most 1 is allowed; shorten physics_step"
+            )
         if not math.isclose(self.substeps * self.physics_step, self.control_step, rel_tol=1e-9):
             raise VehicleError(
                 f"control_step = {self.control_step} s is no whole number of physics steps "
