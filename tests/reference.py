@@ -92,7 +92,7 @@ def deviation(qpos, qvel, speed, x):
     """How far an aircraft is from a state x (n, 17).
 
     Returns:
-        (n, 5): position [m], attitude [rad], velocity [m/s], body rate [rad/s], rotor speed [rad/s].
+        (n, 5): position [m], attitude [rad], velocity [m/s], body rate and rotor speed [rad/s].
     """
     exact_qpos, exact_qvel, exact_speed = to_mujoco(x)
     between = hamilton(inverse(exact_qpos[:, 3:]), qpos[:, 3:])

@@ -145,8 +145,7 @@ def test_every_row_is_finite_and_moves_or_is_counted_and_neighbours_fly_on(task,
     ended = 0
     for vehicle in extreme_vehicles(16):
         environment, undisturbed = (
-            Environment(task, num_envs=16, seed=3, vehicle=vehicle, engine=engine)
-            for _ in range(2)
+            Environment(task, num_envs=16, seed=3, vehicle=vehicle, engine=engine) for _ in range(2)
         )
         environment.reset(), undisturbed.reset()
         start = extreme_starts(vehicle, 8)

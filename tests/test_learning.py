@@ -72,7 +72,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def evaluated(folder: Path) -> dict[str, float]:
     config = TrainConfig.of_folder(folder)
-    return judge(fly(quadrl.Policy.load(folder), make_task(config.task, config.options), episodes=4))
+    task = make_task(config.task, config.options)
+    return judge(fly(quadrl.Policy.load(folder), task, episodes=4))
 
 
 def assert_same_run(a: Path, b: Path) -> None:
@@ -177,6 +178,7 @@ def test_threads_change_nothing(tmp_path, engine, num_envs):
     config = dataclasses.replace(
         TINY,
         task="landing",
+        task_options=("horizon=0.5", "start_height=0.3"),
         engine=engine,
         num_envs=num_envs,
         steps=num_envs * 4 * 6,
@@ -229,16 +231,24 @@ def processes():
 
 
 @pytest.mark.parametrize(
-    ("engine", "task", "checkpoint_seconds"),
-    [("mujoco", "hover", 0.05), ("flight", "landing", 0.0)],
+    ("engine", "task", "option", "checkpoint_seconds"),
+    [
+        ("mujoco", "hover", "radius=0.5", 0.05),
+        ("flight", "landing", "start_height=0.3", 0.0),  # down to the ground
+    ],
 )
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_killed_at_any_moment_it_ends_the_same(
-    processes, tmp_path, algo, engine, task, checkpoint_seconds
+    processes, tmp_path, algo, engine, task, option, checkpoint_seconds
 ):
     folder = tmp_path / "killed"
     config = dataclasses.replace(
-        LONG, algo=algo, engine=engine, task=task, checkpoint_seconds=checkpoint_seconds
+        LONG,
+        algo=algo,
+        engine=engine,
+        task=task,
+        task_options=("horizon=0.5", option),
+        checkpoint_seconds=checkpoint_seconds,
     )
     undisturbed = train(config, tmp_path / "undisturbed")
     moments, killed_in_training = [], 0
