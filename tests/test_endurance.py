@@ -37,13 +37,14 @@ def run(*arguments):
 
 
 def test_no_door_leaks(endurance):
-    """Each of the last 50 of 100 leaves less than a fifth of what an open one takes.
+    """Each of the last 30 of 60 leaves less than a quarter of what an open one takes.
 
-    Measured: 0.1 to 20 kB each, of 500 kB (Environment) to 5.5 MB (dm_control, whose last one is
-    sometimes not collected yet: a ninth of the bound).
+    Measured: 0.1 to 4 kB each, of 500 kB (Environment) and more. Two saw up and down over hundreds:
+    dm_control, whose last one (5.5 MB) is not always collected yet, and torch's own caches (60 kB
+    each of 700 kB over 50, 5 kB over 1,600).
     """
     doors = [name for name in endurance.DOORS if "picture" not in name]  # a second each to draw
-    done = run("leak", "--dry", "--count", "100", "--door", *doors)
+    done = run("leak", "--dry", "--count", "60", "--door", *doors)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
