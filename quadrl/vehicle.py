@@ -109,6 +109,12 @@ class Vehicle:
                 f"control_step = {self.control_step} s holds more than {MAX_SUBSTEPS} physics "
                 f"steps of {self.physics_step} s"
             )
+        # Runge and Kutta's method is unstable from 2.785 on, and inexact before.
+        if self.lag_rate * self.physics_step > 1 + 1e-9:
+            raise VehicleError(
+                f"lag_rate = {self.lag_rate} with physics_step = {self.physics_step}: a product of "
+                "at most 1 is allowed; shorten physics_step"
+            )
         if not math.isclose(self.substeps * self.physics_step, self.control_step, rel_tol=1e-9):
             raise VehicleError(
                 f"control_step = {self.control_step} s is no whole number of physics steps "

@@ -76,3 +76,32 @@ def fly(vehicle, start, command, seconds, wind):
     )
     assert solution.success, solution.message
     return solution.y[:, -1].reshape(start.shape)
+
+
+def to_mujoco(x):
+    """qpos (n, 7), qvel (n, 6) and rotor speeds (n, 4) of states x (n, 17)."""
+    q = inverse(x[:, 3:7])
+    return (
+        np.concatenate([x[:, :3], q], axis=-1),
+        np.concatenate([turned(q, x[:, 7:10]), x[:, 10:13]], axis=-1),
+        x[:, 13:],
+    )
+
+
+def deviation(qpos, qvel, speed, x):
+    """How far an aircraft is from a state x (n, 17).
+
+    Returns:
+        (n, 5): position [m], attitude [rad], velocity [m/s], body rate and rotor speed [rad/s].
+    """
+    exact_qpos, exact_qvel, exact_speed = to_mujoco(x)
+    between = hamilton(inverse(exact_qpos[:, 3:]), qpos[:, 3:])
+    angle = 2 * np.arctan2(length(between[:, 1:]), np.abs(between[:, :1]))
+    apart = (
+        length(qpos[:, :3] - exact_qpos[:, :3]),
+        angle,
+        length(qvel[:, :3] - exact_qvel[:, :3]),
+        length(qvel[:, 3:] - exact_qvel[:, 3:]),
+        np.abs(speed - exact_speed).max(axis=-1, keepdims=True),
+    )
+    return np.concatenate(apart, axis=-1)

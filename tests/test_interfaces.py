@@ -476,7 +476,7 @@ def test_a_checkpoint_of_another_interface_is_refused(tmp_path):
     Training(TINY, folder).run()
     changed = json.loads((folder / "config.json").read_text()) | {"action": "position"}
     (folder / "config.json").write_text(json.dumps(changed))
-    with pytest.raises(RunError, match="interface 'rotor'.*'position'"):
+    with pytest.raises(RunError, match="action = 'rotor', and here it is 'position'"):
         Training(TrainConfig.of_folder(folder), folder, resume=True)
 
 

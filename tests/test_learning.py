@@ -7,6 +7,7 @@ import math
 import multiprocessing
 import os
 import random
+import resource
 import shutil
 import signal
 import time
@@ -50,7 +51,7 @@ TINY = TrainConfig(
     checkpoint_seconds=0.0,
     ppo=PPOConfig(epochs=2, minibatch=16),
 )
-LONG = dataclasses.replace(TINY, steps=8 * 4 * 40)
+LONG = dataclasses.replace(TINY, steps=8 * 4 * 30)
 OUTPUTS = ("policy.safetensors", "metrics.csv")
 
 
@@ -69,9 +70,17 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+def evaluated(folder: Path) -> dict[str, float]:
+    config = TrainConfig.of_folder(folder)
+    task = make_task(config.task, config.options)
+    return judge(fly(quadrl.Policy.load(folder), task, episodes=4))
+
+
 def assert_same_run(a: Path, b: Path) -> None:
+    """Weights, normaliser and header; metrics; evaluation."""
     assert (a / "policy.safetensors").read_bytes() == (b / "policy.safetensors").read_bytes()
     assert metrics(a) == metrics(b)
+    assert evaluated(a) == evaluated(b)
 
 
 @pytest.fixture(scope="module")
@@ -163,10 +172,23 @@ def test_same_seed_same_run(finished, tmp_path):
     assert_same_run(finished, train(TINY, tmp_path / "again"))
 
 
-@pytest.mark.parametrize("num_threads", [1, 2])
-def test_threads_change_nothing(finished, tmp_path, num_threads):
-    threaded = dataclasses.replace(TINY, num_threads=num_threads)
-    assert_same_run(finished, train(threaded, tmp_path / "run"))
+@pytest.mark.parametrize(("engine", "num_envs"), [("mujoco", 8), ("flight", 1000)])
+def test_threads_change_nothing(tmp_path, engine, num_envs):
+    # A thread of free flight is worth 256 aircraft; landing's come down into MuJoCo's hands.
+    config = dataclasses.replace(
+        TINY,
+        task="landing",
+        task_options=("horizon=0.5", "start_height=0.3"),
+        engine=engine,
+        num_envs=num_envs,
+        steps=num_envs * 4 * 6,
+        ppo=PPOConfig(epochs=1, minibatch=num_envs),
+    )
+    one, *others = (
+        train(dataclasses.replace(config, num_threads=n), tmp_path / str(n)) for n in (1, 2, 3)
+    )
+    for other in others:
+        assert_same_run(one, other)
 
 
 def test_other_threads_of_torch_change_nothing(finished, tmp_path):
@@ -198,33 +220,39 @@ def train_alone(config: TrainConfig, folder: str) -> None:
 
 @pytest.fixture(scope="module")
 def processes():
-    """Processes that have imported torch already."""
+    """Processes that have imported everything already."""
     patch = pytest.MonkeyPatch()
-    patch.setenv("PYTHONPATH", str(Path(quadrl.__file__).parents[1]))
+    here = Path(__file__).parent
+    patch.setenv("PYTHONPATH", os.pathsep.join(map(str, (Path(quadrl.__file__).parents[1], here))))
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["quadrl.learning.train"])
+    context.set_forkserver_preload([Path(__file__).stem])
     yield context
     patch.undo()
 
 
-@pytest.fixture(scope="module")
-def undisturbed(processes, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "undisturbed"
-    process = processes.Process(target=train_alone, args=(LONG, str(folder)))
-    process.start()
-    process.join()
-    assert process.exitcode == 0
-    return folder
-
-
-@pytest.mark.parametrize("checkpoint_seconds", [0.0, 0.05])
+@pytest.mark.parametrize(
+    ("engine", "task", "option", "checkpoint_seconds"),
+    [
+        ("mujoco", "hover", "radius=0.5", 0.05),
+        ("flight", "landing", "start_height=0.3", 0.0),  # down to the ground
+    ],
+)
+@pytest.mark.parametrize("algo", ALGORITHMS)
 def test_killed_at_any_moment_it_ends_the_same(
-    processes, undisturbed, tmp_path, checkpoint_seconds
+    processes, tmp_path, algo, engine, task, option, checkpoint_seconds
 ):
     folder = tmp_path / "killed"
-    config = dataclasses.replace(LONG, checkpoint_seconds=checkpoint_seconds)
+    config = dataclasses.replace(
+        LONG,
+        algo=algo,
+        engine=engine,
+        task=task,
+        task_options=("horizon=0.5", option),
+        checkpoint_seconds=checkpoint_seconds,
+    )
+    undisturbed = train(config, tmp_path / "undisturbed")
     moments, killed_in_training = [], 0
-    for _ in range(5):
+    for _ in range(2):
         process = processes.Process(target=train_alone, args=(config, str(folder)))
         process.start()
         begun = len(metrics(folder)) if (folder / "metrics.csv").exists() else 0
@@ -349,9 +377,14 @@ def other_version(path):
 
 
 def of_other_networks(path):
-    wide = dataclasses.replace(TINY, hidden=(17,), steps=1)
-    train(wide, path.parent.parent / "wide")
-    shutil.copy(path.parent.parent / "wide" / checkpoint.CHECKPOINT, path)
+    tensors, numbers = checkpoint.load(path)
+    tensors["actor"] = {name: torch.zeros(17) for name in tensors["actor"]}
+    checkpoint.save(path, tensors, numbers)
+
+
+def without_its_settings(path):
+    tensors, numbers = checkpoint.load(path)
+    checkpoint.save(path, tensors, {k: v for k, v in numbers.items() if k != "config"})
 
 
 def lacking_a_part(path):
@@ -366,10 +399,11 @@ def lacking_a_part(path):
         (half, "is damaged or no checkpoint"),
         (flipped, "is damaged or no checkpoint"),
         (lambda path: path.write_bytes(b""), "is damaged or no checkpoint"),
-        (foreign, "has the format None; this version of quadrl reads 'quadrl-checkpoint-1'"),
+        (foreign, "has the format None; this version of quadrl reads 'quadrl-checkpoint-2'"),
         (other_version, "has the format 'quadrl-checkpoint-9'"),
         (of_other_networks, "does not fit its run"),
         (lacking_a_part, "does not fit its run"),
+        (without_its_settings, "does not fit its run: 'config'"),
         (Path.unlink, "there is no checkpoint at"),
     ],
 )
@@ -382,20 +416,124 @@ def test_a_damaged_checkpoint_is_refused_and_nothing_is_touched(copy, damage, sa
     assert contents(copy) == before
 
 
-def test_a_full_disk_does_not_destroy_the_last_checkpoint(finished, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"task": "random_waypoint"}, "task = 'random_waypoint', and here it is 'hover'"),
+        ({"task_options": ()}, "task_options = .., and here it is .'horizon=0.5'."),
+        ({"vehicle": "racer"}, "vehicle = 'racer', and here it is 'paper'"),
+        ({"engine": "flight"}, "engine = 'flight', and here it is 'mujoco'"),
+        ({"seed": 1}, "seed = 1, and here it is 0"),
+        ({"gamma": 0.5}, "gamma = 0.5, and here it is 0.9"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused(copy, tmp_path, change, says):
+    # The networks are of one size, so nothing else would notice.
+    other = stopped(dataclasses.replace(TINY, **change), tmp_path / "other", 2)
+    shutil.copy(other / checkpoint.CHECKPOINT, copy)
+    with pytest.raises(RunError, match=f"trained with {says}: .*start a new run") as caught:
+        Training(TINY, copy, resume=True)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["quadrl", "mujoco", "torch", "torchrl", "numpy"])
+def test_a_checkpoint_of_other_versions_is_refused(copy, name):
+    path = copy / checkpoint.CHECKPOINT
+    tensors, numbers = checkpoint.load(path)
+    numbers["config"]["versions"][name] = "0.0.7"
+    checkpoint.save(path, tensors, numbers)
+    with pytest.raises(RunError, match=rf"versions\.{name} = '0\.0\.7', and here it is "):
+        Training(TINY, copy, resume=True)
+
+
+class HalfWritten:
+    """A file that takes half of what it is given; then `end` happens."""
+
+    def __init__(self, file, end):
+        self.file, self.end = file, end
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.file.close()
+
+    def write(self, content):
+        self.file.write(content[: len(content) // 2])
+        self.file.flush()
+        self.end()
+
+
+def breaking_at(name, end, monkeypatch):
+    """Files that are written whole break in the middle of the one that is called so."""
+
+    def opened(path, mode):
+        file = open(path, mode)
+        return HalfWritten(file, end) if path.name == f"{name}.part" else file
+
+    monkeypatch.setattr("quadrl.policy.open", opened, raising=False)
+
+
+def full():
+    raise OSError(28, "No space left on device")
+
+
+def killed():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.parametrize("name", [checkpoint.CHECKPOINT, "policy.safetensors", "metrics.csv"])
+def test_a_full_disk_does_not_destroy_what_is_there(finished, tmp_path, monkeypatch, name):
     folder = stopped(TINY, tmp_path / "run", 4)
-    before = (folder / checkpoint.CHECKPOINT).read_bytes()
-
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
+    before = contents(folder)
     with monkeypatch.context() as patch:
-        patch.setattr("os.fsync", full)
+        breaking_at(name, full, patch)
         with pytest.raises(OSError, match="No space left"):
             Training(TINY, folder, resume=True).run()
-    assert (folder / checkpoint.CHECKPOINT).read_bytes() == before
+    if name in before:
+        assert (folder / name).read_bytes() == before[name]
     assert not list(folder.glob("*.part"))
     assert_same_run(finished, train(TINY, folder, resume=True))
+
+
+def train_with_small_files(folder: str, limit: int) -> None:
+    """Go on; the system itself refuses every byte of a file beyond the limit."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    with pytest.raises(OSError, match="File too large"):
+        train(TINY, Path(folder), resume=True)
+
+
+def test_a_file_that_the_system_cuts_short_is_not_the_checkpoint(finished, processes, tmp_path):
+    folder = stopped(TINY, tmp_path / "run", 4)
+    before = (folder / checkpoint.CHECKPOINT).read_bytes()
+    process = processes.Process(
+        target=train_with_small_files, args=(str(folder), len(before) - 1000)
+    )
+    process.start()
+    process.join()
+    assert process.exitcode == 0
+    assert (folder / checkpoint.CHECKPOINT).read_bytes() == before
+    assert_same_run(finished, train(TINY, folder, resume=True))
+
+
+def train_killed_while_writing(folder: str, name: str) -> None:
+    breaking_at(name, killed, pytest.MonkeyPatch())
+    train(TINY, Path(folder), resume=True)
+
+
+@pytest.mark.parametrize("name", [checkpoint.CHECKPOINT, "policy.safetensors", "metrics.csv"])
+def test_killed_in_the_middle_of_writing_nothing_is_lost(finished, processes, tmp_path, name):
+    folder = stopped(TINY, tmp_path / "run", 4)
+    before = contents(folder)
+    process = processes.Process(target=train_killed_while_writing, args=(str(folder), name))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    assert (folder / f"{name}.part").exists()
+    if name in before:
+        assert (folder / name).read_bytes() == before[name]
+    assert_same_run(finished, train(TINY, folder, resume=True))
+    assert not list(folder.glob("*.part"))
 
 
 def test_checkpoints_keep_every_kind_of_number(tmp_path):
@@ -718,7 +856,7 @@ def test_the_configuration_of_a_run_is_found_again(finished):
     assert saved["resolved_task"]["horizon"] == 0.5
     assert saved["resolved_task"]["radius"] == 0.5
     assert saved["resolved_vehicle"]["mass"] == 0.65
-    assert set(saved["versions"]) == {"mujoco", "torch", "torchrl", "numpy"}
+    assert set(saved["versions"]) == {"quadrl", "mujoco", "torch", "torchrl", "numpy"}
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from safetensors.torch import save as to_bytes
 from quadrl.learning.config import RunError
 from quadrl.policy import HEADER, UNREADABLE, read_header, write_whole
 
-FORMAT = "quadrl-checkpoint-1"
+FORMAT = "quadrl-checkpoint-2"
 CHECKPOINT = "checkpoint.safetensors"
 
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import tyro
 
-from quadrl import tasks
+from quadrl import __version__, tasks
 from quadrl.environment import MAX_ENVS, MAX_THREADS
 from quadrl.errors import QuadrlError
 from quadrl.interfaces import INTERFACES
@@ -23,6 +23,8 @@ from quadrl.vehicle import VEHICLES, Vehicle
 
 CONFIG = "config.json"
 ALGORITHMS = ("ppo", "trpo", "gae")
+FREE = ("num_threads", "checkpoint_seconds")
+"""Settings that change no number."""
 MAX_BATCH = 1 << 24
 """Most transitions in a batch: some GB."""
 
@@ -279,12 +281,28 @@ class TrainConfig:
         return max(1, math.ceil(self.steps / (self.num_envs * self.rollout)))
 
     def resolved(self) -> dict[str, Any]:
-        """As plain values, with everything that the names stand for."""
-        return dataclasses.asdict(self) | {
+        """As JSON gives it back, with everything that the names stand for."""
+        whole = dataclasses.asdict(self) | {
             "resolved_task": dataclasses.asdict(tasks.make(self.task, **self.options)),
             "resolved_vehicle": dataclasses.asdict(VEHICLES[self.vehicle]),
             "versions": versions(),
         }
+        return json.loads(json.dumps(whole))
+
+    def difference(self, saved: dict[str, Any]) -> str:
+        """The first setting that changes numbers and was another in a resolved configuration.
+
+        Args:
+            saved: What `resolved` gave when it was saved.
+
+        Returns:
+            Its name and both values in words; nothing when the numbers are the same.
+        """
+        was, now = _flat(saved), _flat(self.resolved())
+        for name in (*now, *was):
+            if name not in FREE and was.get(name) != now.get(name):
+                return f"{name} = {was.get(name)!r}, and here it is {now.get(name)!r}"
+        return ""
 
     @classmethod
     def of_folder(cls, folder: Path) -> TrainConfig:
@@ -303,7 +321,7 @@ class TrainConfig:
             config = cls(**values)
         except (KeyError, TypeError, AttributeError) as error:
             raise RunError(f"{folder}: its configuration is damaged: {error}") from error
-        now = json.loads(json.dumps(config.resolved()))
+        now = config.resolved()
         for part in ("resolved_task", "resolved_vehicle"):
             if saved.get(part) != now[part]:
                 raise RunError(
@@ -311,6 +329,18 @@ class TrainConfig:
                     "parameters have changed since; start a new run"
                 )
         return config
+
+
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of settings by both names: ppo.clip, versions.torch, task.horizon."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            group = name.removeprefix("resolved_")
+            flat |= {f"{group}.{inner}": v for inner, v in value.items()}
+        else:
+            flat[name] = value
+    return flat
 
 
 def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
@@ -373,10 +403,11 @@ def _is_number(value: object) -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that a run depends on."""
+    """Of the packages that the numbers of a run depend on."""
     from importlib.metadata import version
 
-    return {name: version(name) for name in ("mujoco", "torch", "torchrl", "numpy")}
+    packages = {name: version(name) for name in ("mujoco", "torch", "torchrl", "numpy")}
+    return {"quadrl": __version__} | packages
 
 
 RECIPES: dict[str, dict[str, Any]] = {

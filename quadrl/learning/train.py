@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import json
 import time
 import warnings
@@ -240,20 +241,19 @@ class Training:
         numbers = {
             "iteration": self.iteration,
             "seconds": self.seconds,
-            "action": self.config.action,
+            "config": self.config.resolved(),
         }
         checkpoint.save(self.folder / checkpoint.CHECKPOINT, tensors, numbers)
 
     def _restore(self) -> None:
         path = self.folder / checkpoint.CHECKPOINT
         tensors, numbers = checkpoint.load(path)
-        trained = numbers.get("action", "rotor")  # older ones know no other
-        if trained != self.config.action:
-            raise RunError(
-                f"{path} was trained with the action interface {trained!r}, and its run's is "
-                f"{self.config.action!r}: it would fly wrongly; start a new run"
-            )
         try:
+            if other := self.config.difference(numbers["config"]):
+                raise RunError(
+                    f"{path} was trained with {other}: it would not end as it began; go back to "
+                    "that, or start a new run"
+                )
             self.actor.load_state_dict(tensors["actor"])
             self.critic.load_state_dict(tensors["critic"])
             self.algorithm.restore(tensors.get("optimiser", {}))
@@ -290,10 +290,9 @@ class _Log:
             with open(path, newline="") as file:
                 rows = list(csv.reader(file))[1:]
             kept = [row for row in rows if len(row) == len(self.COLUMNS)][:iteration]
-        scratch = path.with_name(path.name + ".part")
-        with open(scratch, "w", newline="") as file:
-            csv.writer(file).writerows([list(self.COLUMNS), *kept])
-        scratch.replace(path)
+        whole = io.StringIO(newline="")
+        csv.writer(whole).writerows([list(self.COLUMNS), *kept])
+        write_text(path, whole.getvalue())
         self._file = open(path, "a", newline="")  # noqa: SIM115 - closed by close
         self._writer = csv.writer(self._file)
         self._events = SummaryWriter(str(folder / EVENTS), purge_step=iteration + 1)
