@@ -125,3 +125,16 @@ def test_command_prints_a_table():
     assert done.returncode == 0, done.stderr
     assert "15,000/s" in done.stdout
     assert "memory of 4,096 aircraft" in done.stdout
+
+
+def test_the_parts_of_a_training_add_up_to_all_of_it(tmp_path):
+    script = Path(__file__).parents[1] / "scripts" / "profile_training"
+    out = tmp_path / "profile.json"
+    subprocess.run([sys.executable, script, "--steps", "8192", "--out", out], check=True)
+    engines = json.loads(out.read_text())["seconds"]
+    assert list(engines) == ["mujoco", "flight"]
+    for parts in engines.values():
+        whole = parts.pop("all")
+        assert all(seconds > 0 for seconds in parts.values())
+        assert sum(parts.values()) == pytest.approx(whole)
+    assert engines["flight"]["simulation"] < engines["mujoco"]["simulation"]
