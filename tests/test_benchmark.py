@@ -137,4 +137,3 @@ def test_the_parts_of_a_training_add_up_to_all_of_it(tmp_path):
         whole = parts.pop("all")
         assert all(seconds > 0 for seconds in parts.values())
         assert sum(parts.values()) == pytest.approx(whole)
-    assert engines["flight"]["simulation"] < engines["mujoco"]["simulation"]
