@@ -49,13 +49,15 @@ class Landing(Task[Touchdown]):
     """Reward for each step: none, or it would hover over the pad rather than come to rest."""
     speed_weight: float = 5.0
     """Reward for a m/s of speed lost."""
-    haste_weight: float = 20.0
-    """Cost of a m/s over the speed of a gentle approach, at each step: more than its progress."""
-    gentle_speed: float = 0.2
-    """Speed of a gentle approach at the pad [m/s]."""
+    spin_weight: float = 10.0
+    """Reward for a rad/s of body rate lost; with less it may turn for ever and never rest."""
+    haste_weight: float = 40.0
+    """Cost of sinking a m/s faster than a gentle approach, at each step: more than its progress."""
+    gentle_speed: float = 0.15
+    """Sink rate of a gentle approach at the pad [m/s]."""
     gentle_rate: float = 0.8
     """What each metre of height adds to it [1/s]."""
-    success_weight: float = 100.0
+    success_weight: float = 200.0
     """Reward for coming to rest on the pad; a larger one makes it hurry."""
     failure_weight: float = 300.0
     """Cost of a crash: more than the progress of a dive to the ground."""
@@ -128,7 +130,10 @@ class Landing(Task[Touchdown]):
         terms = super().reward(before, now, rotor_command, outcome, vehicle)
         xp, zero = namespace(now.distance), 0.0 * now.distance
         height = abs(now.to_goal[..., 2])
-        haste = now.speed - (self.gentle_speed + self.gentle_rate * height)
+        # Not the speed: exploration gives some in every direction, which would cost most near the
+        # ground and keep it in the air.
+        sink = (abs(before.to_goal[..., 2]) - height) / vehicle.control_step
+        haste = sink - (self.gentle_speed + self.gentle_rate * height)
         weight = self.haste_weight * reward_share(vehicle)
         terms["haste"] = -weight * xp.where(haste > 0, haste, 0.0 * haste)
         terms["success"] = xp.where(outcome.succeeded, zero + self.success_weight, zero)
