@@ -46,8 +46,6 @@ from quadrl.vehicle import ROTORS, Vehicle, resolve
 
 Observation = dict[str, Array]
 MAX_ENVS = 1 << 20
-
-
 MAX_THREADS = 1024
 
 
