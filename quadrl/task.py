@@ -264,8 +264,9 @@ class Task(abc.ABC, Generic[FieldsT]):
     aircraft's centre when it stands on its feet."""
     progress_weight: float = 100.0
     """Reward for a metre of distance gained."""
-    attitude_weight: float = 10.0
-    """Reward for a unit of attitude error lost."""
+    attitude_weight: float = 30.0
+    """Reward for a unit of attitude error lost: with 10 the heading is learned last or not at all,
+    and a policy that knows no heading tips over now and then."""
     speed_weight: float = 2.0
     """Reward for a m/s lost of the speed, or of that relative to a target (gym-aero has 0.1, with
     which hover takes twice the steps)."""

@@ -51,14 +51,14 @@ class Landing(Task[Touchdown]):
     """Reward for a m/s of speed lost."""
     spin_weight: float = 10.0
     """Reward for a rad/s of body rate lost; with less it may turn for ever and never rest."""
-    haste_weight: float = 40.0
+    haste_weight: float = 60.0
     """Cost of sinking a m/s faster than a gentle approach, at each step: more than its progress."""
-    gentle_speed: float = 0.15
+    gentle_speed: float = 0.1
     """Sink rate of a gentle approach at the pad [m/s]."""
-    gentle_rate: float = 0.8
+    gentle_rate: float = 0.6
     """What each metre of height adds to it [1/s]."""
-    success_weight: float = 200.0
-    """Reward for coming to rest on the pad; a larger one makes it hurry."""
+    success_weight: float = 100.0
+    """Reward for coming to rest on the pad; with 200 it hurries and touches down faster."""
     failure_weight: float = 300.0
     """Cost of a crash: more than the progress of a dive to the ground."""
     start_height: float = 3.0

@@ -300,6 +300,22 @@ def test_stopped_after_each_part_of_an_iteration(finished, tmp_path, after):
     assert_same_run(finished, train(TINY, folder, resume=True))
 
 
+def test_two_trainings_do_not_share_a_folder(finished, tmp_path, processes):
+    folder = stopped(TINY, tmp_path / "run", 4)
+    first = Training(TINY, folder, resume=True)
+    before = contents(folder)
+    with pytest.raises(RunError, match=r"another training works in .*run"):
+        Training(TINY, folder, resume=True)
+    process = processes.Process(target=train, args=(TINY, folder), kwargs={"resume": True})
+    process.start()
+    process.join()
+    assert process.exitcode == 1
+    assert contents(folder) == before
+    first.run()
+    assert_same_run(finished, folder)
+    train(TINY, folder, resume=True)  # its end has set it free
+
+
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_algorithm_goes_on_where_it_was_stopped(tmp_path, algo):
     config = dataclasses.replace(TINY, algo=algo)
@@ -720,6 +736,20 @@ def test_judgement_by_hand():
     assert figures["episodes"] == 3
     assert figures["diverged"] == 1
     json.dumps(figures, allow_nan=False)
+
+
+def test_heading_error_by_hand():
+    """Yaw 10, -30 and 90 degrees; the first only since the last 2 s, turned about before."""
+    record = make_record()
+    half = np.radians([10.0, -30.0, 90.0]) / 2
+    quaternion = np.zeros_like(record.quaternion)
+    quaternion[..., 0], quaternion[..., 3] = np.cos(half), np.sin(half)
+    quaternion[:60, 0] = [0.0, 0.0, 0.0, 1.0]
+    quaternion[60:, 2] = np.nan  # over since
+    figures = judge(make_record(quaternion=quaternion))
+    assert figures["heading_error_deg"] == pytest.approx((10 + 30 + 90) / 3)
+    free = make_record(quaternion=quaternion, task=make_task("random_waypoint", {}))
+    assert "heading_error_deg" not in judge(free)
 
 
 def test_an_error_before_the_last_two_seconds_does_not_count():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
-from torchrl.envs import DMControlEnv, DMControlWrapper, GymWrapper
+from torchrl.envs import DMControlEnv, DMControlWrapper, EnvBase, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 import quadrl
@@ -95,8 +95,31 @@ def test_a_partial_reset_leaves_the_other_rows_alone():
     assert torch.equal(after["observation"][~keep], second.reset()["observation"][~keep])
 
 
-def test_what_is_handed_out_is_never_changed_later():
-    environment = QuadrotorEnv("hover", COUNT, seed=0, horizon=0.2, reward_terms=True)
+@pytest.mark.parametrize("task", ["hover", "target_following"])
+def test_episodes_begin_anew_as_torchrl_itself_would_have_it(task):
+    one, other = (QuadrotorEnv(task, COUNT, seed=0, horizon=0.6) for _ in range(2))
+    met = again = one.reset()
+    other.reset()
+    begun = 0
+    for t, action in enumerate(ACTIONS[:40]):
+        now = one.step(met.set("action", action))
+        same = other.step(again.set("action", action))
+        assert (now == same).all()
+        begun += int(now["next", "done"].sum())
+        met, again = one.step_mdp(now), other.step_mdp(same)
+        if t == 20:  # some of them over at other times than the rest
+            for flags in (met, again):
+                flags.set("done", torch.tensor([[True], [False], [False], [True]]))
+        met, again = one.maybe_reset(met), EnvBase.maybe_reset(other, again)
+        assert set(met.keys()) == set(again.keys())
+        for name in met.keys():  # noqa: SIM118
+            assert torch.equal(met[name], again[name]), (t, name)
+    assert begun > COUNT
+
+
+@pytest.mark.parametrize("reward_terms", [False, True])
+def test_what_is_handed_out_is_never_changed_later(reward_terms):
+    environment = QuadrotorEnv("hover", COUNT, seed=0, horizon=0.2, reward_terms=reward_terms)
     met = environment.reset()
     handed_out, copies = [met], [met.clone()]
     for action in ACTIONS[:12]:

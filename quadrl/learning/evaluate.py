@@ -182,24 +182,34 @@ def judge(record: Record) -> dict[str, Any]:
     Returns:
         episodes; success_rate and survival_rate (shares); position_error_m and
         position_error_std_m: mean, and deviation over the episodes, of the error over the last 2 s
-        [m]; return_mean and return_std; length_mean_s; diverged; and the task's own.
+        [m]; where the heading matters heading_error_deg: mean of |yaw| over the same time;
+        return_mean and return_std; length_mean_s; diverged; and the task's own.
     """
     steps = max(1, round(FINAL_STRETCH / record.control_step))
     number = np.arange(len(record.error))[:, None]
     last = (number >= record.length - steps) & (number < record.length)
-    final = np.sum(np.where(last, record.error, 0.0), 0) / last.sum(0)
+    final = _means(record.error, last)
     returns = np.nansum(record.reward, 0)
+    w, x, y, z = np.moveaxis(record.quaternion, -1, 0)
+    yaw = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
+    heading = {"heading_error_deg": float(_means(np.abs(yaw), last).mean())}
     return {
         "episodes": int(len(returns)),
         "success_rate": float(record.is_success.mean()),
         "survival_rate": float(1 - (record.terminated & ~record.is_success).mean()),
         "position_error_m": float(final.mean()),
         "position_error_std_m": float(final.std()),
+        **(heading if record.task.heading_matters else {}),
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
         "length_mean_s": float(record.length.mean() * record.control_step),
         "diverged": int(record.diverged.sum()),
     } | record.task.figures(record)
+
+
+def _means(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The mean of values (T, N) of each aircraft over the chosen steps, (N,)."""
+    return np.sum(np.where(chosen, values, 0.0), 0) / chosen.sum(0)
 
 
 def smoothness(record: Record) -> dict[str, Any]:

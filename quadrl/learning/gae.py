@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.modules import ProbabilisticActor, ValueOperator
+from tensordict.nn import TensorDictModuleBase
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import A2CLoss
 
 from quadrl.learning.config import GAEConfig
@@ -18,7 +19,9 @@ from quadrl.learning.config import GAEConfig
 class GAE:
     """One gradient step of the policy on each batch, and a few epochs of the critic."""
 
-    def __init__(self, actor: ProbabilisticActor, critic: ValueOperator, config: GAEConfig) -> None:
+    def __init__(
+        self, actor: ProbabilisticActor, critic: TensorDictModuleBase, config: GAEConfig
+    ) -> None:
         """Set up the loss and the optimisers."""
         self.config = config
         self.loss = A2CLoss(

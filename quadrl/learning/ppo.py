@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.modules import ProbabilisticActor, ValueOperator
+from tensordict.nn import TensorDictModuleBase
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
 from quadrl.learning.config import PPOConfig
@@ -15,7 +16,9 @@ from quadrl.learning.config import PPOConfig
 class PPO:
     """Several epochs of clipped gradient steps on each batch."""
 
-    def __init__(self, actor: ProbabilisticActor, critic: ValueOperator, config: PPOConfig) -> None:
+    def __init__(
+        self, actor: ProbabilisticActor, critic: TensorDictModuleBase, config: PPOConfig
+    ) -> None:
         """Set up the loss and the optimiser."""
         self.config = config
         self.loss = ClipPPOLoss(
@@ -47,10 +50,11 @@ class PPO:
         config = self.config
         for group in self.optimiser.param_groups:
             group["lr"] = config.learning_rate * remaining
+        batch = batch.exclude("loc", "scale")
         losses: Any = None
         for _ in range(config.epochs):
-            for rows in torch.randperm(len(batch)).split(config.minibatch):
-                losses = self.loss(batch[rows])
+            for part in batch[torch.randperm(len(batch))].split(config.minibatch):
+                losses = self.loss(part)
                 objective = losses["loss_objective"] + losses["loss_critic"]
                 if config.entropy > 0:
                     objective = objective + losses["loss_entropy"]

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import fcntl
 import io
 import json
+import os
 import time
 import warnings
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -115,9 +118,16 @@ class Training:
         self._generator_state: torch.Tensor | None = None
         if not resume:
             new_folder(folder)
+        self._unlock = weakref.finalize(self, os.close, _lock(folder))
+        if not resume:
             write_text(folder / CONFIG, json.dumps(config.resolved(), indent=2))
         elif any((folder / name).exists() for name in (checkpoint.CHECKPOINT, POLICY_FILE)):
-            self._restore()  # without either, it was stopped before the first checkpoint
+            # Without either, it was stopped before the first checkpoint.
+            try:
+                self._restore()
+            except RunError:
+                self._unlock()
+                raise
 
     def run(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> Policy:
         """Train to the end, and save the policy.
@@ -128,6 +138,12 @@ class Training:
         Raises:
             RunError: A weight is no longer a finite number.
         """
+        try:
+            return self._run(on_progress)
+        finally:
+            self._unlock()
+
+    def _run(self, on_progress: Callable[[Progress], None]) -> Policy:
         config = self.config
         if self.iteration >= config.iterations and (self.folder / POLICY_FILE).exists():
             return Policy.load(self.folder)
@@ -271,6 +287,24 @@ class Training:
             ValueError,
         ) as error:
             raise RunError(f"{path} does not fit its run: {error}") from error
+
+
+def _lock(folder: Path) -> int:
+    """Make the folder this process's own for as long as the descriptor that it returns is open.
+
+    Raises:
+        RunError: Another training works on it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise RunError(
+            f"another training works in {folder}: wait for its end or stop it, or start a new run "
+            "with another --out"
+        ) from error
+    return descriptor
 
 
 class _Log:

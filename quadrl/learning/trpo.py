@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.distributions import kl_divergence
-from torchrl.modules import ProbabilisticActor, ValueOperator
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.common import LossModule
 
 from quadrl.learning.config import TRPOConfig
@@ -25,7 +26,9 @@ class TRPOLoss(LossModule):
     of the acting policy from the present one, in closed form) and `loss_critic`.
     """
 
-    def __init__(self, actor_network: ProbabilisticActor, critic_network: ValueOperator) -> None:
+    def __init__(
+        self, actor_network: ProbabilisticActor, critic_network: TensorDictModuleBase
+    ) -> None:
         """Keep the networks; their parameters stay their own."""
         super().__init__()
         self.actor_network = actor_network
@@ -34,9 +37,13 @@ class TRPOLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The three losses as scalars."""
         surrogate, kl = self.surrogate_and_kl(tensordict)
-        value = self.critic_network.module(tensordict.get("observation"))
-        critic = (value - tensordict.get("value_target")).square().mean()
+        critic = self.critic_loss(tensordict)
         return TensorDict({"loss_objective": -surrogate, "kl": kl, "loss_critic": critic})
+
+    def critic_loss(self, batch: TensorDictBase) -> Tensor:
+        """Mean squared error of the critic, a scalar."""
+        value = self.critic_network(batch.select("observation")).get("state_value")
+        return (value - batch.get("value_target")).square().mean()
 
     def surrogate_and_kl(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Mean of ratio times advantage, and mean KL divergence; scalars."""
@@ -111,7 +118,7 @@ class TRPO:
     """One natural-gradient step of the policy on each batch, and a few epochs of the critic."""
 
     def __init__(
-        self, actor: ProbabilisticActor, critic: ValueOperator, config: TRPOConfig
+        self, actor: ProbabilisticActor, critic: TensorDictModuleBase, config: TRPOConfig
     ) -> None:
         """Set up the loss and the critic's optimiser."""
         self.config = config
@@ -137,9 +144,7 @@ class TRPO:
         loss = torch.zeros(())
         for _ in range(config.critic_epochs):
             for rows in torch.randperm(len(batch)).split(config.minibatch):
-                part: Any = batch[rows]
-                value = self.loss.critic_network.module(part.get("observation"))
-                loss = (value - part.get("value_target")).square().mean()
+                loss = self.loss.critic_loss(batch[rows])
                 self.optimiser.zero_grad()
                 loss.backward()
                 self.optimiser.step()
