@@ -81,7 +81,7 @@ def learning_curve(metrics: dict[str, np.ndarray], title: str, path: Path) -> Pa
     survival = metrics["survival"][ended]
     axes[1].plot(steps[ended], survival, color=STYLE["grey"], lw=1.5, label="survival")
     axes[1].set_ylim(-0.03, 1.03)
-    axes[1].legend(frameon=False, loc="lower right")
+    axes[1].legend(frameon=False, loc="best")
     axes[0].set_title(title, loc="left", fontweight="bold")
     axes[-1].set_xlabel("control steps [thousands], actions sampled from the policy")
     top = axes[0].secondary_xaxis("top", functions=_steps_to_seconds(steps, metrics["seconds"]))
@@ -141,7 +141,7 @@ def learning_curves(
         axis.set_xlim(left=0)
     for axis in axes[1]:
         axis.set_ylim(-0.03, 1.03)
-    axes[0, 0].legend(frameon=False, loc="lower right")
+    axes[0, 0].legend(frameon=False, loc="best")
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
     return _write(figure, path)
 
