@@ -7,6 +7,7 @@ import importlib.util
 import itertools
 import json
 import os
+import shlex
 import sys
 import time
 from collections.abc import Container, Iterable, Sequence
@@ -114,7 +115,7 @@ class Train:
         training = Training(config, folder, resume=self.resume is not None)
         if self.resume is not None:
             _say(f"going on with {folder} at iteration {training.iteration}")
-        go_on = f"go on with it: quadrl train --resume {folder}"
+        go_on = f"go on with it: {_again('train --resume', folder)}"
         try:
             with _ProgressBar(config) as bar:
                 policy = training.run(bar.show)
@@ -355,12 +356,17 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
+_brought: list[Path] = []
+"""The files named by `--import`."""
+
+
 def _import_own(arguments: list[str]) -> None:
     """Run the files named by `--import FILE`, which register the user's own tasks and aircraft.
 
     Raises:
         OptionError: There is no such file.
     """
+    _brought.clear()
     while "--import" in arguments:
         at = arguments.index("--import")
         if at + 1 == len(arguments) or not Path(arguments[at + 1]).is_file():
@@ -372,6 +378,7 @@ def _import_own(arguments: list[str]) -> None:
         module = importlib.util.module_from_spec(spec)
         sys.modules[path.stem] = module
         spec.loader.exec_module(module)
+        _brought.append(path)
 
 
 class _ProgressBar:
@@ -611,17 +618,23 @@ def _sum_up(folder: Path, config: TrainConfig, judged: dict[str, Any]) -> None:
         EVALUATION: "the figures",
         "metrics.csv": f"the training, row by row; also: tensorboard --logdir {folder}",
         CONFIG: "the resolved configuration",
-        "checkpoint.safetensors": f"to go on: quadrl train --resume {folder}",
+        "checkpoint.safetensors": f"to go on: {_again('train --resume', folder)}",
     }
     _say(f"in {folder}")
     for name, meaning in meanings.items():
         if (folder / name).exists():
             _say(f"  {name:<22}  {meaning}")
     _say(
-        f"\nnext: quadrl render {folder} --camera chase --seed 7\n"
-        f"      quadrl evaluate {folder} --episodes 1000\n"
-        f"      quadrl tasks"
+        f"\nnext: {_again('render', folder)} --camera chase --seed 7\n"
+        f"      {_again('evaluate', folder)} --episodes 1000\n"
+        f"      {_again('tasks')}"
     )
+
+
+def _again(command: str, *folder: Path) -> str:
+    """A command as it has to be typed: with the files that brought in what the run needs."""
+    brought = [word for path in _brought for word in ("--import", str(path))]
+    return shlex.join(["quadrl", *brought, *command.split(), *map(str, folder)])
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]] = ()) -> Table:

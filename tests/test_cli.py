@@ -569,6 +569,12 @@ def test_a_file_brings_in_tasks_and_aircraft(tmp_path):
     assert outcome.returncode == 0, outcome.stderr
     judged = json.loads(outcome.stdout)
     assert judged["task"] == "near_hover" and judged["success_rate"] == 1.0
+    command = [*command[:3], "--import", "own.py", "train", "near_hover", "--no-video"]
+    command += ["--num-envs", "8", "--rollout", "4", "--steps", "64", "--episodes", "1"]
+    trained = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert "next: quadrl --import own.py render runs/near_hover-ppo-0 --camera" in trained.stdout
 
 
 def test_an_import_of_nothing_is_refused(capsys):
