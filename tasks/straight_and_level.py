@@ -37,6 +37,9 @@ class StraightAndLevel(MovingGoalTask[Line]):
     ends = "more than 0.7 m off the altitude or 3 m off the line, on the ground"
     solved = "in the air, on altitude and near the line to the end"
 
+    speed_weight: float = 10.0
+    """Reward for a m/s lost of the speed relative to the line's; with 20 it speeds up so hard that
+    it may tip over."""
     line_speed: float = 2.0
     """Speed along the line [m/s]."""
     lead: float = 1.0
