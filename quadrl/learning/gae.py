@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import A2CLoss
 
@@ -20,7 +20,7 @@ class GAE:
     """One gradient step of the policy on each batch, and a few epochs of the critic."""
 
     def __init__(
-        self, actor: ProbabilisticActor, critic: TensorDictModuleBase, config: GAEConfig
+        self, actor: ProbabilisticActor, critic: TensorDictModule, config: GAEConfig
     ) -> None:
         """Set up the loss and the optimisers."""
         self.config = config

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
@@ -17,7 +17,7 @@ class PPO:
     """Several epochs of clipped gradient steps on each batch."""
 
     def __init__(
-        self, actor: ProbabilisticActor, critic: TensorDictModuleBase, config: PPOConfig
+        self, actor: ProbabilisticActor, critic: TensorDictModule, config: PPOConfig
     ) -> None:
         """Set up the loss and the optimiser."""
         self.config = config

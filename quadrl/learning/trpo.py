@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.distributions import kl_divergence
 from torchrl.modules import ProbabilisticActor
@@ -26,9 +26,7 @@ class TRPOLoss(LossModule):
     of the acting policy from the present one, in closed form) and `loss_critic`.
     """
 
-    def __init__(
-        self, actor_network: ProbabilisticActor, critic_network: TensorDictModuleBase
-    ) -> None:
+    def __init__(self, actor_network: ProbabilisticActor, critic_network: TensorDictModule) -> None:
         """Keep the networks; their parameters stay their own."""
         super().__init__()
         self.actor_network = actor_network
@@ -118,7 +116,7 @@ class TRPO:
     """One natural-gradient step of the policy on each batch, and a few epochs of the critic."""
 
     def __init__(
-        self, actor: ProbabilisticActor, critic: TensorDictModuleBase, config: TRPOConfig
+        self, actor: ProbabilisticActor, critic: TensorDictModule, config: TRPOConfig
     ) -> None:
         """Set up the loss and the critic's optimiser."""
         self.config = config
