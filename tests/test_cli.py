@@ -134,7 +134,7 @@ def test_train_without_video_and_where_to_go_on(tmp_path, capsys):
     assert {p.name for p in folder.iterdir()} == FILES
     said = capsys.readouterr().out
     assert "100 %        192 steps" in said
-    for command in (f"quadrl render {folder}", f"quadrl evaluate {folder}"):
+    for command in (f"quadrl render '{folder}'", f"quadrl evaluate '{folder}'"):
         assert command in said  # on one line, however long
 
 
