@@ -440,7 +440,7 @@ def test_a_damaged_checkpoint_is_refused_and_nothing_is_touched(copy, damage, sa
         ({"vehicle": "racer"}, "vehicle = 'racer', and here it is 'paper'"),
         ({"engine": "flight"}, "engine = 'flight', and here it is 'mujoco'"),
         ({"seed": 1}, "seed = 1, and here it is 0"),
-        ({"gamma": 0.5}, "gamma = 0.5, and here it is 0.9"),
+        ({"gamma": 0.5}, f"gamma = 0.5, and here it is {TrainConfig.gamma}"),
     ],
 )
 def test_a_checkpoint_of_another_run_is_refused(copy, tmp_path, change, says):
