@@ -89,7 +89,6 @@ class QuadrotorEnv(EnvBase):
             {flag: Binary(shape=column, dtype=torch.bool) for flag in FLAGS[:3]}, shape=shape
         ).to(self.device)
         self._restored = False
-        self._on_cpu = self.device == torch.device("cpu")
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Go on where `environment.save` was called: the next full reset returns that moment."""
@@ -150,7 +149,7 @@ class QuadrotorEnv(EnvBase):
         if terms:
             content["reward_terms"] = TensorDict(terms, batch_size=self.batch_size)
         packed = TensorDict(content, batch_size=self.batch_size)
-        return packed if self._on_cpu else packed.to(self.device)
+        return packed if self.device.type == "cpu" else packed.to(self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         self.environment.seed(seed)
