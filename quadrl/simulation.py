@@ -16,6 +16,7 @@ from mujoco.batch import Batch
 
 from quadrl import native
 from quadrl.flight import FIELDS, EngineError, Flight
+from quadrl.rotation import norm
 from quadrl.state import ROWS, TABLE_ROWS, Start, State
 from quadrl.task import TaskError
 from quadrl.vehicle import MARK, MARK_SLOT, ROTORS, Vehicle
@@ -51,6 +52,8 @@ class Simulation(abc.ABC):
             *(array.ctypes.data for array in (self.qpos, self.qvel, self.act)),
             self.qpos.strides[0] // 8 if shape else 0,
             self.origin.ctypes.data,
+            vehicle.resolved_speed,
+            vehicle.resolved_spin,
         )
 
     @property
@@ -84,14 +87,18 @@ class Simulation(abc.ABC):
         """Compute the state after `advance`.
 
         Returns:
-            None when all went well; else which aircraft diverged (shape of the simulation, bool).
-            Those keep their last good state.
+            None when all went well; else which aircraft diverged (shape of the simulation, bool):
+            a number that is not finite or that MuJoCo calls unstable, or faster than the physics
+            step resolves (`Vehicle.resolved_speed`, `resolved_spin`). Those keep their last good
+            state.
         """
         self._frames.reverse()
         if not self._fill(None):
             return None
         table, last = (frame.table for frame in self._frames)
-        broken = ~(np.abs(table[: ROWS["time"]]) < mujoco.mjMAXVAL).all(axis=0)
+        sound = (np.abs(table[: ROWS["time"]]) < mujoco.mjMAXVAL).all(axis=0)
+        sound &= table[ROWS["speed"]] <= self.vehicle.resolved_speed
+        broken = ~(sound & (table[ROWS["spin"]] <= self.vehicle.resolved_spin))
         if self.shape:
             rows = np.flatnonzero(broken)
             table[:, rows] = last[:, rows]
@@ -114,23 +121,34 @@ class Simulation(abc.ABC):
             The state of those aircraft.
 
         Raises:
-            TaskError: The start holds a number that is not finite, or past what MuJoCo itself calls
-                unstable.
+            TaskError: The start is what `read` calls diverged.
         """
         self.clear(rows)
         self._write(rows, start)
         if self._fill(rows):
-            sound = {k: (np.abs(part) < mujoco.mjMAXVAL).all() for k, part in vars(start).items()}
-            names = [name for name, good in sound.items() if not good] or ["position"]
-            raise TaskError(
-                f"the task's sample gives {' and '.join(names)} that is not finite, or larger than "
-                f"{mujoco.mjMAXVAL:g}"
-            )
+            raise TaskError(self._complaint(start))
         if rows is None:
             self._frames[0].table[ROWS["time"]] = 0.0
             return self.state
         self._frames[0].table[ROWS["time"], rows] = 0.0
         return State.of_table(self._frames[0].table[:, rows])
+
+    def _complaint(self, start: Start) -> str:
+        """What is wrong with a start."""
+        step = f"; a shorter physics_step than {self.vehicle.physics_step} s resolves more"
+        fastest = {
+            "velocity": (self.vehicle.resolved_speed, step),
+            "body_rate": (self.vehicle.resolved_spin, step),
+        }
+        for name, part in vars(start).items():
+            limit, advice = fastest.get(name, (mujoco.mjMAXVAL, ""))
+            if not (norm(part) <= limit).all():
+                break
+        else:  # with the height of the origin added
+            name, limit, advice = "position", mujoco.mjMAXVAL, ""
+        return (
+            f"the task's sample gives {name} that is not finite, or larger than {limit:g}{advice}"
+        )
 
     def save(self) -> dict[str, np.ndarray]:
         """Everything that the next step depends on, as arrays."""

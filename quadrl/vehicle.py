@@ -37,6 +37,11 @@ MARK_SLOT = 9
 MIN, MAX = mujoco.mjMINVAL, mujoco.mjMAXVAL  # what MuJoCo takes for zero, and for unstable
 LENGTHS = (1e-3, 1e3)  # [m]; the meshes of a smaller one have no volume to MuJoCo
 MAX_SUBSTEPS = 10_000
+# What a physics step resolves (tests/test_divergence.py): the angle turned in it [rad], and the
+# rates of drag and aerodynamic moment times the step. An aircraft must be able to turn once a
+# second and to fall as fast as it can.
+TURN, DAMPING = 0.5, 1.0
+SLOWEST_SPIN = 2 * math.pi  # [rad/s]
 
 
 class VehicleError(QuadrlError, ValueError):
@@ -115,6 +120,20 @@ class Vehicle:
                 f"lag_rate = {self.lag_rate} with physics_step = {self.physics_step}: a product of "
                 "at most 1 is allowed; shorten physics_step"
             )
+        if self.resolved_spin < SLOWEST_SPIN:
+            raise VehicleError(
+                f"physics_step = {self.physics_step} with inertia = {self.inertia} and "
+                f"moment_coefficient = {self.moment_coefficient} resolves no more than "
+                f"{self.resolved_spin:.3g} rad/s, and at least {SLOWEST_SPIN:.3g} is needed; "
+                "shorten physics_step"
+            )
+        if self.resolved_speed < self._terminal_speed:
+            raise VehicleError(
+                f"physics_step = {self.physics_step} with mass = {self.mass} and "
+                f"drag_coefficient = {self.drag_coefficient} resolves no more than "
+                f"{self.resolved_speed:.3g} m/s, and it falls at up to "
+                f"{self._terminal_speed:.3g} m/s; shorten physics_step"
+            )
         if not math.isclose(self.substeps * self.physics_step, self.control_step, rel_tol=1e-9):
             raise VehicleError(
                 f"control_step = {self.control_step} s is no whole number of physics steps "
@@ -135,6 +154,32 @@ class Vehicle:
     def max_speed(self) -> float:
         """Omega_max [rad/s]."""
         return math.sqrt(self.max_thrust_ratio) * self.hover_speed
+
+    @functools.cached_property
+    def resolved_speed(self) -> float:
+        """Fastest flight that a physics step resolves [m/s]: 2 k_D |v| dt / m is at most 1.
+
+        Who flies faster is terminated and counted as diverged.
+        """
+        damping = 2 * self.drag_coefficient * self.physics_step / self.mass
+        return min(DAMPING / damping, MAX) if damping else MAX
+
+    @functools.cached_property
+    def resolved_spin(self) -> float:
+        """Fastest body rate that a physics step resolves [rad/s].
+
+        |omega| dt is at most 0.5, and 2 k_M |omega| dt / J at most 1. Who turns faster is
+        terminated and counted as diverged.
+        """
+        damping = 2 * self.moment_coefficient * self.physics_step / min(self.inertia)
+        turning = min(TURN / self.physics_step, MAX)
+        return min(turning, DAMPING / damping) if damping else turning
+
+    @functools.cached_property
+    def _terminal_speed(self) -> float:
+        if self.drag_coefficient == 0:
+            return 0.0  # it never stops falling faster
+        return min(math.sqrt(self.mass * GRAVITY / self.drag_coefficient), MAX)
 
     @functools.cached_property
     def _scale(self) -> float:

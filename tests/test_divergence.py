@@ -1,9 +1,11 @@
 """Extreme aircraft, actions and contacts: what is flown is right, or terminated and counted.
 
 How far a flight can be trusted is told by four numbers of the aircraft and its flight, each a rate
-times the physics step: see LIMITS, and the tables of docs/endurance.md.
+times the physics step: see LIMITS, and the tables of docs/endurance.md. Who is faster than the step
+resolves (`Vehicle.resolved_speed`, `resolved_spin`) has diverged.
 """
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -13,12 +15,15 @@ from scipy.stats import qmc
 
 from quadrl.environment import Environment
 from quadrl.simulation import ENGINES, BatchSimulation
+from quadrl.state import Start
+from quadrl.task import TaskError
 from quadrl.vehicle import Vehicle, VehicleError
 
 STEP = 0.01
-RIGHT = 1e-3
-"""Largest error of position [m] and attitude [rad], and of velocity, body rate and rotor speed
-as a share of the fastest of the flight (1 m/s and 1 rad/s at least) and of hover."""
+RIGHT, RESOLVED = 1e-3, 5e-2
+"""Largest errors of position [m] and attitude [rad], and of velocity, body rate and rotor speed
+as a share of the fastest of the flight (1 m/s and 1 rad/s at least) and of hover: of a flight
+within LIMITS, and of any that has not diverged."""
 # Greatest rates times the step at which half a second of flight is RIGHT: of the rotor lag, of the
 # turning, and of the aerodynamic moment (2 k_M |omega| / J) and drag (2 k_D |v| / m).
 LIMITS = {
@@ -41,30 +46,35 @@ RANGES = {  # logarithmic
 
 
 def extreme_vehicles(count):
-    """Aircraft all over RANGES; an action commands every rotor from rest to its fastest."""
-    sampled = qmc.LatinHypercube(len(RANGES), rng=np.random.default_rng(0)).random(count)
+    """Aircraft all over RANGES; an action commands every rotor from rest to its fastest.
+
+    Those that the step is too long for are refused, and left out.
+    """
+    sampled = qmc.LatinHypercube(len(RANGES), rng=np.random.default_rng(0)).random(2 * count)
     low, high = np.array(list(RANGES.values())).T
     vehicles = []
     for row in low * (high / low) ** sampled:
         p = dict(zip(RANGES, row.tolist(), strict=True))
         across = p["inertia"] * p["mass"] * p["arm_length"] ** 2
         weight = 9.81 * p["mass"]
-        vehicles.append(
-            Vehicle(
-                mass=p["mass"],
-                arm_length=p["arm_length"],
-                inertia=(across, across, p["flatness"] * across),
-                thrust_coefficient=weight / (4 * p["hover_speed"] ** 2),
-                torque_coefficient=p["torque"] * weight / (4 * p["hover_speed"] ** 2),
-                drag_coefficient=weight / p["terminal"] ** 2,
-                moment_coefficient=p["moment_coefficient"],
-                lag_rate=p["lag"] / STEP,
-                max_thrust_ratio=p["ratio"],
-                action_scale=2.5 * p["hover_speed"],
-                physics_step=STEP,
+        with contextlib.suppress(VehicleError):
+            vehicles.append(
+                Vehicle(
+                    mass=p["mass"],
+                    arm_length=p["arm_length"],
+                    inertia=(across, across, p["flatness"] * across),
+                    thrust_coefficient=weight / (4 * p["hover_speed"] ** 2),
+                    torque_coefficient=p["torque"] * weight / (4 * p["hover_speed"] ** 2),
+                    drag_coefficient=weight / p["terminal"] ** 2,
+                    moment_coefficient=p["moment_coefficient"],
+                    lag_rate=p["lag"] / STEP,
+                    max_thrust_ratio=p["ratio"],
+                    action_scale=2.5 * p["hover_speed"],
+                    physics_step=STEP,
+                )
             )
-        )
-    return vehicles
+    assert len(vehicles) >= count
+    return vehicles[:count]
 
 
 def extreme_actions(steps):
@@ -80,13 +90,14 @@ def extreme_actions(steps):
 
 
 def extreme_starts(vehicle, count):
-    """States (count, 17) of `reference`: any attitude, to 10 m/s, turning to 0.1 of a step."""
+    """States (count, 17) of `reference`: any attitude, to the fastest that a step resolves."""
     rng = np.random.default_rng(2)
     attitude, velocity, spin = rng.normal(size=(3, count, 4))
     attitude /= np.linalg.norm(attitude, axis=-1, keepdims=True)
+    fastest = min(20.0, 0.99 * vehicle.resolved_speed)
     moving = []
-    for direction, most in ((velocity, 10.0), (spin, 0.1 / STEP)):
-        size = most * np.geomspace(0.01, 1.0, count)[:, None]
+    for direction, most in ((velocity, fastest), (spin, 0.99 * vehicle.resolved_spin)):
+        size = most * np.geomspace(1e-3, 1.0, count)[:, None]
         moving.append(size * direction[:, :3] / np.linalg.norm(direction[:, :3], axis=-1)[:, None])
     rotors = rng.uniform(0.0, vehicle.max_speed, (count, 4))
     return np.concatenate([np.zeros((count, 3)), attitude, *moving, rotors], axis=-1)
@@ -105,14 +116,15 @@ def rates(vehicle, qvel):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_extreme_flights_are_right_where_their_rates_say_so(engine):
-    judged, trusted, worst = 0, 0, 0.0
-    for vehicle in extreme_vehicles(24):
+def test_extreme_flights_are_right_or_ended(engine):
+    count, trusted, ended, worst, worst_trusted = 0, 0, 0, 0.0, 0.0
+    for vehicle in extreme_vehicles(12):
         commands = vehicle.rotor_command(extreme_actions(CONTROL_STEPS))
         start = extreme_starts(vehicle, 8)
         simulation = BatchSimulation(vehicle, 8, altitude=3.0, engine=engine)
         simulation.qpos[:], simulation.qvel[:], simulation.act[:] = reference.to_mujoco(start)
-        within, fast = np.ones(8, dtype=bool), np.ones((8, 2))
+        within, whole = np.ones((2, 8), dtype=bool)
+        fast = np.ones((8, 2))
         flown = []
         for command in commands:
             simulation.ctrl[:] = command
@@ -122,20 +134,27 @@ def test_extreme_flights_are_right_where_their_rates_say_so(engine):
                 simulation.advance(1)
                 for k, part in enumerate((simulation.qvel[:, :3], simulation.qvel[:, 3:])):
                     fast[:, k] = np.fmax(fast[:, k], np.linalg.norm(part, axis=-1))
-            flown.append([x.copy() for x in (simulation.qpos, simulation.qvel, simulation.act)])
-        judged, trusted = judged + 8, trusted + within.sum()
-        exact, calm = start[within], np.zeros((within.sum(), 3))
-        scale = np.ones((within.sum(), 5))
-        scale[:, 2:4], scale[:, 4] = fast[within], vehicle.hover_speed
-        for command, state in zip(commands, flown, strict=True):
-            if not within.any():
+            state = [x.copy() for x in (simulation.qpos, simulation.qvel, simulation.act)]
+            if (diverged := simulation.read()) is not None:
+                whole &= ~diverged
+                within &= whole
+            flown.append((state, whole.copy()))
+        count, trusted, ended = count + 8, trusted + within.sum(), ended + (~whole).sum()
+        some = flown[0][1]  # what ended before the first state has no state to judge
+        exact, calm = start[some], np.zeros((some.sum(), 3))
+        scale = np.ones((some.sum(), 5))
+        scale[:, 2:4], scale[:, 4] = fast[some], vehicle.hover_speed
+        for command, (state, whole) in zip(commands, flown, strict=True):
+            if not whole.any():
                 break
-            exact = reference.fly(vehicle, exact, command[within], vehicle.control_step, calm)
-            apart = reference.deviation(*(part[within] for part in state), exact) / scale
-            worst = max(worst, apart.max())
-    assert worst < RIGHT, worst
-    # Both kinds are there: flights that are judged, and flights beyond the limits.
-    assert 0.1 * judged < trusted < 0.9 * judged, trusted
+            exact = reference.fly(vehicle, exact, command[some], vehicle.control_step, calm)
+            apart = reference.deviation(*(part[some] for part in state), exact) / scale
+            worst = max(worst, apart[whole[some]].max())
+            worst_trusted = max(worst_trusted, apart[within[some]].max(initial=0.0))
+    assert worst_trusted < RIGHT, worst_trusted
+    assert worst < RESOLVED, worst
+    # All three kinds are there.
+    assert 0.05 * count < trusted < 0.9 * (count - ended) and ended > 0.05 * count, (trusted, ended)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -207,3 +226,47 @@ def test_rotors_faster_than_the_step_are_refused():
         Vehicle(lag_rate=101.0)
     finer = dataclasses.replace(Vehicle(), lag_rate=1000.0, physics_step=0.001)
     assert finer.substeps == 50
+
+
+def test_an_aircraft_that_the_step_is_too_long_for_is_refused():
+    # 2 k_M |omega| dt / J = 1 at 7.5e-3 / (2 * 0.1 * 0.01) = 3.75 rad/s: not a turn a second.
+    with pytest.raises(VehicleError, match=r"no more than 3.75 rad/s.*shorten physics_step"):
+        Vehicle(moment_coefficient=0.1)
+    assert Vehicle(moment_coefficient=0.1, physics_step=0.005).resolved_spin == 7.5
+    # 2 k_D |v| dt / m = 1 at 0.65 / (2 * 200 * 0.01) = 0.1625 m/s; it falls at 0.179 m/s.
+    with pytest.raises(VehicleError, match=r"0.163 m/s, and it falls at up to 0.179 m/s"):
+        Vehicle(drag_coefficient=200.0)
+    # Without drag and moment only the turning counts: half a radian in a step.
+    free = Vehicle(drag_coefficient=0.0, moment_coefficient=0.0)
+    assert (free.resolved_spin, free.resolved_speed) == (50.0, 1e10)
+
+
+@pytest.mark.parametrize("task", ["static_waypoint", "straight_and_level"])
+def test_whoever_turns_faster_than_the_step_resolves_has_diverged(task):
+    """In tasks that do not end by the tilt."""
+    environment = Environment(task, num_envs=3, seed=0)
+    environment.reset()
+    simulation = environment.simulation
+    simulation.qvel[:, 3:] = [[0, 0, 49.0], [0, 0, 60.0], [0, 0, 80.0]]
+    now = environment.step(np.zeros((3, 4)))
+    # The moment slows it: omega / (1 + omega k_M t / J_z), after 0.05 s 49.7 and 62.7 rad/s.
+    assert now.diverged.tolist() == now.terminated.tolist() == [False, False, True]
+    assert not now.is_success.any() and not now.truncated.any()
+
+
+def test_a_start_that_the_step_does_not_resolve_is_refused():
+    simulation = BatchSimulation(Vehicle(), 2, altitude=3.0)
+    state = simulation.state
+    turning = Start(
+        position=np.zeros((1, 3)),
+        quaternion=np.array([[1.0, 0, 0, 0]]),
+        velocity=np.zeros((1, 3)),
+        body_rate=np.array([[0, 0, 51.0]]),
+        rotor_speed=np.zeros((1, 4)),
+    )
+    with pytest.raises(TaskError, match=r"body_rate.*larger than 50; .*shorter physics_step"):
+        simulation.place(np.array([1]), turning)
+    simulation.place(
+        np.array([1]), dataclasses.replace(turning, body_rate=np.array([[0, 0, 50.0]]))
+    )
+    assert state.spin[1] == 50.0

@@ -15,6 +15,8 @@ from quadrl.vehicle import Vehicle
 
 NAMES = [field.name for field in dataclasses.fields(State)]
 ALTITUDE = 3.0
+# Its step resolves every rate of `random_start`.
+VEHICLE = Vehicle(physics_step=5e-5)
 
 
 def random_quaternions(rng, shape):
@@ -50,15 +52,15 @@ def assert_same(state, expected, rows=...):
 
 
 def single_simulation():
-    model = Vehicle().compile_lean()
-    return SingleSimulation(Vehicle(), model, mujoco.MjData(model), altitude=ALTITUDE)
+    model = VEHICLE.compile_lean()
+    return SingleSimulation(VEHICLE, model, mujoco.MjData(model), altitude=ALTITUDE)
 
 
 # ------------------------------------------------------------------- the kernel is the definition
 
 
 def test_kernel_of_a_batch_is_the_definition_bit_by_bit():
-    simulation = BatchSimulation(Vehicle(), 2000, altitude=ALTITUDE)
+    simulation = BatchSimulation(VEHICLE, 2000, altitude=ALTITUDE)
     start = random_start(0, (2000,))
     placed = simulation.place(np.arange(2000), start)
     assert_same(placed, defined(start))
@@ -79,7 +81,7 @@ def test_kernel_of_one_aircraft_is_the_definition_bit_by_bit():
 
 def test_kernel_straight_up_is_the_definition_bit_by_bit():
     # Nose straight up or down: the x axis has no level part at all, 0 in every digit.
-    simulation = BatchSimulation(Vehicle(), 2, altitude=ALTITUDE)
+    simulation = BatchSimulation(VEHICLE, 2, altitude=ALTITUDE)
     vertical = np.array([[0.5, 0.5, 0.5, -0.5], [0.5, -0.5, -0.5, -0.5]])
     start = dataclasses.replace(random_start(12, (2,)), quaternion=vertical)
     placed = simulation.place(np.arange(2), start)
@@ -98,7 +100,7 @@ def test_definition_of_a_batch_is_that_of_its_rows_bit_by_bit():
 
 @pytest.mark.parametrize("rows", [[0], [6], [1, 4, 5], list(range(7))])
 def test_placing_some_rows_leaves_the_others(rows):
-    simulation = BatchSimulation(Vehicle(), 7, altitude=ALTITUDE)
+    simulation = BatchSimulation(VEHICLE, 7, altitude=ALTITUDE)
     everyone, some = random_start(2, (7,)), random_start(3, (len(rows),))
     simulation.place(np.arange(7), everyone)
     rows = np.array(rows)
@@ -113,7 +115,7 @@ def test_placing_some_rows_leaves_the_others(rows):
 
 
 def test_the_state_after_a_step_is_the_definition_of_mujoco_s_coordinates():
-    simulation = BatchSimulation(Vehicle(), 9, altitude=ALTITUDE)
+    simulation = BatchSimulation(VEHICLE, 9, altitude=ALTITUDE)
     simulation.place(np.arange(9), random_start(4, (9,)))
     for _ in range(2):  # two tables take turns
         simulation.ctrl[:] = 220.0
@@ -131,7 +133,7 @@ def test_the_state_after_a_step_is_the_definition_of_mujoco_s_coordinates():
 
 
 def test_the_last_state_stays_whole_while_the_next_is_read():
-    simulation = BatchSimulation(Vehicle(), 3, altitude=ALTITUDE)
+    simulation = BatchSimulation(VEHICLE, 3, altitude=ALTITUDE)
     simulation.place(np.arange(3), random_start(5, (3,)))
     before = simulation.state
     kept = {name: np.array(getattr(before, name)) for name in NAMES}

@@ -109,7 +109,7 @@ def test_a_control_step_that_is_no_multiple_is_refused(physics_step, control_ste
 
 @pytest.mark.parametrize(
     ("physics_step", "control_step", "substeps"),
-    [(0.01, 0.01, 1), (0.0025, 0.05, 20), (0.1, 0.3, 3), (1 / 240, 1 / 48, 5)],
+    [(0.01, 0.01, 1), (0.0025, 0.05, 20), (0.05, 0.15, 3), (1 / 240, 1 / 48, 5)],
 )
 def test_substeps(physics_step, control_step, substeps):
     assert Vehicle(physics_step=physics_step, control_step=control_step).substeps == substeps

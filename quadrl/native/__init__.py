@@ -145,7 +145,7 @@ def load(path: Path) -> ctypes.CDLL:
     integer = ctypes.c_int64
     opened.quadrl_state.argtypes = [
         *(integer, _POINTER, _POINTER, _POINTER, _POINTER),
-        *(integer, _POINTER, _POINTER, integer),
+        *(integer, _POINTER, ctypes.c_double, ctypes.c_double, _POINTER, integer),
     ]
     opened.quadrl_flight.restype = opened.quadrl_aircraft_size.restype = integer
     opened.quadrl_flight.argtypes = [

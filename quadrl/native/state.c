@@ -26,10 +26,12 @@ QUADRL_EXPORT int quadrl_state_rows(void) { return ROWS; }
 
 // qpos (7), qvel (6) and act (4) of aircraft i stand at i * stride doubles. ids lists the n
 // aircraft to compute, or is NULL for the first n. out is (ROWS, columns), row-major. Returns how
-// many of them hold a number that is not finite or is past what MuJoCo itself calls unstable.
+// many of them hold a number that is not finite or is past what MuJoCo itself calls unstable, or
+// are faster than max_speed [m/s] or max_spin [rad/s].
 QUADRL_EXPORT int64_t quadrl_state(int64_t n, const int64_t* ids, const double* qpos,
                                    const double* qvel, const double* act, int64_t stride,
-                                   const double* origin, double* out, int64_t columns) {
+                                   const double* origin, double max_speed, double max_spin,
+                                   double* out, int64_t columns) {
   int64_t broken = 0;
   for (int64_t i = 0; i < n; ++i) {
     const int64_t row = ids ? ids[i] : i;
@@ -71,6 +73,7 @@ QUADRL_EXPORT int64_t quadrl_state(int64_t n, const int64_t* ids, const double* 
     OUT(SPIN) = norm(v + 3, 3);
     OUT(LEVEL_ERROR) = norm(sine, 2) + norm(off, 2);
     OUT(EAST_ERROR) = norm(sine, 3) + norm(off, 3);
+    sound &= (OUT(SPEED) <= max_speed) & (OUT(SPIN) <= max_spin);
 #undef OUT
     broken += !sound;
   }
