@@ -138,15 +138,16 @@ def benchmark(task: str, *, num_envs: int, seconds: float, repeats: int) -> dict
     }
 
 
-def rows(measured: dict[str, Any]) -> list[tuple[str, str, str, str]]:
-    """What `benchmark` returned, to be read: what, rate, share of bare mj_step, target."""
+def rows(measured: dict[str, Any]) -> list[tuple[str, ...]]:
+    """What `benchmark` returned, to be read: what, fastest and median rate, share, target."""
     written = []
     for row in measured["rates"]:
         target = "" if row["target_share"] is None else f"{row['target_share']:.2f}"
         if row["target_rate"] is not None:
             target = f"{row['target_rate']:,}/s"
         share = f"{row['share']:.2f} ({row['of']})"
-        written.append((row["what"], f"{row['rate']:,.0f}", share, target))
+        median = statistics.median(row["repeats"])
+        written.append((row["what"], f"{row['rate']:,.0f}", f"{median:,.0f}", share, target))
     return written
 
 

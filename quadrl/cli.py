@@ -314,7 +314,7 @@ class Benchmark:
             sys.stdout.write(json.dumps(measured) + "\n")
             return
         table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-        for column in ("what", "control steps/s", "of bare mj_step", "target"):
+        for column in ("what", "control steps/s", "median", "of bare mj_step", "target"):
             table.add_column(column, justify="left" if column == "what" else "right")
         for row in rows(measured):
             table.add_row(*row)
