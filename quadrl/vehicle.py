@@ -140,7 +140,7 @@ class Vehicle:
                 f"of {self.physics_step} s"
             )
 
-    @property
+    @functools.cached_property
     def substeps(self) -> int:
         """Physics steps in a control step."""
         return max(1, round(self.control_step / self.physics_step))
@@ -222,7 +222,10 @@ class Vehicle:
 
         Omega_c = clip(Omega_hover + action_scale * clip(action, -1, 1), 0, Omega_max).
         """
-        if isinstance(action, np.ndarray):
+        if isinstance(action, np.ndarray) and action.ndim == 1:
+            # For one aircraft Python's numbers, the same doubles, take half the time of NumPy's.
+            within = np.array([-1.0 if x < -1.0 else min(x, 1.0) for x in action.tolist()])
+        elif isinstance(action, np.ndarray):
             within = np.minimum(np.maximum(action, -1.0), 1.0)  # half the time of clip
         else:
             within = action.clip(-1.0, 1.0)
