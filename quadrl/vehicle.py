@@ -125,14 +125,15 @@ class Vehicle:
                 f"physics_step = {self.physics_step} with inertia = {self.inertia} and "
                 f"moment_coefficient = {self.moment_coefficient} resolves no more than "
                 f"{self.resolved_spin:.3g} rad/s, and at least {SLOWEST_SPIN:.3g} is needed; "
-                "shorten physics_step"
+                "give it a moment_coefficient of its own, or a shorter physics_step"
             )
         if self.resolved_speed < self._terminal_speed:
             raise VehicleError(
                 f"physics_step = {self.physics_step} with mass = {self.mass} and "
                 f"drag_coefficient = {self.drag_coefficient} resolves no more than "
                 f"{self.resolved_speed:.3g} m/s, and it falls at up to "
-                f"{self._terminal_speed:.3g} m/s; shorten physics_step"
+                f"{self._terminal_speed:.3g} m/s; give it a drag_coefficient of its own, or a "
+                "shorter physics_step"
             )
         if not math.isclose(self.substeps * self.physics_step, self.control_step, rel_tol=1e-9):
             raise VehicleError(
