@@ -73,7 +73,8 @@ class Transition:
     is_success: Array
     """bool: over, and what was asked is done."""
     diverged: Array
-    """bool: the simulation broke down; the state is the last good one, and terminated is set."""
+    """bool: the simulation broke down, or flew faster than its step resolves; the state is the last
+    good one, and terminated is set."""
     error: Array
     """The task's error [m]."""
 
