@@ -120,25 +120,26 @@ class Vehicle:
                 f"lag_rate = {self.lag_rate} with physics_step = {self.physics_step}: a product of "
                 "at most 1 is allowed; shorten physics_step"
             )
-        if self.resolved_spin < SLOWEST_SPIN:
-            raise VehicleError(
-                f"physics_step = {self.physics_step} with inertia = {self.inertia} and "
-                f"moment_coefficient = {self.moment_coefficient} resolves no more than "
-                f"{self.resolved_spin:.3g} rad/s, and at least {SLOWEST_SPIN:.3g} is needed; "
-                "give it a moment_coefficient of its own, or a shorter physics_step"
-            )
-        if self.resolved_speed < self._terminal_speed:
-            raise VehicleError(
-                f"physics_step = {self.physics_step} with mass = {self.mass} and "
-                f"drag_coefficient = {self.drag_coefficient} resolves no more than "
-                f"{self.resolved_speed:.3g} m/s, and it falls at up to "
-                f"{self._terminal_speed:.3g} m/s; give it a drag_coefficient of its own, or a "
-                "shorter physics_step"
-            )
+        self._check_step("inertia", "moment_coefficient", self.resolved_spin, SLOWEST_SPIN, "rad/s")
+        self._check_step(
+            "mass", "drag_coefficient", self.resolved_speed, self._terminal_speed, "m/s"
+        )
         if not math.isclose(self.substeps * self.physics_step, self.control_step, rel_tol=1e-9):
             raise VehicleError(
                 f"control_step = {self.control_step} s is no whole number of physics steps "
                 f"of {self.physics_step} s"
+            )
+
+    def _check_step(
+        self, mass: str, coefficient: str, resolved: float, needed: float, unit: str
+    ) -> None:
+        """Refuse a physics step that does not resolve what the aircraft needs at least."""
+        if resolved < needed:
+            raise VehicleError(
+                f"{mass} = {getattr(self, mass)} and {coefficient} = {getattr(self, coefficient)} "
+                f"with physics_step = {self.physics_step}: no more than {resolved:.3g} {unit} is "
+                f"resolved, and {needed:.3g} is needed; give it a {coefficient} of its own, or a "
+                f"physics_step of at most {self.physics_step * resolved / needed:.2g} s"
             )
 
     @functools.cached_property
