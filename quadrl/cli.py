@@ -605,9 +605,9 @@ def _sum_up(folder: Path, config: TrainConfig, judged: dict[str, Any]) -> None:
     console.print(
         f"\n[bold]{config.task}[/bold] trained with {config.algo.upper()} in "
         f"{judged['training_s']:.1f} s of wall clock from the first step to the saved policy "
-        f"(imports: {judged['imports_s']:.1f} s)\n"
-        f"{judged['episodes']} episodes with the mean action: {survived:.0f} % to the end, "
-        f"{100 * judged['success_rate']:.0f} % successful, error over the last 2 s "
+        f"(imports: {judged['imports_s']:.1f} s; engine: {config.engine})\n"
+        f"{judged['episodes']} episodes in MuJoCo with the mean action: {survived:.0f} % to the "
+        f"end, {100 * judged['success_rate']:.0f} % successful, error over the last 2 s "
         f"{100 * judged['position_error_m']:.1f} cm\n"
     )
     meanings = {

@@ -438,7 +438,7 @@ def test_a_damaged_checkpoint_is_refused_and_nothing_is_touched(copy, damage, sa
         ({"task": "random_waypoint"}, "task = 'random_waypoint', and here it is 'hover'"),
         ({"task_options": ()}, "task_options = .., and here it is .'horizon=0.5'."),
         ({"vehicle": "racer"}, "vehicle = 'racer', and here it is 'paper'"),
-        ({"engine": "flight"}, "engine = 'flight', and here it is 'mujoco'"),
+        ({"engine": "mujoco"}, "engine = 'mujoco', and here it is 'flight'"),
         ({"seed": 1}, "seed = 1, and here it is 0"),
         ({"gamma": 0.5}, f"gamma = 0.5, and here it is {TrainConfig.gamma}"),
     ],
@@ -630,7 +630,10 @@ def test_the_critic_sees_the_last_observation_of_an_episode_not_the_next_first(t
     training._learn = lambda batch: (seen.append(batch.clone()), learn(batch))[1]
     training.run()
     environment = Environment(
-        make_task("hover", {"horizon": 0.5}), num_envs=8, seed=TINY.seed * SEED_STRIDE
+        make_task("hover", {"horizon": 0.5}),
+        num_envs=8,
+        seed=TINY.seed * SEED_STRIDE,
+        engine=TINY.engine,
     )
     observation = environment.flatten(environment.reset())
     ends = 0

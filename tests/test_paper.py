@@ -20,7 +20,7 @@ from test_learning import brake, make_record
 import quadrl
 from quadrl.environment import Environment
 from quadrl.learning import study
-from quadrl.learning.config import RunError, TrainConfig, recipe
+from quadrl.learning.config import RunError, recipe
 from quadrl.learning.evaluate import EVALUATION_SEED, fly, judge, make_gusts, smoothness
 from quadrl.learning.figures import FigureError, learning_curves, lines, spread
 from quadrl.learning.policy import export, make_actor_critic
@@ -226,7 +226,7 @@ def test_a_new_run_begins_with_the_command_that_anybody_would_give(tmp_path):
     (run,) = small(tmp_path)
     assert run.command(7) == [
         "train", "hover", "--algo", "ppo", "--seed", "0", "--steps", "1",
-        "--vehicle", "paper", "--engine", "mujoco", "--num-threads", "1", "--out",
+        "--vehicle", "paper", "--engine", "flight", "--num-threads", "1", "--out",
         str(tmp_path / "hover-ppo-0"), "--no-video", "--episodes", "7",
     ]  # fmt: skip
 
@@ -481,7 +481,7 @@ def test_the_lowest_seed_is_shipped_and_is_the_same_file(tmp_path, capsys, monke
     for name, number in (("a", seed + 1), ("b", seed)):
         folder = tmp_path / name
         folder.mkdir()
-        config = TrainConfig(**{**recipe("hover").__dict__, "seed": number})
+        config = dataclasses.replace(recipe("hover"), seed=number, engine="mujoco")
         (folder / "config.json").write_text(json.dumps(config.resolved()))
         dataclasses.replace(source, metadata=source.metadata | {"seed": number}).save(
             folder / "policy.safetensors"
@@ -503,7 +503,8 @@ def test_the_lowest_seed_is_shipped_and_is_the_same_file(tmp_path, capsys, monke
         quadrl.policy.SHIPPED / "hover_ppo.safetensors"
     ).read_bytes()
     again = json.loads((out / "hover_ppo.json").read_text())
-    assert again["command"] == beside["command"] == f"quadrl train hover --algo ppo --seed {seed}"
+    command = f"quadrl train hover --algo ppo --seed {seed} --engine mujoco"
+    assert again["command"] == beside["command"] == command
     assert again["evaluation"]["episodes"] == 20
     # Shipped before, and no longer worth having: taken away again.
     monkeypatch.setattr(ship, "WORTH_HAVING", 1.1)

@@ -191,9 +191,9 @@ class TrainConfig:
     """Name of the aircraft."""
     action: str = "rotor"
     """What actions mean: rotor (the paper's), thrust_body_rate, velocity or position."""
-    engine: Engine = "mujoco"
-    """What the training flies in: mujoco, or flight (free flight wherever there is nothing to
-    touch). Evaluations fly in mujoco."""
+    engine: Engine = "flight"
+    """What the training flies in: flight (free flight wherever there is nothing to touch), or
+    mujoco. Evaluations fly in mujoco."""
     task_options: tuple[str, ...] = ()
     """Fields of the task that differ from its defaults, such as horizon=5."""
     num_envs: int = 256

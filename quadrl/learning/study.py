@@ -19,7 +19,6 @@ from quadrl.learning.config import RunError, TrainConfig, make_task, recipe
 from quadrl.learning.evaluate import EVALUATION_SEED, Controller, fly, judge, smoothness
 from quadrl.learning.figures import read_metrics
 from quadrl.policy import Policy
-from quadrl.simulation import Engine
 from quadrl.vehicle import VEHICLES
 
 EVALUATION = "evaluation.json"
@@ -88,7 +87,6 @@ def plan(
     seeds: Iterable[int],
     *,
     steps: int | None = None,
-    engine: Engine = "mujoco",
     num_threads: int = 0,
 ) -> list[Run]:
     """The runs of a study, seed by seed, so that a study that is stopped has whole seeds.
@@ -99,7 +97,6 @@ def plan(
         algorithms: Names of algorithms.
         seeds: Of the trainings.
         steps: Control steps of each; None for what the task trains with by default.
-        engine: What they fly in; evaluations fly in MuJoCo.
         num_threads: Of each simulation; 0 for every core.
     """
     runs = []
@@ -111,7 +108,6 @@ def plan(
                     config,
                     seed=seed,
                     steps=steps or config.steps,
-                    engine=engine,
                     num_threads=num_threads,
                 )
                 runs.append(Run(config, out / f"{task}-{algo}-{seed}"))
