@@ -141,13 +141,14 @@ class Simulation(abc.ABC):
             "body_rate": (self.vehicle.resolved_spin, step),
         }
         for name, part in vars(start).items():
-            limit, advice = fastest.get(name, (mujoco.mjMAXVAL, ""))
-            if not (norm(part) <= limit).all():
+            limit, advice = fastest.get(name, (np.inf, ""))
+            if not ((np.abs(part) < mujoco.mjMAXVAL).all() and (norm(part) <= limit).all()):
                 break
         else:  # with the height of the origin added
-            name, limit, advice = "position", mujoco.mjMAXVAL, ""
+            name, limit, advice = "position", np.inf, ""
         return (
-            f"the task's sample gives {name} that is not finite, or larger than {limit:g}{advice}"
+            f"the task's sample gives {name} that is not finite, or larger than "
+            f"{min(limit, mujoco.mjMAXVAL):g}{advice}"
         )
 
     def save(self) -> dict[str, np.ndarray]:

@@ -256,6 +256,19 @@ def test_whoever_turns_faster_than_the_step_resolves_has_diverged(task):
     assert not now.is_success.any() and not now.truncated.any()
 
 
+def test_whoever_flies_faster_than_the_step_resolves_has_diverged():
+    environment = Environment(
+        "static_waypoint", num_envs=2, seed=0, vehicle=Vehicle(control_step=STEP)
+    )
+    environment.reset()
+    environment.simulation.qvel[:, 0] = [3000.0, 20000.0]
+    # The drag slows it: v / (1 + v k_D t / m), to 2120 and 5306 m/s, of 3611 resolved.
+    now = environment.step(np.zeros((2, 4)))
+    assert now.diverged.tolist() == [False, True]
+    assert 2000 < environment.simulation.state.speed[0] < 2200
+    assert environment.simulation.state.speed[1] < 1  # where it was
+
+
 def test_a_start_that_the_step_does_not_resolve_is_refused():
     simulation = BatchSimulation(Vehicle(), 2, altitude=3.0)
     state = simulation.state
@@ -268,7 +281,10 @@ def test_a_start_that_the_step_does_not_resolve_is_refused():
     )
     with pytest.raises(TaskError, match=r"body_rate.*larger than 50; .*shorter physics_step"):
         simulation.place(np.array([1]), turning)
-    simulation.place(
-        np.array([1]), dataclasses.replace(turning, body_rate=np.array([[0, 0, 50.0]]))
-    )
+    fast = dataclasses.replace(turning, body_rate=np.array([[0, 0, 50.0]]))
+    simulation.place(np.array([1]), fast)
     assert state.spin[1] == 50.0
+    # What is at fault is named, though it comes after the others, and is no speed of flight.
+    spun = dataclasses.replace(fast, rotor_speed=np.full((1, 4), 1e10))
+    with pytest.raises(TaskError, match=r"rotor_speed that is not finite, or larger than 1e\+10$"):
+        simulation.place(np.array([1]), spun)
