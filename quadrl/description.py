@@ -1,4 +1,4 @@
-"""What a task is, in words and numbers: for the command line, the README and the contract."""
+"""What a task is, in words and numbers: for the command line and the documentation."""
 
 from __future__ import annotations
 
@@ -6,139 +6,63 @@ import ast
 import dataclasses
 import inspect
 import textwrap
-from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from quadrl.environment import Environment
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
-
-Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
-"""The head of a table, and its rows."""
+from quadrl.vehicle import Vehicle, resolve
 
 
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """Some numbers of the flat observation."""
+def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]:
+    """All that there is to know of a task before it is flown, as JSON can hold it.
 
-    name: str
-    first: int
-    last: int
-    unit: str
-    meaning: str
+    Args:
+        task: The task.
+        vehicle: The aircraft; None for the paper's.
 
-
-@dataclasses.dataclass(frozen=True)
-class Term:
-    """A term of the reward; the weight is None where the task has no option of that name."""
-
-    name: str
-    weight: float | None
-    meaning: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Option:
-    """A field of the task."""
-
-    name: str
-    value: Any
-    meaning: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Description:
-    """All that is to be known of a task before it is flown."""
-
-    name: str
-    asks: str
-    starts: str
-    ends: str
-    solved: str
-    horizon: float  # [s]
-    observation: tuple[Entry, ...]
-    action: str
-    reward: tuple[Term, ...]
-    options: tuple[Option, ...]
-
-
-def describe(task: Task, vehicle: Vehicle | None = None) -> Description:
-    """A task, flown by an aircraft (None: the paper's)."""
-    vehicle, texts = vehicle or Vehicle(), docstrings(type(task))
-    entries, first = [], 0
-    for name, part in task.observation.items():
-        entries.append(Entry(name, first, first + part.size - 1, part.unit, part.meaning))
-        first += part.size
-    weights = ((term, f"{term}_weight") for term in task.term_names(vehicle))
-    options = [field.name for field in dataclasses.fields(task)]
-    return Description(
-        name=task.name,
-        asks=task.asks,
-        starts=task.starts,
-        ends=task.ends,
-        solved=task.solved,
-        horizon=task.horizon,
-        observation=tuple(entries),
-        action=describe_action(vehicle),
-        reward=tuple(
-            Term(term, getattr(task, weight, None), texts.get(weight, ""))
-            for term, weight in weights
-        ),
-        options=tuple(
-            Option(name, getattr(task, name), texts.get(name, ""))
-            for name in options
-            if name != "horizon" and not name.endswith("_weight")
-        ),
-    )
+    Returns:
+        name, asks, starts, ends, solved (texts); time_limit [s]; training: settings that have other
+        defaults with this task; observation: name, first, last, unit and meaning of each term of
+        the flat vector; action (text); reward: name, weight (None without an option of that name)
+        and meaning of each term; options: name, value and meaning of the others.
+    """
+    vehicle, texts = resolve(vehicle), docstrings(type(task))
+    environment = Environment(task, vehicle=vehicle, seed=0)
+    terms = zip(environment.layout.items(), task.observation.values(), strict=True)
+    values = dataclasses.asdict(task)
+    return {
+        **{name: getattr(task, name) for name in ("name", "asks", "starts", "ends", "solved")},
+        "time_limit": task.time_limit,
+        "training": task.training,
+        "observation": [
+            {"name": name, "first": where.start, "last": where.stop - 1, "unit": term.unit,
+             "meaning": term.meaning}
+            for (name, where), term in terms
+        ],
+        "action": describe_action(vehicle),
+        "reward": [
+            {"name": term, "weight": values.get(f"{term}_weight"),
+             "meaning": texts.get(f"{term}_weight", "")}
+            for term in environment.term_names
+        ],
+        "options": [
+            {"name": name, "value": value, "meaning": texts.get(name, "")}
+            for name, value in values.items()
+            if name != "time_limit" and not name.endswith("_weight")
+        ],
+    }  # fmt: skip
 
 
 def describe_action(vehicle: Vehicle) -> str:
-    """What the numbers of an action mean."""
+    """What the numbers of an action mean with the control mode "rotor", in words."""
+    hover, fastest = (_span(speeds) for speeds in (vehicle.hover_speed, vehicle.max_speed))
     return (
-        f"Four numbers in [-1, 1], one a rotor: the change of its speed command from hover "
-        f"({vehicle.hover_speed:.1f} rad/s), {vehicle.action_scale:g} rad/s at 1; commands stay "
-        f"within 0 and {vehicle.max_speed:.1f} rad/s"
+        f"{vehicle.rotor_count} numbers in [-1, 1], one per rotor: the change of its speed command "
+        f"from hover ({hover} rad/s), {vehicle.action_scale:g} rad/s at 1; commands stay between 0 "
+        f"and {fastest} rad/s"
     )
-
-
-def observation_rows(described: Sequence[Description]) -> Rows:
-    """The entries of the flat observation, and which tasks have them if not all."""
-    entries = {entry.name: entry for task in described for entry in task.observation}
-    rows = []
-    for name, entry in entries.items():
-        having = [task.name for task in described if entry in task.observation]
-        where = "" if len(having) == len(described) else f" (only {', '.join(having)})"
-        rows.append((name, f"{entry.first}..{entry.last}", entry.unit, entry.meaning + where))
-    return ("observation", "numbers", "unit", "meaning and frame"), rows
-
-
-def reward_rows(described: Sequence[Description]) -> Rows:
-    """The terms of the reward, their usual weight, and which tasks have another."""
-    found: dict[str, list[tuple[str, Term]]] = {}
-    for task in described:
-        for term in task.reward:
-            found.setdefault(term.name, []).append((task.name, term))
-    rows = []
-    for name, terms in found.items():
-        (first, usual), *_ = terms
-        alone = len(described) > 1 and first != described[0].name  # not a term of all tasks
-        others = [(task, t) for task, t in terms if alone or t.weight != usual.weight]
-        differs = ", ".join(f"{task} {_weight(term)}" for task, term in others)
-        rows.append((name, usual.meaning, "" if alone else _weight(usual), differs))
-    head = ("reward", "meaning", "weight", "where it differs")
-    return (head, rows) if len(described) > 1 else (head[:3], [row[:3] for row in rows])
-
-
-def option_rows(described: Description) -> Rows:
-    """The options of a task."""
-    rows = [
-        (o.name, f"{o.value:g}" if isinstance(o.value, float) else str(o.value), o.meaning)
-        for o in described.options
-    ]
-    return ("option", "default", "meaning"), rows
-
-
-def _weight(term: Term) -> str:
-    return "of the task" if term.weight is None else f"{term.weight:g}"
 
 
 def docstrings(kind: type) -> dict[str, str]:
@@ -148,11 +72,13 @@ def docstrings(kind: type) -> dict[str, str]:
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
         assert isinstance(definition, ast.ClassDef)
         for field, text in zip(definition.body, definition.body[1:], strict=False):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(field.target, ast.Name)
-                and isinstance(text, ast.Expr)
-                and isinstance(text.value, ast.Constant)
-            ):
-                found[field.target.id] = " ".join(str(text.value.value).split()).rstrip(".")
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                value = text.value if isinstance(text, ast.Expr) else None
+                if isinstance(value, ast.Constant):
+                    found[field.target.id] = " ".join(str(value.value).split()).rstrip(".")
     return found
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = f"{values.min():.1f}", f"{values.max():.1f}"
+    return low if low == high else f"{low} to {high}"

@@ -1,533 +1,307 @@
-"""The core of every door: a task and a simulation make transitions.
+"""The core of every API: a task and an engine make transitions.
 
-One environment flies one aircraft (`num_envs=None`, arrays without a leading axis) or a batch.
-It keeps the clock, the generators and the episode's fields; it resets what it is told to and
-never by itself. Aircraft i of a batch seeded with s is the single environment seeded with s + i.
+An environment owns N rows: seeds, episodes, and the snapshot that the engine and the pure
+functions of `quadrl.transition` bring forward. It resets what it is told to and never by itself.
+Row i of a batch seeded with s is the single environment seeded with s + i.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
-import reprlib
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from quadrl import interfaces, tasks
+from quadrl import mjcf, parameters, records, tasks, transition, validation
+from quadrl.control import modes
+from quadrl.engines.mujoco import ENGINES, BatchEngine, DataEngine, Engine, EngineName
 from quadrl.errors import QuadrlError
+from quadrl.markers import Marker
+from quadrl.parameters import Parameters
+from quadrl.randomization import Ranges
+from quadrl.rng import PARAMETERS, Rng, check_seed
 from quadrl.rotation import Array
-from quadrl.simulation import (
-    ENGINES,
-    BatchSimulation,
-    Engine,
-    Rows,
-    Simulation,
-    SingleSimulation,
-)
-from quadrl.state import Start, State
-from quadrl.task import (
-    EPISODE_DRAWS,
-    Draw,
-    Errors,
-    Fields,
-    Marker,
-    Measures,
-    OptionError,
-    Outcome,
-    Task,
-    TaskError,
-    check_choices,
-    total,
-)
-from quadrl.vehicle import ROTORS, Vehicle, resolve
+from quadrl.task import Snapshot, Task
+from quadrl.transition import Clock, Episode, Observation, Transition
+from quadrl.vehicle import Vehicle, resolve
 
-Observation = dict[str, Array]
 MAX_ENVS = 1 << 20
 MAX_THREADS = 1024
-
-
-class ActionError(QuadrlError, ValueError):
-    """An action of the wrong shape or kind, or with a number that is not finite."""
-
-
-@dataclasses.dataclass(slots=True)
-class Transition:
-    """What one control step gave; arrays (...) of the environment's shape, one row an aircraft.
-
-    The parts of the observation are live views: copy them before the next step or reset.
-    """
-
-    observation: Observation
-    """Named parts (..., k) in the task's order."""
-    reward: Array
-    """The sum of the terms."""
-    reward_terms: dict[str, Array]
-    """Named terms of the reward."""
-    terminated: Array
-    """bool: over by failure, or by success where the task says so."""
-    truncated: Array
-    """bool: over by the clock; never together with terminated."""
-    is_success: Array
-    """bool: over, and what was asked is done."""
-    diverged: Array
-    """bool: the simulation broke down, or flew faster than its step resolves; the state is the last
-    good one, and terminated is set."""
-    error: Array
-    """The task's error [m]."""
+MOMENT = ("action", "rotor_command", "time")
+"""Arrays of a snapshot that are its own."""
 
 
 class Environment:
-    """A task flown by a vehicle in a simulation."""
+    """A task flown by N aircraft; a single one is N = 1."""
+
+    snapshot: Snapshot
+    """What tasks see now: live, valid until the next step."""
 
     def __init__(
         self,
         task: str | Task,
         *,
-        num_envs: int | None = None,
+        num_envs: int = 1,
         seed: int | None = None,
-        vehicle: Vehicle | None = None,
+        vehicle: Vehicle | str | None = None,
         num_threads: int = 0,
-        engine: Engine = "mujoco",
-        simulation: Simulation | None = None,
-        action: str = "rotor",
+        engine: EngineName | Engine = "mujoco",
+        control_mode: str = "rotor",
+        ranges: Mapping[str, Any] | None = None,
     ) -> None:
-        """Make the simulation and seed the generators.
+        """Make the engine and seed the rows.
 
         Args:
             task: A name of the catalogue or a task.
-            num_envs: Number of aircraft N; None for one without a leading axis.
-            seed: Aircraft i is seeded with seed + i; None draws one from the system.
-            vehicle: The aircraft; None for the paper's.
+            num_envs: Number of aircraft N.
+            seed: Row i is seeded with seed + i; None draws one from the system.
+            vehicle: The aircraft or its name; None for the paper's.
             num_threads: Threads of a batch; 0 for every core.
-            engine: "mujoco", or "flight": free flight wherever there is nothing to touch.
-            simulation: Use this one instead of making one (then N is its own).
-            action: What actions mean, a name of `interfaces.INTERFACES`.
+            engine: "mujoco", "free_flight" (wherever there is nothing to touch), or an engine that
+                is made already, whose vehicle and N count then.
+            control_mode: What actions mean, a name of `control.modes.CONTROL_MODES`.
+            ranges: Parameters and wind that are drawn for each row at each reset, as
+                `quadrl.randomization.Ranges` takes them.
 
         Raises:
-            ValueError: Unknown task or interface, or a number of aircraft that cannot be.
+            QuadrlError: An unknown name, or a value that cannot be.
             NativeError: The rotor callbacks cannot be built or installed.
         """
         self.task = tasks.make(task)
-        self.vehicle = simulation.vehicle if simulation and vehicle is None else resolve(vehicle)
-        if simulation is None:
-            check_choices([engine], ENGINES, "engine")
-            simulation = _simulation(self.task, self.vehicle, num_envs, num_threads, engine)
-        self.simulation = simulation
-        self.shape = simulation.shape
-        self.interface = interfaces.make(action, self.vehicle)
-        self._action_shape = (*self.shape, self.interface.size)
-        self.num_envs = self.shape[0] if self.shape else 1
-        self.horizon_steps = max(1, round(self.task.horizon / self.vehicle.control_step))
-        settle_steps = round(self.task.settle / self.vehicle.control_step)
-        self._settle_steps = min(max(1, settle_steps), self.horizon_steps)
+        self.vehicle = engine.vehicle if isinstance(engine, Engine) else resolve(vehicle)
+        self.ranges = Ranges(self.vehicle, ranges) if ranges else None
+        if not isinstance(engine, Engine):
+            validation.choice("engine", engine, ENGINES)
+            count = validation.number("num_envs", num_envs, 1, MAX_ENVS, whole=True)
+            threads = validation.number("num_threads", num_threads, 0, MAX_THREADS, whole=True)
+            altitude = max(self.task.altitude, self.vehicle.ground_clearance)
+            world = {"contact": self.task.contact, "scene": self.task.scene}
+            if count == 1:  # as `BatchEngine`, without a pool of threads
+                model = mjcf.compile_model(self.vehicle, drawn=False, **world)
+                data = mujoco.MjData(model)
+                engine = DataEngine(self.vehicle, model, data, altitude=altitude, engine=engine)
+            else:
+                engine = BatchEngine(
+                    self.vehicle,
+                    count,
+                    altitude=altitude,
+                    num_threads=threads,
+                    engine=engine,
+                    per_row=self.ranges is not None and self.ranges.per_row,
+                    **world,
+                )
+        self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
+        self.control_mode = modes.make(control_mode, self.vehicle)
+        self.action_size = self.control_mode.size
+        timestep = self.vehicle.control_timestep
+        self.time_limit_steps = max(1, round(self.task.time_limit / timestep))
+        settle = min(max(1, round(self.task.settle_time / timestep)), self.time_limit_steps)
+        self._clock = Clock(timestep, self.time_limit_steps, settle)
+        nominal = Parameters.of(parameters.rows(self.vehicle), timestep)
+        self._nominal = nominal.map(np.ascontiguousarray)  # NumPy is faster with these
+        self.term_names = transition.check_task(
+            self.task, self._nominal, self.action_size, float(self.origin[2])
+        )
+        """Names of the reward's terms, in their order."""
         self.layout: dict[str, slice] = {}
-        """Where each named part of the observation stands in the flat vector."""
+        """Where each named term of the observation stands in the flat vector."""
         self.size = 0
-        for name, part in self.task.observation.items():
-            self.layout[name] = slice(self.size, self.size + part.size)
-            self.size += part.size
-        self.generators: list[np.random.Generator] = []
-        self.seed(seed)
-        self._steps: Any = None
-        self.fields: Fields
-        self._measures: Measures
-        self._command: np.ndarray
-        self._setpoint: np.ndarray
-        self._flown = 0  # physics steps of this control step that the interface's loops have flown
+        for name, term in self.task.observation.items():
+            width = term.width(self.vehicle.rotor_count)
+            self.layout[name] = slice(self.size, self.size + width)
+            self.size += width
+        self._keys = np.zeros(self.num_envs, dtype=np.int64)  # (N,) seed of each row
+        self._episodes = np.zeros(self.num_envs, dtype=np.int64)  # (N,) begun since it was seeded
+        self._episode: Episode | None = None
+        self._setpoint: Any = None
+        self._command: Any = None
+        self._flown = 0  # physics steps of this control step that the mode's loops have flown
         self._diverged: np.ndarray | None = None  # in them
+        self.seed(seed)
 
-    def seed(self, seed: int | None = None) -> int:
-        """Give every aircraft a new generator; returns the seed of the first.
+    def seed(self, seed: int | None = None, rows: np.ndarray | None = None) -> int:
+        """Begin the episodes of a seed anew: row i gets seed + i; rows (n,) or None for all.
 
         Raises:
-            OptionError: The seed is no whole number, or a negative one.
+            QuadrlError: The seed is no whole number from 0 on.
         """
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
-        check_seed(seed)
-        self.generators = [np.random.default_rng(seed + i) for i in range(self.num_envs)]
+        seed = check_seed(seed)
+        rows = np.arange(self.num_envs) if rows is None else validation.rows(rows, self.num_envs)
+        self._keys[rows], self._episodes[rows] = seed + rows, 0
         return seed
 
-    def reset(self, rows: Rows = None) -> Observation:
+    def reset(self, rows: np.ndarray | None = None) -> Observation:
         """Begin an episode.
 
         Args:
             rows: Numbers (n,) or mask (N,) of the aircraft that begin one; None for all.
 
         Returns:
-            The observation of those aircraft, parts (n, k), or (k,) for a single one.
+            The observation of those aircraft, terms (n, k).
 
         Raises:
-            OptionError: A number of an aircraft that is not there, or one twice.
-            TaskError: The task gives arrays of the wrong shape, or a start that no aircraft can
-                have.
+            QuadrlError: A number of an aircraft that is not there, or one twice; or the task gives
+                arrays of the wrong shape, or a start that no aircraft can have.
         """
-        rows = None if rows is None else self._checked(rows)
-        if self._steps is None and rows is not None and len(rows) < self.num_envs:
+        rows = np.arange(self.num_envs) if rows is None else validation.rows(rows, self.num_envs)
+        if self._episode is None and len(rows) < self.num_envs:
             raise RuntimeError("the first reset must be of every aircraft")
-        everyone = rows is None or len(rows) == self.num_envs
-        if self.shape and rows is None:
-            rows = np.arange(self.num_envs)
-        start, fields = self.task.sample(Draw(self._draw_block(rows)), self.vehicle)
-        self._check_start(start, () if rows is None else (len(rows),))
-        state = self.simulation.place(rows, start)
-        measures = self.task.measure(state, fields)
-        if self._steps is None:
-            self._check_task(start, state, measures, fields)
-        observation = self.task.observe(state, measures, fields, self.vehicle)
-        if everyone or rows is None:
-            self.fields, self._measures = fields, measures
-            # For one aircraft a number of Python's own: cheaper than an array without axes.
-            self._steps = np.zeros(self.shape, dtype=np.int64) if self.shape else 0
-            self._error_sum, self._final_sum = np.zeros(self.shape), np.zeros(self.shape)
+        place = self._keys[rows], self._episodes[rows]
+        seen = self._draw(rows, Rng(*place, PARAMETERS))
+        start, task_state = self.task.begin(Rng(*place), seen)
+        state = self.engine.place(rows, start)
+        if self.ranges is not None:
+            self.engine.air[rows] = self._air
+        now, episode = transition.begin(self.task, state, task_state, seen, self.action_size)
+        self._episodes[rows] += 1
+        if len(rows) == self.num_envs:
+            self._keep(now)
+            self._episode = episode
         else:
-            _put(self.fields, rows, fields)
-            _put(self._measures, rows, measures)
-            steps: Any = self._steps
-            steps[rows] = 0
-            self._error_sum[rows] = self._final_sum[rows] = 0.0
-        return observation
+            records.put(self.snapshot, rows, now)
+            records.put(self._episode, rows, episode)
+        return self.task.observe(now)
+
+    def _draw(self, rows: np.ndarray, rng: Rng) -> Parameters:
+        """Draw the parameters of rows that begin; returns those that the task may see."""
+        if self.ranges is None:
+            return self._nominal
+        table, self._air = self.ranges.draw(rng, len(rows))
+        if self.ranges.per_row:
+            self.engine.write_parameters(rows, table)
+        if not self.task.true_parameters:
+            return self._nominal
+        return Parameters.of(table, self._clock.control_timestep)
+
+    def _keep(self, now: Snapshot) -> None:
+        """Take a snapshot as the present one."""
+        if self.task.true_parameters and self.ranges is not None and self.ranges.per_row:
+            own = Parameters.of(self.engine.parameters, self._clock.control_timestep)
+            now.parameters = own
+        if self._episode is None or now.task is not self.snapshot.task:
+            # What a task remembers must not be a view of buffers that the next steps write.
+            now.task = records.owned(now.task)
+        self.snapshot = now
 
     def step(self, action: Array) -> Transition:
         """Fly one control step.
 
         Args:
-            action: (..., 4), what it means is the interface's; clipped to [-1, 1].
+            action: (N, k), clipped to [-1, 1]; the control mode says what it means.
 
         Returns:
             The transition. An aircraft whose episode is over flies on until it is reset.
 
         Raises:
-            ActionError: Wrong shape or kind, or a number that is not finite.
-            TaskError: The task gave a reward that is not finite.
+            QuadrlError: Wrong shape or kind, or a number that is not finite; or the task gave a
+                reward that is not finite.
             RuntimeError: There was no reset before.
         """
         self.begin(action)
-        if self.interface.has_loops:
+        if self.control_mode.has_loops:
             for _ in range(self.vehicle.substeps):
                 self.control()
-                self.simulation.advance(1)
+                self.engine.advance(1)
         else:
-            self.simulation.advance()
+            self.engine.advance(self.vehicle.substeps)
         return self.finish()
 
     def begin(self, action: Array) -> None:
         """First half of a step: the commands to the rotors, or the setpoint of the loops."""
-        if self._steps is None:
+        if self._episode is None:
             raise RuntimeError("call reset before the first step")
-        action = _as_numbers(action)
-        if action.shape != self._action_shape:
-            raise ActionError(
-                f"an action of shape {action.shape} was given; {self._action_shape} is expected"
-            )
-        if self.shape:
-            sound = np.isfinite(action).all()
+        self._action = action = validation.action(action, (self.num_envs, self.action_size))
+        self._setpoint = self.control_mode.setpoint(self.engine.state, action)
+        self._flown, self._diverged = 0, None
+        if self.control_mode.has_loops:
+            self._command = np.zeros_like(self.engine.ctrl)
+            # The loops read the state at every physics step, past the life of its buffers.
+            self.snapshot = records.copied(self.snapshot)
         else:
-            sound = all(map(math.isfinite, action.tolist()))
-        if not sound:
-            where = np.argwhere(~np.isfinite(action))[0]
-            raise ActionError(
-                f"action{where.tolist()} is {action[tuple(where)]}: every number must be finite"
-            )
-        if self.interface.has_loops:
-            self._setpoint = self.interface.setpoint(self.simulation.state, action)
-            self._command = np.zeros_like(self.simulation.ctrl)
-            self._flown, self._diverged = 0, None
-            return
-        self._command = self.vehicle.rotor_command(action)
-        self.simulation.ctrl[...] = self._command
+            self._command = self.engine.ctrl[:] = self._setpoint
 
     def control(self) -> None:
-        """Before each physics step of an interface with loops: the commands to the rotors.
+        """Before each physics step of a control mode with loops: the commands to the rotors.
 
         The reward sees their mean over the control step.
         """
-        if self._flown and (diverged := self.simulation.read()) is not None:
-            self._diverged = diverged if self._diverged is None else self._diverged | diverged
-        command = self.interface.rotor_command(self.simulation.state, self._setpoint)
-        self.simulation.ctrl[...] = command
+        if self._flown:
+            self._note(self.engine.read())
+        command = self.control_mode.rotor_command(self.engine.state, self._setpoint)
+        self.engine.ctrl[:] = command
         self._command += command / self.vehicle.substeps
         self._flown += 1
 
+    def _note(self, diverged: np.ndarray | None) -> None:
+        if diverged is not None:
+            self._diverged = diverged if self._diverged is None else self._diverged | diverged
+
     def finish(self) -> Transition:
-        """Second half of a step, after the simulation has advanced."""
-        task, vehicle = self.task, self.vehicle
-        diverged = self.simulation.read()
-        if self._diverged is not None:
-            diverged = self._diverged if diverged is None else self._diverged | diverged
-        self._steps = self._steps + 1
-        state = self.simulation.state
-        state.time[...] = self._steps * vehicle.control_step
-        measures = task.measure(state, self.fields)
-        terminated = task.terminated(state, measures, self.fields, vehicle)
-        if diverged is None:
-            diverged = np.zeros(self.shape, dtype=bool) if self.shape else np.False_
-        else:
-            terminated = terminated | diverged
-        late = self._steps >= self.horizon_steps
-        truncated = late & ~terminated if self.shape else np.bool_(late and not terminated)
-        error = task.error(state, measures, self.fields)
-        is_success = self._judge(state, error, terminated, truncated) & ~diverged
-        outcome = Outcome(failed=terminated & ~is_success, succeeded=is_success)
-        terms = task.reward(self._measures, measures, self._command, outcome, vehicle)
-        fields = task.update(state, measures, self.fields, vehicle)
-        if fields is not self.fields:
-            self.fields, measures = fields, task.measure(state, fields)
-        self._measures = measures
-        reward, observation = total(terms), task.observe(state, measures, fields, vehicle)
-        # One number that is not finite makes the sum so: cheaper than a test of each.
-        if not math.isfinite(np.add.reduce(reward) if self.shape else reward):
-            row = np.flatnonzero(~np.isfinite(np.ravel(reward)))[:1]
-            values = {k: float(np.ravel(term)[row][0]) for k, term in terms.items()}
-            raise TaskError(
-                f"{task.name}: the reward of aircraft {row[0]} is not finite; its terms are "
-                f"{values}"
-            )
-        return Transition(
-            observation=observation,
-            reward=reward,
-            reward_terms=terms,
-            terminated=terminated,
-            truncated=truncated,
-            is_success=is_success,
-            diverged=diverged,
-            error=error,
+        """Second half of a step, after the engine has advanced."""
+        self._note(self.engine.read())
+        assert self._episode is not None
+        now, self._episode, done = transition.finish(
+            *(self.task, self._clock, self._episode, self.snapshot, self.engine.state),
+            *(self._action, self._command, self._diverged),
         )
+        # One number that is not finite makes the sum so: cheaper than a test of each.
+        if not math.isfinite(np.add.reduce(done.reward)):
+            row = int(np.flatnonzero(~np.isfinite(done.reward))[0])
+            values = {name: float(term[row]) for name, term in done.reward_terms.items()}
+            name = f"{self.task.name} reward of aircraft {row}"
+            raise QuadrlError(name=name, value=values, allowed="finite in every term")
+        self._keep(now)
+        return done
 
-    @property
-    def term_names(self) -> tuple[str, ...]:
-        """Names of the reward's terms, in their order."""
-        return self.task.term_names(self.vehicle)
+    def flatten(self, observation: Observation) -> np.ndarray:
+        """The terms of an observation as vectors (n, size), float32."""
+        return np.concatenate(list(observation.values()), axis=-1, dtype=np.float32)
 
-    def flatten(self, observation: Observation, out: np.ndarray | None = None) -> np.ndarray:
-        """The parts of an observation as one vector (..., size), float32 unless `out` is given."""
-        parts = list(observation.values())
-        if not self.shape:
-            return np.concatenate(parts, out=out, dtype=None if out is not None else np.float32)
-        if out is None:
-            out = np.empty((len(parts[0]), self.size), dtype=np.float32)
-        for part, columns in zip(parts, self.layout.values(), strict=True):
-            out[:, columns] = part
-        return out
+    def goals(self) -> np.ndarray:
+        """Where each aircraft should be, (N, 3) [m], world frame."""
+        return self.task.goal(self.snapshot) + self.origin
 
     def markers(self, row: int = 0) -> tuple[Marker, ...]:
         """What the task asks to be drawn of one aircraft's episode, world frame."""
-        fields = self.fields
-        if self.shape:
-            values = {f.name: getattr(fields, f.name)[row] for f in _fields(fields)}
-            fields = type(fields)(**values)
-        return tuple(m.moved(self.simulation.origin) for m in self.task.markers(fields))
+        alone = records.mapped(lambda array: array[row : row + 1], self.snapshot)
+        return tuple(marker.moved(self.origin) for marker in self.task.markers(alone))
 
     def save(self) -> dict[str, np.ndarray]:
         """Everything that the next steps depend on, as arrays: `restore` continues bit for bit."""
-        saved = {f"simulation.{k}": v for k, v in self.simulation.save().items()}
-        saved |= {"steps": self._steps, "error": self._error_sum, "final": self._final_sum}
-        for name, record in (("fields", self.fields), ("measures", self._measures)):
-            saved |= {f"{name}.{f.name}": getattr(record, f.name) for f in _fields(record)}
-        saved["generators"] = np.array([_generator_words(g) for g in self.generators])
-        return {name: np.array(value) for name, value in saved.items()}
+        if self._episode is None:
+            raise RuntimeError("call reset before save")
+        now = self.snapshot
+        saved = {f"engine.{name}": value for name, value in self.engine.save().items()}
+        saved |= records.arrays("task", now.task) | records.arrays("episode", self._episode)
+        saved |= {name: np.array(getattr(now, name)) for name in MOMENT}
+        return saved | {"keys": self._keys.copy(), "episodes": self._episodes.copy()}
 
     def restore(self, saved: dict[str, np.ndarray]) -> Observation:
         """Take up what `save` gave; returns the observation of that moment.
 
         Raises:
-            OptionError: It is not of such an environment.
+            QuadrlError: It is not of such an environment; nothing has changed then.
         """
-        if self._steps is None:
+        if self._episode is None:
             self.reset()  # makes the records, which are filled below
-        for name, own in self.save().items():
-            kept = saved.get(name)
-            if kept is None or (kept.shape, kept.dtype) != (own.shape, own.dtype):
-                found = "nothing" if kept is None else f"{kept.dtype} of shape {kept.shape}"
-                raise OptionError(
-                    f"what was saved is of another environment: {name} is {found}, and {own.dtype} "
-                    f"of shape {own.shape} is expected"
-                )
-        prefix = "simulation."
-        self.simulation.restore(
-            {k.removeprefix(prefix): v for k, v in saved.items() if k.startswith(prefix)}
-        )
-        self._steps = saved["steps"].copy() if self.shape else int(saved["steps"])
-        self._error_sum, self._final_sum = saved["error"].copy(), saved["final"].copy()
-        for name in ("fields", "measures"):
-            record = getattr(self, "fields" if name == "fields" else "_measures")
-            values = {f.name: saved[f"{name}.{f.name}"].copy() for f in _fields(record)}
-            setattr(self, "fields" if name == "fields" else "_measures", type(record)(**values))
-        for generator, words in zip(self.generators, saved["generators"], strict=True):
-            _set_generator_words(generator, words)
-        state = self.simulation.state
-        return self.task.observe(state, self._measures, self.fields, self.vehicle)
-
-    def _judge(self, state: State, error: Array, terminated: Array, truncated: Array) -> Array:
-        """Add up the errors, and decide on the episodes that end now."""
-        self._error_sum = self._error_sum + error
-        settling = self._steps > self.horizon_steps - self._settle_steps
-        if settling is not False:
-            self._final_sum = self._final_sum + error * settling
-        over: Any = terminated | truncated
-        if not (over.any() if self.shape else over):
-            return over
-        errors = Errors(
-            final=self._final_sum / self._settle_steps, mean=self._error_sum / self._steps
-        )
-        return over & self.task.success(state, self.fields, errors, terminated, truncated)
-
-    def _check_start(self, start: Start, shape: tuple[int, ...]) -> None:
-        """Refuse a start of other shapes (NumPy would repeat it), or that no aircraft can have."""
-        for name, columns in _START.items():
-            value = np.asarray(getattr(start, name))
-            if value.shape != (*shape, columns):
-                raise TaskError(
-                    f"{self.task.name}: sample gives {name} of shape {value.shape}, "
-                    f"{(*shape, columns)} is expected"
-                )
-        length = np.square(start.quaternion).sum(-1)
-        if not (np.abs(length - 1) < 1e-6).all():
-            raise TaskError(
-                f"{self.task.name}: sample gives a quaternion of length {np.max(length) ** 0.5:g}; "
-                "1 is expected"
-            )
-
-    def _check_task(self, start: Start, state: State, measures: Measures, fields: Fields) -> None:
-        """Refuse a task whose functions give other shapes or kinds of numbers than they should.
-
-        Done once, at the first reset: they are pure, so a call more changes nothing.
-        """
-        task, vehicle = self.task, self.vehicle
-        terminated = task.terminated(state, measures, fields, vehicle)
-        self._check_array("terminated", terminated, self.shape, "b")
-        error = task.error(state, measures, fields)
-        self._check_array("error", error, self.shape, "fiu")
-        errors = Errors(final=error, mean=error)
-        success = task.success(state, fields, errors, terminated, np.logical_not(terminated))
-        self._check_array("success", success, self.shape, "b")
-        outcome = Outcome(failed=terminated, succeeded=success)
-        terms = task.reward(measures, measures, start.rotor_speed, outcome, vehicle)
-        for name, term in terms.items():
-            self._check_array(f"the reward's term {name!r}", term, self.shape, "fiu")
-        observation = task.observe(state, measures, fields, vehicle)
-        if list(observation) != list(task.observation):
-            raise TaskError(
-                f"{task.name}: observe gives {', '.join(observation)}; declared are "
-                f"{', '.join(task.observation)}, in this order"
-            )
-        for name, part in task.observation.items():
-            self._check_array(f"part {name!r}", observation[name], (*self.shape, part.size), "fiu")
-
-    def _check_array(self, what: str, value: Any, shape: tuple[int, ...], kinds: str) -> None:
-        array = np.asarray(value)
-        if array.shape != shape or array.dtype.kind not in kinds:
-            raise TaskError(
-                f"{self.task.name}: {what} has shape {array.shape} and dtype {array.dtype}; "
-                f"{'bool' if kinds == 'b' else 'numbers'} of shape {shape} are expected"
-            )
-
-    def _checked(self, rows: np.ndarray) -> np.ndarray:
-        """Numbers of aircraft, in order, from numbers or a mask."""
-        given = np.asarray(rows)
-        if given.dtype == bool and given.shape == self.shape:
-            return np.flatnonzero(given)
-        whole = given.ndim == 1 and (given.dtype.kind in "iu" or len(given) == 0)
-        numbers = np.unique(given) if whole else np.zeros(0, dtype=np.int64)
-        within = len(numbers) == 0 or (numbers[0] >= 0 and numbers[-1] < self.num_envs)
-        if not self.shape or not whole or len(numbers) != len(given) or not within:
-            raise OptionError(
-                f"rows = {reprlib.repr(given.tolist())}: different numbers from 0 to "
-                f"{self.num_envs - 1} are allowed, or a mask of shape {self.shape}"
-            )
-        return numbers.astype(np.int64)
-
-    def _draw_block(self, rows: Rows) -> np.ndarray:
-        if rows is None:
-            return self.generators[0].random(EPISODE_DRAWS)
-        block = np.empty((len(rows), EPISODE_DRAWS))
-        for into, row in zip(block, rows, strict=True):
-            self.generators[row].random(out=into)
-        return block
-
-
-def _simulation(
-    task: Task, vehicle: Vehicle, num_envs: int | None, num_threads: int, engine: Engine
-) -> Simulation:
-    altitude = task.origin_height(vehicle)
-    if num_envs is None:
-        model = vehicle.compile_lean(contact=task.contact)
-        data = mujoco.MjData(model)
-        return SingleSimulation(vehicle, model, data, altitude=altitude, engine=engine)
-    if not isinstance(num_envs, (int, np.integer)) or not 1 <= num_envs <= MAX_ENVS:
-        raise OptionError(
-            f"num_envs = {num_envs!r}: a whole number from 1 to {MAX_ENVS} is allowed"
-        )
-    if not isinstance(num_threads, (int, np.integer)) or not 0 <= num_threads <= MAX_THREADS:
-        raise OptionError(
-            f"num_threads = {num_threads!r}: a whole number from 0 to {MAX_THREADS} is allowed"
-        )
-    return BatchSimulation(
-        vehicle,
-        int(num_envs),
-        altitude=altitude,
-        contact=task.contact,
-        num_threads=num_threads,
-        engine=engine,
-    )
-
-
-def check_seed(seed: object) -> None:
-    """Refuse what no generator can be seeded with.
-
-    Raises:
-        OptionError: It is no whole number, or a negative one.
-    """
-    if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise OptionError(f"seed = {seed!r}: a whole number from 0 on is allowed")
-
-
-_START = {"position": 3, "quaternion": 4, "velocity": 3, "body_rate": 3, "rotor_speed": ROTORS}
-"""What `Start` holds, and its numbers an aircraft."""
-
-
-def _as_numbers(action: Any) -> np.ndarray:
-    """An action in double precision; what NumPy would only convert with a loss is refused."""
-    try:
-        array = np.asarray(action)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ActionError(f"an action that is no array of numbers was given: {error}") from error
-    if array.dtype.char not in "fd" and not np.can_cast(array.dtype, np.float64):
-        raise ActionError(
-            f"an action of dtype {array.dtype} was given; real numbers are expected, such as "
-            "float32 or float64"
-        )
-    return array.astype(np.float64, copy=False)
-
-
-def _fields(record: Any) -> Sequence[dataclasses.Field]:
-    return dataclasses.fields(record)
-
-
-def _put(record: Any, rows: Rows, new: Any) -> None:
-    """Write rows of a record of arrays."""
-    for field in _fields(record):
-        getattr(record, field.name)[rows] = getattr(new, field.name)
-
-
-def _generator_words(generator: np.random.Generator) -> list[np.uint64]:
-    """The state of a PCG64 generator as six 64-bit words."""
-    state: Any = generator.bit_generator.state
-    mask = (1 << 64) - 1
-    words = [
-        w for n in (state["state"]["state"], state["state"]["inc"]) for w in (n >> 64, n & mask)
-    ]
-    return [np.uint64(w) for w in (*words, state["has_uint32"], state["uinteger"])]
-
-
-def _set_generator_words(generator: np.random.Generator, words: np.ndarray) -> None:
-    high, low, inc_high, inc_low, has, value = (int(w) for w in words)
-    generator.bit_generator.state = {
-        "bit_generator": "PCG64",
-        "state": {"state": high << 64 | low, "inc": inc_high << 64 | inc_low},
-        "has_uint32": has,
-        "uinteger": value,
-    }
+        own = self.save()
+        records.check_alike(saved, own)
+        name = "engine.parameters"
+        if not (self.ranges and self.ranges.per_row or np.array_equal(saved[name], own[name])):
+            reason = "what was saved is of another aircraft"
+            raise QuadrlError(reason, name=name, value=saved[name], allowed="this aircraft's")
+        prefix = "engine."
+        self.engine.restore({k[len(prefix) :]: v for k, v in saved.items() if k.startswith(prefix)})
+        self._keys[:], self._episodes[:] = saved["keys"], saved["episodes"]
+        self._episode = records.of_arrays("episode", self._episode, saved)
+        task_state = records.of_arrays("task", self.snapshot.task, saved)
+        action, command, time = (np.array(saved[name]) for name in MOMENT)
+        seen = self.snapshot.parameters
+        now = Snapshot(self.engine.state, task_state, seen, action, command, time)
+        now.potentials = self.task.measure(now)
+        self._keep(now)
+        return self.task.observe(now)

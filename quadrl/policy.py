@@ -1,8 +1,8 @@
 """A trained policy as numbers: NumPy in, NumPy out, no torch.
 
-The file is safetensors: arrays and a table of strings, nothing that could run. Its network is the
-paper's: hidden layers of tanh, and the mean and the log-variance of a normal distribution over
-the actions; observations are normalised with the mean and the deviation of the training.
+The file is safetensors: arrays and a table of strings, nothing that could run. The network is the
+paper's: hidden layers of tanh, then the mean and the log-variance of a normal distribution over the
+actions. Observations are normalised with the mean and the deviation of the training.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from quadrl.errors import QuadrlError
-from quadrl.vehicle import ROTORS
 
-FORMAT = "quadrl-policy-1"
+FORMAT = "quadrl-policy-2"
+FIRST_FORMAT = "quadrl-policy-1"
+"""The same arrays, with other names in the metadata; it can still be read."""
+RENAMED = {"action": "control_mode", "horizon": "time_limit", "settle": "settle_time"}
+"""Keys of the metadata and of its task options: names of the first format to present ones."""
 FILE = "policy.safetensors"
 CLIP = 10.0
-"""Normalised observations are held within +-CLIP."""
+"""Normalised observations are clipped to +-CLIP."""
 LOG_VARIANCE = (-12.0, 2.0)
-"""Within which the log-variance of the actions is held."""
+"""Bounds of the log-variance of the actions."""
 SHIPPED = Path(__file__).parent / "assets" / "policies"
 """The policies that come with the package: TASK_ALGO.safetensors, with a .json beside each."""
+SHIPPED_AS = {"vpg": "gae"}
+"""Algorithms that the file names call otherwise: the paper's word for the policy gradient."""
 
 UNREADABLE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError,
               RecursionError)  # fmt: skip
 """What reading a damaged safetensors file and its header can raise."""
 HEADER = "quadrl"
-"""The one entry of the file's table, JSON: of several, safetensors writes the order at random."""
-
-
-class PolicyError(QuadrlError, ValueError):
-    """A file that is no policy of quadrl, or a policy for something else."""
+"""The one entry of the file's table, JSON: safetensors writes several in random order."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Policy:
     """The mean action of a trained network."""
 
     weights: tuple[np.ndarray, ...]
-    """Of each layer, (outputs, inputs); the last gives mean and log-variance, (2 * 4, hidden)."""
+    """Of each layer, (outputs, inputs); the last gives k means and k log-variances, (2 k, ...)."""
     biases: tuple[np.ndarray, ...]
     """Of each layer, (outputs,)."""
     mean: np.ndarray
@@ -57,34 +58,45 @@ class Policy:
     task: str
     """The task that it was trained for."""
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """How it was made: algorithm, seed, steps, vehicle, action interface."""
+    """How it was made: algo, seed, steps, vehicle, rotors, control_mode, task_options."""
 
     @property
-    def action(self) -> str:
-        """The action interface that it was trained with."""
-        return str(self.metadata.get("action", "rotor"))
+    def control_mode(self) -> str:
+        """What its actions mean."""
+        return str(self.metadata.get("control_mode", "rotor"))
+
+    @property
+    def size(self) -> int:
+        """Numbers in an observation."""
+        return len(self.mean)
+
+    @property
+    def action_size(self) -> int:
+        """Numbers in an action, k."""
+        return len(self.biases[-1]) // 2
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """The mean action.
 
         Args:
-            observation: Flat vector (..., size) in the order of the task's parts.
+            observation: Flat vectors (..., size), in the order of the task's terms.
 
         Returns:
-            Actions (..., 4), within [-1, 1].
+            Actions (..., k), within [-1, 1].
 
         Raises:
-            ValueError: The observation has another size.
+            QuadrlError: The observation has another size.
         """
         return np.clip(self._outputs(observation)[0], -1.0, 1.0)
 
     def sampled(self, seed: int) -> Callable[[np.ndarray], np.ndarray]:
-        """The stochastic policy: observations as for the mean action to actions drawn anew.
-
-        They are drawn as in training: from a normal distribution, and clipped to [-1, 1].
+        """The stochastic policy, as in training: a normal distribution, clipped to [-1, 1].
 
         Args:
             seed: Of the draws.
+
+        Returns:
+            A function of observations, as the policy itself.
         """
         generator = np.random.default_rng(seed)
 
@@ -95,20 +107,36 @@ class Policy:
 
         return act
 
+    def check_fits(self, size: int, action_size: int, where: str) -> None:
+        """Refuse a task and a vehicle with another layout than the policy was trained for.
+
+        Args:
+            size: Numbers in an observation there.
+            action_size: Numbers in an action there.
+            where: The task and the vehicle, in words.
+
+        Raises:
+            QuadrlError: The policy observes or commands another number of values.
+        """
+        for what, own, needed in (
+            ("observation", self.size, size),
+            ("action", self.action_size, action_size),
+        ):
+            if own != needed:
+                name = f"{what} size of the policy for {self.task}"
+                raise QuadrlError(name=name, value=own, allowed=f"{needed} for {where}")
+
     def _outputs(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and log-variance (..., 4) of the actions."""
+        """Mean and log-variance (..., k) of the actions."""
         observation = np.asarray(observation, dtype=np.float32)
         if observation.shape[-1:] != self.mean.shape:
-            raise ValueError(
-                f"an observation of shape {observation.shape} was given; the policy for "
-                f"{self.task} expects (..., {len(self.mean)})"
-            )
+            allowed = f"(..., {self.size}) for the policy for {self.task}"
+            raise QuadrlError(name="observation shape", value=observation.shape, allowed=allowed)
         hidden = np.clip((observation - self.mean) / self.deviation, -CLIP, CLIP)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = np.tanh(hidden @ weight.T + bias)
         output = hidden @ self.weights[-1].T + self.biases[-1]
-        half = output.shape[-1] // 2
-        return output[..., :half], output[..., half:]
+        return output[..., : self.action_size], output[..., self.action_size :]
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
@@ -127,87 +155,75 @@ class Policy:
             path: A .safetensors file, or a run folder that holds policy.safetensors.
 
         Raises:
-            PolicyError: There is no such file, or it is damaged, or no policy of quadrl.
+            QuadrlError: The file is missing, damaged or not a policy of quadrl.
         """
         path = Path(path)
         file = path / FILE if path.is_dir() else path
         if not file.is_file():
-            raise PolicyError(
-                f"no policy at {file}; give a run folder (quadrl train ... --out FOLDER makes one) "
-                "or a .safetensors file"
+            raise QuadrlError(
+                f"there is no policy at {file}; give a run folder (quadrl train ... --out FOLDER "
+                "makes one) or a .safetensors file"
             )
-        try:
-            with safe_open(file, framework="numpy") as opened:
-                header = read_header(opened.metadata())
-                names = opened.keys() if header.get("format") == FORMAT else ()
-                arrays = {name: opened.get_tensor(name) for name in names}
-        except UNREADABLE as error:
-            raise PolicyError(f"{file} is damaged or no safetensors file: {error}") from error
-        if header.get("format") != FORMAT:
-            raise PolicyError(
-                f"{file} is no policy of this version of quadrl: its format is "
-                f"{header.get('format')!r}, {FORMAT!r} is expected"
-            )
-        return cls._of_arrays(file, arrays, header)
+        arrays, header = read_safetensors(file, (FORMAT, FIRST_FORMAT), "numpy")
+        task, metadata = header.get("task"), header.get("metadata")
+        options = metadata.get("task_options", {}) if isinstance(metadata, dict) else None
+        if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
+            raise QuadrlError(f"{file} does not say what its policy was trained for")
+        if header["format"] == FIRST_FORMAT:
+            metadata = _renamed(metadata) | {"task_options": _renamed(options)}
+        layers = max(1, len(arrays) // 2 - 1)
+        names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS))
+        if set(arrays) != set(names):
+            raise QuadrlError(f"{file} is damaged: its arrays are {', '.join(sorted(arrays))}")
+        weights, biases = (tuple(arrays[f"{p}_{k}"] for k in range(layers)) for p in PARTS)
+        policy = cls(weights, biases, arrays["mean"], arrays["deviation"], task, metadata)
+        if not _is_network(policy):
+            raise QuadrlError(f"{file} is damaged: its arrays do not make a policy network")
+        return policy
 
     @classmethod
     def pretrained(cls, task: str, algo: str = "ppo") -> Policy:
-        """A policy that comes with the package; how it was made stands in the .json beside it.
+        """A policy that comes with the package; the .json beside it says how it was made.
 
         Args:
             task: The task that it was trained for.
-            algo: The algorithm that it was trained with.
+            algo: The algorithm that it was trained with: ppo, trpo or vpg (or gae, its alias).
 
         Raises:
-            PolicyError: There is none; the message lists those that there are.
+            QuadrlError: There is no such policy; the message lists those that there are.
         """
-        file = SHIPPED / f"{task}_{algo}.safetensors"
-        if file not in (there := shipped()):
-            names = ", ".join("{} with {}".format(*known.stem.rsplit("_", 1)) for known in there)
-            raise PolicyError(
-                f"no policy comes with quadrl for {task} with {algo}; choices: {names or 'none'}; "
-                f"or train one with quadrl train {task} --algo {algo}"
+        file = SHIPPED / f"{task}_{SHIPPED_AS.get(algo, algo)}.safetensors"
+        if file not in shipped():
+            raise QuadrlError(
+                f"or train one with quadrl train {task} --algo {algo}",
+                name="pretrained policy",
+                value=f"{task}_{algo}",
+                allowed=f"one of {', '.join(known.stem for known in shipped())}",
             )
         return cls.load(file)
 
-    @classmethod
-    def _of_arrays(
-        cls, file: Path, arrays: dict[str, np.ndarray], header: dict[str, Any]
-    ) -> Policy:
-        """Check that the arrays make a network, and build it."""
-        try:
-            layers = max(1, len(arrays) // 2 - 1)
-            weights = tuple(arrays[f"weight_{k}"] for k in range(layers))
-            biases = tuple(arrays[f"bias_{k}"] for k in range(layers))
-            mean, deviation = arrays["mean"], arrays["deviation"]
-            task, metadata = header["task"], header["metadata"]
-        except KeyError as error:
-            raise PolicyError(f"{file} lacks a part of a policy: {error}") from error
-        width = mean.size
-        sound = mean.shape == deviation.shape == (width,) and len(arrays) == 2 * layers + 2
-        for weight, bias in zip(weights, biases, strict=True):
-            sound = sound and weight.shape == (bias.size, width) and bias.shape == (bias.size,)
-            width = bias.size
-        numbers = all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values())
-        if not sound or not numbers or width != 2 * ROTORS or not (deviation > 0).all():
-            raise PolicyError(f"{file}: the arrays in it do not make a policy network")
-        if not _stays_finite(weights, biases):
-            raise PolicyError(f"{file}: its weights are so large that its actions are no numbers")
-        known = isinstance(task, str) and isinstance(metadata, dict)
-        if not known or not isinstance(metadata.get("task_options", {}), dict):
-            raise PolicyError(f"{file} does not say what the policy was trained for")
-        return cls(weights, biases, mean, deviation, task, metadata)
+
+PARTS = ("weight", "bias")
 
 
-def _stays_finite(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...]) -> bool:
-    """Whether no observation makes a sum in the network larger than single precision holds."""
+def _renamed(values: dict[str, Any]) -> dict[str, Any]:
+    return {RENAMED.get(name, name): value for name, value in values.items()}
+
+
+def _is_network(policy: Policy) -> bool:
+    """Whether the arrays fit together and no observation makes an output that is not finite."""
+    arrays = (*policy.weights, *policy.biases, policy.mean, policy.deviation)
+    width = policy.mean.size
+    sound = policy.mean.shape == policy.deviation.shape == (width,)
+    sound = sound and all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays)
     largest = CLIP
-    for weight, bias in zip(weights, biases, strict=True):
-        sums = largest * np.abs(weight, dtype=np.float64).sum(axis=1) + np.abs(bias)
-        if not (sums < np.finfo(np.float32).max / 2).all():
+    for weight, bias in zip(policy.weights, policy.biases, strict=True):
+        if not sound or weight.shape != (bias.size, width) or bias.shape != (bias.size,):
             return False
-        largest = 1.0  # of tanh
-    return True
+        sums = largest * np.abs(weight, dtype=np.float64).sum(axis=1) + np.abs(bias)
+        sound = bool((sums < np.finfo(np.float32).max / 2).all())
+        width, largest = bias.size, 1.0  # the largest output of tanh
+    return sound and width > 0 and width % 2 == 0 and bool((policy.deviation > 0).all())
 
 
 def shipped() -> list[Path]:
@@ -216,7 +232,7 @@ def shipped() -> list[Path]:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: what stood there stays until the new one is on the disk."""
+    """Write a file whole or not at all: the old one stays until the new one is on the disk."""
     scratch = path.with_name(path.name + ".part")
     try:
         with open(scratch, "wb") as file:
@@ -230,11 +246,27 @@ def write_whole(path: Path, content: bytes) -> None:
         raise
 
 
-def read_header(table: dict[str, str] | None) -> dict[str, Any]:
-    """What `HEADER` says in the table of a safetensors file; nothing when it is not there.
+def read_safetensors(
+    path: Path, formats: tuple[str, ...], framework: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arrays of a safetensors file, and the header that quadrl wrote into its table.
+
+    Args:
+        path: The file.
+        formats: Accepted values of the header's format.
+        framework: "numpy" or "pt".
 
     Raises:
-        ValueError: It is no JSON.
+        QuadrlError: The file cannot be read, or is of another format.
     """
-    header = json.loads((table or {}).get(HEADER, "{}"))
-    return header if isinstance(header, dict) else {}
+    try:
+        with safe_open(path, framework=framework) as opened:
+            header = json.loads((opened.metadata() or {}).get(HEADER, "{}"))
+            written = header.get("format")
+            names = opened.keys() if written in formats else ()
+            arrays = {name: opened.get_tensor(name) for name in names}
+    except UNREADABLE as error:
+        raise QuadrlError(f"{path} is damaged or not a safetensors file: {error}") from error
+    if written not in formats:
+        raise QuadrlError(name=f"format of {path}", value=written, allowed=" or ".join(formats))
+    return arrays, header

@@ -1,14 +1,13 @@
 """Attitude: quaternions, rotation matrices and the sines and cosines of the Z-Y-X angles.
 
-Arrays are (..., k) of any namespace of the array API (NumPy, PyTorch). Quaternions are
+Arrays are (N, ..., k) of any namespace of the array API (NumPy, PyTorch). Quaternions are
 (w, x, y, z), body to world; a rotation matrix takes body to world. Observations are built from
 additions, products, quotients and square roots alone, which IEEE 754 rounds exactly: the same
-numbers come out for one aircraft, for a batch, and from the C kernel (`native/state.c`).
+numbers come out for any number of rows, and from the C kernel (`native/state.c`).
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -28,46 +27,33 @@ def namespace(array: Array) -> Any:
 def stack(*parts: Array) -> Array:
     """Components (...) of vectors as one array (..., k)."""
     first = parts[0]
-    if isinstance(first, np.ndarray) and first.ndim:
-        whole = np.empty((*first.shape, len(parts)), np.result_type(*parts))
-        for k, part in enumerate(parts):
-            whole[..., k] = part
-        return whole
-    if isinstance(first, (np.ndarray, np.generic)):
-        return np.array(parts)
-    return namespace(first).stack(parts, axis=-1)
-
-
-def held(values: Array) -> Array:
-    """A copy (...) of live values; of one aircraft a scalar, with which NumPy counts faster."""
-    return values[()] if values.ndim == 0 else values + 0.0
+    if not isinstance(first, np.ndarray):
+        return namespace(first).stack(parts, axis=-1)
+    # Each component contiguous, as in the tables of the state: NumPy's loops then run over rows.
+    whole = np.empty((len(parts), *first.shape), np.result_type(*parts))
+    for k, part in enumerate(parts):
+        whole[k] = part
+    return np.moveaxis(whole, 0, -1)
 
 
 def square_norm(vector: Array) -> Array:
     """Sum of squares over the last axis, (..., k) to (...), added from left to right."""
-    if _is_single(vector):
-        return np.float64(_sum_of_squares(vector.tolist()))
-    return _sum_of_squares([vector[..., k] for k in range(vector.shape[-1])])
+    square = vector * vector
+    total = square[..., 0]
+    for k in range(1, vector.shape[-1]):
+        total = total + square[..., k]
+    return total
 
 
 def norm(vector: Array) -> Array:
-    """Euclidean norm over the last axis, (..., k) to (...)."""
-    if _is_single(vector):
-        # Python's numbers are the same doubles, and ten times faster than arrays without axes.
-        return np.float64(math.sqrt(_sum_of_squares(vector.tolist())))
-    return namespace(vector).sqrt(square_norm(vector))
-
-
-def _is_single(vector: Array) -> bool:
-    """Whether it is one NumPy vector of doubles."""
-    return isinstance(vector, np.ndarray) and vector.ndim == 1 and vector.dtype.char == "d"
-
-
-def _sum_of_squares(parts: list[Array]) -> Array:
-    total = parts[0] * parts[0]
-    for part in parts[1:]:
-        total = total + part * part
-    return total
+    """Euclidean norm over the last axis, (..., k) to (...); its gradient at zero is zero."""
+    square = square_norm(vector)
+    if isinstance(square, np.ndarray):
+        return np.sqrt(square)
+    xp = namespace(square)
+    positive = square > 0
+    # The root's own gradient is infinite at zero, and infinity times zero is not a number.
+    return xp.where(positive, xp.sqrt(xp.where(positive, square, xp.ones_like(square))), 0 * square)
 
 
 def rotation_matrix(quaternion: Array) -> Array:
@@ -84,18 +70,14 @@ def rotation_matrix(quaternion: Array) -> Array:
 
 def to_body(rotation: Array, vector: Array) -> Array:
     """World vector (..., 3) in the body frame: the transposed rotation times the vector."""
-    if _is_single(vector):
-        # As in `norm`: the same doubles in the same order.
-        (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-        x, y, z = vector.tolist()
-        return np.array((a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z))
-    rows = [rotation[..., k, :] * vector[..., k, None] for k in range(3)]
-    return rows[0] + rows[1] + rows[2]
+    parts = rotation * vector[..., None]
+    return parts[..., 0, :] + parts[..., 1, :] + parts[..., 2, :]
 
 
 def to_world(rotation: Array, vector: Array) -> Array:
     """Body vector (..., 3) in the world frame: the rotation times the vector."""
-    return (rotation * vector[..., None, :]).sum(-1)
+    parts = rotation * vector[..., None, :]
+    return parts[..., 0] + parts[..., 1] + parts[..., 2]
 
 
 def sin_cos_attitude(rotation: Array) -> tuple[Array, Array]:
@@ -105,7 +87,7 @@ def sin_cos_attitude(rotation: Array) -> tuple[Array, Array]:
     """
     xp = namespace(rotation)
     r = rotation
-    horizontal = xp.sqrt(r[..., 0, 0] * r[..., 0, 0] + r[..., 1, 0] * r[..., 1, 0])
+    horizontal = norm(r[..., :2, 0])
     cos_pitch = xp.where(horizontal > 1e-9, horizontal, xp.full_like(horizontal, 1e-9))
     sines = (r[..., 2, 1] / cos_pitch, -r[..., 2, 0], r[..., 1, 0] / cos_pitch)
     cosines = (r[..., 2, 2] / cos_pitch, horizontal, r[..., 0, 0] / cos_pitch)
@@ -138,3 +120,21 @@ def quaternion_from_heading_and_tilt(heading: Array, tilt: Array, direction: Arr
     half = xp.sin(tilt / 2)
     lean = stack(xp.cos(tilt / 2), half * xp.cos(direction), half * xp.sin(direction), zero)
     return quaternion_product(turn, lean)
+
+
+def heading_of(rotation: Array) -> Array:
+    """Unit vectors (N, 2), east and north, of where body x points; east if up or down."""
+    ahead = rotation[:, :2, 0]
+    length = norm(ahead)[:, None]
+    return np.where(length > 1e-6, ahead / np.maximum(length, 1e-6), np.array([1.0, 0.0]))
+
+
+def rotation_of_angles(sines: Array, cosines: Array) -> Array:
+    """Rotations (N, 3, 3), body to world, of sines and cosines (N, 3) of roll, pitch, yaw."""
+    (sr, sp, sy), (cr, cp, cy) = sines.T, cosines.T
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

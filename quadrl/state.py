@@ -1,4 +1,4 @@
-"""The state of one aircraft or of many, by name."""
+"""The state of rows of aircraft, by name."""
 
 from __future__ import annotations
 
@@ -6,78 +6,73 @@ import dataclasses
 
 import numpy as np
 
-from quadrl.rotation import (
-    Array,
-    namespace,
-    norm,
-    rotation_matrix,
-    sin_cos_attitude,
-    to_body,
-)
+from quadrl.rotation import Array, norm, rotation_matrix, sin_cos_attitude, to_body
 
-ROWS = {
-    "position": slice(0, 3),
-    "quaternion": slice(3, 7),
-    "rotation": slice(7, 16),
-    "sin_attitude": slice(16, 19),
-    "cos_attitude": slice(19, 22),
-    "velocity": slice(22, 25),
-    "body_velocity": slice(25, 28),
-    "body_rate": slice(28, 31),
-    "rotor_speed": slice(31, 35),
-    "speed": 35,
-    "spin": 36,
-    "level_error": 37,
-    "east_error": 38,
-    "time": 39,
+SIZES = {
+    "position": 3,
+    "quaternion": 4,
+    "rotation": 9,
+    "sin_attitude": 3,
+    "cos_attitude": 3,
+    "velocity": 3,
+    "body_velocity": 3,
+    "body_rate": 3,
+    "height": 1,
+    "speed": 1,
+    "angular_speed": 1,
+    "level_error": 1,
+    "east_error": 1,
+    "rotor_speed": 0,  # one per rotor: last, since their number differs
 }
-"""Where each quantity stands in the table that `native/state.c` fills (time is not its)."""
-TABLE_ROWS = 40
-REST_SPEED, REST_SPIN = 0.05, 0.1  # [m/s], [rad/s]: slower is at rest
+"""Rows of the table that `native/state.c` fills, in their order."""
+FIRST = dict(zip(SIZES, np.cumsum([0, *SIZES.values()]).tolist(), strict=False))
+"""First row of each quantity."""
+REST_SPEED, REST_TURN = 0.05, 0.1  # [m/s], [rad/s]: slower is at rest
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class State:
-    """What a task sees of the aircraft; arrays of shape (..., k) that share the leading shape.
+    """What a task sees of the aircraft; arrays (N, ...).
 
-    A state that a simulation hands out shows its live table: it holds until the next but one step.
+    A state that an engine hands out is made of views of live buffers, valid for one more step.
     """
 
-    position: Array  # (..., 3) [m], world, from the origin of the task's frame
-    quaternion: Array  # (..., 4) (w, x, y, z), body to world
-    rotation: Array  # (..., 3, 3) body to world
-    sin_attitude: Array  # (..., 3) sine of roll, pitch, yaw (Z-Y-X)
-    cos_attitude: Array  # (..., 3) cosine of roll, pitch, yaw
-    velocity: Array  # (..., 3) [m/s], world frame
-    body_velocity: Array  # (..., 3) [m/s], body frame
-    body_rate: Array  # (..., 3) [rad/s], angular velocity in the body frame
-    rotor_speed: Array  # (..., 4) [rad/s]
-    speed: Array  # (...) [m/s]
-    spin: Array  # (...) [rad/s]
-    level_error: Array  # (...) |sin zeta| + |cos zeta - 1| of roll and pitch
-    east_error: Array  # (...) the same of roll, pitch and yaw
-    time: Array  # (...) [s], since the start of the episode
+    position: Array  # (N, 3) [m], world, from the origin of the task's frame
+    quaternion: Array  # (N, 4) (w, x, y, z), body to world
+    rotation: Array  # (N, 3, 3) body to world
+    sin_attitude: Array  # (N, 3) sine of roll, pitch, yaw (Z-Y-X)
+    cos_attitude: Array  # (N, 3) cosine of roll, pitch, yaw
+    velocity: Array  # (N, 3) [m/s], world frame
+    body_velocity: Array  # (N, 3) [m/s], body frame
+    body_rate: Array  # (N, 3) [rad/s], angular velocity in the body frame
+    height: Array  # (N,) [m], of the centre of mass above the ground
+    speed: Array  # (N,) [m/s]
+    angular_speed: Array  # (N,) [rad/s]
+    level_error: Array  # (N,) |sin zeta| + |cos zeta - 1| of roll and pitch
+    east_error: Array  # (N,) the same of roll, pitch and yaw
+    rotor_speed: Array  # (N, R) [rad/s]
 
     @property
     def cos_tilt(self) -> Array:
-        """Cosine of the angle between the body's z axis and the vertical, (...)."""
-        return self.rotation[..., 2, 2][()]  # a scalar, of one aircraft
+        """Cosine of the angle between the body's z axis and the vertical, (N,)."""
+        return self.rotation[..., 2, 2]
 
     @property
     def at_rest(self) -> Array:
-        """Whether it neither moves nor turns, (...) bool."""
-        return (self.speed < REST_SPEED) & (self.spin < REST_SPIN)
+        """Whether it neither moves nor turns, (N,) bool."""
+        return (self.speed < REST_SPEED) & (self.angular_speed < REST_TURN)
 
     @classmethod
     def of_table(cls, table: np.ndarray) -> State:
-        """Named views of a (TABLE_ROWS,) or (TABLE_ROWS, n) table: columns are aircraft.
+        """Named views of a table (rows, N).
 
         Rows are contiguous over the aircraft, so that NumPy's loops run over all of them at once.
         """
-        # A row alone is an array without axes for one aircraft, hence the ellipsis.
-        parts = {name: table[rows, ...].T for name, rows in ROWS.items()}
-        matrix = table[ROWS["rotation"]].reshape(3, 3, *table.shape[1:])
-        parts["rotation"] = matrix.transpose(2, 0, 1) if table.ndim > 1 else matrix
+        parts = {}
+        for name, size in SIZES.items():
+            rows = table[FIRST[name] :] if not size else table[FIRST[name] : FIRST[name] + size]
+            parts[name] = rows[0] if size == 1 else rows.T
+        parts["rotation"] = parts["rotation"].T.reshape(3, 3, -1).transpose(2, 0, 1)
         return cls(**parts)
 
     @classmethod
@@ -88,14 +83,22 @@ class State:
         velocity: Array,
         body_rate: Array,
         rotor_speed: Array,
-        time: Array,
+        origin_height: float,
     ) -> State:
-        """The same from coordinates in any array namespace; the definition of the C kernel."""
-        xp = namespace(position)
+        """The same from coordinates in any array namespace; the definition of the C kernel.
+
+        Args:
+            position: (N, 3) [m], task frame.
+            quaternion: (N, 4) (w, x, y, z), body to world.
+            velocity: (N, 3) [m/s], world frame.
+            body_rate: (N, 3) [rad/s], body frame.
+            rotor_speed: (N, R) [rad/s].
+            origin_height: Of the origin of the task's frame above the ground [m].
+        """
         rotation = rotation_matrix(quaternion)
         sines, cosines = sin_cos_attitude(rotation)
         return cls(
-            position=xp.asarray(position),
+            position=position,
             quaternion=quaternion,
             rotation=rotation,
             sin_attitude=sines,
@@ -103,21 +106,27 @@ class State:
             velocity=velocity,
             body_velocity=to_body(rotation, velocity),
             body_rate=body_rate,
-            rotor_speed=rotor_speed,
+            height=position[..., 2] + origin_height,
             speed=norm(velocity),
-            spin=norm(body_rate),
+            angular_speed=norm(body_rate),
             level_error=norm(sines[..., :2]) + norm(cosines[..., :2] - 1),
             east_error=norm(sines) + norm(cosines - 1),
-            time=time,
+            rotor_speed=rotor_speed,
         )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class Start:
-    """How an episode begins, arrays (..., k)."""
+    """How episodes begin, arrays (n, k)."""
 
-    position: Array  # (..., 3) [m], world, from the origin of the task's frame
-    quaternion: Array  # (..., 4) (w, x, y, z), body to world
-    velocity: Array  # (..., 3) [m/s], world frame
-    body_rate: Array  # (..., 3) [rad/s], body frame
-    rotor_speed: Array  # (..., 4) [rad/s]
+    position: Array  # (n, 3) [m], world, from the origin of the task's frame
+    quaternion: Array  # (n, 4) (w, x, y, z), body to world
+    velocity: Array  # (n, 3) [m/s], world frame
+    body_rate: Array  # (n, 3) [rad/s], body frame
+    rotor_speed: Array  # (n, R) [rad/s]
+
+
+def c_rows() -> str:
+    """The rows of the table as C constants."""
+    rows = ", ".join(f"ROW_{name.upper()} = {first}" for name, first in FIRST.items())
+    return f"enum {{ {rows} }};\n"

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from quadrl.task import OptionError, Task, check_choices
+from quadrl.errors import QuadrlError
+from quadrl.task import Task
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
 from quadrl.tasks.random_waypoint import RandomWaypoint
 from quadrl.tasks.static_waypoint import StaticWaypoint
 from quadrl.tasks.straight_and_level import StraightAndLevel
 from quadrl.tasks.target_following import TargetFollowing
+from quadrl.validation import choice
 
 TASKS: dict[str, type[Task]] = {
     task.name: task
@@ -27,16 +29,18 @@ TASKS: dict[str, type[Task]] = {
 
 
 def register(task: type[Task]) -> type[Task]:
-    """Add a task to the catalogue, so that every door knows it by its name.
+    """Add a task to the catalogue, so that every API knows it by its name.
 
     Raises:
-        OptionError: It is no class of a task with a name, or another task has the name.
+        QuadrlError: It is not a Task subclass with a name, or another task has the name.
     """
     named = isinstance(task, type) and issubclass(task, Task) and hasattr(task, "name")
     if not named or not isinstance(task.name, str) or not task.name.isidentifier():
-        raise OptionError(f"{task!r} is no class of a task with a name such as 'my_task'")
+        allowed = "a Task subclass with a string `name` such as 'my_task'"
+        raise QuadrlError(name="task", value=task, allowed=allowed)
     if TASKS.get(task.name, task) is not task:
-        raise OptionError(f"a task named {task.name!r} is registered already")
+        allowed = "a name that no other task has"
+        raise QuadrlError(name="task name", value=task.name, allowed=allowed)
     TASKS[task.name] = task
     return task
 
@@ -49,9 +53,7 @@ def make(name: str | Task, **options: Any) -> Task:
         **options: Fields of the task.
 
     Raises:
-        ValueError: Unknown task or option; the message lists the choices.
+        QuadrlError: Unknown task or option; the message lists the choices.
     """
-    if isinstance(name, Task):
-        return name.replace(**options)
-    check_choices([name], TASKS, "task")
-    return TASKS[name]().replace(**options)
+    task = name if isinstance(name, Task) else TASKS[choice("task", name, TASKS)]()
+    return task.replace(**options)

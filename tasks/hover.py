@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 
+from quadrl.parameters import Parameters
+from quadrl.rng import Rng, hovering
 from quadrl.rotation import Array, namespace
-from quadrl.state import Start, State
-from quadrl.task import Draw, Errors, Fields, Measures, Task
-from quadrl.vehicle import Vehicle
+from quadrl.state import Start
+from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, touches_ground
 
 
 @dataclasses.dataclass(frozen=True)
-class Hover(Task[Fields]):
+class Hover(Task):
     """Hold the origin of the task's frame, heading east."""
 
     name = "hover"
@@ -19,6 +20,12 @@ class Hover(Task[Fields]):
     starts = "within 0.5 m of it, any heading, tilted up to 0.2 rad, at up to 0.3 m/s and 0.3 rad/s"
     ends = "more than 3 m away, on the ground, tilted past 90 degrees"
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
+    targets = (
+        Target("success_rate", "successful", 1.0, True),
+        Target("position_error_m", "error over the last 2 s", 0.05, unit="cm"),
+        Target("heading_error_deg", "off east", 15.0, unit="deg"),
+    )
+    training = {"gamma": 0.9, "steps": 204_800, "ppo": {"learning_rate": 8e-3}}
     heading_matters = True
 
     radius: float = 0.5
@@ -34,28 +41,23 @@ class Hover(Task[Fields]):
     tolerance: float = 0.1
     """Largest final error that counts as success [m]."""
 
-    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Fields]:
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
         """Near the waypoint, nearly level and slow; the rotors at hover speed."""
-        position = draw.vector(self.radius)
-        xp = namespace(position)
+        position = rng.vector(self.radius)
         start = Start(
             position=position,
-            quaternion=draw.attitude(self.tilt),
-            velocity=draw.vector(self.speed),
-            body_rate=draw.vector(self.spin),
-            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
+            quaternion=rng.attitude(self.tilt),
+            velocity=rng.vector(self.speed),
+            body_rate=rng.vector(self.spin),
+            rotor_speed=hovering(position, parameters),
         )
-        return start, Fields(goal=xp.zeros_like(position))
+        return start, TaskState(goal=namespace(position).zeros_like(position))
 
-    def terminated(
-        self, state: State, measures: Measures, fields: Fields, vehicle: Vehicle
-    ) -> Array:
+    def terminated(self, now: Snapshot) -> Array:
         """Away, on the ground or on its back."""
-        away = measures.distance > self.max_distance
-        return away | self.touches_ground(state, vehicle) | (state.cos_tilt < 0)
+        away = now.potentials.distance > self.max_distance
+        return away | touches_ground(now) | (now.state.cos_tilt < 0)
 
-    def success(
-        self, state: State, fields: Fields, errors: Errors, terminated: Array, truncated: Array
-    ) -> Array:
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Still flying at the end, and close."""
-        return truncated & (errors.final < self.tolerance)
+        return end.truncated & (end.final_error < self.tolerance)

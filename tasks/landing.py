@@ -9,26 +9,43 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from quadrl.rotation import Array, namespace, square_norm
-from quadrl.state import Start, State
-from quadrl.task import Draw, Errors, Fields, Marker, Measures, Outcome, Task, reward_share
-from quadrl.vehicle import Vehicle
+from quadrl.markers import Marker
+from quadrl.parameters import Parameters
+from quadrl.rng import Rng
+from quadrl.rotation import Array, namespace, norm, square_norm, stack
+from quadrl.state import Start
+from quadrl.task import (
+    EpisodeEnd,
+    Snapshot,
+    Target,
+    Task,
+    TaskState,
+    reward_share,
+    stands,
+    strikes_ground,
+)
 
 if TYPE_CHECKING:
-    from quadrl.learning.evaluate import Record
+    from quadrl.reading import Reading
+    from quadrl.snapshot import Rollout
 
-
-@dataclasses.dataclass
-class Touchdown(Fields):
-    """What has happened so far."""
-
-    down: Array  # (...) 1 once a foot has touched, 0 before
-    speed: Array  # (...) [m/s], at the last control step
-    rest: Array  # (...) control steps at rest on the pad, without a break
+# How the yardstick controllers come down.
+DESCENT_RATE = 0.8  # [1/s], sink speed over the height
+TOUCHDOWN_SPEED = 0.2  # [m/s]
+MAX_DESCENT_SPEED = 1.2  # [m/s]
 
 
 @dataclasses.dataclass(frozen=True)
-class Landing(Task[Touchdown]):
+class Touchdown(TaskState):
+    """What has happened so far."""
+
+    down: Array  # (N,) 1 once a foot has touched, 0 before
+    speed: Array  # (N,) [m/s], at the last control step
+    rest: Array  # (N,) control steps at rest on the pad, without a break
+
+
+@dataclasses.dataclass(frozen=True)
+class Landing(Task):
     """Land on the pad; the origin of the frame is where the aircraft's centre comes to rest."""
 
     name = "landing"
@@ -40,6 +57,12 @@ class Landing(Task[Touchdown]):
         "5 m away"
     )
     solved = "at rest on the pad, upright"
+    targets = (
+        Target("success_rate", "successful", 0.98, True),
+        Target("crash_rate", "crashes", 0.0),
+        Target("touchdown_speed_median_m_s", "touchdown, median", 0.3, unit="m/s"),
+    )
+    training = {"gamma": 0.97, "steps": 2_621_440}
     heading_matters = True
     contact = True
 
@@ -48,11 +71,12 @@ class Landing(Task[Touchdown]):
     survival_weight: float = 0.0
     """Reward for each step: none, or it would hover over the pad rather than come to rest."""
     speed_weight: float = 5.0
-    """Reward for a m/s of speed lost."""
+    """Reward for each m/s by which the speed falls."""
     spin_weight: float = 10.0
-    """Reward for a rad/s of body rate lost; with less it may turn for ever and never rest."""
+    """Reward for each rad/s by which the body rate falls; with less a rotation is left."""
     haste_weight: float = 60.0
-    """Cost of sinking a m/s faster than a gentle approach, at each step: more than its progress."""
+    """Cost of sinking a m/s faster than a gentle approach, at each step; larger than the progress
+    reward."""
     gentle_speed: float = 0.1
     """Sink rate of a gentle approach at the pad [m/s]."""
     gentle_rate: float = 0.6
@@ -78,91 +102,90 @@ class Landing(Task[Touchdown]):
     rest_time: float = 0.25
     """How long the aircraft has to be at rest [s]."""
 
-    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Touchdown]:
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Touchdown]:
         """Level and at rest, high over the pad and beside its axis."""
-        offset = draw.uniform(0.0, self.start_offset)
-        xp, zero = namespace(offset), namespace(offset).zeros_like(offset)
-        up = xp.stack([zero, zero, zero + self.start_height], axis=-1)
-        position = up + offset[..., None] * draw.level_direction()
-        fields = Touchdown(goal=xp.zeros_like(position), down=zero, speed=zero, rest=zero)
-        return draw.level_start(position, vehicle), fields
+        offset = rng.uniform(0.0, self.start_offset)
+        zero = namespace(offset).zeros_like(offset)
+        up = stack(zero, zero, zero + self.start_height)
+        position = up + offset[..., None] * rng.level_direction()
+        state = Touchdown(goal=0 * position, down=zero, speed=0 * zero, rest=0 * zero)
+        return rng.level_start(position, parameters), state
 
-    def terminated(
-        self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
-    ) -> Array:
+    def terminated(self, now: Snapshot) -> Array:
         """Crashed, in its own wash, away, or at rest for long enough."""
-        strikes, stands = self.strikes_ground(state, vehicle), self.stands(state, vehicle)
+        state, down = now.state, stands(now)
         tilted = state.cos_tilt < math.cos(self.max_tilt)
         # The speed of a touchdown is that of the last control step in the air.
-        hard = (fields.down == 0) & (fields.speed > self.max_touchdown)
+        hard = (now.task.down == 0) & (now.task.speed > self.max_touchdown)
         sinks = state.body_velocity[..., 2] < -self.max_sink
-        away = measures.distance > self.max_distance
-        rested = self._rest(state, fields, vehicle) * vehicle.control_step >= self.rest_time
-        return strikes | (stands & (tilted | hard)) | sinks | away | rested
+        away = now.potentials.distance > self.max_distance
+        rested = self._rest(now) * now.parameters.control_timestep >= self.rest_time
+        return strikes_ground(now) | (down & (tilted | hard)) | sinks | away | rested
 
-    def success(
-        self, state: State, fields: Touchdown, errors: Errors, terminated: Array, truncated: Array
-    ) -> Array:
-        """At rest on the pad: the only way in which a soft, upright, unmoving end comes about."""
-        return terminated & state.at_rest & (fields.down > 0) & self._over_pad(state)
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
+        """At rest on the pad for long enough, upright, neither rotor nor hull on the ground."""
+        rested = self._rest(now) * now.parameters.control_timestep >= self.rest_time
+        upright = now.state.cos_tilt >= math.cos(self.max_tilt)
+        return end.terminated & rested & upright & ~strikes_ground(now)
 
-    def update(
-        self, state: State, measures: Measures, fields: Touchdown, vehicle: Vehicle
-    ) -> Touchdown:
+    def update(self, before: Snapshot, now: Snapshot) -> Touchdown:
         """Remember the touchdown, the speed and how long the aircraft has been at rest."""
-        stands, xp = self.stands(state, vehicle), namespace(fields.down)
+        down = now.task.down
+        xp = namespace(down)
         return Touchdown(
-            goal=fields.goal,
-            down=xp.where(stands, xp.ones_like(fields.down), fields.down),
-            speed=measures.speed,
-            rest=self._rest(state, fields, vehicle),
+            goal=now.task.goal,
+            down=xp.where(stands(now), xp.ones_like(down), down),
+            speed=now.potentials.speed,
+            rest=self._rest(now),
         )
 
-    def reward(
-        self,
-        before: Measures,
-        now: Measures,
-        rotor_command: Array,
-        outcome: Outcome,
-        vehicle: Vehicle,
-    ) -> dict[str, Array]:
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """The common terms, the haste of the approach, and what the end is worth."""
-        terms = super().reward(before, now, rotor_command, outcome, vehicle)
-        xp, zero = namespace(now.distance), 0.0 * now.distance
-        height = abs(now.to_goal[..., 2])
+        terms = super().reward(before, now, end)
+        height, last = (abs(shot.potentials.to_goal[..., 2]) for shot in (now, before))
+        xp, zero = namespace(height), 0.0 * height
         # Not the speed: exploration gives some in every direction, which would cost most near the
         # ground and keep it in the air.
-        sink = (abs(before.to_goal[..., 2]) - height) / vehicle.control_step
+        sink = (last - height) / now.parameters.control_timestep
         haste = sink - (self.gentle_speed + self.gentle_rate * height)
-        weight = self.haste_weight * reward_share(vehicle)
-        terms["haste"] = -weight * xp.where(haste > 0, haste, 0.0 * haste)
-        terms["success"] = xp.where(outcome.succeeded, zero + self.success_weight, zero)
-        terms["failure"] = xp.where(outcome.failed, zero - self.failure_weight, zero)
+        weight = self.haste_weight * reward_share(now.parameters)
+        terms["haste"] = -weight * xp.where(haste > 0, haste, zero)
+        terms["success"] = xp.where(end.succeeded, zero + self.success_weight, zero)
+        terms["failure"] = xp.where(end.failed, zero - self.failure_weight, zero)
         return terms
 
-    def markers(self, fields: Touchdown) -> Sequence[Marker]:
+    def guide(self, reading: Reading) -> tuple[Array, Array]:
+        """Over the pad, and down on it, slower the lower; it presses on when the pad is reached."""
+        height = np.maximum(-reading.to_goal[..., 2], 0.0)
+        aside = norm(reading.to_goal[..., :2])
+        sink = np.minimum(DESCENT_RATE * height + TOUCHDOWN_SPEED, MAX_DESCENT_SPEED)
+        sink = sink * np.clip(1.5 - aside / (0.2 + 0.2 * height), 0.0, 1.0)  # within a cone
+        zero = np.zeros_like(sink)
+        offset = stack(reading.to_goal[..., 0], reading.to_goal[..., 1], zero)
+        return offset, stack(zero, zero, -sink)
+
+    def markers(self, now: Snapshot) -> Sequence[Marker]:
         """The pad."""
         return [Marker("pad", size=self.pad_radius, rgba=(0.95, 0.95, 0.95, 1.0))]
 
-    def figures(self, record: Record) -> dict[str, float]:
+    def metrics(self, rollout: Rollout) -> dict[str, float]:
         """Speed of the touchdowns, the crashes, and the time that a landing takes."""
-        down = record.position[..., 2] < 0.01
+        down = rollout.position[..., 2] < 0.01
         first = down.argmax(0)
         flights = np.flatnonzero(down.any(0) & (first > 0))
-        speed = np.linalg.norm(record.velocity[first[flights] - 1, flights], axis=-1)
-        landed = record.length[record.is_success] * record.control_step
+        speed = np.linalg.norm(rollout.velocity[first[flights] - 1, flights], axis=-1)
+        landed = rollout.length[rollout.is_success] * rollout.control_timestep
         return {
             "touchdown_speed_median_m_s": float(np.median(speed)) if len(speed) else math.nan,
             "touchdown_speed_max_m_s": float(speed.max()) if len(speed) else math.nan,
-            "crash_rate": float((record.terminated & ~record.is_success).mean()),
+            "crash_rate": float((rollout.terminated & ~rollout.is_success).mean()),
             "landing_time_mean_s": float(landed.mean()) if len(landed) else math.nan,
         }
 
-    def _rest(self, state: State, fields: Touchdown, vehicle: Vehicle) -> Array:
-        """Control steps at rest on the pad, this one included."""
-        rests = self.stands(state, vehicle) & state.at_rest & self._over_pad(state)
-        xp = namespace(fields.rest)
-        return xp.where(rests, fields.rest + 1, xp.zeros_like(fields.rest))
+    def _rest(self, now: Snapshot) -> Array:
+        """Control steps at rest on the pad, this one included, (N,)."""
+        rests = stands(now) & now.state.at_rest & self._over_pad(now)
+        return namespace(now.task.rest).where(rests, now.task.rest + 1, 0 * now.task.rest)
 
-    def _over_pad(self, state: State) -> Array:
-        return square_norm(state.position[..., :2]) < self.pad_radius**2
+    def _over_pad(self, now: Snapshot) -> Array:
+        return square_norm(now.state.position[..., :2]) < self.pad_radius**2

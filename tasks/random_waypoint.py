@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 
-from quadrl.rotation import namespace
+from quadrl.parameters import Parameters
+from quadrl.rng import Rng
+from quadrl.rotation import Array, namespace
 from quadrl.state import Start
-from quadrl.task import Draw, Fields
-from quadrl.tasks.waypoints import WaypointTask
-from quadrl.vehicle import Vehicle
+from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, touches_ground
 
 
 @dataclasses.dataclass(frozen=True)
-class RandomWaypoint(WaypointTask[Fields]):
+class RandomWaypoint(Task):
     """Fly to a waypoint in a shell around the start and hold it; the heading is free."""
 
     name = "random_waypoint"
@@ -20,14 +20,31 @@ class RandomWaypoint(WaypointTask[Fields]):
     starts = "at rest and level at the origin, any heading"
     ends = "more than 5 m from the waypoint, on the ground"
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
+    targets = (
+        Target("success_rate", "successful", 0.99, True),
+        Target("position_error_m", "error over the last 2 s", 0.06, unit="cm"),
+    )
+    training = {"steps": 2_621_440}
 
     nearest: float = 1.0
     """Smallest distance of the waypoint from the start [m]."""
     farthest: float = 2.5
     """Largest distance of the waypoint from the start [m]."""
+    max_distance: float = 5.0
+    """Distance from the waypoint that ends the episode [m]."""
+    tolerance: float = 0.1
+    """Largest final error that counts as success [m]."""
 
-    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Fields]:
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
         """At rest at the origin, level, any heading."""
-        goal = draw.vector(self.farthest, shortest=self.nearest)
+        goal = rng.vector(self.farthest, shortest=self.nearest)
         origin = namespace(goal).zeros_like(goal)
-        return draw.level_start(origin, vehicle), Fields(goal=goal)
+        return rng.level_start(origin, parameters), TaskState(goal=goal)
+
+    def terminated(self, now: Snapshot) -> Array:
+        """Far away or on the ground."""
+        return (now.potentials.distance > self.max_distance) | touches_ground(now)
+
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
+        """Still flying at the end, and close."""
+        return end.truncated & (end.final_error < self.tolerance)

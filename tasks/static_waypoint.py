@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-import reprlib
 from collections.abc import Sequence
 
 import numpy as np
 
+from quadrl.errors import QuadrlError
+from quadrl.markers import Marker
+from quadrl.parameters import Parameters
+from quadrl.rng import Rng, hovering
 from quadrl.rotation import Array, namespace
-from quadrl.state import Start, State
-from quadrl.task import Draw, Errors, Fields, Marker, Measures, OptionError
-from quadrl.tasks.waypoints import WaypointTask
-from quadrl.vehicle import Vehicle
+from quadrl.state import Start
+from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, touches_ground
+from quadrl.validation import MAX_OPTION, numbers
 
 WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
 
 
-@dataclasses.dataclass
-class Route(Fields):
+@dataclasses.dataclass(frozen=True)
+class Route(TaskState):
     """Where the aircraft is on its route."""
 
-    leg: Array  # (...) number of the current waypoint, from 0
+    leg: Array  # (N,) number of the current waypoint, from 0
 
 
 @dataclasses.dataclass(frozen=True)
-class StaticWaypoint(WaypointTask[Route]):
+class StaticWaypoint(Task):
     """Fly to a list of waypoints in order, heading east, and hold the last."""
 
     name = "static_waypoint"
@@ -36,6 +38,12 @@ class StaticWaypoint(WaypointTask[Route]):
     starts = "at rest at the origin, heading east, disturbed by up to 0.05 rad, m/s and rad/s"
     ends = "more than 5 m from the current waypoint, on the ground"
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m, on the last waypoint"
+    targets = (
+        Target("success_rate", "successful", 1.0, True),
+        Target("position_error_m", "error over the last 2 s", 0.05, unit="cm"),
+        Target("heading_error_deg", "off east", 15.0, unit="deg"),
+    )
+    training = {"gamma": 0.9, "ppo": {"learning_rate": 8e-3}}
     heading_matters = True
 
     waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)
@@ -44,69 +52,67 @@ class StaticWaypoint(WaypointTask[Route]):
     """Distance at which a waypoint counts as reached and the next one is the goal [m]."""
     disturbance: float = 0.05
     """Largest tilt [rad], speed [m/s] and body rate [rad/s] at the start."""
+    max_distance: float = 5.0
+    """Distance from the current waypoint that ends the episode [m]."""
+    tolerance: float = 0.1
+    """Largest final error that counts as success [m]."""
 
     def __post_init__(self) -> None:
-        """Refuse a route that is none."""
-        try:
-            points = tuple(tuple(map(float, point)) for point in self.waypoints)
-        except (TypeError, ValueError, OverflowError):
-            points = ()
-        if not points or any(len(point) != 3 for point in points):
-            raise OptionError(
-                f"waypoints = {reprlib.repr(self.waypoints)}: at least one point of three "
-                "coordinates is expected"
-            )
+        """Validate the route."""
+        name, route = f"{self.name} waypoints", self.waypoints
+        if (
+            not isinstance(route, (Sequence, np.ndarray))
+            or isinstance(route, str)
+            or not len(route)
+        ):
+            raise QuadrlError(name=name, value=route, allowed="at least one point (x, y, z)")
+        points = tuple(numbers(name, point, 3, -MAX_OPTION, MAX_OPTION) for point in route)
         object.__setattr__(self, "waypoints", points)
         super().__post_init__()
 
-    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Route]:
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Route]:
         """At rest at the origin, heading east, slightly disturbed."""
-        velocity = draw.vector(self.disturbance)
-        xp = namespace(velocity)
-        position = xp.zeros_like(velocity)
+        velocity = rng.vector(self.disturbance)
+        position = namespace(velocity).zeros_like(velocity)
         start = Start(
             position=position,
-            quaternion=draw.attitude(self.disturbance, heading=0.0),
+            quaternion=rng.attitude(self.disturbance, heading=0.0),
             velocity=velocity,
-            body_rate=draw.vector(self.disturbance),
-            rotor_speed=xp.full_like(draw.uniform(0, 1, 4), vehicle.hover_speed),
+            body_rate=rng.vector(self.disturbance),
+            rotor_speed=hovering(position, parameters),
         )
-        leg = xp.zeros_like(position[..., 0])
-        return start, Route(goal=position + _point(self.waypoints[0], position), leg=leg)
+        return start, Route(goal=self._waypoint(0, position), leg=position[..., 0])
 
-    def update(self, state: State, measures: Measures, fields: Route, vehicle: Vehicle) -> Route:
+    def update(self, before: Snapshot, now: Snapshot) -> Route:
         """On to the next waypoint when this one is reached."""
-        xp = namespace(fields.goal)
-        last = len(self.waypoints) - 1
-        onward = (measures.distance < self.reach) & (fields.leg < last)
-        if not onward.any():
-            return fields
-        leg = fields.leg + xp.where(onward, 1.0, 0.0)
-        goal = fields.goal
-        for number, waypoint in enumerate(self.waypoints):
-            here = (onward & (leg == number))[..., None]
-            goal = xp.where(here, _point(waypoint, goal), goal)
-        return Route(goal=goal, leg=leg)
+        xp, task = namespace(now.task.goal), now.task
+        onward = (now.potentials.distance < self.reach) & (task.leg < len(self.waypoints) - 1)
+        goal = task.goal
+        for number in range(1, len(self.waypoints)):
+            here = (onward & (task.leg == number - 1))[..., None]
+            goal = xp.where(here, self._waypoint(number, goal), goal)
+        return Route(goal=goal, leg=xp.where(onward, task.leg + 1, task.leg))
 
-    def success(
-        self, state: State, fields: Route, errors: Errors, terminated: Array, truncated: Array
-    ) -> Array:
+    def terminated(self, now: Snapshot) -> Array:
+        """Far away or on the ground."""
+        return (now.potentials.distance > self.max_distance) | touches_ground(now)
+
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Still flying at the end, and close to the last waypoint."""
-        close = super().success(state, fields, errors, terminated, truncated)
-        return close & (fields.leg == len(self.waypoints) - 1)
+        last = now.task.leg == len(self.waypoints) - 1
+        return end.truncated & (end.final_error < self.tolerance) & last
 
-    def markers(self, fields: Route) -> Sequence[Marker]:
+    def markers(self, now: Snapshot) -> Sequence[Marker]:
         """The route, and the waypoints that are still to come, by number."""
         route = np.array([(0.0, 0.0, 0.0), *self.waypoints])
-        later = [k for k in range(len(self.waypoints)) if k > fields.leg]
+        later = [k for k in range(len(self.waypoints)) if k > now.task.leg[0]]
         spheres = [
             Marker("sphere", self.waypoints[k], 0.06, WAITING, label=str(k + 1)) for k in later
         ]
         return [Marker("path", size=0.004, rgba=WAITING, points=route), *spheres]
 
-
-def _point(waypoint: tuple[float, float, float], like: Array) -> Array:
-    """A waypoint (3,) as an array of the kind of another."""
-    if isinstance(like, np.ndarray):
-        return np.array(waypoint)
-    return namespace(like).asarray(waypoint, dtype=like.dtype, device=like.device)
+    def _waypoint(self, number: int, like: Array) -> Array:
+        """A waypoint, a row per row of another array (N, 3)."""
+        x, y, z = self.waypoints[number]
+        zero = 0 * like[..., 0]
+        return namespace(like).stack([zero + x, zero + y, zero + z], axis=-1)

@@ -8,27 +8,40 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quadrl.markers import Marker
+from quadrl.parameters import Parameters
+from quadrl.rng import Rng
 from quadrl.rotation import Array, namespace, norm
-from quadrl.state import Start, State
-from quadrl.task import Draw, Errors, Fields, Marker, Measures, OptionError
-from quadrl.tasks.moving_goal import MovingGoalTask
-from quadrl.vehicle import Vehicle
+from quadrl.state import Start
+from quadrl.task import (
+    OBSERVATION,
+    TARGET_VELOCITY,
+    EpisodeEnd,
+    Potentials,
+    Snapshot,
+    Target,
+    Task,
+    TaskState,
+    touches_ground,
+)
+from quadrl.validation import number
 
 if TYPE_CHECKING:
-    from quadrl.learning.evaluate import Record
+    from quadrl.reading import Reading
+    from quadrl.snapshot import Rollout
 
 LINE: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.45)
 
 
-@dataclasses.dataclass
-class Line(Fields):
+@dataclasses.dataclass(frozen=True)
+class Line(TaskState):
     """The line to fly; it passes through the origin of the task's frame."""
 
-    direction: Array  # (..., 3) unit vector, level, world frame
+    direction: Array  # (N, 3) unit vector, level, world frame
 
 
 @dataclasses.dataclass(frozen=True)
-class StraightAndLevel(MovingGoalTask[Line]):
+class StraightAndLevel(Task):
     """Fly along a line at a set speed; the goal runs ahead of the aircraft on the line."""
 
     name = "straight_and_level"
@@ -36,10 +49,20 @@ class StraightAndLevel(MovingGoalTask[Line]):
     starts = "on a line in any direction, level, at 0 to 2 m/s along it, any heading"
     ends = "more than 0.7 m off the altitude or 3 m off the line, on the ground"
     solved = "in the air, on altitude and near the line to the end"
+    targets = (
+        Target("survival_rate", "flown to the end", 0.99, True),
+        Target("altitude_rms_m", "altitude error, RMS", 0.05, unit="cm"),
+        Target("cross_track_rms_m", "off the line, RMS", 0.10, unit="cm"),
+        Target("speed_error_share", "speed error", 0.05),
+    )
+    training = {"gamma": 0.94, "steps": 1_966_080}
+    observation = OBSERVATION | TARGET_VELOCITY
 
+    time_limit: float = 20.0
+    """Time limit of an episode [s]."""
     speed_weight: float = 10.0
-    """Reward for a m/s lost of the speed relative to the line's; with 20 it speeds up so hard that
-    it may tip over."""
+    """Reward for each m/s by which the speed relative to the line's falls; with 20 it speeds up so
+    hard that it may tip over."""
     line_speed: float = 2.0
     """Speed along the line [m/s]."""
     lead: float = 1.0
@@ -50,70 +73,74 @@ class StraightAndLevel(MovingGoalTask[Line]):
     """Distance off the line that ends the episode [m]."""
 
     def __post_init__(self) -> None:
-        """Refuse a line that is not flown."""
+        """Validate the speed."""
         super().__post_init__()
-        if self.line_speed <= 0:
-            raise OptionError(f"{self.name}: line_speed = {self.line_speed} must be positive")
+        number(f"{self.name} line_speed", self.line_speed, positive=True)
 
-    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Line]:
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Line]:
         """On a line of any heading, at rest or up to the set speed along it."""
-        direction = draw.level_direction()
-        velocity = draw.uniform(0.0, self.line_speed)[..., None] * direction
+        direction = rng.level_direction()
+        velocity = rng.uniform(0.0, self.line_speed)[..., None] * direction
         origin = namespace(direction).zeros_like(direction)
-        start = draw.level_start(origin, vehicle, velocity)
+        start = rng.level_start(origin, parameters, velocity)
         return start, Line(goal=direction * self.lead, direction=direction)
 
-    def goal(self, state: State, fields: Line) -> Array:
+    def goal(self, now: Snapshot) -> Array:
         """The point of the line ahead of the aircraft's projection."""
-        east, north = fields.direction[..., 0], fields.direction[..., 1]
-        along = state.position[..., 0] * east + state.position[..., 1] * north
-        return (along + self.lead)[..., None] * fields.direction
+        direction, position = now.task.direction, now.state.position
+        along = position[..., 0] * direction[..., 0] + position[..., 1] * direction[..., 1]
+        return (along + self.lead)[..., None] * direction
 
-    def target_velocity(self, state: State, fields: Line) -> Array:
+    def target_velocity(self, now: Snapshot) -> Array:
         """The line's."""
-        return self.line_speed * fields.direction
+        return self.line_speed * now.task.direction
 
-    def measure(self, state: State, fields: Line) -> Measures:
+    def measure(self, now: Snapshot) -> Potentials:
         """The distance is that from the line: the goal itself is never reached."""
-        measures = super().measure(state, fields)
-        offset = measures.to_goal - self.lead * fields.direction
-        return dataclasses.replace(measures, distance=norm(offset))
+        potentials = super().measure(now)
+        offset = potentials.to_goal - self.lead * now.task.direction
+        return dataclasses.replace(potentials, distance=norm(offset))
 
-    def terminated(self, state: State, measures: Measures, fields: Line, vehicle: Vehicle) -> Array:
+    def terminated(self, now: Snapshot) -> Array:
         """Off the altitude, off the line or on the ground."""
-        height = state.position[..., 2]
-        return (
-            (abs(height) > self.max_altitude_error)
-            | (measures.distance > self.max_offset)
-            | self.touches_ground(state, vehicle)
-        )
+        high = abs(now.state.position[..., 2]) > self.max_altitude_error
+        return high | (now.potentials.distance > self.max_offset) | touches_ground(now)
 
-    def success(
-        self, state: State, fields: Line, errors: Errors, terminated: Array, truncated: Array
-    ) -> Array:
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """To the end."""
-        return truncated
+        return end.truncated
 
-    def markers(self, fields: Line) -> Sequence[Marker]:
+    def guide(self, reading: Reading) -> tuple[Array, Array]:
+        """To the nearest point of the line through the goal, and along it at its velocity."""
+        line = reading.target_velocity
+        along = line / np.maximum(norm(line), 1e-9)[..., None]
+        ahead = np.sum(reading.to_goal * along, axis=-1, keepdims=True)
+        return reading.to_goal - ahead * along, line
+
+    def markers(self, now: Snapshot) -> Sequence[Marker]:
         """The line, and posts that show its altitude."""
-        direction, length = np.asarray(fields.direction), self.line_speed * self.horizon + 5.0
+        direction = np.asarray(now.task.direction[0])
+        length = self.line_speed * self.time_limit + 5.0
         line = Marker("line", tuple(-10.0 * direction), 0.008, LINE, end=tuple(length * direction))
         feet = [tuple(k * direction - (0, 0, self.altitude)) for k in range(0, int(length), 2)]
         posts = [Marker("line", foot, 0.004, LINE, end=(*foot[:2], 0.0)) for foot in feet]
         return [line, *posts]
 
-    def figures(self, record: Record) -> dict[str, float]:
+    def metrics(self, rollout: Rollout) -> dict[str, float]:
         """Altitude and cross-track error over the flight, speed error over its second half."""
-        ahead = record.goal - record.position
-        direction = record.goal[..., :2] / np.linalg.norm(record.goal[..., :2], axis=-1)[..., None]
+        ahead = rollout.goal - rollout.position
+        direction = (
+            rollout.goal[..., :2] / np.linalg.norm(rollout.goal[..., :2], axis=-1)[..., None]
+        )
         across = ahead[..., 0] * direction[..., 1] - ahead[..., 1] * direction[..., 0]
-        speed = (record.velocity[..., :2] * direction).sum(-1)[len(record.error) // 2 :]
+        speed = (rollout.velocity[..., :2] * direction).sum(-1)[len(rollout.error) // 2 :]
+        off = (
+            np.abs(np.nanmean(speed, 0) / self.line_speed - 1)
+            if np.isfinite(speed).any()
+            else speed
+        )
         return {
-            "altitude_rms_m": float(np.sqrt(np.nanmean(record.position[..., 2] ** 2))),
+            "altitude_rms_m": float(np.sqrt(np.nanmean(rollout.position[..., 2] ** 2))),
             "cross_track_rms_m": float(np.sqrt(np.nanmean(across**2))),
-            "speed_error_share": float(
-                np.nanmean(np.abs(np.nanmean(speed, 0) / self.line_speed - 1))
-                if np.isfinite(speed).any()
-                else np.nan
-            ),
+            "speed_error_share": float(np.nanmean(off)) if np.isfinite(speed).any() else np.nan,
         }

@@ -8,14 +8,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from quadrl.rotation import Array, namespace
-from quadrl.state import Start, State
-from quadrl.task import FULL_TURN, Draw, Errors, Fields, Marker, Measures, OptionError
-from quadrl.tasks.moving_goal import MovingGoalTask
-from quadrl.vehicle import Vehicle
+from quadrl.errors import QuadrlError
+from quadrl.markers import Marker
+from quadrl.parameters import Parameters
+from quadrl.rng import FULL_TURN, Rng
+from quadrl.rotation import Array, namespace, norm, stack
+from quadrl.state import Start
+from quadrl.task import (
+    OBSERVATION,
+    TARGET_VELOCITY,
+    EpisodeEnd,
+    Potentials,
+    Snapshot,
+    Target,
+    Task,
+    TaskState,
+    touches_ground,
+)
+from quadrl.validation import number
 
 if TYPE_CHECKING:
-    from quadrl.learning.evaluate import Record
+    from quadrl.reading import Reading
+    from quadrl.snapshot import Rollout
 
 WAVES = 2  # sines in each coordinate of the target's path
 AXES = 3
@@ -23,17 +37,17 @@ SLOWEST = 1e-6  # [rad/s]; the slower, the longer the waves, and the fewer digit
 PATH: tuple[float, float, float, float] = (0.95, 0.55, 0.20, 0.35)
 
 
-@dataclasses.dataclass
-class Path(Fields):
+@dataclasses.dataclass(frozen=True)
+class Path(TaskState):
     """The target's path: in each coordinate a sum of sines, from the origin of the frame."""
 
-    amplitude: Array  # (..., AXES * WAVES) [m]
-    frequency: Array  # (..., AXES * WAVES) [rad/s]
-    phase: Array  # (..., AXES * WAVES) [rad]
+    amplitude: Array  # (N, AXES * WAVES) [m]
+    frequency: Array  # (N, AXES * WAVES) [rad/s]
+    phase: Array  # (N, AXES * WAVES) [rad]
 
 
 @dataclasses.dataclass(frozen=True)
-class TargetFollowing(MovingGoalTask[Path]):
+class TargetFollowing(Task):
     """Stay 1 m from a target on a smooth random path; from which side is free."""
 
     name = "target_following"
@@ -41,7 +55,16 @@ class TargetFollowing(MovingGoalTask[Path]):
     starts = "1 m beside the target, at rest and level, any heading"
     ends = "more than 5 m from the target, on the ground"
     solved = "in the air to the end, distance within 0.3 m of 1 m on average"
+    targets = (
+        Target("survival_rate", "flown to the end", 0.99, True),
+        Target("distance_rms_m", "distance off 1 m, RMS", 0.15, unit="cm"),
+    )
+    observation = OBSERVATION | TARGET_VELOCITY
 
+    time_limit: float = 20.0
+    """Time limit of an episode [s]."""
+    speed_weight: float = 20.0
+    """Reward for each m/s by which the speed relative to the target falls."""
     keep: float = 1.0
     """Distance to keep [m]."""
     target_speed: float = 1.5
@@ -58,75 +81,78 @@ class TargetFollowing(MovingGoalTask[Path]):
     """Largest mean error of the distance that counts as success [m]."""
 
     def __post_init__(self) -> None:
-        """Refuse a path that is none."""
+        """Validate the path."""
         super().__post_init__()
-        if not SLOWEST <= self.slowest <= self.fastest:
-            raise OptionError(
-                f"{self.name}: slowest = {self.slowest}, fastest = {self.fastest}: at least "
-                f"{SLOWEST:g}, in this order, is allowed"
-            )
-        if not 0 <= self.climb_share <= 1:
-            raise OptionError(f"{self.name}: climb_share = {self.climb_share}: 0 to 1 is allowed")
+        number(f"{self.name} climb_share", self.climb_share, 0, 1)
+        number(f"{self.name} slowest", self.slowest, SLOWEST)
+        if self.fastest < self.slowest:
+            allowed = f"at least slowest, {self.slowest:g}"
+            raise QuadrlError(name=f"{self.name} fastest", value=self.fastest, allowed=allowed)
 
-    def sample(self, draw: Draw, vehicle: Vehicle) -> tuple[Start, Path]:
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Path]:
         """At rest, beside the target, level, any heading."""
-        side = draw.level_direction()
-        xp = namespace(side)
-        frequency = draw.uniform(self.slowest, self.fastest, AXES * WAVES)
+        side = rng.level_direction()
+        frequency = rng.uniform(self.slowest, self.fastest, AXES * WAVES)
+        share = rng.uniform(0.3, 1.0, AXES * WAVES)
         # The speeds of the sines of an axis add up to its limit at most, and the axes together
         # (east and north alike) to `target_speed`.
         climb = self.climb_share * self.target_speed
         along = ((self.target_speed**2 - climb**2) / 2) ** 0.5
-        limit = xp.asarray(np.repeat([along, along, climb], WAVES) / WAVES)
-        amplitude = draw.uniform(0.3, 1.0, AXES * WAVES) * limit / frequency
-        start = draw.level_start(self.keep * side, vehicle)
-        phase = draw.uniform(0.0, FULL_TURN, AXES * WAVES)
-        origin = xp.zeros_like(side)
-        return start, Path(goal=origin, amplitude=amplitude, frequency=frequency, phase=phase)
+        level, up = slice(0, 2 * WAVES), slice(2 * WAVES, None)
+        limits = [share[..., level] * (along / WAVES), share[..., up] * (climb / WAVES)]
+        xp = namespace(side)
+        amplitude = xp.concat(limits, axis=-1) / frequency
+        start = rng.level_start(self.keep * side, parameters)
+        phase = rng.uniform(0.0, FULL_TURN, AXES * WAVES)
+        goal = xp.zeros_like(side)
+        return start, Path(goal=goal, amplitude=amplitude, frequency=frequency, phase=phase)
 
-    def goal(self, state: State, fields: Path) -> Array:
+    def goal(self, now: Snapshot) -> Array:
         """The target itself."""
-        return _position(fields, state.time)
+        return _position(now.task, now.time)
 
-    def target_velocity(self, state: State, fields: Path) -> Array:
+    def target_velocity(self, now: Snapshot) -> Array:
         """Of the target."""
-        xp = namespace(fields.phase)
-        angle = fields.frequency * state.time[..., None] + fields.phase
-        return _by_axis(fields.amplitude * fields.frequency * xp.cos(angle))
+        path = now.task
+        angle = path.frequency * now.time[..., None] + path.phase
+        return _by_axis(path.amplitude * path.frequency * namespace(angle).cos(angle))
 
-    def measure(self, state: State, fields: Path) -> Measures:
+    def measure(self, now: Snapshot) -> Potentials:
         """The distance left is that to the sphere around the target."""
-        measures = super().measure(state, fields)
-        return dataclasses.replace(measures, distance=abs(measures.distance - self.keep))
+        potentials = super().measure(now)
+        return dataclasses.replace(potentials, distance=abs(potentials.distance - self.keep))
 
-    def terminated(self, state: State, measures: Measures, fields: Path, vehicle: Vehicle) -> Array:
+    def terminated(self, now: Snapshot) -> Array:
         """Too far from the target, or on the ground."""
-        lost = measures.distance > self.max_distance - self.keep
-        return lost | self.touches_ground(state, vehicle)
+        lost = now.potentials.distance > self.max_distance - self.keep
+        return lost | touches_ground(now)
 
-    def success(
-        self, state: State, fields: Path, errors: Errors, terminated: Array, truncated: Array
-    ) -> Array:
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """To the end, and near the distance on average."""
-        return truncated & (errors.mean < self.tolerance)
+        return end.truncated & (end.mean_error < self.tolerance)
 
-    def markers(self, fields: Path) -> Sequence[Marker]:
+    def guide(self, reading: Reading) -> tuple[Array, Array]:
+        """To the nearest point at the distance to keep, and along with the target."""
+        share = self.keep / np.maximum(norm(reading.to_goal), 1e-9)
+        return reading.to_goal * (1 - share)[..., None], reading.target_velocity
+
+    def markers(self, now: Snapshot) -> Sequence[Marker]:
         """The path of the target."""
-        points = _position(fields, np.linspace(0.0, self.horizon, 160))
+        points = _position(now.task, np.linspace(0.0, self.time_limit, 160))
         return [Marker("path", size=0.008, rgba=PATH, points=points)]
 
-    def figures(self, record: Record) -> dict[str, float]:
+    def metrics(self, rollout: Rollout) -> dict[str, float]:
         """How well the distance is kept over the flight."""
-        return {"distance_rms_m": float(np.sqrt(np.nanmean(record.error**2)))}
+        return {"distance_rms_m": float(np.sqrt(np.nanmean(rollout.error**2)))}
 
 
-def _position(fields: Path, time: Array) -> Array:
-    """Where the target is at a time (...) [s], (..., 3) [m], task frame."""
-    xp = namespace(fields.phase)
-    angle = fields.frequency * time[..., None] + fields.phase
-    return _by_axis(fields.amplitude * (xp.sin(angle) - xp.sin(fields.phase)))
+def _position(path: Path, time: Array) -> Array:
+    """Where the target is at times (N,) [s], (N, 3) [m], task frame."""
+    xp = namespace(path.phase)
+    angle = path.frequency * time[..., None] + path.phase
+    return _by_axis(path.amplitude * (xp.sin(angle) - xp.sin(path.phase)))
 
 
 def _by_axis(waves: Array) -> Array:
-    """Sum the sines of each axis: (..., AXES * WAVES) to (..., AXES)."""
-    return waves[..., 0::WAVES] + waves[..., 1::WAVES]
+    """Sum the sines of each axis: (N, AXES * WAVES) to (N, AXES)."""
+    return stack(*(waves[..., k] + waves[..., k + 1] for k in range(0, AXES * WAVES, WAVES)))

@@ -2,6 +2,7 @@
 
 In the paper's own terms: v and omega in the body frame, and q the rotation from the inertial frame
 to the body, the inverse of MuJoCo's. Products of quaternions are written out as the paper has them.
+Beyond the paper: any number of rotors anywhere, and another lag while a rotor slows down.
 """
 
 import numpy as np
@@ -38,18 +39,18 @@ def length(vector):
 
 
 def derivative(x, vehicle, command, wind):
-    """Of x (..., 17): position (3), q (4), v (3), omega (3), rotor speed (4)."""
-    q, v, omega, speed = x[..., 3:7], x[..., 7:10], x[..., 10:13], x[..., 13:17]
-    k_t, k_q, arm = vehicle.thrust_coefficient, vehicle.torque_coefficient, vehicle.arm_length
-    one, two, three, four = np.moveaxis(speed**2, -1, 0)
-    zero = np.zeros_like(one)
-    force = np.stack([zero, zero, k_t * (one + two + three + four)], axis=-1)  # (7)
-    moment = [
-        arm * k_t * (two - four),
-        arm * k_t * (three - one),
-        k_q * (-one + two - three + four),
-    ]
-    moment = np.stack(moment, axis=-1)
+    """Of x (..., 13 + R): position (3), q (4), v (3), omega (3), rotor speed (R)."""
+    q, v, omega, speed = x[..., 3:7], x[..., 7:10], x[..., 10:13], x[..., 13:]
+    force, moment = np.zeros_like(v), np.zeros_like(v)
+    lag = np.empty_like(speed)
+    for k, rotor in enumerate(vehicle.rotors):  # (7)
+        square, axis = speed[..., k, None] ** 2, np.array(rotor.axis)
+        thrust = rotor.thrust_coefficient * square * axis
+        force += thrust
+        moment += np.cross(rotor.position, thrust)
+        moment -= rotor.spin * rotor.torque_coefficient * square * axis  # the reaction
+        rising = command[..., k] > speed[..., k]
+        lag[..., k] = np.where(rising, rotor.lag_up, rotor.lag_down)
     air = v - turned(q, wind)
     force = force - vehicle.drag_coefficient * length(air) * air  # (8)
     moment = moment - vehicle.moment_coefficient * length(omega) * omega  # (9)
@@ -59,13 +60,13 @@ def derivative(x, vehicle, command, wind):
         -0.5 * hamilton(pure(omega), q),  # (6)
         force / vehicle.mass + turned(q, np.broadcast_to(GRAVITY, v.shape)) - np.cross(omega, v),
         (moment - np.cross(omega, inertia * omega)) / inertia,  # (3) above, (4)
-        -vehicle.lag_rate * (speed - command),  # (10)
+        -lag * (speed - command),  # (10)
     ]
     return np.concatenate(rates, axis=-1)
 
 
 def fly(vehicle, start, command, seconds, wind):
-    """States x (n, 17) after some seconds at constant commands (n, 4); see `derivative`."""
+    """States x (n, 13 + R) after some seconds at constant commands (n, R); see `derivative`."""
     solution = solve_ivp(
         lambda _, x: derivative(x.reshape(start.shape), vehicle, command, wind).ravel(),
         (0.0, seconds),
@@ -79,7 +80,7 @@ def fly(vehicle, start, command, seconds, wind):
 
 
 def to_mujoco(x):
-    """qpos (n, 7), qvel (n, 6) and rotor speeds (n, 4) of states x (n, 17)."""
+    """qpos (n, 7), qvel (n, 6) and rotor speeds (n, R) of states x (n, 13 + R)."""
     q = inverse(x[:, 3:7])
     return (
         np.concatenate([x[:, :3], q], axis=-1),
@@ -88,11 +89,15 @@ def to_mujoco(x):
     )
 
 
+QUANTITIES = ("position", "attitude", "velocity", "body_velocity", "body_rate", "rotor_speed")
+
+
 def deviation(qpos, qvel, speed, x):
-    """How far an aircraft is from a state x (n, 17).
+    """How far aircraft are from exact states x (n, 13 + R).
 
     Returns:
-        (n, 5): position [m], attitude [rad], velocity [m/s], body rate and rotor speed [rad/s].
+        (n, 6), as QUANTITIES names them: position [m], attitude [rad], velocity in the world and in
+        the body frame [m/s], body rate and rotor speed [rad/s].
     """
     exact_qpos, exact_qvel, exact_speed = to_mujoco(x)
     between = hamilton(inverse(exact_qpos[:, 3:]), qpos[:, 3:])
@@ -101,6 +106,7 @@ def deviation(qpos, qvel, speed, x):
         length(qpos[:, :3] - exact_qpos[:, :3]),
         angle,
         length(qvel[:, :3] - exact_qvel[:, :3]),
+        length(turned(inverse(qpos[:, 3:]), qvel[:, :3]) - x[:, 7:10]),
         length(qvel[:, 3:] - exact_qvel[:, 3:]),
         np.abs(speed - exact_speed).max(axis=-1, keepdims=True),
     )

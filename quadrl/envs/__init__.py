@@ -1,1 +1,39 @@
-"""The doors of Gymnasium and TorchRL."""
+"""The APIs: dm_control, Gymnasium and TorchRL, thin layers over `quadrl.environment`."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+from quadrl import tasks
+
+if TYPE_CHECKING:
+    from quadrl.envs import dm_control, gymnasium, torchrl
+
+__all__ = ["dm_control", "gymnasium", "register_ids", "torchrl"]
+
+
+def register_ids() -> None:
+    """Register every task of the catalogue as quadrl/<CamelCase>-v0 (idempotent)."""
+    for name in tasks.TASKS:
+        camel = "".join(word.capitalize() for word in name.split("_"))
+        if (id := f"quadrl/{camel}-v0") not in gym.registry:
+            gym.register(
+                id=id,
+                entry_point="quadrl.envs.gymnasium:QuadrotorEnv",
+                vector_entry_point="quadrl.envs.gymnasium:QuadrotorVectorEnv",
+                kwargs={"task": name},
+                # The environment itself refuses a step before a reset and a bad action, and the
+                # tests run Gymnasium's checks: the two wrappers would only cost time.
+                order_enforce=False,
+                disable_env_checker=True,
+            )
+
+
+def __getattr__(name: str) -> Any:
+    """Import an API when it is first asked for: each brings a library of its own."""
+    if name in __all__:
+        return importlib.import_module(f"quadrl.envs.{name}")
+    raise AttributeError(f"module 'quadrl.envs' has no attribute {name!r}")

@@ -1,9 +1,8 @@
-"""Door two: Gymnasium, one aircraft or a native vector of them.
+"""Gymnasium: one aircraft, or a native vector of many.
 
-The observation is the flat float32 vector of the task's parts (`environment.layout` says which
-entry is what); the action is Box(-1, 1, (4,)), and the option `action` says what it means. `info`
-of a step carries `reward_terms`, `is_success`, `error` [m] and `diverged`. A new version of an id
-(-vN) means other numbers.
+The observation is the flat float32 vector of the task's terms (`environment.layout` has the slice
+of each name); the action is Box(-1, 1, (k,)), and `control_mode` says what it means. The `info` of
+a step holds `reward_terms`, `is_success`, `error` [m] and `diverged`. A new -vN is for new numbers.
 """
 
 from __future__ import annotations
@@ -15,152 +14,102 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from quadrl import tasks
-from quadrl.environment import Environment, Transition, check_seed
-from quadrl.simulation import Engine
-from quadrl.task import OptionError, Task, check_choices, check_option
-from quadrl.vehicle import Vehicle, resolve
+from quadrl import validation
+from quadrl.environment import Transition
+from quadrl.envs.common import Pictures, make
+from quadrl.errors import QuadrlError
+from quadrl.task import Task
 
+Array = np.ndarray
 Info = dict[str, Any]
 
 
-class _Door:
-    """What the single environment and the vector share: how they are made, and how they draw."""
+class _Shared:
+    """What the single environment and the vector share."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
     def _make(
         self,
         task: str | Task,
-        num_envs: int | None,
+        num_envs: int,
         *,
-        vehicle: Vehicle | None = None,
-        action: str = "rotor",
-        max_episode_steps: int | None = None,
-        num_threads: int = 0,
-        engine: Engine = "mujoco",
+        reward_terms: bool = True,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
         camera: str = "track",
-        reward_terms: bool = True,
-        **options: Any,  # noqa: ANN401 - of the task's own types
+        **settings: Any,
     ) -> tuple[gym.spaces.Box, gym.spaces.Box]:
         """Make the environment; returns the spaces of one aircraft."""
-        if render_mode not in (None, "rgb_array"):
-            raise OptionError(f"unknown render_mode {render_mode!r}; choices: None, 'rgb_array'")
-        vehicle = resolve(vehicle)
-        if max_episode_steps is not None:
-            check_option("environment", "max_episode_steps", max_episode_steps, 200)
-            options["horizon"] = max_episode_steps * vehicle.control_step
-        self.environment = Environment(
-            tasks.make(task, **options),
-            num_envs=num_envs,
-            vehicle=vehicle,
-            num_threads=num_threads,
-            engine=engine,
-            action=action,
-        )
+        if render_mode is not None:
+            validation.choice("render_mode", render_mode, self.metadata["render_modes"])
+        environment = self.environment = make(task, num_envs, **settings)
+        self._pictures = Pictures(environment, camera, width, height)
         self.render_mode, self._terms_wanted = render_mode, reward_terms
-        self.metadata = self.metadata | {"render_fps": round(1 / vehicle.control_step)}
-        self._camera, self._picture = camera, {"width": width, "height": height}
-        self._renderer: Any = None
+        fps = round(1 / environment.vehicle.control_timestep)
+        self.metadata = self.metadata | {"render_fps": fps}
         return (
-            gym.spaces.Box(-np.inf, np.inf, (self.environment.size,), np.float32),
-            gym.spaces.Box(-1.0, 1.0, (self.environment.interface.size,), np.float32),
+            gym.spaces.Box(-np.inf, np.inf, (environment.size,), np.float32),
+            gym.spaces.Box(-1.0, 1.0, (environment.action_size,), np.float32),
         )
 
-    def _frame(self, row: int = 0) -> np.ndarray:
-        """The picture (height, width, 3) of one aircraft, uint8."""
-        environment, simulation = self.environment, self.environment.simulation
-        if self._renderer is None:
-            from quadrl.rendering import Renderer
-
-            model = environment.vehicle.compile(contact=environment.task.contact)
-            self._renderer = Renderer(model, **self._picture)
-        goal = environment.task.goal(simulation.state, environment.fields) + simulation.origin
-        return self._renderer.frame(
-            simulation.qpos.reshape(-1, 7)[row],
-            camera=self._camera,
-            goal=goal.reshape(-1, 3)[row],
-            markers=environment.markers(row),
-        )
-
-    def _close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+    def _values(self, now: Transition) -> Info:
+        """What the info of a step tells, arrays (N,)."""
+        values: Info = {"is_success": now.is_success, "error": now.error, "diverged": now.diverged}
+        return values | {"reward_terms": now.reward_terms} if self._terms_wanted else values
 
 
-class QuadrotorEnv(_Door, gym.Env):
-    """One aircraft. `gym.make("quadrl/Hover-v0")`.
+class QuadrotorEnv(_Shared, gym.Env):
+    """One aircraft: `gym.make("quadrl/Hover-v0")`.
 
-    `gym.make` keeps its argument `max_episode_steps` to itself, for a TimeLimit that knows nothing
-    of success: give `horizon` [s] instead.
+    `gym.make` keeps its argument `max_episode_steps` for a TimeLimit wrapper that knows nothing of
+    success: give the task's option `time_limit` [s] instead.
     """
 
-    def __init__(self, task: str | Task = "hover", **settings: Any) -> None:  # noqa: ANN401
+    def __init__(self, task: str | Task = "hover", **settings: Any) -> None:
         """Make the environment.
 
         Args:
             task: A name of the catalogue or a task.
-            **settings: `vehicle` (None: the paper's); `action` (what actions mean: "rotor", or
-                another name of `quadrl.interfaces.INTERFACES`); `max_episode_steps` (None: the
-                task's horizon); `render_mode` (None or "rgb_array"), `width` and `height`
-                [pixels] and `camera` (a camera of `quadrl.rendering`) of a picture;
-                `reward_terms` (True: in `info`); any field of the task.
-
-        Raises:
-            OptionError: Unknown task, interface, option or render mode; the message lists what
-                there is.
+            **settings: Those of `quadrl.envs.common.make`; `reward_terms` (whether `info` holds
+                them); `render_mode` (None or "rgb_array"), `width`, `height` [pixels] and `camera`
+                (a name of `quadrl.rendering`) of a picture.
         """
-        self.observation_space, self.action_space = self._make(task, None, **settings)
+        settings = {"num_threads": 1} | settings
+        self.observation_space, self.action_space = self._make(task, 1, **settings)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, Info]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:
         """Begin an episode; a seed starts the sequence of episodes anew."""
+        if seed is not None:
+            self.environment.seed(seed)
         super().reset(seed=seed)
-        self.environment.generators = [self.np_random]
-        return self.environment.flatten(self.environment.reset()), {}
+        return self.environment.flatten(self.environment.reset())[0], {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Fly one control step.
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, Info]:
+        """Fly one control step; an action (k,) that is not finite raises a QuadrlError."""
+        # An array needs no copy for its leading axis; anything else is the environment's to judge.
+        now = self.environment.step(action[None] if isinstance(action, np.ndarray) else (action,))
+        observation = self.environment.flatten(now.observation)[0]
+        info = _of_one(self._values(now))
+        return observation, now.reward.item(), now.terminated.item(), now.truncated.item(), info
 
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite.
-        """
-        now = self.environment.step(action)
-        info: Info = {
-            "is_success": bool(now.is_success),
-            "error": float(now.error),
-            "diverged": bool(now.diverged),
-        }
-        if self._terms_wanted:
-            info["reward_terms"] = {name: float(term) for name, term in now.reward_terms.items()}
-        observation = self.environment.flatten(now.observation)
-        return observation, float(now.reward), bool(now.terminated), bool(now.truncated), info
-
-    def render(self) -> np.ndarray | None:
-        """The current picture (height, width, 3) uint8, or None without a render mode.
-
-        Raises:
-            RenderingUnavailable: There is nothing to draw with.
-        """
-        return None if self.render_mode is None else self._frame()
+    def render(self) -> Array | None:
+        """The current picture (height, width, 3) uint8, or None without a render mode."""
+        return None if self.render_mode is None else self._pictures.frame()
 
     def close(self) -> None:
         """Free the renderer."""
-        self._close()
+        self._pictures.close()
 
 
-class QuadrotorVectorEnv(_Door, VectorEnv):
-    """Many aircraft on all cores. `gym.make_vec("quadrl/Hover-v0", num_envs=1024)`.
+class QuadrotorVectorEnv(_Shared, VectorEnv):
+    """Many aircraft on all cores: `gym.make_vec("quadrl/Hover-v0", num_envs=1024)`.
 
-    Autoreset as Gymnasium's SyncVectorEnv has it: NEXT_STEP (default; the step after an end ignores
-    the row's action, resets it and gives reward 0), SAME_STEP (the end's own observation and info
-    are `info["final_obs"]` and `info["final_info"]`), or DISABLED (reset with
-    `options={"reset_mask": mask}`). `info["_name"]` says which rows `info["name"]` holds for.
+    Autoreset follows Gymnasium's SyncVectorEnv. NEXT_STEP (default): the step after an end ignores
+    the row's action, resets the row and gives it reward 0. SAME_STEP: `info["final_obs"]` and
+    `info["final_info"]` hold the end's own observation and info. DISABLED: reset with
+    `options={"reset_mask": mask}`. `info["_name"]` masks the rows that `info["name"]` holds for.
     TorchRL's GymWrapper takes DISABLED, and SAME_STEP with `reward_terms=False`: it cannot read an
     info within an info.
     """
@@ -171,122 +120,80 @@ class QuadrotorVectorEnv(_Door, VectorEnv):
         num_envs: int = 1,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        **settings: Any,  # noqa: ANN401
+        **settings: Any,
     ) -> None:
-        """Make the environments.
-
-        Args:
-            task: A name of the catalogue or a task.
-            num_envs: N.
-            autoreset_mode: Or its name.
-            **settings: As `QuadrotorEnv` has them, and `num_threads` (0: every core).
-
-        Raises:
-            OptionError: Unknown task, interface, option or mode, or an impossible number of
-                environments.
-        """
+        """Make N environments; `autoreset_mode` may be a name, settings are those above."""
         modes = {mode.value: mode for mode in AutoresetMode} | dict(AutoresetMode.__members__)
         if not isinstance(autoreset_mode, AutoresetMode):
-            check_choices([autoreset_mode], modes, "autoreset mode")
-            autoreset_mode = modes[autoreset_mode]
-        self.single_observation_space, self.single_action_space = self._make(
-            task, num_envs, **settings
-        )
+            autoreset_mode = modes[validation.choice("autoreset_mode", autoreset_mode, modes)]
+        single = self._make(task, num_envs, **settings)
         self.num_envs, self.autoreset_mode = num_envs, autoreset_mode
         self.metadata = self.metadata | {"autoreset_mode": autoreset_mode}
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.single_observation_space, self.single_action_space = single
+        self.observation_space, self.action_space = (batch_space(s, num_envs) for s in single)
+        self._observation = np.zeros((num_envs, self.environment.size), np.float32)
+        self._resting = np.zeros(num_envs, dtype=bool)  # NEXT_STEP: reset at the next step
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, Info]:
-        """Begin episodes, in all environments or in those of `options["reset_mask"]`.
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:
+        """Begin episodes in the rows of `options["reset_mask"]` (N,) bool, by default in all.
 
-        Environment i is seeded with seed + i.
+        Row i is seeded with seed + i.
         """
-        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
-        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
-            raise OptionError(f"reset_mask: bool of shape ({self.num_envs},), some of it True")
+        rows = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if rows.dtype != bool or rows.shape != (self.num_envs,) or not rows.any():
+            allowed = f"an array of {self.num_envs} bool, at least one of them True"
+            raise QuadrlError(name="reset_mask", value=rows, allowed=allowed)
         if seed is not None:
-            check_seed(seed)
-            for i in np.flatnonzero(mask):
-                self.environment.generators[i] = np.random.default_rng(seed + int(i))
-        if mask.all():
-            self._observation = self.environment.flatten(self.environment.reset())
-            self._over = np.zeros(self.num_envs, dtype=bool)
-        else:
-            self._renew(mask)
+            self.environment.seed(seed, rows)
+        self._begin(rows)
         return self._observation.copy(), {}
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Fly one control step in every environment.
-
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite.
-        """
-        now = self.environment.step(actions)
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Info]:
+        """Fly one control step in every row; actions (N, k)."""
+        now, mode = self.environment.step(actions), self.autoreset_mode
         self._observation = self.environment.flatten(now.observation)
-        reward, terminated, truncated = now.reward, now.terminated, now.truncated
-        last, self._over = self._over, np.logical_or(terminated, truncated)
-        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over.any():
-            over = self._over.copy()
+        resting, flown = self._resting, ~self._resting
+        reward = np.where(flown, now.reward, 0.0)
+        terminated, truncated = now.terminated & flown, now.truncated & flown
+        ended, values = terminated | truncated, self._values(now)
+        if mode == AutoresetMode.SAME_STEP and ended.any():
             final = np.full(self.num_envs, None, dtype=object)
-            for i in np.flatnonzero(over):
+            for i in np.flatnonzero(ended):
                 final[i] = self._observation[i].copy()
-            info = self._info(now, ~over) | {"final_obs": final, "_final_obs": over}
-            info |= {"final_info": self._info(now, over), "_final_info": over.copy()}
-            self._renew(over)
-        elif self.autoreset_mode == AutoresetMode.NEXT_STEP and last.any():
-            info = self._info(now, ~last)
-            reward = np.where(last, 0.0, reward)
-            terminated, truncated = terminated & ~last, truncated & ~last
-            self._renew(last)
+            info = _masked(values, ~ended) | {"final_obs": final, "_final_obs": ended}
+            info |= {"final_info": _masked(values, ended), "_final_info": ended.copy()}
+            self._begin(ended)
         else:
-            info = self._info(now, np.ones(self.num_envs, dtype=bool))
+            info = _masked(values, flown)
+            if resting.any():
+                self._begin(resting)
+            self._resting = ended & (mode == AutoresetMode.NEXT_STEP)
         return self._observation.copy(), reward, terminated, truncated, info
 
-    def _info(self, now: Transition, rows: np.ndarray) -> Info:
-        """A step's info for `rows` (N,) bool: an array a name, 0 elsewhere, and a mask a name."""
-
-        def masked(**values: np.ndarray) -> Info:
-            arrays = {k: np.where(rows, value, np.zeros_like(value)) for k, value in values.items()}
-            return arrays | {f"_{name}": rows.copy() for name in values}
-
-        info = masked(is_success=now.is_success, error=now.error, diverged=now.diverged)
-        if self._terms_wanted:
-            info |= {"reward_terms": masked(**now.reward_terms), "_reward_terms": rows.copy()}
-        return info
-
-    def _renew(self, rows: np.ndarray) -> None:
+    def _begin(self, rows: Array) -> None:
         """Begin an episode in some rows (N,) bool."""
         self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
-        self._over[rows] = False
+        self._resting = self._resting & ~rows
 
-    def render(self) -> tuple[np.ndarray, ...] | None:
+    def render(self) -> tuple[Array, ...] | None:
         """A picture (height, width, 3) uint8 of each aircraft, or None without a render mode."""
-        if self.render_mode is None:
-            return None
-        return tuple(self._frame(row) for row in range(self.num_envs))
+        rows = range(self.num_envs)
+        return None if self.render_mode is None else tuple(map(self._pictures.frame, rows))
 
-    def close_extras(self, **_: Any) -> None:  # noqa: ANN401
+    def close_extras(self, **_: Any) -> None:
         """Free the renderer."""
-        self._close()
+        self._pictures.close()
 
 
-def register_ids() -> None:
-    """Register every task of the catalogue as quadrl/<CamelCase>-v0 (idempotent)."""
-    for name in tasks.TASKS:
-        camel = "".join(word.capitalize() for word in name.split("_"))
-        if (id := f"quadrl/{camel}-v0") not in gym.registry:
-            gym.register(
-                id=id,
-                entry_point="quadrl.envs.gymnasium:QuadrotorEnv",
-                vector_entry_point="quadrl.envs.gymnasium:QuadrotorVectorEnv",
-                kwargs={"task": name},
-                # The environment itself refuses a step before a reset and a bad action, and the
-                # tests run Gymnasium's checks: the two wrappers would only cost time.
-                order_enforce=False,
-                disable_env_checker=True,
-            )
+def _of_one(values: Info) -> Info:
+    """The values of the only row, as Python's own numbers."""
+    return {k: _of_one(v) if isinstance(v, dict) else v.item() for k, v in values.items()}
+
+
+def _masked(values: Info, rows: Array) -> Info:
+    """Arrays (N,), 0 outside of `rows` (N,) bool, and a mask per name."""
+    info: Info = {f"_{name}": rows.copy() for name in values}
+    for name, value in values.items():
+        nested = isinstance(value, dict)
+        info[name] = _masked(value, rows) if nested else np.where(rows, value, np.zeros_like(value))
+    return info

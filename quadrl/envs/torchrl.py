@@ -1,11 +1,14 @@
-"""Door three: a batched TorchRL environment.
+"""TorchRL: a batched environment. It needs torch, so `import quadrl` leaves it out."""
 
-Not imported with `import quadrl`, since it needs torch.
-"""
+# ruff: noqa: E402 - triton is shielded before torchrl is imported.
 
 from __future__ import annotations
 
 from typing import Any
+
+from quadrl.rendering import gl
+
+gl.shield_triton()  # torchrl imports triton, perhaps after a picture
 
 import numpy as np
 import torch
@@ -13,20 +16,17 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from quadrl import tasks
-from quadrl.environment import Environment
-from quadrl.simulation import Engine
+from quadrl.envs.common import make
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 
-FLAGS = ("done", "terminated", "truncated", "is_success")
+DONE = ("done", "terminated", "truncated")
 
 
 class QuadrotorEnv(EnvBase):
-    """N aircraft, batch size [N]; observation (N, size) float32, action (N, 4) in [-1, 1].
+    """N aircraft, batch size [N]; observation (N, size) float32, action (N, k) in [-1, 1].
 
-    Simulated on the CPU, whatever the device of the tensors. Beside the observation stand
-    `is_success`, `error` [m] and, when asked for, the named `reward_terms`.
+    Simulated on the CPU, whatever the device of the tensors. `is_success`, `error` [m] and, on
+    request, the named `reward_terms` stand beside the observation.
     """
 
     def __init__(
@@ -36,58 +36,41 @@ class QuadrotorEnv(EnvBase):
         seed: int | None = None,
         device: str | torch.device = "cpu",
         *,
-        vehicle: Vehicle | None = None,
-        action: str = "rotor",
-        num_threads: int = 0,
-        engine: Engine = "mujoco",
         reward_terms: bool = False,
-        **options: Any,  # noqa: ANN401 - of the task's own types
+        **settings: Any,
     ) -> None:
         """Make the environments.
 
         Args:
             task: A name of the catalogue or a task.
             num_envs: N.
-            seed: Aircraft i is seeded with seed + i.
+            seed: Row i is seeded with seed + i; None for one from the system.
             device: Of the tensors.
-            vehicle: The aircraft; None for the paper's.
-            action: What actions mean, a name of `quadrl.interfaces.INTERFACES`.
-            num_threads: Threads of the simulation; 0 for every core.
-            engine: "mujoco", or "flight": free flight wherever there is nothing to touch.
             reward_terms: Whether to give the named terms of the reward (they cost time).
-            **options: Fields of the task.
+            **settings: Those of `quadrl.envs.common.make`.
 
         Raises:
-            ValueError: Unknown task, interface or option, or an impossible number of environments.
+            QuadrlError: Unknown name or impossible value.
         """
-        self.environment = Environment(
-            tasks.make(task, **options),
-            num_envs=num_envs,
-            seed=seed,
-            vehicle=vehicle,
-            num_threads=num_threads,
-            engine=engine,
-            action=action,
-        )
+        self.environment = make(task, num_envs, seed=seed, **settings)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._terms = self.environment.term_names if reward_terms else ()
         shape, column = torch.Size([num_envs]), torch.Size([num_envs, 1])
         vector = torch.Size([num_envs, self.environment.size])
-        actions = torch.Size([num_envs, self.environment.interface.size])
-        parts: dict[str, Any] = {
+        actions = torch.Size([num_envs, self.environment.action_size])
+        entries: dict[str, Any] = {
             "observation": Unbounded(vector, dtype=torch.float32),
             "is_success": Binary(shape=column, dtype=torch.bool),
             "error": Unbounded(column, dtype=torch.float32),
         }
         if self._terms:
             terms = {name: Unbounded(column) for name in self._terms}
-            parts["reward_terms"] = Composite(terms, shape=shape)
-        self.observation_spec = Composite(parts, shape=shape).to(self.device)
+            entries["reward_terms"] = Composite(terms, shape=shape)
+        done = {flag: Binary(shape=column, dtype=torch.bool) for flag in DONE}
+        self.observation_spec = Composite(entries, shape=shape).to(self.device)
         self.action_spec = Bounded(-1.0, 1.0, actions, dtype=torch.float32).to(self.device)
         self.reward_spec = Unbounded(column, dtype=torch.float32).to(self.device)
-        self.done_spec = Composite(
-            {flag: Binary(shape=column, dtype=torch.bool) for flag in FLAGS[:3]}, shape=shape
-        ).to(self.device)
+        self.done_spec = Composite(done, shape=shape).to(self.device)
         self._restored = False
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
@@ -95,21 +78,22 @@ class QuadrotorEnv(EnvBase):
         self._observation = self.environment.flatten(self.environment.restore(saved))
         self._restored = True
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:  # noqa: ANN401
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None and not mask.all():
             rows = mask.reshape(-1).cpu().numpy()
             self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
         elif not self._restored:
             self._observation = self.environment.flatten(self.environment.reset())
-        flags = {flag: torch.zeros(self.num_envs, 1, dtype=torch.bool) for flag in FLAGS}
+        flags = {name: torch.zeros(self.num_envs, 1, dtype=torch.bool) for name in DONE}
+        flags["is_success"] = torch.zeros_like(flags["done"])
         zeros = {name: torch.zeros(self.num_envs, 1) for name in ("error", *self._terms)}
         return self._pack(flags | {"error": zeros.pop("error")}, zeros)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Begin anew where episodes are over.
 
-        It gives what EnvBase gives, whose generality would cost more than the whole step.
+        The result is that of EnvBase, whose generality would cost more than the whole step.
         """
         over = tensordict.get("done")
         values = dict(tensordict.items())

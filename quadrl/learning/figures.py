@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -13,8 +15,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from quadrl.errors import QuadrlError
-from quadrl.learning.evaluate import Record
+from quadrl.learning.folder import METRICS, read_config
 from quadrl.policy import write_whole
+from quadrl.rollout import Rollout
+from quadrl.validation import choice
+
+Metrics = dict[str, np.ndarray]
+"""Columns of a metrics.csv, (iterations,) each; missing values are NaN."""
 
 STYLE = {
     "blue": "#2a6fbb",
@@ -30,8 +37,8 @@ PANELS = {
     "error": ("error [m]", "orange"),
 }
 """Of a learning curve: column of metrics.csv, label and colour."""
-COLOURS = {"ppo": "blue", "trpo": "orange", "gae": "green"}
-"""Of the algorithms; another gets one that is left."""
+COLOURS = {"ppo": "blue", "trpo": "orange", "vpg": "green"}
+"""Of the algorithms; others get the remaining ones."""
 CLOCKS = {
     "steps": ("control steps [thousands]", 1e-3),
     "seconds": ("wall clock of the training [s]", 1.0),
@@ -40,43 +47,52 @@ CLOCKS = {
 CURVE_POINTS = 200
 
 
-class FigureError(QuadrlError):
-    """A plot of something that is not there."""
-
-
-def read_metrics(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a metrics.csv, (iterations,) each; what is missing is not a number.
+def read_metrics(path: Path) -> Metrics:
+    """The columns of a metrics.csv.
 
     Raises:
-        FigureError: There is none, or nothing in it, or something else.
+        QuadrlError: The file is missing, empty or malformed.
     """
     if not path.is_file():
-        raise FigureError(f"nothing to plot: there is no {path}")
+        raise QuadrlError(f"nothing to plot: there is no {path}")
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
     if not rows:
-        raise FigureError(f"nothing to plot yet: {path} has no rows")
+        raise QuadrlError(f"nothing to plot yet: {path} has no rows")
     try:
         metrics = {
             name: np.array([float(row[name]) if row[name] else np.nan for row in rows])
             for name in rows[0]
         }
     except (TypeError, ValueError) as error:
-        raise FigureError(f"{path} holds something that is no number: {error}") from error
+        raise QuadrlError(f"{path} is malformed: {error}") from error
     if missing := {"steps", "seconds", *PANELS, "survival"} - set(metrics):
-        raise FigureError(f"{path} has no column {', '.join(sorted(missing))}")
+        raise QuadrlError(f"{path} has no column {', '.join(sorted(missing))}")
     return metrics
 
 
-def learning_curve(metrics: dict[str, np.ndarray], title: str, path: Path) -> Path:
-    """Return, success and error over the steps of a training; figure 3 of the paper."""
-    figure, axes = _figure(3, (8.0, 7.2), sharex=True)
+def draw_learning_curve(folder: Path, path: Path) -> Path:
+    """Draw the learning curve of a run folder.
+
+    Raises:
+        QuadrlError: The folder holds no run that has begun.
+    """
+    config = read_config(folder)
+    title = f"{config['task']}, {str(config['algo']).upper()}, seed {config['seed']}"
+    return learning_curve(read_metrics(folder / METRICS), title, path)
+
+
+def learning_curve(metrics: Metrics, title: str, path: Path) -> Path:
+    """Draw return, success and error over the steps of a training; figure 3 of the paper."""
+    figure = Figure(figsize=(8.0, 7.2), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True)
     steps = metrics["steps"] / 1e3
     for axis, (name, (label, colour)) in zip(axes, PANELS.items(), strict=True):
         ended = np.isfinite(metrics[name])  # in some batches no episode ends
         axis.plot(steps[ended], metrics[name][ended], color=STYLE[colour], lw=2, label=name)
         axis.set_ylabel(label)
         axis.set_ylim(bottom=0 if name != "return" else None)
+        _tidy(axis)
     ended = np.isfinite(metrics["survival"])
     survival = metrics["survival"][ended]
     axes[1].plot(steps[ended], survival, color=STYLE["grey"], lw=1.5, label="survival")
@@ -86,18 +102,18 @@ def learning_curve(metrics: dict[str, np.ndarray], title: str, path: Path) -> Pa
     axes[-1].set_xlabel("control steps [thousands], actions sampled from the policy")
     top = axes[0].secondary_xaxis("top", functions=_steps_to_seconds(steps, metrics["seconds"]))
     top.set_xlabel("wall clock [s]")
-    return _write(figure, path)
+    return save(figure, path)
 
 
 def learning_curves(
-    groups: Mapping[str, Sequence[dict[str, np.ndarray]]],
+    groups: Mapping[str, Sequence[Metrics]],
     title: str,
     path: Path,
     clocks: Sequence[str] = ("steps", "seconds"),
 ) -> Path:
-    """Return and success of several trainings over each other; figures 3 to 5 of the paper.
+    """Draw return and success of several trainings over each other; figures 3 to 5 of the paper.
 
-    Of each algorithm the median over its runs is drawn, and the band from the worst to the best.
+    Of each algorithm it shows the median over its runs, and the band from the worst to the best.
 
     Args:
         groups: The metrics of the runs of each algorithm.
@@ -106,49 +122,44 @@ def learning_curves(
         clocks: Of CLOCKS, a column each.
 
     Raises:
-        FigureError: No episode has ended in any of the runs.
+        QuadrlError: No episode has ended in any of the runs.
     """
-    figure = Figure(figsize=(4.6 * max(len(clocks), 2), 5.4), layout="constrained")
     panels = ("return", "success")
     # With one clock the panels stand side by side.
-    shape = (len(panels), len(clocks)) if len(clocks) > 1 else (1, len(panels))
-    axes = figure.subplots(*shape, squeeze=False)
-    if len(clocks) == 1:
-        figure.set_size_inches(9.2, 3.2)
-        axes = axes.T
+    one = len(clocks) == 1
+    size, shape = ((9.2, 3.2), (1, 2)) if one else ((4.6 * len(clocks), 5.4), (2, len(clocks)))
+    figure = Figure(figsize=size, layout="constrained")
+    grid: Any = figure.subplots(*shape, squeeze=False)
+    axes = grid.T if one else grid
     spare = iter(name for name in STYLE if name not in COLOURS.values())
     drawn = False
     for algo, runs in groups.items():
         colour = STYLE[COLOURS[algo] if algo in COLOURS else next(spare, "grey")]
-        number = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
-        for column, clock in enumerate(clocks):
-            for row, panel in enumerate(panels):
-                band = spread(runs, panel, clock)
-                if band is None:
-                    continue
-                drawn = drawn or panel == "return"
-                x, (low, median, high) = band[0] * CLOCKS[clock][1], band[1]
-                axis = axes[row, column]
-                axis.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
-                axis.plot(x, median, color=colour, lw=1.8, label=f"{algo.upper()}, {number}")
-                axis.set_ylabel("return of an episode" if panel == "return" else "success [share]")
-                axis.set_xlabel(CLOCKS[clock][0])
+        label = f"{algo.upper()}, {len(runs)} seed{'s' * (len(runs) > 1)}"
+        cells = itertools.product(enumerate(panels), enumerate(clocks))
+        for (row, panel), (column, clock) in cells:
+            if (band := spread(runs, panel, clock)) is None:
+                continue
+            drawn = drawn or panel == "return"
+            x, (low, median, high) = band[0] * CLOCKS[clock][1], band[1]
+            axis = axes[row, column]
+            axis.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
+            axis.plot(x, median, color=colour, lw=1.8, label=label)
+            axis.set_ylabel("return of an episode" if panel == "return" else "success [share]")
+            axis.set_xlabel(CLOCKS[clock][0])
     if not drawn:
-        raise FigureError(f"nothing to plot yet for {title}: no episode has ended")
+        raise QuadrlError(f"nothing to plot yet for {title}: no episode has ended")
     for axis in axes.flat:
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+        _tidy(axis)
         axis.set_xlim(left=0)
     for axis in axes[1]:
         axis.set_ylim(-0.03, 1.03)
     axes[0, 0].legend(frameon=False, loc="best")
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
-    return _write(figure, path)
+    return save(figure, path)
 
 
-def spread(
-    runs: Sequence[dict[str, np.ndarray]], name: str, clock: str
-) -> tuple[np.ndarray, np.ndarray] | None:
+def spread(runs: Sequence[Metrics], name: str, clock: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Worst, median and best (3, n) of a column over runs, and where (n,); None without any.
 
     The points lie where every run has been; between the batches in which episodes ended a run is
@@ -169,107 +180,65 @@ def spread(
     return points, np.quantile(values, (0.0, 0.5, 1.0), axis=0)
 
 
-def lines(
-    panels: Mapping[str, Mapping[str, tuple[Sequence[float], np.ndarray]]],
-    labels: tuple[str, str],
-    title: str,
-    path: Path,
-    *,
-    logarithmic: bool = False,
-) -> Path:
-    """Figures over something, with the spread over seeds, a panel each.
-
-    Args:
-        panels: Of each panel by its title, by the name of the line: where (n,), and the values of
-            the seeds (seeds, n). The name begins with the algorithm; dashed if it ends in
-            "sampled", in grey if it is no algorithm.
-        labels: Of the axes.
-        title: Of the picture.
-        path: The picture.
-        logarithmic: Whether the values are.
-    """
-    figure = Figure(figsize=(3.6 * len(panels), 3.3), layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axis, (name, drawn) in zip(axes, panels.items(), strict=True):
-        for label, (x, values) in drawn.items():
-            colour = STYLE[COLOURS.get(label.split()[0].lower(), "grey")]
-            dashes = "--" if label.endswith("sampled") else "-"
-            known = values[np.isfinite(values).all(axis=1)]
-            if len(known):
-                low, median, high = np.quantile(known, (0.0, 0.5, 1.0), axis=0)
-                axis.fill_between(x, low, high, color=colour, alpha=0.12, lw=0)
-                axis.plot(x, median, dashes, color=colour, lw=1.6, label=label)
-        axis.set_title(name, fontsize=10)
-        axis.set_xlabel(labels[0])
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
-        if logarithmic:
-            axis.set_yscale("log")
-    axes[0].set_ylabel(labels[1])
-    handles = {  # a line that one panel lacks is in another
-        label: handle
-        for axis in axes
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
-    if handles:
-        figure.legend(
-            handles.values(),
-            handles,
-            loc="outside lower center",
-            ncols=4,
-            frameon=False,
-            fontsize=8,
-        )
-    figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
-    return _write(figure, path)
-
-
-def trajectory(record: Record, title: str, path: Path, episodes: int = 8) -> Path:
-    """Flights in space and by axis, with what was to be reached; figure 6 of the paper."""
+def trajectory(rollout: Rollout, title: str, path: Path, episodes: int = 8) -> Path:
+    """Draw flights in space and by axis, with their goal; figure 6 of the paper."""
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.25, 1))
-    space = figure.add_subplot(grid[:, 0], projection="3d")
+    space: Any = figure.add_subplot(grid[:, 0], projection="3d")
     rows = [figure.add_subplot(grid[k, 1]) for k in range(4)]
-    shown = min(episodes, record.position.shape[1])
+    shown = min(episodes, rollout.position.shape[1])
     colours = [STYLE[name] for name in ("blue", "orange", "green", "violet")]
-    time = np.arange(1, len(record.error) + 1) * record.control_step
+    time = np.arange(1, len(rollout.error) + 1) * rollout.control_timestep
     for i in range(shown):
         colour = colours[i % len(colours)]
-        x, y, z = record.position[:, i].T
+        x, y, z = rollout.position[:, i].T
         space.plot(x, y, z, color=colour, lw=1.4, alpha=0.9)
         space.scatter(x[:1], y[:1], z[:1], color=colour, s=18, marker="o")
         for k, axis in enumerate(rows[:3]):
-            axis.plot(time, record.position[:, i, k], color=colour, lw=1.2, alpha=0.85)
-        rows[3].semilogy(time, np.maximum(record.error[:, i], 1e-4), color=colour, lw=1.2)
-    goal = record.goal[:, 0]
+            axis.plot(time, rollout.position[:, i, k], color=colour, lw=1.2, alpha=0.85)
+        rows[3].semilogy(time, np.maximum(rollout.error[:, i], 1e-4), color=colour, lw=1.2)
+    goal = rollout.goal[:, 0]
     space.plot(*goal.T, color="black", lw=1, ls="--")
     space.scatter(*goal[:1].T, color="black", marker="*", s=120, label="goal")
     for k, (axis, name) in enumerate(zip(rows, ("x", "y", "z", "error"), strict=True)):
         axis.set_ylabel(f"{name} [m]")
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+        _tidy(axis)
         if k < 3:
             axis.plot(time, goal[:, k], color="black", lw=1, ls="--")
             axis.tick_params(labelbottom=False)
     rows[3].set_xlabel("time [s]")
     space.set(xlabel="x east [m]", ylabel="y north [m]", zlabel="z up [m]")
-    _equal_axes(space, record.position[:, :shown], goal)
+    _equal_axes(space, rollout.position[:, :shown], goal)
     space.legend(frameon=False, loc="upper left")
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
-    return _write(figure, path)
+    return save(figure, path)
 
 
-def _figure(rows: int, size: tuple[float, float], sharex: bool) -> tuple[Figure, Sequence]:
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(rows, 1, sharex=sharex)
-    for axis in axes:
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
-    return figure, axes
+def save(figure: Figure, path: Path) -> Path:
+    """Write a picture, whole or not at all; its kind is what the name ends in.
+
+    Raises:
+        QuadrlError: The name ends in no kind of picture.
+    """
+    kinds = FigureCanvasAgg(figure).get_supported_filetypes()
+    kind = choice(f"ending of {path}", path.suffix.removeprefix(".").lower(), sorted(kinds))
+    picture = io.BytesIO()
+    # Neither the date nor random names: the same metrics make the same file.
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    with matplotlib.rc_context({"svg.hashsalt": "quadrl"}):
+        figure.savefig(picture, dpi=DPI, format=kind, metadata=undated)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, picture.getvalue())
+    return path
+
+
+def _tidy(axis: Any) -> None:
+    axis.grid(alpha=0.25)
+    axis.spines[["top", "right"]].set_visible(False)
 
 
 def _steps_to_seconds(steps: np.ndarray, seconds: np.ndarray) -> tuple:
-    """The two directions between the axes below and above; both grow with the iterations."""
+    """The functions from the lower axis to the upper one and back; both grow with iterations."""
     x, y = np.concatenate([[0.0], steps]), np.concatenate([[0.0], seconds])
     slope = (y[-1] / x[-1]) if x[-1] else 1.0
     forward = lambda s: np.where(s > x[-1], s * slope, np.interp(s, x, y))  # noqa: E731
@@ -277,26 +246,11 @@ def _steps_to_seconds(steps: np.ndarray, seconds: np.ndarray) -> tuple:
     return forward, backward
 
 
-def _equal_axes(axis: object, *points: np.ndarray) -> None:
+def _equal_axes(axis: Any, *points: np.ndarray) -> None:
     """The same scale on every axis, so that a path keeps its shape."""
     everything = np.concatenate([p.reshape(-1, 3) for p in points])
     low, high = np.nanmin(everything, 0), np.nanmax(everything, 0)
     centre, half = (low + high) / 2, max((high - low).max() / 2, 0.1) * 1.05
     for k, name in enumerate("xyz"):
         getattr(axis, f"set_{name}lim")(centre[k] - half, centre[k] + half)
-    axis.set_box_aspect((1, 1, 1))  # type: ignore[attr-defined]
-
-
-def _write(figure: Figure, path: Path) -> Path:
-    kinds = FigureCanvasAgg(figure).get_supported_filetypes()
-    kind = path.suffix.removeprefix(".").lower()
-    if kind not in kinds:
-        raise FigureError(f"{path}: a picture's name ends in one of .{', .'.join(sorted(kinds))}")
-    picture = io.BytesIO()
-    # Neither the date nor names drawn at random: the same figures make the same file.
-    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with matplotlib.rc_context({"svg.hashsalt": "quadrl"}):
-        figure.savefig(picture, dpi=DPI, format=kind, metadata=undated)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, picture.getvalue())
-    return path
+    axis.set_box_aspect((1, 1, 1))

@@ -1,17 +1,13 @@
-"""The one training loop: collect, estimate advantages, let the algorithm learn, write it down.
+"""The training loop: collect, estimate advantages, let the algorithm learn, write it down.
 
-A run is a folder. Everything that the next iteration depends on (networks, optimiser, normaliser,
+A run is a folder. Everything that the next iteration depends on (networks, optimisers, normaliser,
 generators, the simulated aircraft) stands in its checkpoint, so a run that was killed at any
-moment goes on and ends with the same policy, bit for bit.
+moment continues and ends with the same policy, bit for bit.
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import fcntl
-import io
-import json
 import os
 import time
 import warnings
@@ -24,12 +20,14 @@ import numpy as np
 import torch
 
 from quadrl.envs.torchrl import QuadrotorEnv
+from quadrl.errors import QuadrlError
 from quadrl.learning import checkpoint
-from quadrl.learning.config import CONFIG, RunError, TrainConfig, new_folder, write_text
-from quadrl.learning.gae import GAE as PolicyGradient
-from quadrl.learning.policy import export, make_actor_critic
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.folder import CONFIG, Log, lock_folder, new_folder, write_json
+from quadrl.learning.networks import export, make_actor_critic
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
+from quadrl.learning.vpg import VPG
 from quadrl.policy import FILE as POLICY_FILE
 from quadrl.policy import Policy
 from quadrl.vehicle import VEHICLES
@@ -40,15 +38,13 @@ with warnings.catch_warnings():
     from torchrl.collectors import Collector
     from torchrl.objectives.value import GAE
 
-METRICS = "metrics.csv"
-EVENTS = "events"
 SEED_STRIDE = 1 << 20
 """Distance between the aircraft's seeds of two trainings: the most aircraft that there can be."""
-ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "gae": PolicyGradient}
+ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "vpg": VPG}
 
 
 def make_collector(env: QuadrotorEnv, actor: torch.nn.Module, frames: int) -> Collector:
-    """TorchRL's collector without what a training does not use: batches of `frames` steps."""
+    """TorchRL's collector of batches of `frames` steps, without what a training does not use."""
     return Collector(
         env,
         actor,
@@ -63,39 +59,38 @@ def make_collector(env: QuadrotorEnv, actor: torch.nn.Module, frames: int) -> Co
 
 @dataclasses.dataclass
 class Progress:
-    """Where a training stands, for whoever shows it."""
+    """The state of a training after an iteration."""
 
     iteration: int
     iterations: int
     steps: int
     seconds: float
-    figures: dict[str, float]
+    metrics: dict[str, float]
 
 
 class Training:
     """A run in its folder."""
 
     def __init__(self, config: TrainConfig, folder: Path, *, resume: bool = False) -> None:
-        """Make everything that learns; then the folder, or take up its checkpoint when resuming.
+        """Make everything that learns; then make the folder, or load its checkpoint.
 
         Raises:
-            RunError: The folder cannot be used.
+            QuadrlError: The folder cannot be used.
         """
         self.config, self.folder = config, folder
         torch.manual_seed(config.seed)
         self.env = QuadrotorEnv(
-            config.task,
+            config.make_task(),
             config.num_envs,
             seed=config.seed * SEED_STRIDE,
             vehicle=VEHICLES[config.vehicle],
-            action=config.action,
+            control_mode=config.control_mode,
             num_threads=config.num_threads,
             engine=config.engine,
-            **config.options,
         )
         self.actor, self.critic, self.normaliser = make_actor_critic(
             self.env.environment.size,
-            self.env.environment.interface.size,
+            self.env.environment.action_size,
             hidden=config.hidden,
             critic_hidden=config.critic_hidden,
             initial_deviation=config.initial_deviation,
@@ -111,32 +106,34 @@ class Training:
         )
         self.iteration = 0
         self.seconds = 0.0  # of training, in all processes that worked on it
-        self._running = {
-            "return": np.zeros(config.num_envs),
-            "length": np.zeros(config.num_envs),
-        }
+        self._running = {name: np.zeros(config.num_envs) for name in ("return", "length")}
         self._generator_state: torch.Tensor | None = None
         if not resume:
             new_folder(folder)
-        self._unlock = weakref.finalize(self, os.close, _lock(folder))
+        self._unlock = weakref.finalize(self, os.close, lock_folder(folder))
         if not resume:
-            write_text(folder / CONFIG, json.dumps(config.resolved(), indent=2))
+            write_json(folder / CONFIG, config.resolved())
         elif any((folder / name).exists() for name in (checkpoint.CHECKPOINT, POLICY_FILE)):
             # Without either, it was stopped before the first checkpoint.
             try:
                 self._restore()
-            except RunError:
+            except QuadrlError:
                 self._unlock()
                 raise
+
+    @property
+    def steps(self) -> int:
+        """Control steps of all aircraft so far."""
+        return self.iteration * self.config.num_envs * self.config.rollout
 
     def run(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> Policy:
         """Train to the end, and save the policy.
 
         Returns:
-            The policy that was saved.
+            The saved policy.
 
         Raises:
-            RunError: A weight is no longer a finite number.
+            QuadrlError: A weight is no longer finite.
         """
         try:
             return self._run(on_progress)
@@ -150,35 +147,33 @@ class Training:
         collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
         if self._generator_state is not None:
             torch.set_rng_state(self._generator_state)
-        # Nets this small gain nothing from a second thread and lose a lot when a core is taken, and
-        # with one the numbers are the same on any number of cores.
+        # Networks this small gain nothing from a second thread and lose a lot when a core is busy,
+        # and with one the results are the same on any number of cores.
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
-        log = _Log(self.folder, self.iteration)
-        started, begun_at, saved_at = time.perf_counter(), self.seconds, time.perf_counter()
-        batches = iter(collector)
+        log = Log(self.folder, self.iteration)
+        started = saved = time.perf_counter()
+        before, batches = self.seconds, iter(collector)
         try:
             while self.iteration < config.iterations:
-                figures = self._learn(next(batches))
+                metrics = self._learn(next(batches))
                 self.iteration += 1
-                self.seconds = begun_at + time.perf_counter() - started
-                steps = self.iteration * config.num_envs * config.rollout
+                now = time.perf_counter()
+                self.seconds = before + now - started
                 if not all(weight.isfinite().all() for weight in self.algorithm.parameters):
-                    raise RunError(
-                        f"the training diverged after {steps} steps: a weight is no longer finite; "
-                        "lower the learning rate and start a new run"
+                    raise QuadrlError(
+                        f"the training diverged after {self.steps} steps: a weight is no longer "
+                        "finite; lower the learning rate and start a new run"
                     )
-                log.write(self.iteration, steps, self.seconds, figures)
-                on_progress(
-                    Progress(self.iteration, config.iterations, steps, self.seconds, figures)
-                )
-                last = self.iteration == config.iterations
-                if last or time.perf_counter() - saved_at > config.checkpoint_seconds:
+                log.write(self.iteration, self.steps, self.seconds, metrics)
+                progress = (self.iteration, config.iterations, self.steps, self.seconds, metrics)
+                on_progress(Progress(*progress))
+                if self.iteration == config.iterations or now - saved > config.checkpoint_seconds:
                     self.save()
-                    saved_at = time.perf_counter()
+                    saved = time.perf_counter()
             policy = self.policy()
             policy.save(self.folder / POLICY_FILE)
-            self.seconds = begun_at + time.perf_counter() - started
+            self.seconds = before + time.perf_counter() - started
         finally:
             log.close()
             torch.set_num_threads(threads)
@@ -186,70 +181,66 @@ class Training:
         return policy
 
     def policy(self) -> Policy:
-        """The policy as it stands."""
+        """The policy at this moment."""
         config = self.config
         metadata = {
             "algo": config.algo,
             "seed": config.seed,
-            "steps": self.iteration * config.num_envs * config.rollout,
+            "steps": self.steps,
             "vehicle": config.vehicle,
-            "action": config.action,
-            "task_options": config.options,
+            "rotors": VEHICLES[config.vehicle].rotor_count,
+            "control_mode": config.control_mode,
+            "task_options": config.task_options,
         }
         return export(self.actor, config.task, metadata)
 
     def _learn(self, batch: Any) -> dict[str, float]:
         """One iteration on a batch (aircraft, time)."""
-        config = self.config
-        figures = self._episodes(batch)
+        metrics = self._episodes(batch)
         with torch.no_grad():
-            if self.iteration == 0:  # before, there was nothing to normalise with
+            if self.iteration == 0:  # the first batch was collected without a normaliser
                 self.normaliser.update(batch["observation"])
                 batch["action_log_prob"] = self.actor.get_dist(batch).log_prob(batch["action"])
-            batch["next", "reward"] *= config.reward_scale
+            batch["next", "reward"] *= self.config.reward_scale
             self.advantages(batch)
         flat = batch.select(
             "observation", "action", "action_log_prob", "loc", "scale", "advantage", "value_target"
         ).reshape(-1)
-        remaining = 1 - self.iteration / config.iterations
-        figures |= self.algorithm.update(flat, remaining)
+        metrics |= self.algorithm.update(flat, 1 - self.iteration / self.config.iterations)
         if self.iteration > 0:
             self.normaliser.update(batch["observation"])
-        figures["deviation"] = float(batch["scale"].mean())
-        return figures
+        return metrics | {"deviation": float(batch["scale"].mean())}
 
     def _episodes(self, batch: Any) -> dict[str, float]:
         """Return, length, success and survival of the episodes that ended in the batch."""
-        ahead = batch["next"]
         names = ("reward", "done", "terminated", "is_success", "error")
-        reward, done, terminated, success, error = (ahead[name][..., 0].numpy().T for name in names)
-        returns, lengths = [], []
-        for t in range(len(reward)):
-            self._running["return"] += reward[t]
+        columns = (batch["next", name][..., 0].numpy().T for name in names)
+        reward, done, terminated, success, error = columns  # (time, aircraft)
+        ended: dict[str, list[np.ndarray]] = {name: [] for name in self._running}
+        for gained, over in zip(reward, done, strict=True):
+            self._running["return"] += gained
             self._running["length"] += 1
-            over = done[t]
-            returns.append(self._running["return"][over])
-            lengths.append(self._running["length"][over])
-            for running in self._running.values():
+            for name, running in self._running.items():
+                ended[name].append(running[over])
                 running[over] = 0.0
-        ended = np.concatenate(returns)
-        figures = {"episodes": float(len(ended)), "reward": float(reward.mean())}
-        figures["error"] = float(error.mean())
-        if len(ended):
-            figures |= {
-                "return": float(ended.mean()),
-                "length": float(np.concatenate(lengths).mean()),
+        returns, lengths = (np.concatenate(ended[name]) for name in ("return", "length"))
+        metrics = {"episodes": float(len(returns)), "reward": float(reward.mean())}
+        metrics["error"] = float(error.mean())
+        if len(returns):
+            metrics |= {
+                "return": float(returns.mean()),
+                "length": float(lengths.mean()),
                 "success": float(success[done].mean()),
                 "survival": float(1 - (terminated & ~success)[done].mean()),
             }
-        return figures
+        return metrics
 
     def save(self) -> None:
         """Write the checkpoint."""
         tensors = {
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
-            "optimiser": self.algorithm.save(),
+            "optimisers": self.algorithm.save(),
             "environment": self.env.environment.save(),
             "running": self._running,
             "generator": torch.get_rng_state(),
@@ -265,83 +256,17 @@ class Training:
         path = self.folder / checkpoint.CHECKPOINT
         tensors, numbers = checkpoint.load(path)
         try:
-            if other := self.config.difference(numbers["config"]):
-                raise RunError(
-                    f"{path} was trained with {other}: it would not end as it began; go back to "
-                    "that, or start a new run"
-                )
+            checkpoint.check_same(path, numbers["config"], self.config.resolved())
             self.actor.load_state_dict(tensors["actor"])
             self.critic.load_state_dict(tensors["critic"])
-            self.algorithm.restore(tensors.get("optimiser", {}))
-            arrays = {k: v.numpy() for k, v in tensors["environment"].items()}
-            self.env.restore(arrays)
+            self.algorithm.restore(tensors.get("optimisers", {}))
+            self.env.restore({k: v.numpy() for k, v in tensors["environment"].items()})
             self._running = {k: v.numpy().copy() for k, v in tensors["running"].items()}
             self._generator_state = tensors["generator"]
             self.iteration, self.seconds = int(numbers["iteration"]), float(numbers["seconds"])
-        except (
-            ArithmeticError,
-            AttributeError,
-            KeyError,
-            RuntimeError,
-            TypeError,
-            ValueError,
-        ) as error:
-            raise RunError(f"{path} does not fit its run: {error}") from error
-
-
-def _lock(folder: Path) -> int:
-    """Make the folder this process's own for as long as the descriptor that it returns is open.
-
-    Raises:
-        RunError: Another training works on it.
-    """
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(descriptor)
-        raise RunError(
-            f"another training works in {folder}: wait for its end or stop it, or start a new run "
-            "with another --out"
-        ) from error
-    return descriptor
-
-
-class _Log:
-    """metrics.csv and TensorBoard events; rows past the checkpoint are written anew."""
-
-    COLUMNS = (
-        "iteration", "steps", "seconds", "episodes", "return", "length", "success", "survival",
-        "reward", "error", "deviation", "critic_loss", "kl", "clip_fraction",
-    )  # fmt: skip
-
-    def __init__(self, folder: Path, iteration: int) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        path = folder / METRICS
-        kept: list[list[str]] = []
-        if path.exists():
-            with open(path, newline="") as file:
-                rows = list(csv.reader(file))[1:]
-            kept = [row for row in rows if len(row) == len(self.COLUMNS)][:iteration]
-        whole = io.StringIO(newline="")
-        csv.writer(whole).writerows([list(self.COLUMNS), *kept])
-        write_text(path, whole.getvalue())
-        self._file = open(path, "a", newline="")  # noqa: SIM115 - closed by close
-        self._writer = csv.writer(self._file)
-        self._events = SummaryWriter(str(folder / EVENTS), purge_step=iteration + 1)
-
-    def write(self, iteration: int, steps: int, seconds: float, figures: dict[str, float]) -> None:
-        known = {"iteration": iteration, "steps": steps, "seconds": round(seconds, 3)} | figures
-        self._writer.writerow([_text(known.get(name, "")) for name in self.COLUMNS])
-        self._file.flush()
-        for name, value in figures.items():
-            self._events.add_scalar(name, value, iteration)
-
-    def close(self) -> None:
-        self._file.close()
-        self._events.close()
-
-
-def _text(value: float | str) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+        except QuadrlError:
+            raise
+        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError,
+                ValueError) as error:  # fmt: skip
+            reason = str(error).partition("\n")[0]
+            raise QuadrlError(f"{path} does not fit its run: {reason}") from error

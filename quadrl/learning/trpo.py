@@ -14,6 +14,7 @@ from torch.distributions import kl_divergence
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.common import LossModule
 
+from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.config import TRPOConfig
 
 
@@ -27,7 +28,7 @@ class TRPOLoss(LossModule):
     """
 
     def __init__(self, actor_network: ProbabilisticActor, critic_network: TensorDictModule) -> None:
-        """Keep the networks; their parameters stay their own."""
+        """Keep references to the networks."""
         super().__init__()
         self.actor_network = actor_network
         self.critic_network = critic_network
@@ -62,7 +63,7 @@ def conjugate_gradients(
     Args:
         product: x (n,) to A x (n,).
         target: b (n,), float64.
-        iterations: At most so many.
+        iterations: Their largest number.
         tolerance: On the squared residual over that of b.
 
     Returns:
@@ -108,51 +109,32 @@ def fisher_product(
 
 
 def flat(tensors: Sequence[Tensor]) -> Tensor:
-    """One vector of all."""
+    """All tensors in one vector."""
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
-class TRPO:
+class TRPO(Algorithm):
     """One natural-gradient step of the policy on each batch, and a few epochs of the critic."""
 
     def __init__(
         self, actor: ProbabilisticActor, critic: TensorDictModule, config: TRPOConfig
     ) -> None:
-        """Set up the loss and the critic's optimiser."""
-        self.config = config
+        """Make the loss and the critic's optimiser."""
+        super().__init__(config)
         self.loss = TRPOLoss(actor, critic)
         self.policy = list(actor.parameters())
-        self.parameters = [*self.policy, *critic.parameters()]
-        self.optimiser = torch.optim.Adam(critic.parameters(), lr=config.critic_rate, eps=1e-5)
+        self.add_optimiser("critic", critic.parameters(), config.critic_rate)
+        self.parameters += self.policy
 
-    def update(self, batch: TensorDictBase, remaining: float) -> dict[str, float]:
-        """Learn from a batch.
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """The policy's step, then the critic's epochs."""
+        return self.natural_step(batch) | self.fit_critic(self.loss.critic_loss, batch)
 
-        Args:
-            batch: (transitions,), as `TRPOLoss` reads it; advantages normalised.
-            remaining: Share of the training that is left, 1 to 0.
-
-        Returns:
-            Figures for the log.
-        """
-        figures = self.step(batch)
-        config = self.config
-        for group in self.optimiser.param_groups:
-            group["lr"] = config.critic_rate * remaining
-        loss = torch.zeros(())
-        for _ in range(config.critic_epochs):
-            for rows in torch.randperm(len(batch)).split(config.minibatch):
-                loss = self.loss.critic_loss(batch[rows])
-                self.optimiser.zero_grad()
-                loss.backward()
-                self.optimiser.step()
-        return figures | {"critic_loss": loss.item()}
-
-    def step(self, batch: TensorDictBase) -> dict[str, float]:
+    def natural_step(self, batch: TensorDictBase) -> dict[str, float]:
         """The policy's step: natural gradient, then a line search under the KL bound.
 
-        The step is the longest of the tried ones with which the surrogate rises and the mean KL
-        divergence stays under the bound; if none does, the policy stays as it is.
+        Takes the longest of the tried steps with which the surrogate rises and the mean KL
+        divergence stays within the bound; without any, the policy stays as it is.
         """
         config = self.config
         surrogate, kl = self.loss.surrogate_and_kl(batch)
@@ -178,17 +160,6 @@ class TRPO:
 
     @torch.no_grad()
     def _set(self, vector: Tensor) -> None:
-        first = 0
-        for parameter in self.policy:
-            parameter.copy_(vector[first : first + parameter.numel()].view_as(parameter))
-            first += parameter.numel()
-
-    def save(self) -> dict[str, Any]:
-        """The critic's optimiser, by parameter and name."""
-        return {str(k): dict(v) for k, v in self.optimiser.state_dict()["state"].items()}
-
-    def restore(self, saved: dict[str, Any]) -> None:
-        """Take up what `save` gave."""
-        state = self.optimiser.state_dict()
-        state["state"] = {int(k): v for k, v in saved.items()}
-        self.optimiser.load_state_dict(state)
+        parts = vector.split([parameter.numel() for parameter in self.policy])
+        for parameter, part in zip(self.policy, parts, strict=True):
+            parameter.copy_(part.view_as(parameter))

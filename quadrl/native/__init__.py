@@ -1,10 +1,11 @@
-"""The compiled part: MuJoCo callbacks of the rotors, and the state kernel.
+"""The compiled part: MuJoCo callbacks of the rotors, free flight, the state, random numbers.
 
 The C sources beside this file are compiled at first use with the machine's own compiler against
 the headers of the installed mujoco, because they read the structs of exactly that version. The
 library is kept in a cache folder (`$QUADRL_CACHE`, else the user's cache folder), one for each
 version of mujoco, of the sources and of the flags; `$QUADRL_CFLAGS` adds flags at the end of
-these (`scripts/sanitize` does).
+these (`scripts/sanitize` does). `layout.h`, which declares a row of parameters and the rows of the
+state, is written from `quadrl.parameters` and `quadrl.state` into the build.
 """
 
 from __future__ import annotations
@@ -24,10 +25,14 @@ from pathlib import Path
 
 import mujoco
 
-from quadrl.errors import QuadrlError
+from quadrl.errors import NativeError
+from quadrl.parameters import c_structs
+from quadrl.state import c_rows
 
-SOURCES = ("callbacks.c", "flight.c", "state.c")
-HEADERS = ("equations.h",)
+SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c")
+HEADERS = ("aero.h",)
+MARK_SLOT = 9
+"""Entry of an actuator's `dynprm` that holds MARK."""
 # No contraction: a fused multiply-add would round otherwise than NumPy does.
 FLAGS = (
     "-std=c11",
@@ -49,10 +54,6 @@ _KINDS = {
     "passive": ctypes.CFUNCTYPE(None, _POINTER, _POINTER),
     "time": ctypes.CFUNCTYPE(ctypes.c_double),
 }
-
-
-class NativeError(QuadrlError, RuntimeError):
-    """The C part cannot be built, is for another mujoco, or is not installed."""
 
 
 def cache_folder() -> Path:
@@ -99,6 +100,8 @@ def build(include: Path | None = None) -> Path:
     """
     include = include or Path(mujoco.__file__).parent / "include"
     digest = hashlib.sha256(" ".join((*flags(), platform.machine(), str(include))).encode())
+    layout = c_structs() + c_rows()
+    digest.update(layout.encode())
     for name in HEADERS + SOURCES:
         digest.update((_FOLDER / name).read_bytes())
     digest.update((include / "mujoco" / "mujoco.h").read_bytes())
@@ -113,7 +116,8 @@ def build(include: Path | None = None) -> Path:
         folder = Path(tempfile.mkdtemp(prefix="quadrl-"))
         scratch = tempfile.mkdtemp(dir=folder)
     try:
-        command = [compiler(), *flags(), f"-I{include}", "-o", f"{scratch}/{name}"]
+        Path(scratch, "layout.h").write_text(layout)
+        command = [compiler(), *flags(), f"-I{include}", f"-I{scratch}", "-o", f"{scratch}/{name}"]
         command += [str(_FOLDER / source) for source in SOURCES] + ["-lm"]
         outcome = subprocess.run(command, capture_output=True, text=True)
         if outcome.returncode != 0:
@@ -141,16 +145,13 @@ def load(path: Path) -> ctypes.CDLL:
         )
     for name, kind in _KINDS.items():
         setattr(opened, name, ctypes.cast(getattr(opened, f"quadrl_{name}"), kind))
-    opened.quadrl_state.restype = ctypes.c_int64
     integer = ctypes.c_int64
-    opened.quadrl_state.argtypes = [
-        *(integer, _POINTER, _POINTER, _POINTER, _POINTER),
-        *(integer, _POINTER, ctypes.c_double, ctypes.c_double, _POINTER, integer),
-    ]
-    opened.quadrl_flight.restype = opened.quadrl_aircraft_size.restype = integer
-    opened.quadrl_flight.argtypes = [
-        *(integer, integer, integer, *[_POINTER] * 5),
-        *(integer, _POINTER, _POINTER, integer, _POINTER),
+    opened.quadrl_state.restype = opened.quadrl_free_flight.restype = integer
+    opened.quadrl_state.argtypes = [_POINTER, integer, _POINTER, _POINTER]
+    opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
+    opened.quadrl_uniform.restype = None
+    opened.quadrl_uniform.argtypes = [
+        *(integer, _POINTER, _POINTER, integer, integer, integer, _POINTER),
     ]
     return opened
 
@@ -165,17 +166,18 @@ def library() -> ctypes.CDLL:
 def _stop_clock() -> None:
     """Spare every step MuJoCo's readings of the clock, unless somebody has installed one.
 
-    Once in a process: whoever wants the durations of `mjData.timer` after that, of any model, calls
-    `mujoco.set_mjcb_time(None)`, which brings MuJoCo's own clock back. No physics depends on it.
+    Done once per process. Physics does not depend on it, but `mjData.timer` of every model then
+    shows no durations. To keep them, set `$QUADRL_KEEP_CLOCK` to 1 before the first model is made,
+    or call `mujoco.set_mjcb_time(None)` at any time.
     """
-    if mujoco.get_mjcb_time() is None:
+    if os.environ.get("QUADRL_KEEP_CLOCK", "0") in ("", "0") and mujoco.get_mjcb_time() is None:
         mujoco.set_mjcb_time(library().time)
 
 
 def install(replace: bool = False) -> None:
     """Install the rotor callbacks in this process (idempotent).
 
-    Every model that `Vehicle.compile` makes needs them; it calls this itself. A process that
+    Every model that `quadrl.mjcf` makes needs them; it calls this itself. A process that
     receives such a model from elsewhere (a spawned worker) calls it once.
 
     Args:

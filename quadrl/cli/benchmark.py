@@ -1,0 +1,43 @@
+"""`quadrl benchmark`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+from quadrl.cli.console import console, make_table, say
+from quadrl.validation import number
+
+
+@dataclasses.dataclass(frozen=True)
+class Benchmark:
+    """Measure the speed of every layer in one run, as rates and as shares of bare mj_step."""
+
+    num_envs: int = 1024
+    """Aircraft in the batch."""
+    seconds: float = 0.2
+    """Length of each measurement; short, since the speed of a machine drifts."""
+    repeats: int = 30
+    """Measurements of each layer, in turns: the fastest is the rate, the median ratio of a turn the
+    share."""
+    task: str = "hover"
+    """The task that is flown."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Measure and print."""
+        from quadrl.benchmark import benchmark, rows, summary
+
+        number("seconds", self.seconds, positive=True)
+        number("repeats", self.repeats, 1, whole=True)
+        measured = benchmark(
+            self.task, num_envs=self.num_envs, seconds=self.seconds, repeats=self.repeats
+        )
+        if self.json:
+            sys.stdout.write(json.dumps(measured) + "\n")
+            return
+        head = ("what", "control steps/s", "median", "of bare mj_step", "target")
+        console.print(make_table(head, rows(measured), numbers=4))
+        say(f"\n{summary(measured)}")

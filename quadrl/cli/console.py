@@ -1,0 +1,47 @@
+"""What the commands print with."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from quadrl.tasks import TASKS
+
+console = Console()
+own_files: list[Path] = []
+"""The files named by `--import`."""
+
+
+def say(text: str) -> None:
+    """Print text whose paths and commands are not to be broken over lines."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def make_table(head: Sequence[str], rows: Iterable[Sequence[str]] = (), numbers: int = 0) -> Table:
+    """A table without lines, whose texts are no markup; the last columns hold `numbers`."""
+    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
+    for k, column in enumerate(head):
+        right = k >= len(head) - numbers
+        table.add_column(column, no_wrap=k == 0, justify="right" if right else "left")
+    for row in rows:
+        table.add_row(*(escape(cell) for cell in row))
+    return table
+
+
+def again(command: str, *folder: Path) -> str:
+    """A command as it has to be typed, with the files that register what the run needs."""
+    own = [word for path in own_files for word in ("--import", str(path))]
+    # The bare name of a task would mean the policy that comes with quadrl.
+    where = [f"./{path}" if str(path) in TASKS else str(path) for path in folder]
+    return shlex.join(["quadrl", *own, *command.split(), *where])
+
+
+def reason(error: OSError) -> str:
+    """What the system refused, in a shell's words."""
+    path = error.filename2 or error.filename
+    return f"cannot read or write {path}: {error.strerror}" if path else str(error)

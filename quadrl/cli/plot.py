@@ -1,0 +1,70 @@
+"""`quadrl plot`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal
+
+from tyro.conf import Positional
+
+from quadrl.cli.console import say
+from quadrl.errors import QuadrlError
+from quadrl.learning.folder import LEARNING_CURVE, METRICS, read_config
+
+
+@dataclasses.dataclass(frozen=True)
+class Plot:
+    """Draw the learning curve of a run again, or those of several runs over each other."""
+
+    run_folders: Positional[tuple[Path, ...]]
+    """Run folders. Several are overlaid: a picture for each task, a curve for each algorithm with
+    the spread over its runs."""
+    out: Path | None = None
+    """The picture; by default learning_curve.png in the run folder, or, of several runs,
+    learning_curves_TASK.png here."""
+    format: Literal["png", "pdf", "svg"] | None = None
+    """Kind of the picture; by default what the name in --out ends in, or png."""
+
+    def run(self) -> None:
+        """Write the pictures."""
+        out, suffix = self.out, f".{self.format or 'png'}"
+        if not self.run_folders:
+            raise QuadrlError("give a run folder, or several: quadrl plot runs/*")
+        if out and self.format and out.suffix != suffix:
+            reason = "leave out --out or --format"
+            raise QuadrlError(reason, name="--out", value=str(out), allowed=f"a {suffix} file")
+        if len(self.run_folders) == 1:
+            from quadrl.learning.figures import draw_learning_curve
+
+            (folder,) = self.run_folders
+            path = out or (folder / LEARNING_CURVE).with_suffix(suffix)
+            paths = [draw_learning_curve(folder, path)]
+        else:
+            paths = _overlay(self.run_folders, out or Path(f"learning_curves{suffix}"), bool(out))
+        for path in paths:
+            say(f"wrote {path}")
+
+
+def _overlay(folders: tuple[Path, ...], base: Path, named: bool) -> list[Path]:
+    """Draw a picture for each task of several runs; the name stands where there is one task only.
+
+    Raises:
+        QuadrlError: None of the folders holds a run that has begun.
+    """
+    from quadrl.learning.figures import learning_curves, read_metrics
+
+    runs: dict[str, dict[str, list[Any]]] = {}
+    for folder in folders:
+        try:
+            config, metrics = read_config(folder), read_metrics(folder / METRICS)
+        except QuadrlError as error:
+            say(f"left out: {error}")
+            continue
+        runs.setdefault(config["task"], {}).setdefault(config["algo"], []).append(metrics)
+    if not runs:
+        raise QuadrlError(f"none of the {len(folders)} folders holds a run to plot")
+    paths = {task: base.with_name(f"{base.stem}_{task}{base.suffix}") for task in runs}
+    if named and len(runs) == 1:
+        paths = dict.fromkeys(runs, base)
+    return [learning_curves(groups, task, paths[task]) for task, groups in runs.items()]

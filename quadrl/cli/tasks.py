@@ -1,0 +1,96 @@
+"""`quadrl tasks`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from rich.markup import escape
+from tyro.conf import Positional
+
+from quadrl import tasks
+from quadrl.cli.console import console, make_table, say
+from quadrl.description import describe
+
+
+@dataclasses.dataclass(frozen=True)
+class Tasks:
+    """List the tasks, or describe one of them in full."""
+
+    task: Positional[str] = ""
+    """Name of a task, to describe it with its options; all tasks by default."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Print goal, start, ends, observation, action and reward."""
+        chosen = [self.task] if self.task else list(tasks.TASKS)
+        described = [describe(tasks.make(name)) for name in chosen]
+        if self.json:
+            whole = {task["name"]: task for task in described}
+            sys.stdout.write(json.dumps(whole[self.task] if self.task else whole) + "\n")
+            return
+        console.print(make_table(("task", "", ""), _texts(described)))
+        head = ("observation", "numbers", "unit", "meaning and frame")
+        console.print(make_table(head, _observation(described)))
+        console.print(f"\n[bold]action[/bold]  {escape(described[0]['action'])}\n", highlight=False)
+        head = ("reward", "meaning", "weight", "" if self.task else "where it differs")
+        console.print(make_table(head, _reward(described)))
+        if self.task:
+            rows = [(o["name"], _text(o["value"]), o["meaning"]) for o in described[0]["options"]]
+            console.print("", make_table(("option", "default", "meaning"), rows))
+        else:
+            say("\nquadrl tasks NAME shows the options of a task")
+
+
+def _texts(described: list[dict[str, Any]]) -> Iterator[tuple[str, str, str]]:
+    for task in described:
+        yield task["name"], "asks", task["asks"]
+        yield "", "start", task["starts"]
+        yield "", "ends early", task["ends"]
+        yield "", "solved", task["solved"]
+        yield "", "time limit", f"{task['time_limit']:g} s"
+        yield "", "trained with", ", ".join(_settings(task["training"])) or "the usual settings"
+        yield "", "", ""
+
+
+def _settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
+    """Nested settings as `quadrl train` takes them."""
+    for name, value in values.items():
+        word = prefix + name.replace("_", "-")
+        if isinstance(value, dict):
+            yield from _settings(value, f"{word}.")
+        else:
+            yield f"{word} {value}"
+
+
+def _observation(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    """The terms of the flat observation, and the tasks that have them if not all do."""
+    for term in {t["name"]: t for task in described for t in task["observation"]}.values():
+        having = [task["name"] for task in described if term in task["observation"]]
+        where = "" if len(having) == len(described) else f" (only {', '.join(having)})"
+        numbers = f"{term['first']}..{term['last']}"
+        yield term["name"], numbers, term["unit"], term["meaning"] + where
+
+
+def _reward(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    """The terms of the reward, the weight that the first task has, and where another has one."""
+    usual = {term["name"]: term["weight"] for term in described[0]["reward"]}
+    found: dict[str, tuple[str, list[str]]] = {}
+    for task in described:
+        for term in task["reward"]:
+            name, weight = term["name"], term["weight"]
+            differs = found.setdefault(name, (term["meaning"], []))[1]
+            if name not in usual or weight != usual[name]:
+                differs.append(f"{task['name']} {_text(weight)}")
+    for name, (meaning, differs) in found.items():
+        yield name, meaning, _text(usual[name]) if name in usual else "", ", ".join(differs)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "of the task"
+    return f"{value:g}" if isinstance(value, float) else str(value)

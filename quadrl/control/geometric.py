@@ -1,0 +1,73 @@
+"""Geometric tracking control on SE(3), with the lag of the rotors in the design.
+
+Lee, Leok and McClamroch, "Geometric Tracking Control of a Quadrotor UAV on SE(3)", CDC 2010. The
+loops are those of `quadrl.control.loops`, flown at the control step; a task says where to be
+(`Task.guide`) and brings gains of its own where it needs them (`Task.gains`).
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+
+import numpy as np
+
+from quadrl.control.loops import MAX_HEADING_ERROR, Gains, Loops, turned
+from quadrl.reading import Reading
+from quadrl.rotation import Array
+from quadrl.task import Task
+from quadrl.vehicle import Vehicle
+
+
+class Controller(abc.ABC):
+    """Flat observations of a task to actions, as a policy."""
+
+    control_mode = "rotor"
+    """The control mode that it flies with."""
+
+    def __init__(self, vehicle: Vehicle, task: Task) -> None:
+        """Take the aircraft, and the task that says where to be and whether to head east."""
+        self.vehicle, self.task = vehicle, task
+
+    def __call__(self, observation: Array) -> Array:
+        """Actions (..., R), within [-1, 1], for flat observations (..., size)."""
+        rows = np.asarray(observation, dtype=np.float64)
+        reading = Reading.of(rows.reshape(-1, rows.shape[-1]), self.task.observation, self.vehicle)
+        action = self.action(reading, *self.task.guide(reading))
+        return action.reshape(*rows.shape[:-1], -1)
+
+    @abc.abstractmethod
+    def action(self, reading: Reading, offset: Array, velocity: Array) -> Array:
+        """The action (N, R) towards a place at an offset, which moves at a velocity.
+
+        Args:
+            reading: The aircraft now.
+            offset: (N, 3) [m], world frame.
+            velocity: (N, 3) [m/s], world frame.
+        """
+
+
+class GeometricController(Controller):
+    """Position, velocity, attitude and body rate loops."""
+
+    def __init__(self, vehicle: Vehicle, task: Task, gains: Gains | None = None) -> None:
+        """Place the poles, with the task's gains unless others are given."""
+        super().__init__(vehicle, task)
+        gains = gains or Gains(**task.gains)
+        self._loops = Loops(vehicle, vehicle.control_timestep, "position", gains)
+
+    def action(self, reading: Reading, offset: Array, velocity: Array) -> Array:
+        """The loops from the outermost to the innermost."""
+        approach = self._loops.approach_velocity(offset, self._loops.gains.max_speed)
+        heading = towards_east(reading.heading) if self.task.heading_matters else reading.heading
+        error = reading.velocity - velocity - approach
+        command = self._loops.rotor_command(reading, error, heading)
+        return np.clip((command - self.vehicle.hover_speed) / self.vehicle.action_scale, -1.0, 1.0)
+
+
+def towards_east(heading: Array) -> Array:
+    """Unit vectors (N, 2): east, or the heading turned MAX_HEADING_ERROR towards it if farther."""
+    cosine, sine = math.cos(MAX_HEADING_ERROR), math.sin(MAX_HEADING_ERROR)
+    side = np.where(heading[:, 1] > 0, -sine, sine)
+    nearer = turned(heading, np.stack([np.full_like(side, cosine), side], axis=-1))
+    return np.where(heading[:, :1] > cosine, np.array([1.0, 0.0]), nearer)

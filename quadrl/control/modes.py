@@ -1,0 +1,227 @@
+"""Control modes, the meaning of an action: rotor speeds, thrust and body rates, velocity, position.
+
+An action is k numbers in [-1, 1]; each has a unit, a value at 0 and a scale that follow from the
+vehicle. `rotor` is the paper's, and holds for a control step. The others are flown by inner loops
+(`quadrl.control.loops`) that see the true state and command the rotors at every physics step, as
+an autopilot does. They stay within what `rotor` can command, hover plus and minus
+`Vehicle.action_scale`, so modes differ in their meaning and not in their power.
+
+Velocities and offsets are along the level heading: forward, left, up, as in the Crazyflie's hover
+setpoint and MAVLink's SET_POSITION_TARGET_LOCAL_NED with MAV_FRAME_BODY_OFFSET_NED (forward,
+right, down).
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+
+from quadrl.control.allocation import columns, within
+from quadrl.control.loops import MAX_HEADING_ERROR, Controlled, Loops, turned
+from quadrl.rotation import Array, heading_of
+from quadrl.state import State
+from quadrl.validation import choice
+from quadrl.vehicle import GRAVITY, Vehicle
+
+RESPONSE_TIME = 1.0
+"""[s] in which the largest acceleration reaches the velocity at action 1; at the offset of action 1
+a flight of that velocity can be stopped with half of it."""
+POSITION_SHARE = 0.5
+"""Share of the bandwidth at which positions are flown to. With all of it the rotors are at their
+limits for every setpoint that an exploring policy draws, and hover was learned to 61 cm only."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionTerm:
+    """One number of an action."""
+
+    name: str
+    unit: str
+    meaning: str
+    """And the frame."""
+
+
+class ControlMode(abc.ABC):
+    """How actions (N, k) fly aircraft of a vehicle; without a memory between control steps."""
+
+    name: ClassVar[str]
+    """The name in CONTROL_MODES."""
+    has_loops: ClassVar[bool] = True
+    """Whether the rotor commands follow the state, at every physics step."""
+    terms: tuple[ActionTerm, ...]
+    """What the k numbers are."""
+    centre: Array
+    """(k,) in the terms' units, at an action of 0."""
+    scale: Array
+    """(k,) what an action of 1 adds to it, and -1 takes away."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Take the scales from the vehicle."""
+        self.vehicle = vehicle
+
+    @property
+    def size(self) -> int:
+        """Numbers in an action, k."""
+        return len(self.terms)
+
+    def values(self, action: Array) -> Array:
+        """What actions (N, k), clipped to [-1, 1], ask for: (N, k) in the terms' units."""
+        return self.centre + self.scale * within(np.asfortranarray(action), -1.0, 1.0)
+
+    def setpoint(self, state: State, action: Array) -> Array:
+        """What is held for a control step, (N, n), from the state in which it begins."""
+        return self.values(action)
+
+    @abc.abstractmethod
+    def rotor_command(self, state: State, setpoint: Array) -> Array:
+        """Rotor speed commands (N, R) [rad/s] for the next physics step."""
+
+
+class Rotor(ControlMode):
+    """The paper's: each number changes the speed command of a rotor from hover."""
+
+    name = "rotor"
+    has_loops = False
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Hover, plus and minus the vehicle's action scale."""
+        super().__init__(vehicle)
+        self.centre = vehicle.hover_speed
+        self.scale = np.full(vehicle.rotor_count, vehicle.action_scale)
+        self.terms = tuple(
+            ActionTerm(
+                f"rotor_{k + 1}",
+                "rad/s",
+                f"speed command of the rotor at x = {rotor.position[0]:.3g} m (forward), "
+                f"y = {rotor.position[1]:.3g} m (left)",
+            )
+            for k, rotor in enumerate(vehicle.rotors)
+        )
+
+    def setpoint(self, state: State, action: Array) -> Array:
+        """Within what the rotors can do: `Vehicle.rotor_command`."""
+        return self.vehicle.rotor_command(action)
+
+    def rotor_command(self, state: State, setpoint: Array) -> Array:
+        """The setpoint itself."""
+        return setpoint
+
+
+class _Looped(ControlMode):
+    """A mode that is flown by loops at the physics step."""
+
+    controlled: ClassVar[Controlled]
+    share: ClassVar[float] = 1.0
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Place the poles for the physics step."""
+        super().__init__(vehicle)
+        timestep = vehicle.physics_timestep
+        self._loops = Loops(vehicle, timestep, self.controlled, share=self.share)
+        self.centre = np.zeros(4)
+
+
+class ThrustBodyRate(_Looped):
+    """Collective thrust and body rates, as acrobatic pilots and rate controllers have it."""
+
+    name = "thrust_body_rate"
+    controlled = "body_rate"
+    terms = (
+        ActionTerm("thrust", "weight", "collective thrust over the aircraft's weight, body z"),
+        ActionTerm("roll_rate", "rad/s", "about body x (forward)"),
+        ActionTerm("pitch_rate", "rad/s", "about body y (left): nose down"),
+        ActionTerm("yaw_rate", "rad/s", "about body z (up)"),
+    )
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Thrust as far as all rotors together reach down; rates that a largest tilt stops."""
+        super().__init__(vehicle)
+        self.centre = np.array([1.0, 0.0, 0.0, 0.0])
+        self.scale = np.array(
+            [self._loops.max_acceleration[2] / GRAVITY, *self._loops.max_body_rate]
+        )
+
+    def rotor_command(self, state: State, setpoint: Array) -> Array:
+        """The body rate loop alone."""
+        thrust = self.vehicle.mass * GRAVITY * setpoint[:, :1]
+        return self._loops.body_rate_command(state, thrust, setpoint[:, 1:])
+
+
+class Velocity(_Looped):
+    """A velocity along the heading, and the rate of the heading."""
+
+    name = "velocity"
+    controlled = "velocity"
+    terms = (
+        ActionTerm("forward", "m/s", "level, along the present heading"),
+        ActionTerm("left", "m/s", "level, across the present heading"),
+        ActionTerm("up", "m/s", "vertical"),
+        ActionTerm("yaw_rate", "rad/s", "of the heading, counter-clockwise from above"),
+    )
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Velocities that are reached within RESPONSE_TIME."""
+        super().__init__(vehicle)
+        yaw_rate = self._loops.max_body_rate[2]
+        self.scale = np.append(self._loops.max_acceleration * RESPONSE_TIME, yaw_rate)
+
+    def rotor_command(self, state: State, setpoint: Array) -> Array:
+        """The velocity loop and those within it."""
+        heading = heading_of(state.rotation)
+        error = state.velocity - turned(setpoint[:, :3], heading)
+        return self._loops.rotor_command(state, error, heading, setpoint[:, 3:])
+
+
+class Position(_Looped):
+    """A place and a heading, from those that the aircraft has when the control step begins.
+
+    An action of 0 brakes and stays; a place is held by giving its offset again at every step.
+    """
+
+    name = "position"
+    controlled = "position"
+    share = POSITION_SHARE
+    terms = (
+        ActionTerm("forward", "m", "offset, level, along the heading"),
+        ActionTerm("left", "m", "offset, level, across the heading"),
+        ActionTerm("up", "m", "offset, vertical"),
+        ActionTerm("yaw", "rad", "turn of the heading, counter-clockwise from above"),
+    )
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Offsets at which the approach is as fast as RESPONSE_TIME allows."""
+        super().__init__(vehicle)
+        self.scale = np.append(self._loops.max_acceleration * RESPONSE_TIME**2, MAX_HEADING_ERROR)
+        self._max_speed = float(self._loops.max_acceleration[0] * RESPONSE_TIME)  # [m/s]
+
+    def setpoint(self, state: State, action: Array) -> Array:
+        """Where to be (3) [m], task frame, and the heading (2), east and north: (N, 5)."""
+        values, heading = self.values(action), heading_of(state.rotation)
+        place = state.position + turned(values[:, :3], heading)
+        yaw = values[:, 3:]
+        turn = columns(np.cos(yaw), np.sin(yaw))
+        return columns(place, turned(turn, heading))
+
+    def rotor_command(self, state: State, setpoint: Array) -> Array:
+        """Every loop."""
+        offset = setpoint[:, :3] - state.position
+        error = state.velocity - self._loops.approach_velocity(offset, self._max_speed)
+        return self._loops.rotor_command(state, error, setpoint[:, 3:])
+
+
+CONTROL_MODES: dict[str, type[ControlMode]] = {
+    mode.name: mode for mode in (Rotor, ThrustBodyRate, Velocity, Position)
+}
+"""Every control mode by name."""
+
+
+def make(name: str, vehicle: Vehicle) -> ControlMode:
+    """The control mode of a name for a vehicle.
+
+    Raises:
+        QuadrlError: Unknown name; the message lists the choices.
+    """
+    return CONTROL_MODES[choice("control_mode", name, CONTROL_MODES)](vehicle)

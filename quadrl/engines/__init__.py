@@ -1,0 +1,1 @@
+"""The engines: what advances rows of aircraft."""

@@ -1,0 +1,216 @@
+"""What every engine is: rows of coordinates, commands, air and parameters, and a State of them.
+
+An engine takes rotor commands, advances some physics steps, and says which aircraft diverged.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from quadrl import native, parameters
+from quadrl.engines.free_flight import FreeFlight
+from quadrl.errors import QuadrlError
+from quadrl.rotation import norm
+from quadrl.state import FIRST, Start, State
+from quadrl.vehicle import Vehicle
+
+EngineName = Literal["mujoco", "free_flight"]
+ENGINES: tuple[EngineName, ...] = ("mujoco", "free_flight")
+
+
+class Engine(abc.ABC):
+    """What is common: the table of the state, filled from rows of generalised coordinates."""
+
+    model: mujoco.MjModel
+    qpos: np.ndarray  # (N, 7), live
+    qvel: np.ndarray  # (N, 6)
+    act: np.ndarray  # (N, R) rotor speeds [rad/s]
+    ctrl: np.ndarray  # (N, R) rotor commands [rad/s]
+    air: np.ndarray  # (N, 3) wind [m/s], world frame; saved and restored with the rest
+    parameters: np.ndarray  # (N,) rows, or (1,) where all are the same
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        fields: dict[str, np.ndarray],
+        altitude: float,
+        name: str,
+        threads: int,
+    ) -> None:
+        """Set up the tables.
+
+        Args:
+            vehicle: The aircraft as it is specified.
+            fields: Live arrays (N, k) by the names of mjData.
+            altitude: Height of the origin of the task's frame above the ground [m].
+            name: One of ENGINES.
+            threads: Threads to fly on.
+        """
+        self.vehicle, self.num_envs = vehicle, len(fields["qpos"])
+        self.origin = np.array([0.0, 0.0, altitude])  # (3,) [m], world
+        self.qpos, self.qvel, self.act, self.ctrl = (
+            fields[k] for k in ("qpos", "qvel", "act", "ctrl")
+        )
+        self.air = fields["userdata"][:, : parameters.AIR]
+        self._free_flight = FreeFlight(self.model, fields, threads) if name != "mujoco" else None
+        # Two frames in turn: the last state stays whole while the next one is computed.
+        self._frames = [_Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
+        self._kernel = native.library().quadrl_state
+        self._use_parameters()
+
+    @property
+    def state(self) -> State:
+        """The current state, views of live buffers that are valid for one more step."""
+        return self._frames[0].state
+
+    @abc.abstractmethod
+    def _model_field(self, name: str) -> np.ndarray:
+        """A field of the model with a leading axis (N or 1), live."""
+
+    def _use_parameters(self) -> None:
+        """Hand the rows of parameters to what reads them."""
+        rows = self._model_field("body_user")[:, 1]
+        self.parameters = rows.view(parameters.AIRCRAFT)[:, 0]
+        if self._free_flight is not None:
+            self._free_flight.use(self.parameters)
+        arrays = (self.qpos, self.qvel, self.act, self.origin, self.parameters)
+        stride = self.parameters.strides[0] // 8 if len(self.parameters) > 1 else 0
+        # As `Rows` in native/state.c.
+        self._rows = np.array(
+            [*(array.ctypes.data for array in arrays), self.qpos.strides[0] // 8, stride,
+             self._frames[0].columns]
+        )  # fmt: skip
+        self._address = self._rows.ctypes.data
+
+    def write_parameters(self, rows: np.ndarray, table: np.ndarray) -> None:
+        """Give some aircraft (n,) parameters (n,) of their own; MuJoCo's own fields follow."""
+        rotor = table["rotor"][:, : self.vehicle.rotor_count]
+        mass, inertia = table["mass"][:, None], table["inertia"]
+        # What MuJoCo works out from mass and inertia when it compiles a model.
+        weights = np.concatenate([1 / mass, (1 / inertia).mean(1, keepdims=True)], axis=1)
+        ratio = rotor["torque_coefficient"] / rotor["thrust_coefficient"]
+        for name, place, value in (
+            ("body_user", np.s_[:, 1], table.view(np.float64).reshape(len(table), -1)),
+            ("body_mass", np.s_[:, 1], mass[:, 0]),
+            ("body_subtreemass", np.s_[:, :2], mass),
+            ("body_inertia", np.s_[:, 1], inertia),
+            ("dof_M0", np.s_[:], np.concatenate([np.tile(mass, 3), inertia], axis=1)),
+            ("dof_invweight0", np.s_[:], np.repeat(weights, 3, axis=1)),
+            ("body_invweight0", np.s_[:, 1], weights),
+            ("actuator_gear", np.s_[:, :, 5], -rotor["spin"] * ratio),
+            ("actuator_ctrlrange", np.s_[:, :, 1], rotor["max_speed"]),
+        ):
+            field = self._model_field(name)
+            field[place][rows] = value
+
+    @abc.abstractmethod
+    def advance(self, steps: int) -> None:
+        """Some physics steps with the commands in `ctrl`."""
+
+    @abc.abstractmethod
+    def clear(self, rows: np.ndarray) -> None:
+        """Reset what MuJoCo remembers of some aircraft (warm starts, warnings), their air too."""
+
+    def read(self) -> np.ndarray | None:
+        """Compute the state after `advance`.
+
+        Returns:
+            None when all went well; else which aircraft diverged, (N,) bool: a number that is not
+            finite or that MuJoCo calls unstable, or faster than the physics step resolves
+            (`Vehicle.resolved_speed`, `resolved_turn`). Those keep their last good state.
+        """
+        self._frames.reverse()
+        if not self._fill(None):
+            return None
+        table, last = (frame.table for frame in self._frames)
+        sound = (np.abs(table) < mujoco.mjMAXVAL).all(axis=0)
+        sound &= table[FIRST["speed"]] <= self.parameters["resolved_speed"]
+        broken = ~(sound & (table[FIRST["angular_speed"]] <= self.parameters["resolved_turn"]))
+        rows = np.flatnonzero(broken)
+        table[:, rows] = last[:, rows]
+        air = self.air[rows]
+        self.clear(rows)
+        self.air[rows] = air
+        self._write(rows, State.of_table(table[:, rows]))
+        return broken
+
+    def place(self, rows: np.ndarray, start: Start) -> State:
+        """Put aircraft where an episode begins, in calm air.
+
+        Args:
+            rows: Which aircraft, (n,).
+            start: Arrays (n, k).
+
+        Returns:
+            The state of those aircraft.
+
+        Raises:
+            QuadrlError: The start is what `read` calls diverged.
+        """
+        self.clear(rows)
+        self._write(rows, start)
+        if self._fill(rows):
+            self._refuse(rows, start)
+        if len(rows) == self.num_envs:
+            return self.state
+        return State.of_table(self._frames[0].table[:, rows])
+
+    def _refuse(self, rows: np.ndarray, start: Start) -> None:
+        """Say what is wrong with a start."""
+        own = self.parameters if len(self.parameters) == 1 else self.parameters[rows]
+        fastest = {"velocity": own["resolved_speed"].min(), "body_rate": own["resolved_turn"].min()}
+        names = ("velocity", "body_rate", "quaternion", "rotor_speed")
+        for name in names:
+            part, limit = getattr(start, name), fastest.get(name, mujoco.mjMAXVAL)
+            if not ((np.abs(part) < mujoco.mjMAXVAL).all() and (norm(part) <= limit).all()):
+                break
+        else:  # with the height of the origin added
+            name, part, limit = "position", start.position, mujoco.mjMAXVAL
+        step = f"a physics_timestep shorter than {self.vehicle.physics_timestep} s resolves more"
+        allowed = f"finite, and at most {limit:g}"
+        advice = step if name in fastest else ""
+        raise QuadrlError(advice, name=f"{name} at the start", value=part, allowed=allowed)
+
+    @abc.abstractmethod
+    def save(self) -> dict[str, np.ndarray]:
+        """Everything that the next step depends on, as arrays."""
+
+    @abc.abstractmethod
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Take up what `save` gave."""
+
+    def _restore_state(self, saved: dict[str, np.ndarray]) -> None:
+        table = np.ascontiguousarray(saved["parameters"]).view(parameters.AIRCRAFT)[:, 0]
+        if not np.array_equal(table, self.parameters):
+            self.write_parameters(np.arange(len(table)), table)
+        self._fill(None)
+
+    def _saved_parameters(self) -> np.ndarray:
+        rows = np.ascontiguousarray(self.parameters)
+        return rows.view(np.float64).reshape(len(rows), -1).copy()
+
+    def _write(self, rows: np.ndarray, start: Start | State) -> None:
+        self.qpos[rows] = np.concatenate([start.position + self.origin, start.quaternion], axis=-1)
+        self.qvel[rows] = np.concatenate([start.velocity, start.body_rate], axis=-1)
+        self.act[rows] = start.rotor_speed
+
+    def _fill(self, rows: np.ndarray | None) -> int:
+        """Run the C kernel; how many aircraft are not sound."""
+        count, ids = (self.num_envs, None) if rows is None else (len(rows), rows.ctypes.data)
+        return self._kernel(self._address, count, ids, self._frames[0].address)
+
+
+class _Frame:
+    """One table of state with its named views and its address."""
+
+    def __init__(self, count: int, rotors: int) -> None:
+        # Pad rows by one cache line, to avoid set conflicts between them. A few aircraft have none,
+        # and contiguous arrays are faster in NumPy.
+        self.columns = count + 8 * (1 + count // 8 % 2) if count > 8 else count
+        self.table = np.zeros((FIRST["rotor_speed"] + rotors, self.columns))[:, :count]
+        self.state = State.of_table(self.table)
+        self.address = self.table.ctypes.data

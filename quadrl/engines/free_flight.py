@@ -1,0 +1,115 @@
+"""Free flight, integrated in C by the equations alone.
+
+Away from everything that it could touch the aircraft is an ordinary differential equation.
+`native/free_flight.c` integrates it by the Runge-Kutta method on the rows that MuJoCo itself
+steps, so an aircraft passes from one engine to the other with every bit of its state. The forces
+are the callbacks' own (`native/aero.h`), and so are the bytes of the parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+
+from quadrl import native
+from quadrl.errors import QuadrlError
+
+FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
+"""Those of mjData that free flight reads or writes."""
+ROWS_PER_THREAD = 256
+"""Aircraft that are worth a thread."""
+MARGIN = 0.05
+"""Clearance at which MuJoCo takes over [m]; more than what a contact's own margin is."""
+
+
+class FreeFlight:
+    """Advances the rows of a simulation in place."""
+
+    def __init__(self, model: mujoco.MjModel, fields: dict[str, np.ndarray], threads: int) -> None:
+        """Check the model and take the addresses.
+
+        Args:
+            model: A model of `quadrl.mjcf`.
+            fields: Live arrays (N, k) of FIELDS, all with one stride between aircraft.
+            threads: Threads to fly on.
+
+        Raises:
+            QuadrlError: The model holds something that free flight knows nothing of.
+        """
+        _check(model)
+        self._kernel = native.library().quadrl_free_flight
+        count, stride = len(fields["qpos"]), fields["qpos"].strides[0] // 8
+        self._fields = fields  # kept alive: the kernel knows their addresses
+        self._addresses = [fields[name].ctypes.data for name in FIELDS]
+        self._stride = stride
+        self._world = np.array([model.opt.timestep, model.opt.gravity[2], _floor(model)])
+        self._near = np.zeros(count, dtype=np.int8)
+        parts = max(1, min(threads, count // ROWS_PER_THREAD))
+        # Whole groups of lanes to each, so that no group is flown twice.
+        ends = [8 * (count * k // parts // 8) for k in range(parts)] + [count]
+        self._parts = list(zip(ends, ends[1:], strict=False))
+        self._pool = ThreadPoolExecutor(parts - 1) if parts > 1 else None
+
+    def use(self, parameters: np.ndarray) -> None:
+        """Take rows of parameters (N,), or one (1,) for all; live."""
+        stride = parameters.strides[0] // 8 if len(parameters) == len(self._near) > 1 else 0
+        self._parameters = parameters  # kept alive
+        last = (parameters, self._world, self._near)
+        # As `Rows` in native/free_flight.c.
+        self._rows = np.array(
+            [*self._addresses, *(array.ctypes.data for array in last), self._stride, stride]
+        )
+        self._address = self._rows.ctypes.data
+
+    def advance(self, steps: int) -> np.ndarray | None:
+        """Fly some physics steps.
+
+        Returns:
+            None, or the numbers of the aircraft that could touch something meanwhile: they were
+            left as they are, and are MuJoCo's.
+        """
+        waiting: list[Future[int]] = []
+        if self._pool is not None:  # ctypes lets go of the interpreter, so the parts fly together
+            others = self._parts[1:]
+            waiting = [self._pool.submit(self._kernel, self._address, *p, steps) for p in others]
+        marked = self._kernel(self._address, *self._parts[0], steps)
+        marked += sum(part.result() for part in waiting)
+        return np.flatnonzero(self._near) if marked else None
+
+
+def _floor(model: mujoco.MjModel) -> float:
+    """Height of the centre of mass under which something may be touched [m]."""
+    can_touch = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    if not can_touch.any():
+        return -math.inf
+    # Everything of the aircraft lies in a sphere of this radius about its centre of mass.
+    own = model.geom_bodyid == 1
+    reach = np.linalg.norm(model.geom_pos[own], axis=-1) + model.geom_rbound[own]
+    return float(model.geom_pos[~own, 2].max(initial=0.0) + reach.max(initial=0.0) + MARGIN)
+
+
+def _check(model: mujoco.MjModel) -> None:
+    """Refuse what the equations do not describe."""
+    free = model.njnt == 1 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
+    rotors = (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_USER).all()
+    obstacles = [
+        model.geom(k).name or f"number {k}"
+        for k in np.flatnonzero(model.geom_bodyid != 1)
+        if (model.geom_contype[k] or model.geom_conaffinity[k])
+        and model.geom_type[k] != mujoco.mjtGeom.mjGEOM_PLANE
+    ]
+    turned = not (model.body_iquat[-1] == (1, 0, 0, 0)).all() or model.body_ipos[-1].any()
+    for wrong, what in (
+        (model.nbody != 2 or not free, "one aircraft on a free joint and no other body"),
+        (not rotors or model.neq or model.ntendon, "rotors alone, without constraints"),
+        (obstacles, f"nothing to touch but level ground (there is {', '.join(obstacles)})"),
+        (turned, "a centre of mass and principal axes that are the body's own"),
+    ):
+        if wrong:
+            reason = f"free flight is for {what}"
+            raise QuadrlError(
+                reason, name="engine", value="free_flight", allowed="'mujoco' for this model"
+            )

@@ -1,0 +1,190 @@
+"""dm_control: the physics and the task of the domain `quadrotor`; `quadrl.suite` loads them."""
+
+# pyright: reportIncompatibleMethodOverride=false
+# To a type checker dm_control's abstract methods, without annotations, return None.
+# ruff: noqa: E402 - what draws is chosen before dm_control is imported.
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import dataclasses
+from collections.abc import Callable, Generator
+from typing import Any
+
+from quadrl.rendering import gl
+
+gl.choose()
+
+import mujoco as _mujoco
+import numpy as np
+from dm_control import mujoco
+from dm_control.mujoco import wrapper
+from dm_control.rl import control
+from dm_control.suite import base
+from dm_env import specs
+
+from quadrl import mjcf, native, tasks, validation
+from quadrl.engines.mujoco import ENGINES, DataEngine
+from quadrl.environment import Environment, Transition
+from quadrl.errors import QuadrlError
+from quadrl.task import Task
+from quadrl.vehicle import Vehicle, resolve
+
+ENVIRONMENT_KWARGS = "time_limit control_timestep n_sub_steps flat_observation legacy_step".split()
+
+
+class Physics(mujoco.Physics):
+    """The complete model of the aircraft, drawn parts included."""
+
+    engine: DataEngine | None = None
+    """Flies it where free flight is the engine; a copy has none."""
+    inner_loop: Callable[[], None] | None = None
+    """Commands the rotors before each physics step, during the control steps of a control mode
+    with loops."""
+
+    def step(self, nstep: int = 1) -> None:
+        """Advance by physics steps; a NativeError if the rotor callbacks were removed."""
+        if self.inner_loop is None:
+            self._advance(nstep)
+            return
+        for _ in range(nstep):
+            self.inner_loop()
+            self._advance(1)
+
+    def _advance(self, steps: int) -> None:
+        if self.engine is not None and self.engine.fly(steps):
+            self.forward()  # what is drawn and measured belongs to the new state
+            return
+        native.check_installed()
+        super().step(steps)
+
+    @contextlib.contextmanager
+    def check_invalid_state(self) -> Generator[None]:
+        """Nothing: a divergence ends the episode, which is the task's to report."""
+        yield
+
+
+class QuadrotorTask(base.Task):
+    """A task of the catalogue as a dm_control task."""
+
+    def __init__(self, environment: Environment, random: Any = None) -> None:
+        """Wrap an environment of one aircraft.
+
+        Args:
+            environment: It flies in the Physics that the task is for.
+            random: Seed, RandomState or None, as in dm_control. A seed gives the episodes that
+                every other API gives with it.
+        """
+        given = None if isinstance(random, np.random.RandomState) else random
+        environment.seed(given)
+        super().__init__(random)
+        if given is None:
+            environment.seed(int(self.random.randint(2**31)))
+        self.environment = environment
+        """Of one aircraft."""
+        layout = environment.layout.items()  # dm_control asks for a specification before a reset
+        self._observation = {name: np.zeros((1, k.stop - k.start)) for name, k in layout}
+        self.transition: Transition | None = None
+        """The last step (N = 1) with its named reward terms and success; None after a reset."""
+
+    def action_spec(self, physics: Physics) -> specs.BoundedArray:
+        """The terms of the control mode, each between -1 and 1."""
+        names = "\t".join(term.name for term in self.environment.control_mode.terms)
+        bound = np.ones(self.environment.action_size)
+        return specs.BoundedArray(bound.shape, np.float64, -bound, bound, name=names)
+
+    def initialize_episode(self, physics: Physics) -> None:
+        """Begin an episode."""
+        self._observation, self.transition = self.environment.reset(), None
+        super().after_step(physics)  # colours the reward
+
+    def before_step(self, action: np.ndarray, physics: Physics) -> None:
+        """Hand the action to the rotors, or to the loops."""
+        self.environment.begin(np.asarray(action)[None])
+        if self.environment.control_mode.has_loops:
+            physics.inner_loop = self.environment.control
+
+    def after_step(self, physics: Physics) -> None:
+        """Work out the transition."""
+        physics.inner_loop = None  # outside of a control step there is no setpoint
+        now = self.transition = self.environment.finish()
+        self._observation = now.observation
+        super().after_step(physics)
+
+    def get_observation(self, physics: Physics) -> dict[str, np.ndarray]:
+        """Named terms, float64."""
+        terms = self._observation.items()
+        return collections.OrderedDict((name, np.array(value[0])) for name, value in terms)
+
+    def get_reward(self, physics: Physics) -> float:
+        """The reward of the last step."""
+        return self.transition.reward.item() if self.transition else 0.0
+
+    def get_termination(self, physics: Physics) -> float | None:
+        """Discount at the end: 0 for terminated, 1 for truncated; None before."""
+        now = self.transition
+        if now is None or not (now.terminated[0] or now.truncated[0]):
+            return None
+        return 0.0 if now.terminated[0] else 1.0
+
+
+def make(
+    task: str | Task,
+    time_limit: float | None = None,
+    random: Any = None,
+    environment_kwargs: dict[str, Any] | None = None,
+    vehicle: Vehicle | str | None = None,
+    control_mode: str = "rotor",
+    engine: str = "mujoco",
+    ranges: Any = None,
+    **options: Any,
+) -> control.Environment:
+    """Build the dm_control environment of a task.
+
+    Args:
+        task: A name of the catalogue or a task.
+        time_limit: Of an episode [s]; None for the task's.
+        random: Seed, RandomState or None.
+        environment_kwargs: As in `quadrl.suite.load`.
+        vehicle: A name of `quadrl.VEHICLES` or a Vehicle; None for the paper's.
+        control_mode: What actions mean, a name of `quadrl.control.CONTROL_MODES`.
+        engine: "mujoco" or "free_flight".
+        ranges: Of the parameters, drawn at each reset.
+        **options: Those of the task.
+
+    Raises:
+        QuadrlError: Unknown name or impossible value.
+    """
+    settings = dict(environment_kwargs or {})
+    validation.keys("environment_kwargs", settings, ENVIRONMENT_KWARGS)
+    # The task keeps the clock, not dm_control: there a time limit hides a crash on the last step.
+    if (limit := settings.pop("time_limit", time_limit)) is not None:
+        options["time_limit"] = limit
+    task, vehicle = tasks.make(task, **options), resolve(vehicle)
+    timestep = settings.pop("control_timestep", None)
+    if (substeps := settings.pop("n_sub_steps", None)) is not None:
+        if timestep is not None:
+            raise QuadrlError(
+                name="n_sub_steps", value=substeps, allowed="absent where control_timestep is given"
+            )
+        timestep = substeps * vehicle.physics_timestep
+    if timestep is not None:
+        vehicle = dataclasses.replace(vehicle, control_timestep=timestep)
+    model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene)
+    # A simulation that diverges must not pass for a fresh one.
+    model.opt.disableflags |= int(_mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    physics = Physics.from_model(wrapper.MjModel(model))
+    physics.engine = DataEngine(
+        vehicle,
+        model,
+        physics.data.ptr,
+        altitude=max(task.altitude, vehicle.ground_clearance),
+        engine=validation.choice("engine", engine, ENGINES),
+    )
+    environment = Environment(
+        task, vehicle=vehicle, engine=physics.engine, control_mode=control_mode, ranges=ranges
+    )
+    return control.Environment(
+        physics, QuadrotorTask(environment, random), n_sub_steps=vehicle.substeps, **settings
+    )

@@ -1,0 +1,84 @@
+"""What the algorithms share: their optimisers, the critic's epochs, saving and restoring."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn import Parameter
+
+
+class Algorithm(abc.ABC):
+    """An update of the networks from batches; learning rates fall linearly to zero."""
+
+    def __init__(self, config: Any) -> None:
+        """Start without optimisers, with the settings of the algorithm."""
+        self.config = config
+        self.parameters: list[Parameter] = []
+        self._optimisers: dict[str, tuple[torch.optim.Adam, list[Parameter], float]] = {}
+
+    def add_optimiser(
+        self, name: str, parameters: Iterable[Parameter], rate: float, **options: Any
+    ) -> None:
+        """Let Adam optimise some parameters under a name, with an initial learning rate."""
+        own = list(parameters)
+        self.parameters += own
+        adam = torch.optim.Adam(own, lr=rate, eps=1e-5, **options)
+        self._optimisers[name] = adam, own, rate
+
+    def update(self, batch: TensorDictBase, remaining: float) -> dict[str, float]:
+        """Learn from a batch.
+
+        Args:
+            batch: (transitions,), with observation, action, loc, scale, action_log_prob, advantage
+                (normalised) and value_target.
+            remaining: Share of the training that is left, 1 to 0.
+
+        Returns:
+            Metrics for the log.
+        """
+        for adam, _, rate in self._optimisers.values():
+            for group in adam.param_groups:
+                group["lr"] = rate * remaining
+        return self.learn(batch)
+
+    @abc.abstractmethod
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """The update at the present learning rates."""
+
+    def step(self, name: str, loss: Tensor) -> None:
+        """One gradient step of an optimiser."""
+        adam, parameters, _ = self._optimisers[name]
+        adam.zero_grad()
+        loss.backward()
+        if hasattr(self.config, "max_gradient"):
+            torch.nn.utils.clip_grad_norm_(parameters, self.config.max_gradient)
+        adam.step()
+
+    def fit_critic(
+        self, loss: Callable[[TensorDictBase], Tensor], batch: TensorDictBase
+    ) -> dict[str, float]:
+        """Passes of the optimiser "critic" over a batch; returns the last loss for the log."""
+        value = torch.zeros(())
+        for _ in range(self.config.critic_epochs):
+            for rows in torch.randperm(len(batch)).split(self.config.minibatch):
+                value = loss(batch[rows])
+                self.step("critic", value)
+        return {"critic_loss": value.item()}
+
+    def save(self) -> dict[str, Any]:
+        """Tensors of the optimisers by optimiser, parameter and name."""
+        return {
+            name: {str(k): dict(v) for k, v in adam.state_dict()["state"].items()}
+            for name, (adam, _, _) in self._optimisers.items()
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Continue from what `save` returned; an optimiser that had made no step has none."""
+        for name, (adam, _, _) in self._optimisers.items():
+            tensors = {int(k): v for k, v in saved.get(name, {}).items()}
+            adam.load_state_dict(adam.state_dict() | {"state": tensors})

@@ -1,0 +1,39 @@
+"""The plain policy gradient with generalised advantages (Schulman et al. 2016), on A2CLoss.
+
+The paper calls the algorithm GAE, after its advantages.
+"""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import A2CLoss
+
+from quadrl.learning.algorithm import Algorithm
+from quadrl.learning.config import VPGConfig
+
+
+class VPG(Algorithm):
+    """One gradient step of the policy on each batch, and a few epochs of the critic."""
+
+    def __init__(
+        self, actor: ProbabilisticActor, critic: TensorDictModule, config: VPGConfig
+    ) -> None:
+        """Make the loss and the optimisers."""
+        super().__init__(config)
+        self.loss = A2CLoss(
+            actor,
+            critic,
+            entropy_bonus=False,
+            critic_coeff=1.0,
+            loss_critic_type="l2",
+            functional=False,
+        )
+        self.add_optimiser("policy", actor.parameters(), config.learning_rate)
+        self.add_optimiser("critic", critic.parameters(), config.critic_rate)
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """The policy's step, then the critic's epochs."""
+        self.step("policy", self.loss(batch)["loss_objective"])
+        return self.fit_critic(lambda part: self.loss(part)["loss_critic"], batch)

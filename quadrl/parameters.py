@@ -1,0 +1,141 @@
+"""Rows of parameters: what the engines know of each aircraft, one C struct per row.
+
+The struct follows from the numeric fields of `Rotor` and `Vehicle`: a new parameter is a field
+there, and `native/aero.h` and `quadrl/dynamics.py` find it by its name. A row stands in the
+`user` data of the aircraft's body (`body_user`), where the callbacks read it; free flight reads
+the same bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from quadrl.rotation import Array
+from quadrl.vehicle import (
+    MAX_ROTORS,
+    Rotor,
+    Vehicle,
+    hover_squares,
+    mixer,
+    resolved_speed,
+    resolved_turn,
+)
+
+AIR = 3
+"""Numbers of a row of air, in the simulation's `userdata`: the wind [m/s], world frame."""
+MARK = 1903518052.0
+"""Tells the actuators and bodies of quadrl from everybody else's: "quad" in ASCII."""
+SETTINGS = ("name", "rotors", "action_scale", "physics_timestep", "control_timestep")
+"""Fields of `Vehicle` that are no parameter of an aircraft's row."""
+DERIVED = ("foot", "hull", "rotor_height", "resolved_speed", "resolved_turn")
+"""Properties of `Vehicle` that stand in a row."""
+
+
+def _fields(kind: type, settings: tuple[str, ...] = ()) -> list[Any]:
+    sizes = {"float": (), "Vector": (3,)}
+    fields = [field for field in dataclasses.fields(kind) if field.name not in settings]
+    return [(field.name, np.float64, sizes[str(field.type)]) for field in fields]
+
+
+ROTOR = np.dtype([*_fields(Rotor), ("hover_speed", np.float64)])
+AIRCRAFT = np.dtype(
+    [
+        ("mark", np.float64),
+        ("size", np.float64),  # numbers in a row, against a model of another version
+        ("rotor_count", np.float64),
+        *_fields(Vehicle, SETTINGS),
+        *((name, np.float64, (3,) if name in ("foot", "hull") else ()) for name in DERIVED),
+        ("rotor", ROTOR, (MAX_ROTORS,)),
+    ]
+)
+"""A row. Every number is a double."""
+ROW_SIZE = AIRCRAFT.itemsize // 8
+
+
+def rows(vehicle: Vehicle, count: int = 1) -> np.ndarray:
+    """`count` equal rows (count,) of an aircraft."""
+    table = np.zeros(count, dtype=AIRCRAFT)
+    table["mark"], table["size"] = MARK, ROW_SIZE
+    for name in AIRCRAFT.names or ():
+        if name not in ("mark", "size", "rotor"):
+            table[name] = getattr(vehicle, name)
+    for name, *_ in _fields(Rotor):
+        for k, rotor in enumerate(vehicle.rotors):
+            table["rotor"][name][:, k] = getattr(rotor, name)
+    table["rotor"]["hover_speed"][:, : vehicle.rotor_count] = vehicle.hover_speed
+    return table
+
+
+def refresh(table: np.ndarray, timestep: float) -> None:
+    """Work out again, in place, what follows from the other parameters of rows."""
+    count = int(table["rotor_count"][0])
+    rotor = table["rotor"][:, :count]
+    names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")
+    squares = hover_squares(mixer(*(rotor[name] for name in names)), table["mass"])
+    table["rotor"]["hover_speed"][:, :count] = np.sqrt(np.maximum(squares, 0.0))
+    table["resolved_speed"] = resolved_speed(table["mass"], table["drag_coefficient"], timestep)
+    least = table["inertia"].min(axis=-1)
+    table["resolved_turn"] = resolved_turn(least, table["moment_coefficient"], timestep)
+
+
+class Parameters:
+    """Rows by name, in any array namespace: `p.mass` (N,), `p.rotor.position` (N, R, 3)."""
+
+    def __init__(self, arrays: dict[str, Any]) -> None:
+        """Take the arrays; a nested dict becomes nested Parameters."""
+        for name, value in arrays.items():
+            setattr(self, name, Parameters(value) if isinstance(value, dict) else value)
+
+    def __getattr__(self, name: str) -> Array:
+        """Tell type checkers that every parameter is an array."""
+        raise AttributeError(f"there is no parameter {name!r}")
+
+    @classmethod
+    def of(cls, table: np.ndarray, control_timestep: float = 0.0) -> Parameters:
+        """Views of rows (N,).
+
+        Args:
+            table: Rows, which the views show live.
+            control_timestep: Kept beside them, a float [s].
+        """
+        rotor = table["rotor"][:, : int(table["rotor_count"][0])]
+        arrays: dict[str, Any] = {n: table[n] for n in AIRCRAFT.names or () if n != "rotor"}
+        arrays["rotor"] = {name: rotor[name] for name in ROTOR.names or ()}
+        return cls(arrays | {"control_timestep": control_timestep})
+
+    def map(self, function: Callable[[Array], Array]) -> Parameters:
+        """The same with a function applied to every array."""
+        mapped = Parameters({})
+        for name, value in vars(self).items():
+            whole = isinstance(value, float)
+            inner = value.map(function) if isinstance(value, Parameters) else value
+            is_array = not whole and not isinstance(value, Parameters)
+            setattr(mapped, name, function(value) if is_array else inner)
+        return mapped
+
+
+def c_structs() -> str:
+    """The C declarations of a row, for LANES aircraft side by side (1: exactly a row)."""
+
+    def fields(dtype: np.dtype) -> str:
+        lines = []
+        for name in dtype.names or ():
+            inner = dtype[name]
+            if inner.base == ROTOR:
+                lines.append(f"  Rotor {name}[{MAX_ROTORS}];")
+                continue
+            sizes = "".join(f"[{n}]" for n in inner.shape)
+            lines.append(f"  double {name}{sizes}[LANES];")
+        return "\n".join(lines)
+
+    return (
+        "// Written by quadrl/parameters.py from the fields of Rotor and Vehicle.\n"
+        f"#define QUADRL_MARK {MARK!r}\n"
+        f"enum {{ MAX_ROTORS = {MAX_ROTORS}, AIR = {AIR}, ROW_SIZE = {ROW_SIZE} }};\n"
+        f"typedef struct {{\n{fields(ROTOR)}\n}} Rotor;\n"
+        f"typedef struct {{\n{fields(AIRCRAFT)}\n}} Aircraft;\n"
+    )

@@ -1,0 +1,76 @@
+"""Operations on records: dataclasses of arrays with a leading axis N, perhaps of such records."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from quadrl.errors import QuadrlError
+
+
+def mapped(function: Callable[[Any], Any], record: Any) -> Any:
+    """A record with a function applied to each of its arrays; what is no array stays."""
+    values = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if dataclasses.is_dataclass(value):
+            value = mapped(function, value)
+        elif hasattr(value, "dtype"):
+            value = function(value)
+        values[field.name] = value
+    return type(record)(**values)
+
+
+def copied(record: Any) -> Any:
+    """A record whose arrays are its own."""
+    return mapped(np.array, record)
+
+
+def owned(record: Any) -> Any:
+    """The same record where its arrays are its own, else a copy."""
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if value.base is not None or not value.flags.writeable:
+            return copied(record)
+    return record
+
+
+def put(record: Any, rows: np.ndarray, fresh: Any) -> None:
+    """Write rows (n,) of a record from another (n, ...)."""
+    for field in dataclasses.fields(record):
+        into, value = getattr(record, field.name), getattr(fresh, field.name)
+        if dataclasses.is_dataclass(into):
+            put(into, rows, value)
+        elif isinstance(into, np.ndarray):
+            into[rows] = value
+
+
+def arrays(prefix: str, record: Any) -> dict[str, np.ndarray]:
+    """Copies of a record's arrays by name, "PREFIX.FIELD"."""
+    fields = dataclasses.fields(record)
+    return {f"{prefix}.{field.name}": np.array(getattr(record, field.name)) for field in fields}
+
+
+def of_arrays(prefix: str, like: Any, saved: Mapping[str, np.ndarray]) -> Any:
+    """The record of the kind of another that `arrays` took apart."""
+    fields = dataclasses.fields(like)
+    return type(like)(**{field.name: np.array(saved[f"{prefix}.{field.name}"]) for field in fields})
+
+
+def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) -> None:
+    """Refuse saved arrays of other names, shapes or kinds than one's own.
+
+    Raises:
+        QuadrlError: The message names the array.
+    """
+    for name, array in own.items():
+        kept = saved.get(name)
+        if kept is None or (kept.shape, kept.dtype) != (array.shape, array.dtype):
+            found = None if kept is None else f"{kept.dtype} {kept.shape}"
+            reason = "what was saved is of another environment"
+            raise QuadrlError(
+                reason, name=name, value=found, allowed=f"{array.dtype} {array.shape}"
+            )

@@ -1,0 +1,12 @@
+"""Pictures and videos of flights, drawn off screen with MuJoCo.
+
+Everything is in the world frame (East-North-Up, metres). Drawing calls only MuJoCo's kinematics,
+never its dynamics: it needs no rotor callbacks and leaves the simulation's own data alone.
+"""
+
+from quadrl.errors import RenderingUnavailable
+from quadrl.rendering.scene import Renderer
+from quadrl.rendering.trajectory import Trajectory
+from quadrl.rendering.video import render_trajectory, write_video
+
+__all__ = ["Renderer", "RenderingUnavailable", "Trajectory", "render_trajectory", "write_video"]

@@ -1,0 +1,127 @@
+"""The graphics library: which one draws, and how it gets along with dm_control and triton.
+
+mujoco and dm_control choose theirs at import, and without a screen take GLFW, which then fails,
+unless `MUJOCO_GL` is set. Here a machine without a screen gets EGL at its first picture, for
+mujoco.Renderer and, after `choose`, for dm_control as well.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import importlib
+import importlib.util
+import os
+import sys
+import warnings
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from quadrl.errors import RenderingUnavailable
+
+
+@functools.cache
+def shield_triton() -> None:
+    """Load triton's library, if it is installed, so that it can live beside Mesa's in one process.
+
+    Each brings its own LLVM. Mesa's is visible to every library that is loaded after it, and
+    triton's would call into it and crash. Opened with RTLD_DEEPBIND it keeps to its own symbols,
+    and `import triton` then finds it loaded. It takes 0.05 s. Every order of pictures, this call
+    and the import works in which this call comes before the import.
+    """
+    if "triton" in sys.modules or not hasattr(os, "RTLD_DEEPBIND"):
+        return
+    found = importlib.util.find_spec("triton")
+    for folder in (found and found.submodule_search_locations) or ():
+        for library in Path(folder, "_C").glob("libtriton*.so"):
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(str(library), mode=os.RTLD_LOCAL | os.RTLD_NOW | os.RTLD_DEEPBIND)
+
+
+def choose() -> None:
+    """Let dm_control draw without a screen; call it before dm_control is imported, or after.
+
+    Where dm_control would use GLFW, its renderer becomes one that opens EGL at the first picture.
+    """
+    shield_triton()  # dm_control loads Mesa at its import where MUJOCO_GL is egl
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # GLFW's, about the missing screen
+        render: Any = importlib.import_module("dm_control._render")
+    if _without_screen() and render.BACKEND == "glfw":
+        render.Renderer, render.BACKEND = _dm_control_context, "egl"
+
+
+def open_renderer(model: mujoco.MjModel, width: int, height: int, max_geom: int) -> mujoco.Renderer:
+    """MuJoCo's renderer for pictures of a model, width x height pixels, of at most max_geom shapes.
+
+    Raises:
+        RenderingUnavailable: There is no graphics library to draw with.
+    """
+    shield_triton()
+    with _failure_named():
+        if _without_screen():
+            # The class that mujoco.Renderer asks for its contexts.
+            chosen: Any = importlib.import_module("mujoco.egl")
+            sys.modules[mujoco.Renderer.__module__].gl_context.GLContext = chosen.GLContext
+        egl: Any = sys.modules.get("mujoco.egl")
+        if egl and egl.EGL_DISPLAY is None:
+            # Opened in mujoco's place, which would close it at exit: dm_control shares the display,
+            # and could no longer free its own contexts.
+            display = egl.create_initialized_egl_device_display()
+            egl.EGL_DISPLAY = display if display != egl.EGL.EGL_NO_DISPLAY else None
+        with current_context_kept():
+            return mujoco.Renderer(model, height, width, max_geom)
+
+
+def close(renderer: mujoco.Renderer) -> None:
+    """Free a renderer and its context."""
+    context = renderer._gl_context
+    try:
+        with current_context_kept():
+            context.make_current()  # what is freed is freed in the current one
+            renderer.close()
+    except Exception:  # at exit dm_control may have closed the display before, with all in it
+        context._context = None
+
+
+@contextlib.contextmanager
+def current_context_kept() -> Generator[None]:
+    """Leave the thread with the EGL context that it had.
+
+    dm_control makes its own current once and relies on it; it would go on to draw in ours.
+    """
+    egl: Any = sys.modules.get("mujoco.egl")
+    before = egl and egl.EGL_DISPLAY and egl.EGL.eglGetCurrentContext()
+    try:
+        yield
+    finally:
+        if egl and egl.EGL_DISPLAY:
+            context, none = before or egl.EGL.EGL_NO_CONTEXT, egl.EGL.EGL_NO_SURFACE
+            egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, none, none, context)
+
+
+def _without_screen() -> bool:
+    names = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
+    return sys.platform == "linux" and not any(os.environ.get(name) for name in names)
+
+
+def _dm_control_context(max_width: int, max_height: int) -> Any:
+    """A context of dm_control's own kind."""
+    with _failure_named():
+        egl: Any = importlib.import_module("dm_control._render.pyopengl.egl_renderer")
+        return egl.EGLContext(max_width, max_height)
+
+
+@contextlib.contextmanager
+def _failure_named() -> Generator[None]:
+    try:
+        yield
+    except Exception as error:  # each platform fails in its own way
+        raise RenderingUnavailable(
+            "no OpenGL context is available, so nothing can be drawn; simulation and training work "
+            f"without one. On Debian: apt install libegl1 libgl1-mesa-dri. It failed with: {error}"
+        ) from error

@@ -1,0 +1,206 @@
+"""One picture: the aircraft in any pose, and what else there is to see."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quadrl.errors import QuadrlError
+from quadrl.markers import GOAL_RGBA, Marker
+from quadrl.rendering import gl
+from quadrl.rendering.camera import FOLLOW, aircraft_scale, follow_cameras, in_view
+from quadrl.validation import choice, number
+
+Array = NDArray[np.floating[Any]]
+
+MAX_SHAPES = 2000
+TRAIL_SEGMENTS = 120
+TRAIL_WIDTH = 0.008  # [m], of an aircraft with scale 1
+TRAIL_OLD, TRAIL_NEW = np.array([0.35, 0.55, 0.80, 1.0]), np.array([1.0, 0.72, 0.30, 1.0])
+GOAL_RADIUS = 0.08  # [m], of an aircraft with scale 1
+PAD_RGBA = (0.10, 0.13, 0.17, 1.0)
+ANGLE = np.linspace(0, 2 * np.pi, 49)
+CIRCLE = np.stack([np.cos(ANGLE), np.sin(ANGLE), np.zeros_like(ANGLE)], axis=-1)
+
+
+class Renderer(contextlib.AbstractContextManager):
+    """Draws a model's aircraft in any pose; holds a graphics context, so use it in a `with`."""
+
+    def __init__(self, model: mujoco.MjModel, width: int = 1280, height: int = 720) -> None:
+        """Open an off-screen context of width x height pixels.
+
+        Raises:
+            RenderingUnavailable: There is no graphics library to draw with.
+            QuadrlError: The picture is larger than the model's off-screen buffer.
+        """
+        limit = model.vis.global_
+        width = number("width", width, 1, limit.offwidth, whole=True)
+        height = number("height", height, 1, limit.offheight, whole=True)
+        self.model = model
+        self._data = mujoco.MjData(model)
+        self._scale = aircraft_scale(model)
+        self._blades = [  # (blade, its hub, index of its rotor)
+            (model.geom(f"rotor_{k + 1}_blade_{side}").id, model.geom(f"rotor_{k + 1}_hub").id, k)
+            for k in range(model.nu)
+            for side in "ab"
+        ]
+        self._renderer = gl.open_renderer(model, width, height, MAX_SHAPES)
+        self._close = weakref.finalize(self, gl.close, self._renderer)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The names that `frame` takes for its camera: "follow", and those of the model."""
+        return (FOLLOW, *(self.model.cam(k).name for k in range(self.model.ncam)))
+
+    def frame(
+        self,
+        qpos: ArrayLike,
+        *,
+        camera: str | mujoco.MjvCamera = FOLLOW,
+        rotor_angles: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+        trail: ArrayLike | None = None,
+        markers: Sequence[Marker] = (),
+    ) -> NDArray[np.uint8]:
+        """Draw one picture.
+
+        Args:
+            qpos: (7,) position [m] and attitude (w, x, y, z) of the aircraft, world frame.
+            camera: One of `cameras`, or a camera of your own.
+            rotor_angles: (R,) angle by which each rotor has turned about its axis [rad].
+            goal: (3,) [m] where the aircraft should be; the camera "follow" keeps it in view.
+            trail: (n, 3) [m] where it has been, oldest first.
+            markers: What else to draw, world frame.
+
+        Returns:
+            (height, width, 3) colours.
+
+        Raises:
+            QuadrlError: There is no such camera, or there is too much to draw.
+        """
+        model, data = self.model, self._data
+        if isinstance(camera, str):
+            choice("camera", camera, self.cameras)
+        data.qpos[:7] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        if rotor_angles is not None:
+            self._turn_blades(np.asarray(rotor_angles, dtype=float))
+        position = data.qpos[:3].copy()
+        target = position if goal is None else np.asarray(goal, dtype=float)
+        if camera == FOLLOW:
+            camera = follow_cameras(position[None], [in_view(target, markers)], 0.0, self._scale)[0]
+        self._renderer.update_scene(data, camera)
+        if trail is not None:
+            self._add_trail(np.asarray(trail, dtype=float))
+        if goal is not None:
+            # It fades as the aircraft comes near, so as not to veil it.
+            away = np.linalg.norm(target - position) / self._scale
+            rgba = (*GOAL_RGBA[:3], GOAL_RGBA[3] * float(np.clip(away / 0.4, 0.1, 1.0)))
+            self._add_marker(Marker("goal", tuple(target), GOAL_RADIUS * self._scale, rgba))
+        for marker in markers:
+            self._add_marker(marker)
+        with gl.current_context_kept():
+            return self._renderer.render()
+
+    def close(self) -> None:
+        """Give the graphics context back."""
+        self._close()
+
+    def __exit__(self, *_: object) -> None:
+        """Close the context."""
+        self.close()
+
+    def _turn_blades(self, angles: Array) -> None:
+        data = self._data
+        for blade, hub, rotor in self._blades:
+            axes = data.geom_xmat[hub].reshape(3, 3)
+            cos, sin = math.cos(angles[rotor]), math.sin(angles[rotor])
+            turn = axes @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ axes.T
+            centre = data.geom_xpos[hub]
+            data.geom_xpos[blade] = centre + turn @ (data.geom_xpos[blade] - centre)
+            data.geom_xmat[blade] = (turn @ data.geom_xmat[blade].reshape(3, 3)).ravel()
+
+    def _add(
+        self, shape: str, rgba: ArrayLike, size: ArrayLike, position: Array, axes: Array
+    ) -> mujoco.MjvGeom:
+        """Add a shape of MuJoCo's to the scene and return it."""
+        scene = self._renderer.scene
+        if scene.ngeom >= scene.maxgeom:
+            allowed = f"at most {scene.maxgeom}: give fewer markers"
+            raise QuadrlError(name="shapes to draw", value=scene.ngeom + 1, allowed=allowed)
+        geom, kind = scene.geoms[scene.ngeom], getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")
+        scene.ngeom += 1
+        colour, extent = np.asarray(rgba, dtype=np.float32), np.asarray(size, dtype=float)
+        mujoco.mjv_initGeom(geom, kind, extent, position, axes.ravel(), colour)
+        geom.rgba[:3], geom.emission = 0.6 * colour[:3], 1.0  # glows instead of being lit
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # casts no shadow
+        return geom
+
+    def _add_chain(
+        self, shape: str, points: ArrayLike, colours: ArrayLike, widths: ArrayLike
+    ) -> None:
+        """Connect points (n, 3); colours are (n, 4) and widths (n,), or one for all."""
+        points = np.asarray(points, dtype=float)
+        colours = np.broadcast_to(colours, (len(points), 4))
+        widths = np.broadcast_to(widths, len(points))
+        for k in np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6):
+            geom = self._add(shape, colours[k], np.zeros(3), points[k], np.eye(3))
+            kind, width = geom.type, float(widths[k])
+            geom.type = mujoco.mjtGeom.mjGEOM_CYLINDER if shape == "BOX" else kind
+            mujoco.mjv_connector(geom, geom.type, width, points[k], points[k + 1])  # knows no box
+            geom.type = kind
+            if shape == "ARROW":
+                geom.size = (width, width, 2 * geom.size[2])  # MuJoCo draws half of it
+
+    def _add_circle(self, centre: Array, axes: Array, radius: float, rgba: Sequence[float]) -> None:
+        edge = centre + radius * CIRCLE @ axes.T
+        self._add_chain("CAPSULE", edge, (*rgba[:3], 1.0), 0.02 * radius + 0.003)
+
+    def _add_trail(self, points: Array) -> None:
+        shown = np.unique(np.linspace(0, len(points) - 1, TRAIL_SEGMENTS + 1).astype(int))
+        youth = np.linspace(0, 1, len(shown))
+        colours = TRAIL_OLD + youth[:, None] * (TRAIL_NEW - TRAIL_OLD)
+        # Boxes are the cheapest shape: a trail of capsules took 40 ms a frame.
+        self._add_chain("BOX", points[shown], colours, self._scale * TRAIL_WIDTH * youth**0.7)
+
+    def _add_marker(self, marker: Marker) -> None:
+        kind, size, rgba = marker.kind, marker.size, marker.rgba
+        position = np.asarray(marker.position, dtype=float)
+        end = position if marker.end is None else np.asarray(marker.end, dtype=float)
+        quaternion, axes = np.empty(4), np.empty(9)
+        mujoco.mju_quatZ2Vec(quaternion, end - position)  # upright where there is no end
+        mujoco.mju_quat2Mat(axes, quaternion)
+        axes = axes.reshape(3, 3)
+        if kind in ("goal", "sphere"):
+            self._add("SPHERE", rgba, (size,) * 3, position, axes).label = marker.label
+        if kind == "goal":
+            foot = np.array([position[0], position[1], 0.004])  # [m], clear of the ground
+            core = (*rgba[:3], min(1.0, 3.0 * rgba[3]))
+            self._add("SPHERE", core, (0.22 * size,) * 3, position, axes)
+            self._add_chain("CYLINDER", (foot, position), (*rgba[:3], 0.55), 0.05 * size)
+            self._add_circle(foot, np.eye(3), 1.8 * size, rgba)
+        elif kind == "ring":
+            self._add_circle(position, axes, size, rgba)
+        elif kind == "pad":
+            if marker.end is None:
+                position = position * (1.0, 1.0, 0.0)
+            self._add("CYLINDER", PAD_RGBA, (size, 0.002, 0), position, axes)
+            for share in (1.0, 0.62):
+                self._add_circle(position, axes, share * size, rgba)
+            # The letter H: where its two posts and its bar are, and half of their extents.
+            for x, width, height in ((-0.17, 0.045, 0.29), (0.17, 0.045, 0.29), (0, 0.17, 0.04)):
+                centre = position + axes @ (size * x, 0.0, 0.003)
+                self._add("BOX", rgba, (size * width, size * height, 0.001), centre, axes)
+        elif kind == "path":
+            self._add_chain("BOX", marker.points, rgba, size)
+        elif kind in ("line", "arrow"):
+            self._add_chain("ARROW" if kind == "arrow" else "CYLINDER", (position, end), rgba, size)

@@ -1,0 +1,172 @@
+"""The validator of every option and parameter: values are checked once, where they come in."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import numbers as abstract
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from quadrl.errors import QuadrlError
+
+MAX_OPTION = 1e9
+"""Larger options of a task would take the digits from what is added to them."""
+
+
+def number(
+    name: str,
+    value: Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    whole: bool = False,
+    positive: bool = False,
+) -> Any:
+    """A finite number between `low` and `high`, as a float, or as an int where `whole`.
+
+    Raises:
+        QuadrlError: It is no number, not finite, or out of range.
+    """
+    kind = abstract.Integral if whole else abstract.Real
+    if isinstance(value, kind) and not isinstance(value, (bool, np.bool_)):
+        converted: Any = int(value) if whole else _float(value)  # type: ignore[arg-type]
+        if (
+            low <= converted <= high
+            and (whole or math.isfinite(converted))
+            and (converted > 0 or not positive)
+        ):
+            return converted
+    raise QuadrlError(name=name, value=value, allowed=_range(low, high, whole, positive))
+
+
+def numbers(
+    name: str, value: Any, size: int | None = None, low: float = -math.inf, high: float = math.inf
+) -> tuple[float, ...]:
+    """`size` numbers, each between `low` and `high`; of any count where `size` is None.
+
+    Raises:
+        QuadrlError: It is no such sequence.
+    """
+    try:
+        items = None if isinstance(value, str) else tuple(value)
+    except TypeError:
+        items = None
+    if items is None or (size is not None and len(items) != size):
+        many = "a sequence of numbers" if size is None else f"a sequence of {size} numbers"
+        raise QuadrlError(name=name, value=value, allowed=many)
+    return tuple(number(f"{name}[{k}]", item, low, high) for k, item in enumerate(items))
+
+
+def choice(name: str, value: Any, choices: Iterable[str]) -> Any:
+    """A value that is one of the choices.
+
+    Raises:
+        QuadrlError: It is none of them; the message lists them and names the nearest.
+    """
+    allowed = list(choices)
+    if isinstance(value, str) and value in allowed:
+        return value
+    near = difflib.get_close_matches(str(value), allowed, n=1)
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    raise QuadrlError(name=name, value=value, allowed=f"one of {', '.join(allowed)}{hint}")
+
+
+def keys(what: str, given: Iterable[str], choices: Iterable[str]) -> None:
+    """Refuse the first name that is not among the choices.
+
+    Raises:
+        QuadrlError: The message lists the choices.
+    """
+    allowed = list(choices)
+    for name in given:
+        choice(what, name, allowed)
+
+
+def like(name: str, value: Any, default: Any) -> Any:
+    """A value of the same kind as a default: text, flag, finite number or sequence of numbers.
+
+    Raises:
+        QuadrlError: It is of another kind, not finite, or larger than `MAX_OPTION`.
+    """
+    if _kind(value) != _kind(default):
+        allowed = f"a {_kind(default)}, such as {default!r}"
+        raise QuadrlError(name=name, value=value, allowed=allowed)
+    if isinstance(value, (str, bool)) or value is None:
+        return value
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    # Whole numbers past 64 bits are objects to NumPy.
+    if array.dtype.kind not in "fiu" or not (np.abs(array) <= MAX_OPTION).all():
+        raise QuadrlError(
+            name=name, value=value, allowed=f"finite, between -{MAX_OPTION:g} and {MAX_OPTION:g}"
+        )
+    return value
+
+
+def rows(given: Any, count: int) -> np.ndarray:
+    """Numbers of rows, in order, from different numbers (n,) or a mask (count,).
+
+    Raises:
+        QuadrlError: It is neither.
+    """
+    array = np.asarray(given)
+    if array.dtype == bool and array.shape == (count,):
+        return np.flatnonzero(array)
+    whole = array.ndim == 1 and (array.dtype.kind in "iu" or len(array) == 0)
+    chosen = np.unique(array) if whole else np.zeros(0, dtype=np.int64)
+    within = len(chosen) == 0 or (chosen[0] >= 0 and chosen[-1] < count)
+    if not whole or len(chosen) != len(array) or not within:
+        allowed = f"different numbers from 0 to {count - 1}, or a mask ({count},)"
+        raise QuadrlError(name="rows", value=array.tolist(), allowed=allowed)
+    return chosen.astype(np.int64)
+
+
+def action(given: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An action in double precision, a copy; what would be converted with a loss is refused.
+
+    Raises:
+        QuadrlError: Wrong shape or kind, or a number that is not finite.
+    """
+    try:
+        array = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise QuadrlError(str(error), name="action", value=given, allowed="real numbers") from error
+    if array.dtype.char not in "fd" and not np.can_cast(array.dtype, np.float64):
+        allowed = "of real numbers, such as float32 or float64"
+        raise QuadrlError(name="action dtype", value=str(array.dtype), allowed=allowed)
+    if array.shape != shape:
+        raise QuadrlError(name="action shape", value=array.shape, allowed=str(shape))
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+        raise QuadrlError(name=f"action{list(where)}", value=float(array[where]), allowed="finite")
+    return array
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, (bool, str, dict)) or value is None:
+        return {"str": "string", "bool": "flag"}.get(type(value).__name__, type(value).__name__)
+    return "number" if isinstance(value, abstract.Real) else "sequence"
+
+
+def _float(value: Any) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _range(low: float, high: float, whole: bool, positive: bool) -> str:
+    kind = "a whole number" if whole else "a number"
+    if math.isfinite(low) and math.isfinite(high):
+        return f"{kind} between {low:g} and {high:.10g}"
+    if math.isfinite(low):
+        return f"{kind} of at least {low:g}"
+    if math.isfinite(high):
+        return f"{kind} of at most {high:.10g}"
+    return f"{'a positive' if positive else 'a finite'}{' whole' * whole} number"

@@ -1,0 +1,121 @@
+"""Parts of the pages that come from the code itself: tasks, actions, observations, aircraft."""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from typing import Any
+
+from quadrl import VEHICLES, cli, tasks
+from quadrl.cli import tasks as listing
+from quadrl.control import CONTROL_MODES
+from quadrl.description import describe, describe_action, docstrings
+from quadrl.vehicle import GRAVITY, Rotor, Vehicle
+from scripts.reports.report import Parts, asked, table
+
+
+def task_table(**columns: str) -> str:
+    """Attributes of each task by the heads of the columns."""
+    rows = (
+        (f"[`{name}`](../tasks/{name}.py)", *(getattr(task, x) for x in columns.values()))
+        for name, task in tasks.TASKS.items()
+    )
+    return table(("task", *columns), rows)
+
+
+def training_table() -> str:
+    """What each task is trained with and what a policy must reach."""
+    rows = []
+    for name, task in tasks.TASKS.items():
+        settings = " ".join(f"`{setting}`" for setting in listing._settings(task.training))
+        targets = "; ".join(f"{target.words}: {asked(target)}" for target in task.targets)
+        rows.append((f"`{name}`", settings, targets))
+    return table(("task", "settings other than the defaults", "counts as trained"), rows)
+
+
+def control_modes() -> str:
+    """What the control modes ask for, and how much of it on each aircraft."""
+    rows = []
+    for name, kind in CONTROL_MODES.items():
+        modes = [kind(vehicle) for vehicle in VEHICLES.values()]
+        terms = [(f"{term.name}: {term.meaning}", term.unit) for term in modes[0].terms]
+        if not kind.has_loops:  # as many terms as rotors, and all alike
+            terms = [("one number per rotor: its speed command, from hover", terms[0][1])]
+        for k, term in enumerate(terms):
+            scales = (f"{mode.scale[k]:.3g}" for mode in modes)
+            rows.append((f"`{name}`" if k == 0 else "", *term, *scales))
+    scales = (f"scale, {name}" for name in VEHICLES)
+    return table(("`control_mode=`", "what it asks for", "unit", *scales), rows)
+
+
+def observation() -> str:
+    """The entries of the flat observation."""
+    return table(("observation", "numbers", "unit", "meaning and frame"), coded("observation"))
+
+
+def reward() -> str:
+    """The terms of the reward and their weights."""
+    return table(("reward", "meaning", "weight", "where it differs"), coded("reward"))
+
+
+def coded(what: str) -> list[tuple[str, ...]]:
+    """The rows that `quadrl tasks` shows, with the names as code."""
+    described = [describe(tasks.make(name)) for name in tasks.TASKS]
+    rows = getattr(listing, f"_{what}")(described)
+    return [(f"`{name}`", *rest) for name, *rest in rows]
+
+
+def vehicle() -> str:
+    """The parameters of the default aircraft and of its first rotor."""
+    paper, rows = Vehicle(), []
+    for kind, values in ((Vehicle, paper), (Rotor, paper.rotors[0])):
+        for name, text in docstrings(kind).items():
+            if name not in ("name", "rotors"):
+                label = f"`{name}`" if kind is Vehicle else f"rotor 1: `{name}`"
+                rows.append((label, number(getattr(values, name)), text))
+    rows.append(("rotor 1: `hover_speed`", number(float(paper.hover_speed[0])), "follows [rad/s]"))
+    return table(("parameter", "value", "meaning, unit, source"), rows)
+
+
+def number(value: Any) -> str:
+    """A parameter in few digits."""
+    if isinstance(value, tuple):
+        return ", ".join(map(number, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def vehicles() -> str:
+    """The aircraft that come with quadrl."""
+    rows = []
+    for name, v in VEHICLES.items():
+        thrust = sum(r.thrust_coefficient * r.max_speed**2 * r.axis[2] for r in v.rotors)
+        cells = [f"`{name}`", f"{v.mass:g} kg", v.rotor_count, f"{v.size:.3g} m"]
+        cells.append(f"{1 / v.rotors[0].lag_up:.3g} s, {1 / v.rotors[0].lag_down:.3g} s")
+        cells.append(f"{thrust / (v.mass * GRAVITY):.2g}")
+        rows.append([*cells, f"{v.physics_timestep:g} s, {v.control_timestep:g} s"])
+    head = ["vehicle", "mass", "rotors", "arm", "time constants, up and down"]
+    return table([*head, "thrust over weight", "physics and control step"], rows)
+
+
+def commands() -> str:
+    """The subcommands."""
+    rows = []
+    for kind in typing.get_args(cli.Command):
+        text = (inspect.getdoc(typing.get_args(kind)[0]) or "").partition("\n")[0]
+        rows.append((f"`quadrl {kind.__metadata__[0].name}`", text))
+    return table(("command", "what it does"), rows)
+
+
+TEXTS = {"asks": "asks", "starts": "starts", "ends early": "ends", "solved": "solved"}
+PARTS: Parts = {
+    "task-list": lambda: task_table(asks="asks", solved="solved"),
+    "tasks": lambda: task_table(**TEXTS, **{"time limit [s]": "time_limit"}),
+    "training-defaults": training_table,
+    "action": lambda: f"{describe_action(Vehicle())}.",
+    "control-modes": control_modes,
+    "observation": observation,
+    "reward": reward,
+    "vehicle": vehicle,
+    "vehicles": vehicles,
+    "commands": commands,
+}

@@ -1,0 +1,116 @@
+"""Draws docs/images/tasks.jpg, and with --run the other pictures of the README from a training.
+
+The PPO policy that ships for a task flies it; the geometric controller flies what has no policy.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import tyro
+from PIL import Image
+from scipy.integrate import cumulative_trapezoid
+
+from quadrl import mjcf, tasks
+from quadrl.control import make as make_controller
+from quadrl.learning.folder import LEARNING_CURVE
+from quadrl.policy import SHIPPED, Policy
+from quadrl.rendering import Renderer, render_trajectory
+from quadrl.rollout import Rollout, fly
+from quadrl.vehicle import Vehicle
+from scripts.reports.report import IMAGES
+
+MOMENTS, DRAWN, SHOWN = 4, (640, 360), (320, 180)  # drawn larger, for smooth edges [pixels]
+SETTLED = 0.05  # of the largest distance from the last position: little happens after that
+# The flight of the first picture begins farther away than those of the training, to be seen.
+RELEASE = {"radius": 2.6, "max_distance": 6.0, "tilt": 0.5}
+EPISODES, SECONDS, POSES, FPS = 512, 8.0, 4, 60.0
+SIZE = (1600, 500)  # [pixels]
+CAMERA_DISTANCE, ELEVATION = 1.75, -16.0  # [m], [deg]
+
+
+def main(run: Path | None = None) -> None:
+    """Draw them.
+
+    Args:
+        run: Folder of a training of hover, for the first picture and the learning curve.
+    """
+    if run:
+        rollout = fly(Policy.load(run), tasks.make("hover", **RELEASE), episodes=EPISODES, seed=5)
+        picture = exposure(rollout, most_direct(rollout))
+        Image.fromarray(picture).save(IMAGES / "hover.png", optimize=True)
+        shutil.copy(run / LEARNING_CURVE, IMAGES)
+    rows = [np.hstack(list(moments(name))) for name in tasks.TASKS]
+    Image.fromarray(np.vstack(rows)).save(IMAGES / "tasks.jpg", quality=88, optimize=True)
+
+
+def moments(name: str) -> Iterator[np.ndarray]:
+    """A few pictures of a flight of a task, until little happens."""
+    task, file, vehicle = tasks.make(name), SHIPPED / f"{name}_ppo.safetensors", Vehicle()
+    controller = Policy.load(file) if file.exists() else make_controller("geometric", task)
+    rollout = fly(controller, task, episodes=1)
+    flight = rollout.trajectory(vehicle)
+    away = np.linalg.norm(flight.qpos[:, :3] - flight.qpos[-1, :3], axis=1)
+    last = int(np.flatnonzero(away > SETTLED * away.max())[-1])
+    fps = (MOMENTS - 0.9) / (flight.time[last] - flight.time[0])
+    model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene)
+    every = math.ceil(1 / fps)  # one picture a second is the slowest that is drawn
+    width, height = DRAWN
+    frames = render_trajectory(flight, model, fps=fps * every, width=width, height=height)
+    for frame in itertools.islice(frames, 0, MOMENTS * every, every):
+        yield np.asarray(Image.fromarray(frame).resize(SHOWN, Image.Resampling.LANCZOS))
+
+
+def most_direct(rollout: Rollout) -> int:
+    """The flight of least detour among the long and level ones."""
+    path = rollout.position[: round(SECONDS / rollout.control_timestep)]
+    away = np.linalg.norm(path[0, :, :2], axis=-1)
+    length = np.linalg.norm(np.diff(path, axis=0), axis=-1).sum(0)
+    detour = length / np.linalg.norm(path[0], axis=-1)
+    height = np.ptp(path[..., 2], axis=0)
+    shown = (away > 2.2) & (height < 0.6) & rollout.is_success
+    if not shown.any():
+        raise SystemExit("this policy has no flight that would make a picture")
+    return int(np.where(shown, detour, math.inf).argmin())
+
+
+def exposure(rollout: Rollout, episode: int) -> np.ndarray:
+    """Several moments of one flight in one picture, from the start on the left to the goal."""
+    vehicle = Vehicle()
+    model = mjcf.compile_model(vehicle)
+    flight = rollout.trajectory(vehicle, episode).resampled(FPS)
+    last = int(np.searchsorted(flight.time, SECONDS)) - 1
+    position, goal = flight.qpos[: last + 1, :3], flight.goal[0]
+    to_goal = goal - position[0]
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat = goal - 0.46 * to_goal
+    camera.distance, camera.elevation = CAMERA_DISTANCE, ELEVATION
+    camera.azimuth = math.degrees(math.atan2(to_goal[1], to_goal[0])) + 90.0
+    left = np.linalg.norm(position - position[last], axis=1)
+    shares = np.arange(POSES - 1, 0, -1) / (POSES - 1)
+    chosen = [int(np.abs(left - left[0] * share).argmin()) for share in shares] + [last]
+    spins = -np.sign(model.actuator_gear[:, 5])  # the aircraft feels the opposite torque
+    angles = spins * cumulative_trapezoid(flight.rotor_speed, flight.time, axis=0, initial=0)
+    absent = flight.qpos[0].copy()
+    absent[2] += 1000.0
+    with Renderer(model, *SIZE) as renderer:
+        shared = {"camera": camera, "goal": goal, "trail": position}
+        background = renderer.frame(absent, **shared).astype(float)
+        picture = background.copy()
+        for k in chosen:
+            frame = renderer.frame(flight.qpos[k], rotor_angles=angles[k], **shared)
+            change = np.abs(frame - background).max(axis=-1, keepdims=True)
+            cover = np.clip((change - 4.0) / 14.0, 0.0, 1.0)  # noise stays out, edges stay smooth
+            picture += cover * (frame - picture)
+    return picture.round().clip(0, 255).astype(np.uint8)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,116 @@
+"""Trains every task with its defaults, and hover in both engines and on every aircraft.
+
+Run it on a machine that does nothing else; it takes about half an hour on two cores. Interrupted at
+any moment, it continues at the next start.
+"""
+
+from __future__ import annotations
+
+import tyro
+
+from quadrl import VEHICLES, tasks
+from quadrl.control import make as make_controller
+from quadrl.engines.mujoco import ENGINES
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.study import Run
+from quadrl.policy import Policy
+from quadrl.rollout import Controller, fly, summarize
+from scripts.reports import evaluation, report
+from scripts.reports.report import Result, asked, factor, number, table
+
+HOVER_SEEDS = (50, 51, 52, 53, 54)  # not used for tuning, like those below
+SEEDS = (80, 81, 82)
+JOBS = 2  # at the same time, of the trainings whose wall clock is no record
+EPISODES = 100
+LONGEST = 300.0  # [s] that a training of any task may take
+
+
+def plan() -> dict[int, list[Run]]:
+    """The trainings, by how many are made at the same time."""
+    folder = report.RUNS / "training"
+    alone = [
+        TrainConfig("hover", engine=engine, seed=seed) for engine in ENGINES for seed in HOVER_SEEDS
+    ]
+    pairs = [(task, "paper") for task in tasks.TASKS if task != "hover"]
+    pairs += [("hover", vehicle) for vehicle in VEHICLES if vehicle != "paper"]
+    together = [
+        TrainConfig(task, vehicle=vehicle, seed=seed, num_threads=1)
+        for task, vehicle in pairs
+        for seed in SEEDS
+    ]
+    name = "{0.task}-{0.vehicle}-{0.engine}-{0.seed}".format
+    return {k: [Run(c, folder / name(c)) for c in x] for k, x in ((1, alone), (JOBS, together))}
+
+
+def main() -> None:
+    """Train what is missing, evaluate it, write it down."""
+    planned = plan()
+    for jobs, runs in planned.items():
+        evaluation.train(runs, jobs, EPISODES)
+    found = []
+    for run in (run for runs in planned.values() for run in runs):
+        known = evaluation.trained(run)
+        found.append(known | flown(Policy.load(run.folder), known["task"], known["vehicle"]))
+    yardstick = [
+        flown(make_controller("geometric", *pair), *pair)
+        for pair in dict.fromkeys((run["task"], run["vehicle"]) for run in found)
+    ]
+    report.save("training", {"episodes": EPISODES, "yardstick": yardstick, "runs": found})
+
+
+def flown(controller: Controller, task: str, vehicle: str) -> Result:
+    """What a controller, or the mean action of a policy, reaches in MuJoCo."""
+    rollout = fly(controller, task, episodes=EPISODES, vehicle=vehicle)
+    return {"task": task, "vehicle": vehicle, "metrics": summarize(rollout)}
+
+
+# ------------------------------------------------------------------------------- parts of the pages
+
+
+def hover() -> str:
+    """Hover, in both engines and on every aircraft."""
+    result = report.load("training")
+    rows = []
+    for run in (run for run in result["runs"] if run["task"] == "hover"):
+        metrics = run["metrics"]
+        row = [run["vehicle"], run["engine"], run["seed"], f"{run['steps']:,}"]
+        row += [f"{run['training_s']:.1f} s"]
+        row += [f"{100 * metrics[name]:.0f} %" for name in ("survival_rate", "success_rate")]
+        row += [f"{100 * metrics['position_error_m']:.1f} cm"]
+        rows.append([*row, f"{metrics['heading_error_deg']:.1f} deg"])
+    head = ["aircraft", "engine", "seed", "control steps", "training", "flown to the end"]
+    head += ["successful", "error", "heading off east"]
+    known = [row for row in result["yardstick"] if row["task"] == "hover"]
+    error = max(100 * row["metrics"]["position_error_m"] for row in known)
+    success = min(100 * row["metrics"]["success_rate"] for row in known)
+    note = f"The geometric controller, in the same episodes and with every aircraft: {success:.0f} "
+    note += f"% successful, largest error {number(error)} cm."
+    return f"{table(head, rows)}\n\n{note}  \n{report.source(result)}"
+
+
+def suite() -> str:
+    """Every task beside what counts as solved and the geometric controller."""
+    result = report.load("training")
+    rows: list[tuple[str, ...]] = []
+    for name, task in tasks.TASKS.items():
+        runs, known = (
+            [row for row in result[part] if (row["task"], row["vehicle"]) == (name, "paper")]
+            for part in ("runs", "yardstick")
+        )
+        runs = [run for run in runs if run["engine"] == "free_flight"][: len(SEEDS)]
+        for k, target in enumerate(task.targets):
+            reached = (each["metrics"][target.metric] for each in (*runs, *known))
+            cells = (number(value and factor(target) * value) for value in reached)
+            rows.append((f"`{name}`" if k == 0 else "", target.words, asked(target), *cells))
+        seeds = ", ".join(str(run["seed"]) for run in runs)
+        words = f"training, {runs[0]['steps']:,} steps, seeds {seeds}"
+        took = (f"{run['training_s']:.0f} s" for run in runs)
+        rows.append(("", words, f"at most {LONGEST:.0f} s", *took, ""))
+    seeds = ("first seed", "second seed", "third seed")
+    return table(("task", "figure", "asked", *seeds, "geometric controller"), rows)
+
+
+PARTS: report.Parts = {"training-hover": hover, "training-suite": suite}
+
+if __name__ == "__main__":
+    tyro.cli(main)

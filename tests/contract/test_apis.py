@@ -1,0 +1,260 @@
+"""What every API has to do alike: seeds, resets, copies, divergence, refusals."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import quadrl
+from quadrl import envs
+from quadrl.envs.gymnasium import QuadrotorEnv, QuadrotorVectorEnv
+from quadrl.envs.torchrl import QuadrotorEnv as TorchEnv
+from quadrl.errors import QuadrlError
+from quadrl.tasks import TASKS
+from quadrl.testing import varied_actions
+
+ACTIONS = varied_actions(12, 4)[:, 2:]  # (T, N, 4); one dives, one does anything
+
+
+class DmControl:
+    """One aircraft by dm_control; a seed is given when it is made."""
+
+    rows = 1
+
+    def __init__(self, task="hover", seed=None, **settings):
+        self.environment = envs.dm_control.make(task, random=seed, **settings)
+        self.core = self.environment.task.environment
+
+    def reset(self):
+        return self.environment.reset()
+
+    def step(self, actions):
+        return self.environment.step(actions[0])
+
+    def observation(self, given):
+        return np.concatenate(list(given.observation.values()))[None]
+
+    def terminated(self, given):
+        return [given.last() and given.discount == 0.0]
+
+    def copied(self, given):
+        return {name: term.copy() for name, term in given.observation.items()} | {
+            "reward": given.reward
+        }
+
+
+class Gymnasium:
+    """One aircraft by Gymnasium."""
+
+    rows = 1
+
+    def __init__(self, task="hover", seed=None, **settings):
+        self.environment, self.seed = QuadrotorEnv(task, **settings), seed
+        self.core = self.environment.environment
+
+    def reset(self):
+        seed, self.seed = self.seed, None
+        return self.environment.reset(seed=seed)
+
+    def step(self, actions):
+        return self.environment.step(actions[0])
+
+    def observation(self, given):
+        return given[0].reshape(self.rows, -1)
+
+    def terminated(self, given):
+        return np.reshape(given[2], self.rows).tolist()
+
+    def copied(self, given):
+        return {"observation": given[0].copy(), "rest": repr(given[1:])}
+
+
+class Vector(Gymnasium):
+    """Two aircraft by Gymnasium."""
+
+    rows = 2
+
+    def __init__(self, task="hover", seed=None, *, mode="DISABLED", **settings):
+        self.environment = QuadrotorVectorEnv(task, 2, autoreset_mode=mode, **settings)
+        self.core, self.seed = self.environment.environment, seed
+
+    def step(self, actions):
+        return self.environment.step(actions)
+
+
+class TorchRL:
+    """Two aircraft by TorchRL."""
+
+    rows = 2
+
+    def __init__(self, task="hover", seed=None, **settings):
+        self.environment = TorchEnv(task, 2, seed=seed, reward_terms=True, **settings)
+        self.core = self.environment.environment
+
+    def reset(self):
+        self.met = self.environment.reset()
+        return self.met
+
+    def step(self, actions):
+        actions = torch.as_tensor(actions) if isinstance(actions, np.ndarray) else actions
+        now = self.environment.step(self.met.clone().set("action", actions))
+        return now["next"]
+
+    def observation(self, given):
+        return given["observation"].numpy()
+
+    def terminated(self, given):
+        return given["terminated"].flatten().tolist()
+
+    def copied(self, given):
+        return {name: term.clone().numpy() for name, term in given.items(True, True)}
+
+
+APIS = [DmControl, Gymnasium, Vector, TorchRL]
+every_api = pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
+
+
+def episode(flown, actions=ACTIONS):
+    """The observations of an episode (T + 1, N, size)."""
+    seen = [flown.observation(flown.reset())]
+    return np.stack(seen + [flown.observation(flown.step(a[: flown.rows])) for a in actions])
+
+
+@every_api
+def test_a_seed_gives_the_episodes_one_after_the_other(api):
+    one, same, other = api(seed=3), api(seed=3), api(seed=5)
+    first, second = episode(one), episode(one)
+    np.testing.assert_array_equal(first, episode(same))
+    np.testing.assert_array_equal(second, episode(same))
+    starts = [first[0], second[0], episode(other)[0], episode(api())[0], episode(api())[0]]
+    assert len(np.unique(np.concatenate(starts), axis=0)) == 5 * api.rows
+
+
+@every_api
+@pytest.mark.parametrize("seed", [-1, 1.5, "three", True])
+def test_an_impossible_seed_is_refused(api, seed):
+    with pytest.raises(QuadrlError) as caught:
+        api(seed=seed).reset()
+    assert (caught.value.name, caught.value.value) == ("seed", seed)
+
+
+@pytest.mark.parametrize(
+    ("api", "settings"),
+    [
+        *((api, {}) for api in APIS),
+        (Vector, {"mode": "NEXT_STEP"}),
+        (Vector, {"mode": "SAME_STEP"}),
+    ],
+    ids=lambda value: value.get("mode", "") if isinstance(value, dict) else value.__name__,
+)
+def test_what_is_handed_out_is_never_changed_later(api, settings):
+    flown = api(seed=0, time_limit=0.2, **settings)  # four steps, so that resets are among them
+    handed_out = [flown.reset()]
+    copies = [flown.copied(handed_out[0])]
+    for t, actions in enumerate(ACTIONS):
+        handed_out.append(flown.step(actions[: flown.rows]))
+        copies.append(flown.copied(handed_out[-1]))
+        if t % 4 == 3 and not settings:
+            handed_out.append(flown.reset())
+            copies.append(flown.copied(handed_out[-1]))
+    for given, copy in zip(handed_out, copies, strict=True):
+        again = flown.copied(given)
+        assert again.keys() == copy.keys()
+        for name, value in copy.items():
+            np.testing.assert_array_equal(again[name], value)
+
+
+@every_api
+def test_a_divergence_ends_the_episode(api):
+    flown = api(seed=0)
+    flown.reset()
+    still = np.zeros((flown.rows, 4), np.float32)
+    before = flown.observation(flown.step(still))
+    row = flown.rows - 1
+    flown.core.engine.qvel[row, 0] = 1e12
+    given = flown.step(still)
+    assert flown.terminated(given) == [False] * row + [True]
+    np.testing.assert_array_equal(flown.observation(given)[row], before[row])
+    assert np.isfinite(flown.observation(flown.reset())).all()
+    assert not any(flown.terminated(flown.step(still)))
+
+
+@every_api
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"task": "hoover"}, "task"),
+        ({"tollerance": 1.0}, "hover option"),
+        ({"tolerance": "wide"}, "hover tolerance"),
+        ({"time_limit": 0.0}, "hover time_limit"),
+        ({"control_mode": "rotors"}, "control_mode"),
+        ({"engine": "mujocco"}, "engine"),
+        ({"vehicle": "papr"}, "vehicle"),
+        ({"ranges": {"mas": (0.5, 0.6)}}, "range"),
+    ],
+    ids=lambda value: str(value) if isinstance(value, str) else None,
+)
+def test_an_unknown_name_or_value_is_refused(api, settings, name):
+    with pytest.raises(QuadrlError) as caught:
+        api(**settings)
+    assert caught.value.name == name
+    assert caught.value.allowed
+
+
+@every_api
+@pytest.mark.parametrize(
+    ("action", "name", "value"),
+    [
+        (np.zeros(3), "action shape", (3,)),
+        (np.zeros((1, 4)), "action shape", (1, 4)),
+        (np.array([0, 0, np.nan, 0]), "action[0, 2]", None),
+        (np.array([0, -np.inf, 0, 0]), "action[0, 1]", -np.inf),
+    ],
+    ids=["short", "nested", "nan", "infinite"],
+)
+def test_an_impossible_action_is_refused(api, action, name, value):
+    flown = api()
+    flown.reset()
+    actions = np.stack([action] * flown.rows)
+    with pytest.raises((QuadrlError, RuntimeError)) as caught:
+        flown.step(actions)
+    if isinstance(caught.value, QuadrlError):  # TorchRL itself refuses a wrong shape
+        assert caught.value.name == name
+        if value is not None:
+            leading = actions.shape if name == "action shape" else value
+            assert caught.value.value == leading
+    flown.step(np.zeros((flown.rows, 4), np.float32))  # nothing has broken
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_public_names_lead_to_the_same_episodes(name):
+    camel = name.replace("_", " ").title().replace(" ", "")
+    action = varied_actions(1, 3)[0]
+    single, vector = gym.make(f"quadrl/{camel}-v0"), gym.make_vec(f"quadrl/{camel}-v0", num_envs=3)
+    dm = quadrl.load(name, {"random": 7})
+    met, _ = vector.reset(seed=5)
+    np.testing.assert_array_equal(met[2], single.reset(seed=7)[0])
+    terms = np.concatenate(list(dm.reset().observation.values()))
+    np.testing.assert_array_equal(met[2], terms.astype(np.float32))
+    _, rewards, *_ = vector.step(action)
+    assert single.step(action[2])[1] == dm.step(action[2]).reward == rewards[2]
+
+
+def test_the_import_is_light_and_sets_no_variable():
+    code = (
+        "import gymnasium, os, sys; before = dict(os.environ); import quadrl;"
+        "assert dict(os.environ) == before;"
+        "heavy = {'torch', 'dm_control', 'matplotlib', 'scipy', 'quadrl.rendering'};"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules);"
+        "quadrl.suite, quadrl.rendering, quadrl.testing, quadrl.envs.dm_control"
+    )
+    paths = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | paths, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,305 @@
+"""Every task keeps the contract of quadrl.testing, and flies through every API as by mj_step."""
+
+import dataclasses
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import flights
+import numpy as np
+import pytest
+
+from quadrl.control.modes import CONTROL_MODES
+from quadrl.envs import checks
+from quadrl.envs.gymnasium import QuadrotorEnv
+from quadrl.rotation import namespace
+from quadrl.task import Potentials, TaskState
+from quadrl.tasks import TASKS, make
+from quadrl.tasks.hover import Hover
+from quadrl.tasks.landing import Landing
+from quadrl.tasks.static_waypoint import StaticWaypoint
+from quadrl.testing import check_task, varied_actions
+
+SEED, AIRCRAFT = 11, 4
+ACTIONS = varied_actions(110, AIRCRAFT)  # more than twice the time limit of the flights
+WAYPOINTS = ((0.0, 0.1, 0.3), (0.1, 0.0, 0.9), (0.0, 0.0, 5.0))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_task_keeps_the_contract(name):
+    check_task(name)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        Hover(radius=1.0, time_limit=1.0),
+        # The first waypoint is reached at once, the second by the aircraft that climbs.
+        StaticWaypoint(waypoints=WAYPOINTS, reach=0.35),
+    ],
+    ids=["hover", "route"],
+)
+def test_a_variant_of_a_task_keeps_it_too(task):
+    check_task(task)
+
+
+# ------------------------------------------------------------------ the same numbers everywhere
+
+
+def check_identity(task, actions=ACTIONS, mode="rotor"):
+    """Fly a task through every API; returns the flight by mj_step, which all of them repeat."""
+    expected = flights.fly("mj_step", task, SEED, actions, mode)
+    for api in list(flights.APIS)[1:]:
+        flight = flights.fly(api, task, SEED, actions, mode)
+        for column, value in flight.items():
+            # Gymnasium's observations and TorchRL's numbers are float32 casts of the same float64.
+            cast = expected[column].astype(value.dtype)
+            np.testing.assert_array_equal(value, cast, err_msg=f"{api}: {column}")
+        if api in ("environment", "dm_control"):
+            assert flight["observation"].dtype == flight["reward"].dtype == np.float64
+    return expected
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_api_gives_the_numbers_of_a_plain_mj_step_loop(name):
+    flight = check_identity(make(name, time_limit=checks.EPISODE))
+    over = flight["terminated"] | flight["truncated"]
+    assert flight["terminated"].sum() >= 2  # the climb and the dive end early, more than once
+    assert not (flight["terminated"] & flight["truncated"]).any()
+    starts = flight["met"][1:][over[:-1]]
+    assert len(np.unique(starts, axis=0)) == len(starts)
+
+
+@pytest.mark.parametrize("mode", [mode for mode in CONTROL_MODES if mode != "rotor"])
+@pytest.mark.parametrize("name", ["hover", "landing"])  # in free flight, and with contact
+def test_every_control_mode_gives_the_same_numbers_too(name, mode):
+    flight = check_identity(make(name, time_limit=0.5), ACTIONS[:24, 1:3], mode)
+    assert flight["truncated"].sum() >= 2  # several episodes
+
+
+@dataclasses.dataclass(frozen=True)
+class Dropped(Hover):
+    """Falls to the ground, bounces and lies there."""
+
+    contact = True
+
+    def terminated(self, now):
+        return now.potentials.distance > 4.0
+
+
+@pytest.mark.parametrize("altitude", [0.9, 0.07])  # from the air, and on its feet [m]
+def test_contact_gives_the_same_numbers_too(altitude):
+    task = Dropped(altitude=altitude, radius=0.01, time_limit=2.0)
+    flight = check_identity(task, np.full((90, 2, 4), -1.0, np.float32))
+    height = flight["observation"][:, :, 2] + altitude
+    assert (height > -0.01).all()  # it never falls through the ground
+    assert (height < 0.15).sum() > 20  # and lies there for a second of the two
+
+
+@dataclasses.dataclass(frozen=True)
+class Smooth(Hover):
+    """Rewards by the last two actions and the command."""
+
+    def reward(self, before, now, end):
+        change = abs(now.action - before.action).sum(-1)
+        turn = (now.rotor_command - before.rotor_command)[..., 0]
+        return super().reward(before, now, end) | {"change": -change, "turn": turn}
+
+
+def test_a_row_that_begins_anew_has_forgotten_its_last_action():
+    check_identity(Smooth(time_limit=0.5), ACTIONS[:40])
+
+
+# ------------------------------------------------------------------------- faults are noticed
+
+
+def begun(change):
+    """`begin` of hover with its start and its state changed."""
+    return lambda self, rng, parameters: change(*Hover.begin(self, rng, parameters))
+
+
+def rewarded(name, change):
+    """`reward` of hover with a term changed: a function of all terms and the snapshot."""
+
+    def reward(self, before, now, end):
+        terms = Hover.reward(self, before, now, end)
+        return terms | {name: change(terms, now)}
+
+    return reward
+
+
+def level_goal(self, now):
+    terms, height = Hover.observe(self, now), now.state.height
+    goal = terms["goal"]
+    flat = namespace(goal).stack([goal[..., 0], goal[..., 1], 0 * height], axis=-1)
+    return terms | {"goal": flat}
+
+
+def measured_by_a_power(self, now):
+    given = {name: getattr(Hover.measure(self, now), name) for name in Potentials.__slots__}
+    square = given["to_goal"] * given["to_goal"]
+    distance = (square[..., 0] + square[..., 1] + square[..., 2]) ** 0.5
+    return Potentials(**given | {"distance": distance})
+
+
+def nan_far_away(terms, now):
+    distance, xp = now.potentials.distance, namespace(now.time)
+    return xp.where(distance > 2.0, 0 * distance + xp.nan, distance)  # not at once
+
+
+def of_a_goal_that_moves(self, before, now):
+    now.task.goal[..., 0] += 0.1
+    return now.task
+
+
+def by_branches(self, now):
+    distance = now.potentials.distance
+    return distance if (distance < 2.0).any() else 2 * distance
+
+
+def in_double_precision(self, now):
+    xp = namespace(now.time)
+    return xp.astype(now.potentials.distance, xp.float64)
+
+
+def remembered(terms, now, calls=itertools.count()):  # noqa: B008 - one for all calls
+    return terms["survival"] + 1e-9 * next(calls)
+
+
+FAULTS = {
+    "a missing text": ("solved must be a text", {"solved": ""}),
+    "other random numbers": (
+        "two starts for one key",
+        {"begin": begun(lambda start, state: (start, TaskState(np.random.normal(size=(4, 3)))))},
+    ),
+    "no rotation": (
+        "quaternion of begin.*of length 1",
+        {"begin": begun(lambda a, b: (dataclasses.replace(a, quaternion=2 * a.quaternion), b))},
+    ),
+    "a start by the mean of the batch": (
+        "begin of one aircraft and of a batch differ: start.position",
+        {
+            "begin": begun(
+                lambda a, b: (
+                    dataclasses.replace(a, position=0.9 * a.position.mean(0) + a.position),
+                    b,
+                )
+            )
+        },
+    ),
+    "a start in NumPy alone": (
+        "begin with tensors|begin fails",
+        {"begin": begun(lambda a, b: (dataclasses.replace(a, position=np.array(a.position)), b))},
+    ),
+    "a term that is not declared": (
+        "observe.*must be the declared terms",
+        {"observe": lambda self, now: Hover.observe(self, now) | {"wind": now.state.velocity}},
+    ),
+    "a constant entry": ("entries .2. of 'goal' never change", {"observe": level_goal}),
+    "a reward by the mean of the batch": (
+        "one aircraft and a batch get different numbers: spin",
+        {"reward": rewarded("spin", lambda terms, now: terms["spin"] - terms["spin"].mean())},
+    ),
+    "a reward that is not a number": ("near.*nan", {"reward": rewarded("near", nan_far_away)}),
+    "a reward with a memory": (
+        "reward through|get different numbers",
+        {"reward": rewarded("survival", remembered)},
+    ),
+    "one end for all": (
+        r"terminated.*\(\)",
+        {"terminated": lambda self, now: Hover.terminated(self, now).any()},
+    ),
+    "words to draw": ("markers fails.*'str'", {"markers": lambda self, now: ["a sphere"]}),
+    "a negative error": (
+        "an error is negative",
+        {"error": lambda self, now: now.potentials.distance - 0.5},
+    ),
+    "a changed argument": ("read-only", {"update": of_a_goal_that_moves}),
+    "a batch of four": (
+        "a function of 1 rows.* fails",
+        {"error": lambda self, now: now.potentials.distance + 0 * now.state.position[2, 0]},
+    ),
+    "an error in NumPy alone": (
+        "torch arrays fails|with tensors gives error as ndarray",
+        {"error": lambda self, now: np.array(now.potentials.distance)},
+    ),
+    "a branch on numbers": ("fails:.*meta", {"error": by_branches}),
+    "no gradient in the goal": (
+        "gradient by position at rest in the goal is .*nan",
+        {"measure": measured_by_a_power},
+    ),
+    "double precision alone": (
+        "of float32, error becomes torch.float64",
+        {"error": in_double_precision},
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Faulty(Hover):
+    """A hover that is given a fault."""
+
+
+@pytest.mark.parametrize(("message", "changes"), FAULTS.values(), ids=FAULTS)
+def test_a_fault_is_noticed(message, changes, monkeypatch):
+    for name, value in changes.items():
+        monkeypatch.setattr(Faulty, name, value)
+    with pytest.raises(AssertionError, match=f"(?s){message}"):
+        check_task(Faulty)
+
+
+class NotADataclass(Hover):
+    """Its option is none, for want of @dataclass."""
+
+    limit: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Undocumented(NotADataclass):
+    limit: float = 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [(NotADataclass, "must be a frozen dataclass"), (Undocumented, "limit needs a docstring")],
+)
+def test_a_faulty_declaration_is_noticed(kind, message):
+    with pytest.raises(AssertionError, match=message):
+        check_task(kind)
+
+
+def test_an_unfair_api_is_noticed(monkeypatch):
+    step = QuadrotorEnv.step
+
+    def off_by_a_bit(self, action):
+        observation, reward, *rest = step(self, action)
+        return observation, np.nextafter(reward, np.inf).item(), *rest
+
+    monkeypatch.setattr(QuadrotorEnv, "step", off_by_a_bit)
+    with pytest.raises(AssertionError, match="reward through gymnasium"):
+        checks.check_apis(Landing(), ACTIONS[:, 3])
+
+
+def test_the_checks_of_the_frameworks_notice_a_fault(monkeypatch):
+    from quadrl.envs import dm_control
+
+    monkeypatch.setattr(dm_control.QuadrotorTask, "get_reward", lambda self, physics: "much")
+    with pytest.raises(AssertionError, match="dm_env"):
+        checks.check_dm_control(Hover(time_limit=0.5), ACTIONS[:15, 0])
+    monkeypatch.setattr(QuadrotorEnv, "reset", lambda self, **_: (np.zeros(22), {}))
+    with pytest.raises(AssertionError, match="check_env"):
+        checks.check_gymnasium(Hover(time_limit=0.5))
+
+
+def test_the_contract_needs_neither_pytest_nor_torch():
+    code = (
+        "import sys; sys.modules.update(pytest=None, torch=None, torchrl=None, tensordict=None);"
+        "import quadrl; quadrl.testing.check_task('hover')"
+    )
+    paths = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | paths, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr

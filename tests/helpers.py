@@ -1,0 +1,296 @@
+"""What tests share. Each heading has the helpers of one kind of test."""
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+import reference
+from scipy.spatial.transform import Rotation
+
+from quadrl import parameters, tasks
+from quadrl.engines.mujoco import BatchEngine
+from quadrl.environment import Environment
+from quadrl.state import Start
+from quadrl.vehicle import VEHICLES, Vehicle, ring
+
+# ------------------------------------------------------------------- motions, flown by an engine
+
+PARAMETERS = ("mass", "inertia", "drag_coefficient", "moment_coefficient")
+ROTOR_PARAMETERS = ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed")
+UP = np.array([0.0, 0.0, 100.0])  # [m]; where nothing is near
+_ROTOR = dict(thrust_coefficient=1.1e-5, torque_coefficient=2e-7, lag_up=20.0, lag_down=12.0)
+LAYOUTS = VEHICLES | {
+    "eight": Vehicle(
+        name="eight",
+        mass=1.2,
+        inertia=(0.02, 0.02, 0.035),
+        rotors=ring(range(0, 360, 45), [1, -1] * 4, 0.3, max_speed=700.0, **_ROTOR),
+    ),
+    # Five rotors in a ring that leans outwards and is turned about its arms, above the centre.
+    "leaning": Vehicle(
+        name="leaning",
+        mass=0.8,
+        inertia=(0.011, 0.009, 0.016),
+        rotors=tuple(
+            dataclasses.replace(
+                rotor, position=(x, y, 0.04), axis=(0.2 * x - 0.1 * y, 0.2 * y + 0.1 * x, z)
+            )
+            for rotor in ring(range(0, 360, 72), (1, -1, 1, -1, 1), 0.2, max_speed=900.0, **_ROTOR)
+            for x, y in [rotor.position[:2]]
+            for z in [math.sqrt(1 - 0.05 * 0.2**2)]
+        ),
+    ),
+}
+"""Every preset, and layouts that no preset has."""
+
+
+@dataclasses.dataclass
+class Motion:
+    """Of n aircraft, and the wind that they fly in; world frame, body rates in the body's."""
+
+    position: np.ndarray  # (n, 3) [m]
+    quaternion: np.ndarray  # (n, 4) wxyz, body to world
+    velocity: np.ndarray  # (n, 3) [m/s]
+    body_rate: np.ndarray  # (n, 3) [rad/s]
+    rotor_speed: np.ndarray  # (n, R) [rad/s]
+    wind: np.ndarray  # (n, 3) [m/s]
+
+
+def sign(matrix):
+    """1 of a rotation (3, 3), -1 of a mirror image."""
+    return float(np.sign(np.linalg.det(matrix)))
+
+
+def matrices(quaternion):
+    """Rotation matrices (n, 3, 3) of quaternions wxyz (n, 4), by SciPy."""
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+
+
+def quaternions(matrix):
+    """Quaternions wxyz (n, 4) of rotation matrices (n, 3, 3), by SciPy."""
+    return Rotation.from_matrix(matrix).as_quat(scalar_first=True)
+
+
+def random_quaternions(rng, count):
+    """(n, 4) wxyz, any attitude."""
+    quaternion = rng.normal(size=(count, 4))
+    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+
+
+def random_motion(vehicle, count, seed=0, *, speed=2.0, turn=2.0, wind=0.0, rotor=0.1):
+    """Any attitude; each coordinate up to `speed` [m/s], `turn` [rad/s] and `wind` [m/s].
+
+    The rotor speeds differ from hover by a share of up to `rotor`.
+    """
+    rng = np.random.default_rng(seed)
+    return Motion(
+        position=rng.uniform(-1, 1, (count, 3)),
+        quaternion=random_quaternions(rng, count),
+        velocity=rng.uniform(-speed, speed, (count, 3)),
+        body_rate=rng.uniform(-turn, turn, (count, 3)),
+        rotor_speed=vehicle.hover_speed
+        * rng.uniform(1 - rotor, 1 + rotor, (count, vehicle.rotor_count)),
+        wind=rng.uniform(-wind, wind, (count, 3)),
+    )
+
+
+def random_commands(vehicle, count, steps, seed=1, *, rotor=0.1):
+    """Rotor speed commands (steps, n, R) [rad/s], within a share `rotor` of hover."""
+    rng = np.random.default_rng(seed)
+    share = rng.uniform(1 - rotor, 1 + rotor, (steps, count, vehicle.rotor_count))
+    return vehicle.hover_speed * share
+
+
+def put(engine, motion, origin=UP):
+    """Write a motion into an engine."""
+    engine.qpos[:] = np.concatenate([motion.position + origin, motion.quaternion], axis=-1)
+    engine.qvel[:] = np.concatenate([motion.velocity, motion.body_rate], axis=-1)
+    engine.act[:], engine.air[:] = motion.rotor_speed, motion.wind
+
+
+def taken(engine, origin=UP):
+    """The motion that an engine is in."""
+    return Motion(
+        position=engine.qpos[:, :3] - origin,
+        quaternion=engine.qpos[:, 3:].copy(),
+        velocity=engine.qvel[:, :3].copy(),
+        body_rate=engine.qvel[:, 3:].copy(),
+        rotor_speed=engine.act.copy(),
+        wind=engine.air.copy(),
+    )
+
+
+def flown(vehicle, engine, motion, commands, steps):
+    """Fly a motion with each of the commands (k, n, R) for some physics steps."""
+    batch = BatchEngine(vehicle, len(motion.position), altitude=3.0, engine=engine)
+    put(batch, motion)
+    for command in commands:
+        batch.ctrl[:] = command
+        batch.advance(steps)
+    return taken(batch)
+
+
+def coordinates(engine):
+    """qpos, qvel and act side by side (n, 13 + R), a copy."""
+    return np.concatenate([engine.qpos, engine.qvel, engine.act], axis=-1)
+
+
+def parameter_rows(vehicle, count, seed=2, spread=0.2):
+    """Rows of parameters (n,) that differ: each number of each rotor and body by up to `spread`."""
+    rng = np.random.default_rng(seed)
+    table = parameters.rows(vehicle, count)
+    for name in PARAMETERS:
+        table[name] *= rng.uniform(1 - spread, 1 + spread, table[name].shape)
+    for name in ROTOR_PARAMETERS:
+        table["rotor"][name] *= rng.uniform(1 - spread, 1 + spread, table["rotor"][name].shape)
+    parameters.refresh(table, vehicle.physics_timestep)
+    return table
+
+
+# ------------------------------------------------------------------- episodes, flown by the core
+
+# 12 steps to the time limit: several episodes. One route has a waypoint to pass, and one landing is
+# low enough to touch the ground.
+ROUTE = ((0.0, 0.0, -0.05), (0.0, 0.0, -1.0))
+SHORT = {name: tasks.make(name, time_limit=0.6) for name in tasks.TASKS}
+SHORT["a short route"] = tasks.make("static_waypoint", time_limit=0.6, waypoints=ROUTE, reach=0.04)
+SHORT["a low landing"] = tasks.make("landing", time_limit=0.6, start_height=0.05)
+SHORT_CASES = [(name, "mujoco") for name in SHORT]
+SHORT_CASES += [(name, "free_flight") for name in ("hover", "a low landing")]
+
+
+def begun(task="hover", num_envs=1, seed=0, **settings):
+    """An environment that is reset."""
+    environment = Environment(task, num_envs=num_envs, seed=seed, **settings)
+    environment.reset()
+    return environment
+
+
+def idle(environment):
+    """A step with the action 0."""
+    return environment.step(np.zeros((environment.num_envs, environment.action_size)))
+
+
+def observed(environment):
+    """What is seen at the present moment, by name; copies."""
+    seen = environment.task.observe(environment.snapshot)
+    return {name: np.array(value) for name, value in seen.items()}
+
+
+FLAGS = ("terminated", "truncated", "is_success", "diverged")
+
+
+def vehicle_of_row(vehicle, row):
+    """The aircraft that a row of parameters describes."""
+    rotors = tuple(
+        dataclasses.replace(r, **{n: float(row["rotor"][n][k]) for n in ROTOR_PARAMETERS})
+        for k, r in enumerate(vehicle.rotors)
+    )
+    own = {name: row[name].tolist() for name in PARAMETERS}
+    return dataclasses.replace(vehicle, rotors=rotors, **own | {"inertia": tuple(own["inertia"])})
+
+
+def level(count=1, vehicle=None, *, position=(0, 0, 0), velocity=(0, 0, 0)):
+    """A Start of `count` level aircraft that head east, their rotors at hover speed."""
+    vehicle = vehicle or Vehicle()
+    start = {"position": position, "quaternion": (1, 0, 0, 0), "velocity": velocity}
+    start |= {"body_rate": (0, 0, 0), "rotor_speed": vehicle.hover_speed}
+    return Start(**{k: np.array(np.broadcast_to(np.atleast_2d(v), (count, np.shape(v)[-1])), float)
+                    for k, v in start.items()})  # fmt: skip
+
+
+def starting(task, start, task_state=None):
+    """A task whose episodes begin with a Start (n, k), and with a dict `task_state` of arrays.
+
+    Row i begins with row i of these, over and over where there are fewer.
+    """
+
+    def begin(self, rng, parameters):
+        own, state = super(kind, self).begin(rng, parameters)
+        rows = np.arange(len(own.position)) % len(start.position)
+        fields = {name: getattr(start, name)[rows] for name in Start.__dataclass_fields__}
+        if task_state:
+            state = type(state)(**{name: value[rows] for name, value in task_state.items()})
+        return Start(**fields), state
+
+    kind = type(type(task).__name__, (type(task),), {"begin": begin})
+    return kind(**{field.name: getattr(task, field.name) for field in dataclasses.fields(task)})
+
+
+def placed(
+    task="hover", count=1, *, position=(0, 0, 0), velocity=(0, 0, 0), options=(), **settings
+):
+    """An environment, reset, whose aircraft are level somewhere, at hover speed."""
+    made = tasks.make(task, **dict(options))
+    start = level(count, settings.get("vehicle"), position=position, velocity=velocity)
+    environment = Environment(starting(made, start), num_envs=count, seed=0, **settings)
+    environment.reset()
+    return environment
+
+
+def random_actions(steps, count, size=4, seed=0):
+    """(T, N, k) for an environment; one aircraft dives, so that episodes end early too."""
+    actions = np.random.default_rng(seed).uniform(-1, 1, (steps, count, size))
+    actions[:, 1 % count] -= 0.7
+    return actions
+
+
+def recorded(environment, transition):
+    """Copies of everything in a transition and of the coordinates, by name."""
+    parts = {f"observation.{k}": v for k, v in transition.observation.items()}
+    parts |= {f"term.{k}": v for k, v in transition.reward_terms.items()}
+    parts |= {name: getattr(transition, name) for name in ("reward", "error", *FLAGS)}
+    parts |= {"coordinates": coordinates(environment.engine)}
+    return {name: np.array(value) for name, value in parts.items()}
+
+
+def fly(environment, actions):
+    """Records of a flight that resets whoever is over; with what each reset gives."""
+    records = []
+    for action in actions:
+        now = environment.step(action)
+        records.append(recorded(environment, now))
+        if (over := now.terminated | now.truncated).any():
+            fresh = environment.reset(over)
+            records[-1] |= {f"fresh.{k}": np.array(v) for k, v in fresh.items()}
+    return records
+
+
+def assert_records(got, expected, rows=slice(None)):
+    """Rows of the records of a flight are those of another one, bit for bit."""
+    assert len(got) == len(expected)
+    for step, (now, then) in enumerate(zip(got, expected, strict=True)):
+        over = np.flatnonzero(then["terminated"] | then["truncated"])
+        chosen = np.arange(len(then["reward"]))[rows]
+        fresh = np.flatnonzero(np.isin(over, chosen))
+        for name, value in then.items():
+            mine = value[fresh] if name.startswith("fresh.") else value[chosen]
+            if not name.startswith("fresh.") or len(fresh):
+                np.testing.assert_array_equal(now[name], mine, err_msg=f"{name}, step {step}")
+
+
+# ------------------------------------------------------------------- against the exact solution
+
+DATA = Path(__file__).parent / "data"
+
+
+@functools.cache
+def exact(name):
+    """Arrays of tests/data/exact.npz under a name, or the array of that name."""
+    with np.load(DATA / "exact.npz") as file:
+        if name in file:
+            return file[name]
+        prefix = f"{name}/"
+        return {k.removeprefix(prefix): file[k] for k in file.files if k.startswith(prefix)}
+
+
+def deviations(vehicle, engine, name, seconds):
+    """How far an engine is at the end of the flights of a name, as `reference.deviation` has it."""
+    flights = exact(name)
+    batch = BatchEngine(vehicle, len(flights["start"]), altitude=3.0, engine=engine)
+    batch.qpos[:], batch.qvel[:], batch.act[:] = reference.to_mujoco(flights["start"])
+    batch.ctrl[:], batch.air[:] = flights["command"], flights["wind"]
+    batch.advance(round(seconds / vehicle.physics_timestep))
+    return reference.deviation(batch.qpos, batch.qvel, batch.act, flights["end"])

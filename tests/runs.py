@@ -1,0 +1,82 @@
+"""Small trainings, and what their tests compare."""
+
+import contextlib
+import csv
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from quadrl.errors import QuadrlError
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.train import Training
+from quadrl.policy import Policy
+from quadrl.rollout import evaluate
+
+# 6 batches of 32 transitions; episodes of 10 steps, so that many end in between.
+TINY = TrainConfig(
+    "hover",
+    num_envs=8,
+    rollout=4,
+    steps=8 * 4 * 6,
+    hidden=(16,),
+    critic_hidden=(16,),
+    task_options={"time_limit": 0.5},
+    checkpoint_seconds=0.0,
+    ppo={"epochs": 2, "minibatch": 16},
+)
+
+
+def changed(**settings) -> TrainConfig:
+    return dataclasses.replace(TINY, **settings)
+
+
+def train(config: TrainConfig, folder: Path, *, resume: bool = False) -> Path:
+    Training(config, folder, resume=resume).run()
+    return folder
+
+
+class Stop(Exception):
+    pass
+
+
+def stopped(config: TrainConfig, folder: Path, after: int, *, resume: bool = False) -> Path:
+    """A run that stops after the row of an iteration is written, before its checkpoint."""
+
+    def stop(progress):
+        if progress.iteration == after:
+            raise Stop
+
+    with pytest.raises(Stop):
+        Training(config, folder, resume=resume).run(stop)
+    return folder
+
+
+def metrics(folder: Path) -> list[dict[str, str]]:
+    """The rows of metrics.csv but for the wall clock."""
+    with open(folder / "metrics.csv", newline="") as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def assert_same_run(a: Path, b: Path) -> None:
+    """Weights, normaliser and header; metrics; evaluation."""
+    assert (a / "policy.safetensors").read_bytes() == (b / "policy.safetensors").read_bytes()
+    assert metrics(a) == metrics(b)
+    task = TrainConfig.of_folder(a).make_task()
+    one, other = (evaluate(Policy.load(folder), task, episodes=4)[0] for folder in (a, b))
+    assert one == other
+
+
+@contextlib.contextmanager
+def refused(name=None, value=None, allowed=None):
+    """A QuadrlError of one line; with these attributes where they are given."""
+    with pytest.raises(QuadrlError) as caught:
+        yield caught
+    error = caught.value
+    assert str(error) and "\n" not in str(error)
+    for given, own in ((name, error.name), (value, error.value), (allowed, error.allowed)):
+        assert given is None or given == own

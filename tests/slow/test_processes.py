@@ -1,0 +1,73 @@
+"""What concerns the whole process: builds at once, spawned workers, the clock that MuJoCo reads."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quadrl
+from quadrl.environment import Environment
+
+REPOSITORY = Path(quadrl.__file__).parents[1]
+
+
+def test_processes_that_build_at_once_do_not_disturb_each_other(tmp_path):
+    settings = {"QUADRL_CACHE": str(tmp_path / "cache"), "QUADRL_CFLAGS": "-O0"}
+    environment = os.environ | settings | {"PYTHONPATH": str(REPOSITORY)}
+    code = "from quadrl import native; print(native.build()); native.load(native.build())"
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    command = [sys.executable, "-c", code]
+    running = [subprocess.Popen(command, env=environment, **pipes) for _ in range(4)]
+    outcomes = [process.communicate(timeout=120) for process in running]
+    assert [process.returncode for process in running] == [0] * 4, outcomes
+    (path,) = {out.strip() for out, _ in outcomes}
+    assert os.listdir(tmp_path / "cache") == [Path(path).name]  # and no scratch left
+
+
+def fly_hover(seed):
+    environment = Environment("hover", num_envs=2, seed=seed)
+    environment.reset()
+    for k in range(20):
+        environment.step(np.full((2, 4), 0.05 * (k % 5)))
+    return np.array(environment.engine.qpos)
+
+
+def test_a_spawned_process_flies_the_same():
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        elsewhere = pool.apply(fly_hover, (3,))
+    here = fly_hover(3)
+    assert (here[:, 2] > 2.0).all()  # without callbacks it would be on the ground by now
+    np.testing.assert_array_equal(elsewhere, here)
+
+
+FLY = """
+import quadrl, mujoco
+from quadrl import mjcf
+from quadrl.vehicle import Vehicle
+{before}
+model = mjcf.compile_model(Vehicle(), drawn=False)
+data = mujoco.MjData(model)
+{after}
+mujoco.mj_step(model, data)
+timer = data.timer[mujoco.mjtTimer.mjTIMER_STEP]
+print(timer.number, timer.duration > 0)
+"""
+TICKS = "import itertools; clock = itertools.count(1.0); mujoco.set_mjcb_time(lambda: next(clock))"
+BACK = "mujoco.set_mjcb_time(None); mjcf.compile_model(Vehicle(), drawn=False)"
+KEEP = "import os; os.environ['QUADRL_KEEP_CLOCK'] = '1'"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "moves"),
+    [("", "", False), ("", BACK, True), (TICKS, "", True), (KEEP, "", True)],
+    ids=["ours", "brought back", "somebody's", "kept"],
+)
+def test_the_clock_stands_still_unless_somebody_wants_it(before, after, moves):
+    # In a process of its own: the clock is stopped once in a process.
+    script = FLY.format(before=before, after=after)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"1 {moves}\n"), done.stderr

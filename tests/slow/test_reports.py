@@ -1,0 +1,230 @@
+"""The reports: their bookkeeping by hand, and each measurement in a small version."""
+
+import dataclasses
+import json
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from quadrl import benchmark
+from quadrl.learning import study
+from quadrl.learning.config import TrainConfig
+from quadrl.policy import Policy
+from quadrl.rollout import fly, summarize
+from scripts.reports import (
+    claims,
+    cost,
+    evaluation,
+    examples,
+    kills,
+    memory,
+    paper,
+    peers,
+    report,
+    ship,
+    step_size,
+    trial,
+    wall_clock,
+)
+
+
+@pytest.fixture(autouse=True)
+def results(tmp_path, monkeypatch):
+    """Results and pictures go to a folder of their own."""
+    monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(report, "IMAGES", tmp_path / "images")
+    return tmp_path
+
+
+def test_parts_are_spliced_into_a_page(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- begin x -->\nold\n<!-- end x -->\n<!-- begin y --><!-- end y -->\n")
+    parts = {"x": lambda: "[new](tasks.md)", "y": lambda: str(report.load("nothing"))}
+    text = report.written(page, parts)
+    assert "old" not in text and "[new](docs/tasks.md)" in text
+    assert "run `scripts/report nothing`" in text
+    with pytest.raises(KeyError):
+        report.written(page, {})
+
+
+def test_results_keep_machine_commit_and_five_digits():
+    report.save("x", {"a": [1 / 3, math.nan], "b": {"c": 2}})
+    saved = report.load("x")
+    assert (saved["a"], saved["b"]) == ([0.33333, None], {"c": 2})
+    assert saved["machine"]["mujoco"] == mujoco.__version__
+    assert f"Measured at commit {saved['commit']}." in report.source(saved)
+    assert report.spread([3.0, 1.0, math.nan, 2.0], "cm", 100) == "200 (100 to 300) cm"
+
+
+# ------------------------------------------------------------------------------ speed and endurance
+
+
+def test_shares_of_the_benchmark_are_of_bare_mj_step_within_one_turn():
+    measured = benchmark.benchmark("hover", num_envs=3, seconds=0.01, repeats=2)
+    assert {row["target"] for row in measured["rates"]} == {None, 0.90, 20.0, 0.75, 0.35}
+    for of in (benchmark.ALL_CORES, benchmark.ONE_CORE):
+        group = [row for row in measured["rates"] if row["of"] == of]
+        bare = [row for row in group if row["what"].startswith("mj_step")]
+        yardstick = max(bare, key=lambda row: np.median(row["repeats"]))
+        for row in group:
+            assert row["rate"] == max(row["repeats"]) > 0
+            ratios = np.array(row["repeats"]) / yardstick["repeats"]
+            assert row["share"] == pytest.approx(np.median(ratios))
+    assert len(benchmark.rows(measured)) == len(measured["rates"])
+
+
+def test_the_parts_of_a_training_add_up_to_all_of_it():
+    wall_clock.main(steps=8192)
+    for parts in report.load("wall_clock")["seconds"].values():
+        whole = parts.pop("all")
+        assert min(parts.values()) > 0 and sum(parts.values()) == pytest.approx(whole, rel=1e-3)
+
+
+def test_cost_and_step_size(monkeypatch):
+    for name, value in {"COUNTS": (1, 4), "COUNT": 4, "SLICE": 0.001}.items():
+        monkeypatch.setattr(cost, name, value)
+    cost.main()
+    assert "| 4 |" in cost.shown() and "`hover`, 22" in cost.shown()
+    monkeypatch.setattr(step_size, "CONTROL_STEPS", 2)
+    step_size.main((0.05, 0.5))
+    for rows in report.load("step_size")["tables"].values():  # the nearer, the worse
+        slow, fast = (row["errors"]["free_flight"]["position_m"] for row in rows)
+        assert slow < fast < 0.01
+
+
+def test_a_leak_is_noticed(monkeypatch):
+    kept, opened = [], memory.OPENED["Environment"]
+    assert not memory.leaks(cost.alone(memory.growth, "Environment", 40))
+    monkeypatch.setitem(memory.OPENED, "Environment", lambda: kept.append(opened()) or kept[-1])
+    assert memory.leaks(cost.alone(memory.growth, "Environment", 40))
+    # 3 kB a second for the first 2 of 11 s, then half a kB: 30 kB/min.
+    time = np.arange(12.0)
+    curve = np.stack([time, np.where(time <= 2, 3 * time, 6 + 0.5 * (time - 2))], axis=-1)
+    assert memory.slope(curve.tolist()) == pytest.approx(30.0)
+
+
+def test_a_killed_training_ends_as_if_not():
+    row = kills.killed("ppo", "free_flight", 1)
+    assert (row["kills"], row["runs"], row["equal"]) == (1, 1, 1)
+
+
+# ------------------------------------------------------------------------------ others
+
+
+def test_examples_get_the_same_wall_clock():
+    examples.main((1,), ("cleanrl_ppo", "torchrl_ppo", "sb3_ppo"), steps=4096)
+    ours, *others = report.load("examples")["runs"]
+    assert (ours["example"], ours["steps"]) == ("quadrl train", 4096)
+    assert [run["settings"] for run in others] == ["library", "quadrl"] * 3
+    assert all(run["steps"] > 0 and run["seconds"] >= ours["seconds"] for run in others)
+    assert "[`sb3_ppo`](examples/sb3_ppo.py)" in examples.compared()
+
+
+def test_a_simulator_that_cannot_be_installed_is_reported(monkeypatch, tmp_path):
+    monkeypatch.setattr(peers, "ENVIRONMENTS", tmp_path)
+    without = {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": "", "PIP_CONFIG_FILE": "/dev/null"}
+    monkeypatch.setattr(peers, "ENVIRONMENT", report.ENVIRONMENT | without)
+    peers.main(("rotorpy", "quadrl"), (8,), seconds=0.01, rounds=2)
+    result = report.load("peers")
+    assert set(result["missing"]) == {"rotorpy"} and "\n" not in result["missing"]["rotorpy"]
+    kinds = {(row["what"], row["aircraft"]) for row in result["rows"]}
+    assert kinds == {("one", 1), ("batch", 8), ("physics", 8)}
+    assert all(len(row["rates"]) == 2 for row in result["rows"])
+    assert "Not measured: rotorpy" in peers.compared()
+
+
+# ------------------------------------------------------------------------------ the paper
+
+
+def test_smoothness_by_hand():
+    rollout = fly(Policy.pretrained("hover"), "hover", episodes=2)
+    time = 0.05 * np.arange(200)
+    rate = np.zeros((200, 2, 3))
+    rate[:, 0, 1] = 0.3 * np.sin(2 * np.pi * 4.0 * time)  # 4 Hz: all of it is wobble
+    action = np.zeros_like(rollout.action)
+    action[1::2, 0, 0] = 0.4  # one of four rotors, 0.4 at every step of 0.05 s: 2 per second
+    velocity = np.zeros_like(rollout.velocity)
+    velocity[:, 0, 0] = 0.5 * time**2  # jerk 1 m/s^3
+    rows = dict(body_rate=rate, action=action, velocity=velocity)
+    rollout = dataclasses.replace(rollout, **rows, is_success=np.array([True, False]))
+    smooth = evaluation.smoothness(rollout)
+    assert smooth["flights"] == 1
+    assert smooth["action_variation_1_s"] == pytest.approx(2.0)
+    assert smooth["body_rate_rad_s"] == pytest.approx(0.3 / math.sqrt(2), rel=0.01)
+    assert smooth["jerk_m_s3"] == pytest.approx(1.0)
+    assert smooth["wobble_share"] > 0.99
+
+
+def test_a_run_is_measured_by_flying_its_policy(tmp_path):
+    (run,) = study.plan(tmp_path, ("hover",), ("ppo",), (0,), steps=4096, num_threads=1)
+    evaluation.train([run], 1, episodes=2)
+    assert run.done
+    evaluation.train([run], 1, episodes=2)  # there is nothing left to do
+    measured = evaluation.measure(run, episodes=3, gusts=(4.0,))
+    policy = Policy.load(run.folder)
+    assert summarize(fly(policy, "hover", episodes=3)).items() <= measured["mean"].items()
+    blown = summarize(fly(policy, "hover", episodes=3, gusts=4.0))
+    assert measured["gusts"][0]["mean"].items() <= blown.items()
+    assert measured["sampled"] != measured["mean"] and measured["steps"] == 4096
+
+
+def test_curve_and_noisy_weights_by_hand():
+    # 40 batches: means over 2, so the lucky 100 counts for half.
+    returns = [0.0, 2.0, *[50.0] * 17, 100.0, *[50.0] * 18, 30.0, 20.0]
+    found = evaluation.curve_figures({"return": np.array(returns)})
+    assert found == {"first": 1.0, "best": 75.0, "final": 25.0}
+    policy = Policy.pretrained("hover")
+    noisy = evaluation.with_noisy_weights(policy, 0.1, seed=3)
+    for before, after in zip(policy.weights, noisy.weights, strict=True):
+        share = np.linalg.norm(after - before, axis=1) / np.linalg.norm(before, axis=1)
+        np.testing.assert_allclose(share, 0.1, rtol=1e-4)
+
+
+def test_statistics_by_hand():
+    # Five against five, all smaller: one of C(10, 5) = 252 orders, p = 0.004; two against two 0.17.
+    assert trial.smaller([1, 2, 3, 4, 5], [6, 7, 8, 9, 10]) == 1
+    assert trial.smaller([6, 7, 8, 9, 10], [1, 2, 3, 4, 5]) == -1
+    assert trial.smaller([1, 2], [3, 4]) == trial.smaller([], [1]) == trial.smaller([1], [1]) == 0
+    # Five of five: p = 1/32; four of five: 6/32. Zeros and NaN do not count.
+    assert trial.mostly([1, 2, 1, 1, 3]) == 1 and trial.mostly([1, 2, 1, 1, -3]) == 0
+    assert trial.mostly([-1, -2, -1, -1, -3, 0.0, math.nan]) == -1
+    # F(4, 4) exceeds 6.39 in a twentieth of the cases: deviations of a ratio of 2.53.
+    values = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    assert trial.steadier(values, 2.6 * values) == 1 and trial.steadier(values, 2.4 * values) == 0
+    words = ["agrees", "disagrees", "mixed", "not shown"]
+    votes = ([1, 1, -1], [-1, 0, -1], [1, -1, 0], [1, 0, 0])
+    assert [trial.verdict(each) for each in votes] == words
+
+
+def test_verdicts_follow_what_was_measured(monkeypatch):
+    """GAE that fails everywhere, in the results of the paper's page."""
+    monkeypatch.setattr(report, "RESULTS", report.DOCS / "results")
+    result = report.load("paper")
+    for run in result["runs"]:
+        if run["algo"] == "vpg":
+            run["mean"] |= {"success_rate": 0.1, "return_mean": 100.0 * run["seed"]}
+            run["curve"] = {"first": 0.0, "best": 1900.0, "final": 1000.0 - run["seed"]}
+    page = claims.judged(result)
+    for sentence in ("GAE is less suited to flight control.", "GAE is prone to collapse during"):
+        assert f"{sentence}" in page
+        assert "| **agrees** |" in page.partition(sentence)[2].splitlines()[0]
+    assert "5/5 collapsed" in page and "| hover | GAE | 1 of 5 |" in paper.well()
+
+
+def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch):
+    source, seed = Policy.pretrained("hover"), Policy.pretrained("hover").metadata["seed"]
+    for name, number in (("a", seed + 1), ("b", seed)):
+        (tmp_path / name).mkdir()
+        config = TrainConfig("hover", seed=number).resolved()
+        (tmp_path / name / "config.json").write_text(json.dumps(config))
+        source.save(tmp_path / name / "policy.safetensors")
+    monkeypatch.setattr(ship, "EPISODES", 20)
+    ship.main((tmp_path / "a", tmp_path / "b", tmp_path / "none"), tmp_path / "out")
+    beside = json.loads((tmp_path / "out" / "hover_ppo.json").read_text())
+    assert beside["command"] == f"quadrl train hover --algo ppo --seed {seed}"
+    assert beside["evaluation"] == summarize(fly(source, "hover", episodes=20))
+    monkeypatch.setattr(ship, "WORTH_HAVING", 1.1)
+    ship.main((tmp_path / "b",), tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())

@@ -1,0 +1,445 @@
+"""The command: what it writes and prints, and what it refuses with one line and exit code 2."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from runs import contents, metrics
+
+import quadrl
+from quadrl import cli, tasks
+from quadrl.cli.flown import parse_options
+from quadrl.errors import QuadrlError
+from quadrl.learning.config import TrainConfig
+from quadrl.vehicle import VEHICLES
+
+REPOSITORY = Path(quadrl.__file__).parents[1]
+SIZE = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16"]
+TINY = [*SIZE, "--task-options", "time_limit=0.5", "--episodes", "2", "--checkpoint-seconds", "0"]
+FILES = {
+    "config.json",
+    "metrics.csv",
+    "events",
+    "checkpoint.safetensors",
+    "policy.safetensors",
+    "evaluation.json",
+    "learning_curve.png",
+    "trajectory.png",
+}
+METRICS = {"success_rate", "survival_rate", "position_error_m", "return_mean", "return_std"}
+
+
+def command(*arguments: object) -> int:
+    """Exit code of the command in this process."""
+    try:
+        cli.main([str(argument) for argument in arguments])
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+def in_a_process(*arguments: object, **environment: str) -> subprocess.CompletedProcess:
+    variables = os.environ | {"PYTHONPATH": str(REPOSITORY)} | environment
+    words = [sys.executable, "-W", "ignore", "-m", "quadrl", *map(str, arguments)]
+    return subprocess.run(words, env=variables, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run with everything in it; not to be written to."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    assert command("train", "hover", *TINY, "--out", folder) == 0
+    return folder
+
+
+@pytest.fixture
+def copy(run, tmp_path):
+    return Path(shutil.copytree(run, tmp_path / "copy"))
+
+
+@pytest.fixture
+def refusal(capsys, monkeypatch):
+    """A command with bad input: one line on stderr; returns the error and the line."""
+
+    def refused(*arguments: object, printed: bool = False) -> tuple[Exception, str]:
+        capsys.readouterr()
+        assert command(*arguments) == 2
+        said = capsys.readouterr()
+        assert printed or said.out == ""
+        assert said.err.startswith("quadrl: ") and said.err.count("\n") == 1, said.err
+        monkeypatch.setenv("QUADRL_TRACEBACK", "1")  # raises what was said
+        with pytest.raises((QuadrlError, OSError)) as caught:
+            command(*arguments)
+        monkeypatch.delenv("QUADRL_TRACEBACK")
+        capsys.readouterr()
+        return caught.value, said.err
+
+    return refused
+
+
+# --------------------------------------------------------------------------- what it does
+
+
+def test_tasks(capsys):
+    assert command("tasks") == 0
+    listed = capsys.readouterr().out
+    for name in tasks.TASKS:
+        assert name in listed
+    assert command("tasks", "hover") == 0
+    shown = " ".join(capsys.readouterr().out.split())  # wherever the lines break
+    for words in ("time limit 10 s", "rotor_speed 15..18 1", "tilt 0.2 ", "--gamma 0.9"):
+        assert words in shown
+    assert "target_velocity" in listed and "target_velocity" not in shown
+    assert command("tasks", "--json") == 0
+    read = json.loads(capsys.readouterr().out)
+    assert list(read) == list(tasks.TASKS)
+    assert command("tasks", "landing", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == read["landing"]
+
+
+def resolved(monkeypatch, *arguments: str) -> TrainConfig:
+    """The settings that `quadrl train` resolves, without training."""
+    seen = []
+    monkeypatch.setattr("quadrl.learning.run.train", lambda config, *_, **__: seen.append(config))
+    with pytest.raises(TypeError):  # there is nothing to sum up
+        cli.main(["train", *arguments])
+    return seen[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((), TrainConfig("hover")),
+        (("landing",), TrainConfig("landing")),
+        # A word that is another option's value is not the task, wherever it stands.
+        (("--out", "landing", "hover"), TrainConfig("hover")),
+        (("hover", "--out", "landing"), TrainConfig("hover")),
+        (("--algo", "gae", "hover"), TrainConfig("hover", algo="vpg")),
+        (("hover", "--algo=gae"), TrainConfig("hover", algo="vpg")),
+        (("hover", "--algo", "gae", "--algo", "ppo"), TrainConfig("hover")),
+        (("--vehicle", "racer", "landing"), TrainConfig("landing", vehicle="racer")),
+        (("hover", "--gamma", "0.5"), TrainConfig("hover", gamma=0.5)),
+        (("hover", "--ppo.clip", "0.1"), TrainConfig("hover", ppo={"clip": 0.1})),
+        (
+            ("hover", "--hidden", "8", "4", "--task-options", "time_limit=2"),
+            TrainConfig("hover", hidden=(8, 4), task_options={"time_limit": 2}),
+        ),
+    ],
+)
+def test_settings_are_resolved_after_parsing(monkeypatch, arguments, expected):
+    assert resolved(monkeypatch, *arguments) == expected
+
+
+def test_help_says_what_each_setting_means(capsys):
+    assert command("train", "--help") == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for words in ("--num-envs INT", "(default: 256)", "--ppo.clip FLOAT", "quadrl tasks TASK"):
+        assert words in text
+    assert "None}" not in text
+
+
+def test_options_are_read_as_json_where_they_are():
+    pairs = ("a=1", "b=2.5", "c=[1,[2,3]]", "d=true", "e=word", "f=x=y", "g=")
+    assert parse_options(pairs) == {
+        "a": 1, "b": 2.5, "c": (1, (2, 3)), "d": True, "e": "word", "f": "x=y", "g": "",
+    }  # fmt: skip
+
+
+def test_train_writes_every_file(run):
+    assert {p.name for p in run.iterdir()} == FILES | {"flight.mp4"}
+    config = json.loads((run / "config.json").read_text())
+    assert (config["task"], config["num_envs"], config["hidden"]) == ("hover", 8, [16])
+    assert config["resolved_task"]["time_limit"] == 0.5
+    assert [int(row["steps"]) for row in metrics(run)] == [32, 64, 96, 128, 160, 192]
+    assert any(p.name.startswith("events.out.tfevents") for p in (run / "events").iterdir())
+    evaluation = json.loads((run / "evaluation.json").read_text())
+    assert METRICS < set(evaluation)
+    assert evaluation["episodes"] == 2 and evaluation["training_s"] > 0
+    policy = quadrl.Policy.load(run)
+    assert policy.metadata["steps"] == 192 and policy.weights[0].shape == (16, 22)
+    for name in ("learning_curve.png", "trajectory.png"):
+        assert (run / name).read_bytes().startswith(b"\x89PNG")
+    # An episode of 0.5 s has states at 0.05 to 0.5 s: 0.45 s at 25 frames a second are 12.
+    assert imageio_ffmpeg.count_frames_and_secs(str(run / "flight.mp4"))[0] == 12
+
+
+def test_train_says_where_to_go_on(tmp_path, capsys):
+    folder = tmp_path / "a folder" / "run"
+    assert command("train", "hover", *TINY, "--no-video", "--out", folder) == 0
+    assert {p.name for p in folder.iterdir()} == FILES
+    said = capsys.readouterr().out
+    assert "100 %        192 steps" in said
+    for words in (f"quadrl render '{folder}'", f"quadrl evaluate '{folder}'"):
+        assert words in said  # on one line, however long
+    assert command("train", "hover", *TINY, "--no-video", "--seed", "3") == 0
+    assert (tmp_path / "runs" / "hover-ppo-3" / "policy.safetensors").exists()
+
+
+def test_evaluate_prints_one_json_object_and_nothing_else(run, capsys):
+    printed = []
+    for words in ((), (), ("--seed", "9"), ("--task-options", "time_limit=0.25", "radius=0.1")):
+        assert command("evaluate", run, "--episodes", "2", "--json", *words) == 0
+        said = capsys.readouterr()
+        assert said.err == ""
+        printed.append(json.loads(said.out))
+    first, again, fresh, shorter = printed
+    assert first == again  # the mean action, the same episodes
+    assert METRICS < set(first) and all(np.isfinite(first[name]) for name in METRICS)
+    assert first["episodes"] == 2 and first["task"] == "hover"
+    assert first["length_mean_s"] <= 0.5  # the options of the training hold
+    assert fresh["return_mean"] != first["return_mean"]
+    assert shorter["length_mean_s"] == 0.25
+    # That of the training is the same.
+    assert first.items() <= json.loads((run / "evaluation.json").read_text()).items()
+    assert command("evaluate", run / "policy.safetensors", "--episodes", "2") == 0
+    assert "geometric controller" in capsys.readouterr().out
+
+
+def test_controllers_fly_every_aircraft(capsys):
+    options = ["--task", "hover", "--episodes", "2", "--json"]
+    for controller, vehicle in (("geometric", "hexa"), ("lqr", "crazyflie")):
+        words = ["--controller", controller, "--vehicle", vehicle, *options]
+        assert command("evaluate", *words) == 0
+        assert json.loads(capsys.readouterr().out)["success_rate"] == 1.0
+
+
+def test_render_writes_a_video_that_plays(run, tmp_path, capsys):
+    path = tmp_path / "new" / "a.mp4"
+    size = ["--width", "160", "--height", "120", "--fps", "20", "--camera", "chase"]
+    assert command("render", run, "--out", path, *size) == 0
+    assert capsys.readouterr().out == f"wrote {path}\n"
+    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (10, 0.5)
+    played = subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "null", "-"],
+        capture_output=True,
+        text=True,
+    )
+    assert played.returncode == 0 and "160x120" in played.stderr
+
+
+def test_plot(copy, capsys):
+    before = (copy / "learning_curve.png").read_bytes()
+    (copy / "learning_curve.png").unlink()
+    assert command("plot", copy) == 0
+    assert capsys.readouterr().out == f"wrote {copy / 'learning_curve.png'}\n"
+    assert (copy / "learning_curve.png").read_bytes() == before
+    assert command("plot", copy, "--format", "pdf") == 0
+    assert (copy / "learning_curve.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_plot_of_several_runs(run, tmp_path, capsys, refusal):
+    folders = [tmp_path / name for name in ("a", "b", "c")]
+    kinds = (("hover", "ppo"), ("hover", "vpg"), ("landing", "ppo"))
+    for folder, (task, algo) in zip(folders, kinds, strict=True):
+        shutil.copytree(run, folder)
+        config = json.loads((folder / "config.json").read_text()) | {"task": task, "algo": algo}
+        (folder / "config.json").write_text(json.dumps(config))
+    nothing = tmp_path / "no run"
+    nothing.mkdir()
+    assert command("plot", *folders, nothing, "--format", "svg") == 0
+    assert str(nothing) in capsys.readouterr().out  # it is left out, and said so
+    for task, labels in (("hover", ("PPO, 1 seed", "VPG, 1 seed")), ("landing", ("PPO, 1 seed",))):
+        picture = Path(f"learning_curves_{task}.svg").read_text()
+        assert all(label in picture for label in labels)
+    assert command("plot", *folders[:2], "--out", "new/x.pdf") == 0
+    assert command("plot", *folders, "--out", "new/x.png") == 0
+    assert set(os.listdir("new")) == {"x.pdf", "x_hover.png", "x_landing.png"}
+    refusal("plot")
+    assert refusal("plot", *folders, "--out", "a.png", "--format", "svg")[0].name == "--out"
+    refusal("plot", nothing, tmp_path / "nowhere", printed=True)
+
+
+def test_the_name_of_a_task_flies_the_policy_that_ships(capsys, refusal):
+    short = ["--episodes", "5", "--json"]
+    file = quadrl.policy.SHIPPED / "hover_ppo.safetensors"
+    shutil.copytree(quadrl.policy.SHIPPED, "hover")  # a folder of that name is written ./hover
+    printed = []
+    for policy in ("hover", file):
+        assert command("evaluate", policy, *short) == 0
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1]
+    refusal("evaluate", "./hover")
+    refusal("evaluate", "./hover", "--algo", "ppo")
+    assert refusal("evaluate", "hover", "--algo", "sac")[0].value == "hover_sac"
+    assert command("evaluate", "hover", "--algo", "vpg", *short) == 0
+
+
+def test_resume_takes_the_settings_of_the_run(run, copy):
+    before = contents(copy)
+    words = ["--resume", copy, "--no-video", "--episodes", "2"]
+    assert command("train", *words) == 0  # it is finished: nothing changes
+    for name in ("policy.safetensors", "metrics.csv", "checkpoint.safetensors", "config.json"):
+        assert (copy / name).read_bytes() == before[name]
+    for name in ("policy.safetensors", "checkpoint.safetensors", "metrics.csv"):
+        (copy / name).unlink()
+    # The settings of another training are ignored.
+    assert command("train", "landing", *words, "--gamma", "0.5") == 0
+    assert (copy / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
+
+
+OWN = """
+import dataclasses
+
+import quadrl
+from quadrl.tasks.hover import Hover
+
+
+@quadrl.register
+@dataclasses.dataclass(frozen=True)
+class NearHover(Hover):
+    name = "near_hover"
+    training = {"gamma": 0.25}
+    radius: float = 0.1
+
+
+quadrl.VEHICLES["heavy"] = dataclasses.replace(quadrl.Vehicle(), name="heavy", mass=0.8)
+"""
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, first):
+    for registry in (tasks.TASKS, VEHICLES):  # what it registers is taken out again
+        monkeypatch.setitem(registry, "near_hover", None)
+        monkeypatch.delitem(registry, "near_hover")
+        monkeypatch.setitem(registry, "heavy", None)
+        monkeypatch.delitem(registry, "heavy")
+    Path("own.py").write_text(OWN)
+    flown = ["--controller", "geometric", "--task", "near_hover", "--vehicle", "heavy"]
+    words = ["evaluate", *flown, "--episodes", "2", "--json"]
+    own = ["--import", "own.py"]
+    assert command(*(own + words if first else words + own)) == 0
+    judged = json.loads(capsys.readouterr().out)
+    assert judged["task"] == "near_hover" and judged["success_rate"] == 1.0
+    assert cli.console.again("render", Path("runs/x")) == "quadrl --import own.py render runs/x"
+    assert TrainConfig("near_hover", vehicle="heavy").gamma == 0.25
+
+
+# --------------------------------------------------------------------------- what it refuses
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name", "value"),
+    [
+        (["--num-envs", "0"], "num_envs", 0),
+        (["--algo", "sac"], "algo", "sac"),
+        (["--vehicle", "brick"], "vehicle", "brick"),
+        (["--seed", "4294967296"], "seed", 2**32),
+        (["--episodes", "0"], "episodes", 0),
+        (["--ppo.minibatch", "0"], "ppo.minibatch", 0),
+        (["--task-options", "horizn=5"], "hover option", "horizn"),
+        (["--task-options", "time_limit"], "task option", "time_limit"),
+        (["--task-options", "time_limit=far"], "hover time_limit", "far"),
+    ],
+)
+def test_trainings_that_cannot_be_are_refused(refusal, tmp_path, arguments, name, value):
+    folder = tmp_path / "run"
+    error, _ = refusal("train", "hover", *TINY, "--out", folder, *arguments)
+    assert (error.name, error.value) == (name, value)
+    assert not folder.exists()
+
+
+def test_unknown_tasks_are_refused(refusal, run):
+    for arguments in (["train"], ["tasks"], ["evaluate", run, "--task"], ["render", run, "--task"]):
+        error, _ = refusal(*arguments, "hovr")
+        assert (error.name, error.value) == ("task", "hovr") and "hover" in error.allowed
+
+
+def test_what_the_parser_reports(capsys, tmp_path):
+    for arguments in (["train", "hover", "--bogus"], ["train", "--steps", "many"], ["fly"], []):
+        assert command(*arguments) == 2
+        said = capsys.readouterr()
+        assert said.err and "Traceback" not in said.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_folders_that_cannot_be_used(refusal, copy, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("something")
+    _, line = refusal("train", "hover", *TINY, "--out", file / "run")
+    assert str(file) in line and "--out" in line
+    before = contents(copy)
+    _, line = refusal("train", "hover", *TINY, "--out", copy)
+    assert str(copy) in line and contents(copy) == before
+    for words in (
+        ("render", copy, "--out", file / "a.mp4"),
+        ("plot", copy, "--out", file / "a.png"),
+    ):
+        assert str(file) in refusal(*words)[1]
+    assert file.read_text() == "something"
+
+
+def test_a_disk_that_fills_up(capsys, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device", str(tmp_path / "run" / "checkpoint"))
+
+    monkeypatch.setattr("quadrl.learning.checkpoint.write_whole", full)
+    folder = tmp_path / "run"
+    assert command("train", "hover", *TINY, "--no-video", "--out", folder) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "No space left on device" in line and f"quadrl train --resume {folder}" in line
+    monkeypatch.undo()
+    assert command("train", "--resume", folder, "--no-video", "--episodes", "2") == 0
+
+
+def test_a_policy_for_another_layout(refusal, run):
+    # Beside the 22 numbers of hover, tasks with a moving target show its velocity.
+    error, _ = refusal("evaluate", run, "--task", "target_following")
+    assert error.value == 22 and error.allowed.startswith("25 ")
+    error, _ = refusal("evaluate", run, "--vehicle", "hexa")
+    assert error.value == 22 and error.allowed.startswith("24 ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (["evaluate", "--episodes", "0"], "episodes"),
+        (["evaluate", "--seed", "-1"], "seed"),
+        (["evaluate", "--vehicle", "brick"], "vehicle"),
+        (["evaluate", "--task-options", "x=1"], "hover option"),
+        (["evaluate", "--task-options", "x"], "task option"),
+        (["render", "--camera", "chse"], "camera"),
+        (["render", "--width", "161"], "width"),
+        (["render", "--height", "1081"], "height"),
+        (["render", "--fps", "0"], "fps"),
+        (["render", "--out", "a.gif"], "path"),
+        (["plot", "--out", "a.xyz"], "ending of a.xyz"),
+    ],
+)
+def test_flights_that_cannot_be(refusal, run, tmp_path, arguments, name):
+    error, _ = refusal(arguments[0], run, *arguments[1:])
+    assert error.name == name
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_there(refusal, run):
+    refusal("evaluate")
+    refusal("evaluate", run, "--controller", "lqr")
+    for words in (("evaluate",), ("plot",), ("train", "--resume")):
+        assert "nowhere" in refusal(*words, "nowhere")[1]
+    assert refusal("evaluate", "--controller", "pid")[0].name == "controller"
+    assert refusal("--import", "nowhere.py", "tasks")[0].name == "--import"
+
+
+# --------------------------------------------------------------- machines that lack something
+
+
+def test_without_a_compiler_it_says_what_to_install(tmp_path):
+    nothing = {"PATH": str(tmp_path / "bin"), "CC": "", "QUADRL_CACHE": str(tmp_path / "cache")}
+    done = in_a_process("evaluate", "hover", **nothing)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("quadrl: ") and "apt-get install build-essential" in line
+
+
+def test_without_graphics_it_says_what_to_install(tmp_path):
+    done = in_a_process("render", "hover", MUJOCO_GL="disabled")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("quadrl: ") and "apt install libegl1" in line
+    assert not list(tmp_path.glob("*.mp4"))

@@ -1,0 +1,518 @@
+"""Control modes and controllers: they do what they say, on every layout of rotors."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from helpers import LAYOUTS, matrices, quaternions, random_quaternions
+from scipy.optimize import linprog
+from scipy.spatial.transform import Rotation
+
+from quadrl import control, parameters, tasks
+from quadrl.control import CONTROL_MODES, CONTROLLERS, Gains, Weights, lqr, modes
+from quadrl.control.allocation import Allocation
+from quadrl.control.geometric import towards_east
+from quadrl.control.loops import (
+    Loops,
+    attitude_error,
+    cascade,
+    rotor_lag,
+    sampled,
+    turned,
+)
+from quadrl.environment import Environment
+from quadrl.errors import QuadrlError
+from quadrl.reading import Reading
+from quadrl.rollout import fly, summarize
+from quadrl.rotation import heading_of, quaternion_from_heading_and_tilt
+from quadrl.state import Start, State
+from quadrl.task import Snapshot, TaskState
+from quadrl.tasks.hover import Hover
+from quadrl.vehicle import GRAVITY, VEHICLES, Vehicle
+
+PAPER = Vehicle()
+LOOPED = [name for name in CONTROL_MODES if name != "rotor"]
+# High up, and over only by the clock.
+FREE = Hover(time_limit=100.0, max_distance=1e3, altitude=500.0)
+both = pytest.mark.parametrize("name", CONTROLLERS)
+looped = pytest.mark.parametrize("name", LOOPED)
+presets = pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES)
+layouts = pytest.mark.parametrize("vehicle", LAYOUTS.values(), ids=LAYOUTS)
+
+
+class AnyHeading(Hover):
+    """Hover, at whatever heading."""
+
+    heading_matters = False
+
+
+def hovering(vehicle, headings, **coordinates):
+    """Coordinates of aircraft at the origin, level, at rest and hovering, but for what is given."""
+    headings = np.asarray(headings, dtype=float)
+    zero = np.zeros((len(headings), 3))
+    level = quaternion_from_heading_and_tilt(headings, 0 * headings, 0 * headings)
+    speed = np.tile(vehicle.hover_speed, (len(headings), 1))
+    names = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
+    return dict(zip(names, (zero, level, zero, zero, speed), strict=True)) | coordinates
+
+
+def observations(task, headings=(0.0,), goal=(0.0, 0.0, 0.0), vehicle=PAPER, **coordinates):
+    """Flat observations (n, size), float64, of such aircraft; the goal in the world frame."""
+    motion = hovering(vehicle, headings, **coordinates)
+    state = State.of_coordinates(**motion, origin_height=3.0)
+    nominal = parameters.Parameters.of(parameters.rows(vehicle), vehicle.control_timestep)
+    goals = TaskState(goal=np.broadcast_to(np.asarray(goal, dtype=float), state.position.shape))
+    now = Snapshot(state, goals, nominal, state.rotor_speed, state.rotor_speed, state.speed)
+    now = dataclasses.replace(now, potentials=task.measure(now))
+    return np.concatenate(list(task.observe(now).values()), axis=-1)
+
+
+class Flyer:
+    """Such aircraft, flown in a control mode."""
+
+    def __init__(self, mode, vehicle, headings=(0.0,), **coordinates):
+        self.environment = Environment(
+            FREE, num_envs=len(headings), seed=0, vehicle=vehicle, control_mode=mode, num_threads=1
+        )
+        self.environment.reset()
+        self.engine, self.mode = self.environment.engine, self.environment.control_mode
+        start = Start(**hovering(vehicle, headings, **coordinates))
+        self.engine.place(np.arange(len(headings)), start)
+
+    @property
+    def state(self):
+        return self.engine.state
+
+    def fly(self, action, seconds=0.0):
+        """Fly a control step or more; a function of the state gives the action of each anew."""
+        shape = (self.environment.num_envs, self.environment.action_size)
+        for _ in range(max(1, math.ceil(seconds / self.environment.vehicle.control_timestep))):
+            now = action(self.state) if callable(action) else action
+            self.environment.step(np.broadcast_to(now, shape))
+
+
+# ---------------------------------------------------------------------------------- allocation
+
+
+def allocation_of(vehicle):
+    low, high = vehicle.rotor_command(np.array([[-1.0], [1.0]])) ** 2
+    return Allocation(np.linalg.pinv(vehicle.mixer), low, high), low, high
+
+
+@layouts
+def test_what_fits_is_given_exactly_and_what_does_not_stays_within_the_limits(vehicle):
+    allocation, low, high = allocation_of(vehicle)
+    rng, largest = np.random.default_rng(0), [vehicle.mass * GRAVITY, *allocation.moment]
+    wrench = largest * rng.uniform([0.98, -0.12, -0.12, -0.12], [1.02, 0.12, 0.12, 0.12], (50, 4))
+    expected = wrench @ np.linalg.pinv(vehicle.mixer).T
+    np.testing.assert_allclose(allocation.mix(wrench), expected, rtol=1e-9)
+    squares = allocation.mix(largest * rng.uniform(-3, 3, (500, 4)))
+    assert (squares >= low * (1 - 1e-12)).all() and (squares <= high * (1 + 1e-12)).all()
+
+
+@layouts
+def test_yaw_is_cut_first_then_thrust_then_roll_and_pitch_together(vehicle):
+    allocation, low, high = allocation_of(vehicle)
+    weight, (roll, pitch, yaw) = vehicle.mass * GRAVITY, allocation.moment
+    much_yaw, much_thrust, much_tilt = wrench = np.array(
+        [
+            [weight, 0.3 * roll, 0.2 * pitch, 9 * yaw],
+            [2 * weight, 0.3 * roll, 0.2 * pitch, 0.0],
+            [weight, 3 * roll, -1 * pitch, 0.0],
+        ]
+    )
+    given = allocation.mix(wrench) @ vehicle.mixer.T
+    np.testing.assert_allclose(given[0, :3], much_yaw[:3], rtol=1e-9)
+    assert 0 < given[0, 3] < yaw * (1 + 1e-9)
+    np.testing.assert_allclose(given[1, 1:3], much_thrust[1:3], rtol=1e-9)
+    assert weight < given[1, 0] < 2 * weight
+    # The largest share s of both that fits with any thrust t: low <= s tilt + t lift <= high.
+    inverse = np.linalg.pinv(vehicle.mixer)
+    rows = np.stack([inverse[:, 1:3] @ much_tilt[1:3], inverse[:, 0]], axis=-1)
+    best = linprog(
+        [-1, 0], np.vstack([rows, -rows]), np.concatenate([high, -low]), bounds=(0, None)
+    )
+    np.testing.assert_allclose(given[2, 1:3], best.x[0] * much_tilt[1:3], rtol=1e-9)
+
+
+# ------------------------------------------------------------------------------------- the loops
+
+
+@pytest.mark.parametrize("integrators", [2, 4])
+def test_cascade_places_every_pole(integrators):
+    """The closed loop's characteristic polynomial is (z - exp(-p T))^(n + 1)."""
+    size, lag = integrators + 1, 1 / 0.18
+    assert rotor_lag(PAPER) == (pytest.approx(lag), lag)
+    rates = cascade(lag, 5.0, integrators, 0.05)
+    # Nested: command = now + lead (rate_n (... rate_1 (0 - x_1) - x_2 ...) - now).
+    gain = np.zeros(size)
+    for k, rate in enumerate(rates[:-1]):
+        gain[k] += 1
+        gain *= rate
+    gain *= rates[-1]
+    gain[-1] = rates[-1] - 1
+    a, b = np.eye(size, k=1), np.eye(size)[:, -1:] * lag
+    a[-1, -1] = -lag
+    a, b = sampled(a, b, 0.05)
+    poles = np.full(size, math.exp(-5.0 * 0.05))
+    np.testing.assert_allclose(np.poly(a - b * gain), np.poly(poles), atol=1e-9)
+    # Where sampling is fast these are the textbook's: p / 3 and p for three poles.
+    if integrators == 2:
+        np.testing.assert_allclose(cascade(lag, 5.0, 2, 1e-4)[:2], [5 / 3, 5.0], rtol=1e-3)
+
+
+def test_attitude_error_is_the_sine_of_the_angle_about_its_axis():
+    rng = np.random.default_rng(0)
+    axis = rng.normal(size=(50, 3))
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = rng.uniform(0, math.pi, (50, 1))
+    # R = R_d exp(angle axis): in the body frame R_d's columns are those of the inverse turn.
+    desired = Rotation.from_rotvec(-angle * axis).as_matrix()
+    error = attitude_error(3.0 * desired[:, :, 2], desired[:, :, 0] + 0.3 * desired[:, :, 2])
+    np.testing.assert_allclose(error, np.sin(angle) * axis, atol=1e-12)
+
+
+def test_headings_turn_the_right_way():
+    # Heading north, a metre forward is north and a metre left is west.
+    north = np.array([[0.0, 1.0]])
+    np.testing.assert_allclose(turned(np.array([[1.0, 2.0, 3.0]]), north), [[-2.0, 1.0, 3.0]])
+    for heading, wanted in ((0.2, 0.0), (-0.2, 0.0), (2.0, 1.5), (-3.0, -2.5)):  # 0.5 rad nearer
+        nearer = towards_east(np.array([[math.cos(heading), math.sin(heading)]]))
+        np.testing.assert_allclose(nearer, [[math.cos(wanted), math.sin(wanted)]], atol=1e-12)
+
+
+def test_a_reading_gives_back_the_state():
+    rng, task = np.random.default_rng(0), tasks.make("hover")
+    quaternion, speed = random_quaternions(rng, 20), rng.uniform(100, 300, (20, 4))
+    velocity, body_rate, goal = rng.normal(size=(3, 20, 3))
+    motion = dict(quaternion=quaternion, velocity=velocity, body_rate=body_rate, rotor_speed=speed)
+    reading = Reading.of(observations(task, np.zeros(20), goal, **motion), task.observation, PAPER)
+    expected = motion | {"rotation": matrices(quaternion), "to_goal": goal, "target_velocity": 0}
+    expected["speed"] = np.linalg.norm(velocity, axis=-1)
+    expected["angular_speed"] = np.linalg.norm(body_rate, axis=-1)
+    del expected["quaternion"]
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(reading, name), value, rtol=1e-12, atol=1e-12)
+
+
+# ------------------------------------------------------------------------------------ controllers
+
+
+@both
+@pytest.mark.parametrize("task", tasks.TASKS)
+def test_every_task_of_the_paper_is_solved(name, task):
+    figures = summarize(fly(control.make(name, task), task, episodes=8))
+    assert figures["success_rate"] == 1.0
+    if task in ("hover", "static_waypoint", "random_waypoint"):
+        assert figures["position_error_m"] < 1e-3
+    if task == "landing":  # the profile asks for 0.2 m/s at the end
+        assert figures["touchdown_speed_max_m_s"] < 0.4
+
+
+@both
+@layouts
+def test_every_aircraft_hovers_without_tuning(name, vehicle):
+    task = tasks.make("hover", time_limit=5.0)
+    flight = fly(control.make(name, task, vehicle), task, episodes=12, vehicle=vehicle)
+    figures = summarize(flight)
+    assert figures["success_rate"] == 1.0
+    assert figures["position_error_m"] < 0.02
+
+
+@pytest.mark.parametrize(("name", "speed", "spin"), [("geometric", 1.5, 3.0), ("lqr", 0.0, 0.0)])
+def test_recovers_from_sixty_degrees_of_tilt(name, speed, spin):
+    """Far outside of what is linear; geometric control from tumbling as well."""
+    wild = dict(tilt=math.radians(60), speed=speed, spin=spin, max_distance=20.0, altitude=20.0)
+    task = tasks.make("hover", **wild)
+    assert summarize(fly(control.make(name, task), task, episodes=50))["success_rate"] == 1.0
+
+
+@both
+@pytest.mark.parametrize(
+    ("task", "goal", "heading", "sign"),
+    [
+        (Hover, (0, 0, 0), 0.0, (0, 0, 0, 0)),
+        # Rotors 1 to 4 sit ahead, left, behind and right. Ahead: nose down, so behind pushes.
+        (Hover, (0.2, 0, 0), 0.0, (-1, 0, 1, 0)),
+        (Hover, (0, 0.2, 0), 0.0, (0, -1, 0, 1)),
+        (Hover, (0, 0, -0.2), 0.0, (-1, -1, -1, -1)),
+        # Heading north, a goal in the east is to the right: rotor 2, left, pushes.
+        (AnyHeading, (0.2, 0, 0), math.pi / 2, (0, 1, 0, -1)),
+        (AnyHeading, (0, 0, 0), 0.2, (0, 0, 0, 0)),
+        # Back to the right: rotors 1 and 3 react that way (equation 7).
+        (Hover, (0, 0, 0), 0.2, (1, -1, 1, -1)),
+    ],
+)
+def test_goals_and_headings_are_approached_the_right_way(name, task, goal, heading, sign):
+    task = task()
+    action = CONTROLLERS[name](PAPER, task)(observations(task, [heading], goal))
+    np.testing.assert_array_equal(np.sign(np.round(action, 2)), [sign])
+
+
+@both
+@layouts
+def test_rows_are_flown_as_each_alone_and_no_attitude_breaks_it(name, vehicle):
+    """Bit for bit: straight up, straight down, on its back; far away, and on the goal."""
+    task, rng = tasks.make("hover"), np.random.default_rng(0)
+    turns = [angle * axis for angle in np.linspace(-math.pi, math.pi, 17) for axis in np.eye(3)]
+    quaternion, count = quaternions(Rotation.from_rotvec(turns).as_matrix()), len(turns)
+    goal = rng.choice([0.0, 0.1, 1e3, -1e3], (count, 3))
+    speed = vehicle.hover_speed * rng.uniform(0.5, 1.1, (count, vehicle.rotor_count))
+    motion = dict(quaternion=quaternion, velocity=rng.normal(size=(count, 3)), rotor_speed=speed)
+    seen = observations(task, np.zeros(count), goal, vehicle, **motion)
+    controller = control.make(name, task, vehicle)
+    action = controller(seen)
+    assert action.shape == (count, vehicle.rotor_count) and (np.abs(action) <= 1).all()
+    for k in range(count):
+        np.testing.assert_array_equal(controller(seen[k]), action[k])
+
+
+@presets
+def test_the_linear_model_is_the_derivative_of_the_engine(vehicle):
+    """Central differences of one control step of MuJoCo, so that the squares cancel."""
+    # With one lag in both directions: the step response is not linear otherwise.
+    lag = rotor_lag(vehicle)[0]
+    rotors = [dataclasses.replace(rotor, lag_up=lag, lag_down=lag) for rotor in vehicle.rotors]
+    vehicle, count = dataclasses.replace(vehicle, rotors=tuple(rotors)), vehicle.rotor_count
+    # Steps that move every quantity about alike [m, m/s, rad, rad/s, rad/s, 1].
+    sizes = np.repeat([1e-4, 1e-4, 1e-5, 1e-5, 1e-3, 1e-4], [3, 3, 3, 3, count, count])
+    x = np.concatenate([np.diag(sizes), -np.diag(sizes)])
+    part = {name: x[:, : 12 + count][:, where] for name, where in lqr.STATES.items()}
+    part["quaternion"] = quaternions(Rotation.from_rotvec(part.pop("attitude")).as_matrix())
+    part["rotor_speed"] = part["rotor_speed"] + vehicle.hover_speed
+    flyer = Flyer("rotor", vehicle, np.zeros(len(x)), **part)
+    flyer.fly(x[:, 12 + count :])
+    state = flyer.state
+    attitude = Rotation.from_matrix(np.array(state.rotation)).as_rotvec()
+    speed = state.rotor_speed - vehicle.hover_speed
+    after = np.concatenate([state.position, state.velocity, attitude, state.body_rate, speed], -1)
+    difference = (after[: len(sizes)] - after[len(sizes) :]) / (2 * sizes[:, None])
+    a, b = sampled(*lqr.linear_model(vehicle), vehicle.control_timestep)
+    # RK4 takes the lag to (k_c dt)^5 / 120: 4e-9 for the paper's aircraft, 3e-6 for the hexa.
+    np.testing.assert_allclose(difference.T, np.hstack([a, b]), rtol=2e-5, atol=2e-5)
+
+
+@layouts
+def test_the_lqr_solves_its_riccati_equation_and_is_stable(vehicle):
+    regulator = lqr.LQRController(vehicle, Hover())
+    a, b, q, r, p, gain = (getattr(regulator, k) for k in ("a", "b", "q", "r", "p", "gain"))
+    residual = a.T @ p @ a - p - a.T @ p @ b @ np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a) + q
+    assert np.abs(residual).max() < 1e-8 * np.abs(p).max()
+    closed = a - b @ gain
+    assert np.abs(np.linalg.eigvals(closed)).max() < 0.995
+    # p is the cost that is left: that of a step, and what is left after it.
+    np.testing.assert_allclose(
+        q + gain.T @ r @ gain + closed.T @ p @ closed, p, rtol=1e-6, atol=1e-6
+    )
+
+
+# ---------------------------------------------------------------------------------- control modes
+
+
+def test_scales_by_worked_numbers():
+    """Of the paper's aircraft: hover at 225.678 rad/s, commands from 190.678 to 260.678 rad/s."""
+    # 0.8 g (1 - (190.678 / 225.678)^2) = 2.246 m/s^2 down; up 2.623; the smaller counts.
+    # Tilted by 0.4 rad: g tan 0.4 = 4.148 m/s^2. In a second: m/s; over another: m.
+    # Roll: 0.8 l k_T (260.678^2 - 190.678^2) / J_x = 24.26 rad/s^2; sqrt(24.26 * 0.4) = 3.115.
+    # Yaw: 0.8 * 2 k_Q (260.678^2 - 190.678^2) / J_z = 2.917; sqrt(2.917 * 0.5) = 1.208.
+    expected = {
+        "rotor": ([225.678] * 4, [35.0] * 4),
+        "thrust_body_rate": ([1, 0, 0, 0], [0.229, 3.115, 3.115, 1.208]),
+        "velocity": ([0] * 4, [4.148, 4.148, 2.246, 1.208]),
+        "position": ([0] * 4, [4.148, 4.148, 2.246, 0.5]),
+    }
+    assert set(expected) == set(CONTROL_MODES)
+    for name, (centre, scale) in expected.items():
+        mode = modes.make(name, PAPER)
+        np.testing.assert_allclose(mode.centre, centre, atol=6e-4)
+        np.testing.assert_allclose(mode.scale, scale, atol=6e-4)
+    hexa = [modes.make(name, VEHICLES["hexa"]) for name in ("rotor", "velocity")]
+    assert [term.name for term in hexa[0].terms] == [f"rotor_{k}" for k in range(1, 7)]
+    assert [mode.size for mode in hexa] == [6, 4]
+
+
+@layouts
+@pytest.mark.parametrize("name", CONTROL_MODES)
+def test_no_action_hovers_at_any_heading_and_actions_are_clipped(name, vehicle):
+    flyer = Flyer(name, vehicle, headings=(0.0, 2.0, -1.5))
+    flyer.fly(0.0, 1.0)
+    # Leaning rotors that differ push it aside.
+    assert np.abs(flyer.state.position).max() < (1e-3 if vehicle.name == "leaning" else 1e-9)
+    action = np.random.default_rng(0).uniform(-3, 3, (3, flyer.mode.size))
+    clipped = flyer.mode.setpoint(flyer.state, np.clip(action, -1, 1))
+    np.testing.assert_array_equal(flyer.mode.setpoint(flyer.state, action), clipped)
+
+
+@presets
+@looped
+def test_wild_actions_stay_within_the_rotors_limits_and_do_not_flip_the_aircraft(name, vehicle):
+    """Every number at a limit, drawn anew now and then; body rates for a control step only."""
+    flyer, rates = Flyer(name, vehicle, np.linspace(0, 6, 16)), name == "thrust_body_rate"
+    low, high = vehicle.rotor_command(np.array([[-1.0], [1.0]]))
+    rng, share, upright = np.random.default_rng(0), [], []
+    for _ in range(20 if rates else 5):
+        action = np.sign(rng.uniform(-1, 1, (16, 4)))
+        for _ in range(1 if rates else rng.integers(1, 10)):
+            flyer.fly(action)
+            share.append((flyer.engine.ctrl - low) / (high - low))
+            upright.append(flyer.state.rotation[:, 2, 2].min())
+            assert not rates or (np.abs(flyer.state.body_rate) < 1.3 * flyer.mode.scale[1:]).all()
+    assert np.min(share) > -1e-12 and np.max(share) == pytest.approx(1)  # and all of it is used
+    assert rates or 0.5 < min(upright) < 0.99
+    flyer.fly(0.0, 4.0)
+    assert flyer.state.angular_speed.max() < 0.02
+    assert rates or flyer.state.rotation[:, 2, 2].min() > 0.999
+
+
+@presets
+@pytest.mark.parametrize("action", [-1.0, 0.5])
+def test_thrust_gives_the_acceleration_that_it_says(vehicle, action):
+    """m a = (share - 1) m g less drag, after twelve time constants of rotor and step."""
+    flyer, vertical = Flyer("thrust_body_rate", vehicle), np.array([[action, 0, 0, 0]])
+    share = flyer.mode.values(vertical)[0, 0]
+    flyer.fly(vertical, 12 * (1 / rotor_lag(vehicle)[1] + vehicle.physics_timestep))
+    before = flyer.state.velocity[0].copy()
+    flyer.fly(vertical)
+    after = flyer.state.velocity[0]
+    middle, acceleration = (before + after) / 2, (after - before) / vehicle.control_timestep
+    drag = vehicle.drag_coefficient / vehicle.mass * np.abs(middle) * middle
+    expected = np.array([0, 0, (share - 1) * GRAVITY]) - drag
+    np.testing.assert_allclose(acceleration, expected, atol=1e-4 * GRAVITY)
+
+
+def settling(vehicle, poles, share, limit):
+    """Time [s] in which a step response with n poles at one bandwidth is within 5 percent.
+
+    1 - exp(-x) sum_{k<n} x^k / k! = 0.95 at x = 4.74 and 7.75 for n = 2 and 4; a control step is
+    added, since that is how often it is looked at. The bandwidth is the share that the gains ask
+    for of what the rotors allow, or a limit [rad/s] if that is less.
+    """
+    allowed = 1 / (1 / rotor_lag(vehicle)[1] + vehicle.physics_timestep)
+    return {2: 4.74, 4: 7.75}[poles] / min(share * allowed, limit) + vehicle.control_timestep
+
+
+@presets
+@pytest.mark.parametrize("axis", [1, 2, 3])
+def test_a_body_rate_is_reached_in_its_time_and_held(vehicle, axis):
+    """A rate and the lag make two poles; at an action of 1 the largest moment limits it too."""
+    flyer = Flyer("thrust_body_rate", vehicle, headings=(0.0, 0.0))
+    actions, rates = np.array([[0.3], [-1.0]]) * np.eye(4)[axis], flyer.mode.scale[1:]
+    wanted = actions[:, 1:] * rates
+    near = 0.05 * np.abs(wanted).max(axis=1, keepdims=True)
+    # At the limit p / 2 times the largest rate is the largest angular acceleration: the rate is
+    # sqrt(acceleration * angle).
+    share, limit = (1.0, 2 * rates[2] / 0.5) if axis == 3 else (1.3, 2 * min(rates[:2]) / 0.4)
+    seconds = 1.1 * settling(vehicle, 2, share, limit)
+    flyer.fly(actions, seconds)
+    assert (np.abs(flyer.state.body_rate - wanted) < near).all()
+    flyer.fly(actions, seconds)
+    assert (np.abs(flyer.state.body_rate - wanted) < near / 10).all()
+
+
+@presets
+@pytest.mark.parametrize("action", [-0.1, 1.0])
+def test_a_velocity_is_reached_in_its_time_and_held_at_any_heading(vehicle, action):
+    """Velocity, tilt, body rate and lag make four poles; far off the acceleration is limited."""
+    flyer, actions = Flyer("velocity", vehicle, headings=(0.0, 2.0, 4.0)), action * np.eye(3, 4)
+    wanted = actions[:, :3] * flyer.mode.scale[:3]
+    near = 0.05 * np.abs(wanted).max(axis=1, keepdims=True)
+
+    def error():
+        back = heading_of(flyer.state.rotation) * [1, -1]
+        return np.abs(turned(flyer.state.velocity, back) - wanted)
+
+    # At the limit p^2 times the largest angle is the largest angular acceleration.
+    rates = Loops(vehicle, vehicle.physics_timestep, "velocity").max_body_rate
+    # The scale is the largest acceleration times a second.
+    flyer.fly(actions, settling(vehicle, 4, 1.3, min(rates[:2]) / 0.4) + abs(action))
+    assert (error() < near).all()
+    flyer.fly(actions, 2.0)
+    assert (error() < near / 10).all()
+
+
+@presets
+def test_a_position_is_reached_and_held_without_overshoot_and_no_action_brakes(vehicle):
+    flyer = Flyer("position", vehicle, headings=(0.0, 0.8, -0.6))
+    place, east, share = np.array([4.0, -2.0, 0.7]), np.tile([1.0, 0.0], (3, 1)), []
+
+    def action(state):
+        back = heading_of(state.rotation) * [1, -1]
+        x, y = turned(east, back).T
+        return np.column_stack([turned(place - state.position, back), np.arctan2(y, x)])
+
+    for _ in range(16):
+        flyer.fly(lambda state: action(state) / flyer.mode.scale, 0.5)
+        share.append((flyer.state.position @ place / (place @ place)).max())
+    assert max(share) < 1.01
+    np.testing.assert_allclose(flyer.state.position, np.tile(place, (3, 1)), atol=0.01)
+    np.testing.assert_allclose(heading_of(flyer.state.rotation), east, atol=0.03)
+    flyer = Flyer("position", vehicle, velocity=np.array([[2.0, 0.0, 0.0]]))
+    flyer.fly(0.0, 4.0)
+    assert flyer.state.speed[0] < 0.01
+    # Without lag 2 m/s over the rate of the velocity loop, 1.7 / s for the slowest aircraft: 1.2 m.
+    assert 0.2 < flyer.state.position[0, 0] < 2.4
+
+
+# ----------------------------------------------------------------------------- in the environment
+
+
+@looped
+@pytest.mark.parametrize("vehicle", ["paper", "hexa", "eight"])
+def test_a_batch_flies_as_each_alone(name, vehicle):
+    """Bit for bit, whatever the order in which the rows lie in memory."""
+    setting = dict(vehicle=LAYOUTS[vehicle], control_mode=name)
+    batch = Environment("hover", num_envs=5, seed=3, **setting)
+    singles = [Environment("hover", seed=3 + i, **setting) for i in range(5)]
+    for environment in (batch, *singles):
+        environment.reset()
+    for action in np.random.default_rng(0).uniform(-1, 1, (12, 5, 4)):
+        reward = batch.step(action).reward
+        alone = [single.step(action[i : i + 1]).reward[0] for i, single in enumerate(singles)]
+        np.testing.assert_array_equal(reward, alone)
+
+
+@looped
+@pytest.mark.parametrize("broken", [0, 4])
+def test_loops_fly_every_physics_step_and_a_divergence_in_any_ends_the_episode(name, broken):
+    environment = Environment("hover", num_envs=3, seed=0, control_mode=name)
+    environment.reset()
+    control_rotors, commands = environment.control, []
+
+    def noted():
+        control_rotors()
+        if len(commands) == broken:
+            environment.engine.qvel[-1, 5] = np.nan
+        commands.append(environment.engine.ctrl.copy())
+
+    environment.control = noted
+    now = environment.step(np.tile([0.3, -0.2, 0.1, 0.5], (3, 1)))
+    assert len(commands) == PAPER.substeps
+    assert np.ptp(commands, axis=0).max() > 0.1  # the loops were at work [rad/s]
+    # The reward is of the mean command.
+    off = (np.mean(commands, axis=0) - PAPER.hover_speed) / PAPER.max_speed
+    np.testing.assert_allclose(now.reward_terms["control"], -np.sum(off**2, axis=-1))
+    np.testing.assert_array_equal(now.diverged, [False, False, True])
+    np.testing.assert_array_equal(now.terminated, [False, False, True])
+    environment.control = control_rotors
+    assert not environment.step(np.zeros((3, 4))).diverged.any()
+
+
+@pytest.mark.parametrize(
+    ("call", "name", "value"),
+    [
+        (lambda: control.make("lqg", "hover"), "controller", "lqg"),
+        (lambda: control.make("lqr", "hovr"), "task", "hovr"),
+        (lambda: control.make("lqr", "hover", "papr"), "vehicle", "papr"),
+        (lambda: modes.make("velocty", PAPER), "control_mode", "velocty"),
+        (lambda: Environment("hover", control_mode="velocty"), "control_mode", "velocty"),
+        (lambda: control.make("lqr", "hover")(np.zeros(25)), "observation size", 25),
+        (lambda: Gains(authority=1.1), "authority", 1.1),
+        (lambda: Gains(max_tilt=2.0), "max_tilt", 2.0),
+        (lambda: Weights(tilt=0.0), "tilt", 0.0),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(call, name, value):
+    with pytest.raises(QuadrlError) as refused:
+        call()
+    assert (refused.value.name, refused.value.value) == (name, value)

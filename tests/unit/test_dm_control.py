@@ -1,0 +1,222 @@
+"""dm_control; what all APIs have in common is in contract/."""
+
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quadrl
+from quadrl import suite  # before dm_control: it chooses what draws
+from quadrl.envs import dm_control
+from quadrl.errors import QuadrlError
+from quadrl.tasks import TASKS
+from quadrl.tasks.hover import Hover
+
+from dm_control import suite as dm_suite  # isort: skip
+
+TESTS = Path(__file__).parents[1]
+DIVE = np.full(4, -1.0)
+CONTROL_STEP = 0.05  # [s]
+
+
+def run(*arguments):
+    """Output of a Python process that finds this repository's package, without a MUJOCO_GL."""
+    own = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", *arguments],
+        env=own | {"PYTHONPATH": str(TESTS.parent)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def fly(environment, action=DIVE):
+    """Time steps of an episode, the first one included."""
+    steps = [environment.reset()]
+    while not steps[-1].last():
+        steps.append(environment.step(action))
+    return steps
+
+
+def test_dm_controls_own_suite_test_passes():
+    output = run(TESTS / "dm_control_conformance.py")
+    assert output.rstrip().endswith("OK"), output  # nothing skipped either
+    # One test of the constants, and nine of every task.
+    assert int(re.search(r"Ran (\d+) tests", output)[1]) == 1 + 9 * len(TASKS)
+    for name in TASKS:
+        assert output.count(f"task='{name}'") >= 2 * 8
+
+
+def test_after_register_dm_control_loads_the_same_environments():
+    suite.register()
+    suite.register()  # harmless
+    assert ("cartpole", "balance") in dm_suite.BENCHMARKING  # the others are still there
+    for name in TASKS:
+        assert ("quadrotor", name) in dm_suite.ALL_TASKS
+        assert name in dm_suite.TASKS_BY_DOMAIN["quadrotor"]
+        theirs = fly(dm_suite.load("quadrotor", name, task_kwargs={"random": 4}))
+        ours = fly(quadrl.load(name, {"random": 4}))
+        for one, other in zip(theirs, ours, strict=True):
+            assert one[:3] == other[:3]
+            assert list(one.observation) == list(other.observation) == list(TASKS[name].observation)
+            for term in one.observation:
+                np.testing.assert_array_equal(one.observation[term], other.observation[term])
+
+
+def test_the_lists_of_the_domain_name_every_task():
+    assert suite.ALL_TASKS == tuple(("quadrotor", name) for name in TASKS)
+    assert suite.TASKS_BY_DOMAIN == {"quadrotor": tuple(TASKS)}
+    with pytest.raises(AttributeError, match="NO_SUCH_TASKS"):
+        _ = suite.NO_SUCH_TASKS
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_crash_on_the_last_step_is_a_crash_and_the_clock_is_no_crash(name):
+    crashed = fly(quadrl.load(name, {"random": 0}))
+    assert crashed[-1].discount == 0.0
+    assert all(step.discount == 1.0 for step in crashed[1:-1])
+    steps = len(crashed) - 1
+    on_the_clock = fly(quadrl.load(name, {"random": 0, "time_limit": steps * CONTROL_STEP}))
+    assert (len(on_the_clock) - 1, on_the_clock[-1].discount) == (steps, 0.0)
+    earlier = fly(quadrl.load(name, {"random": 0, "time_limit": (steps - 1) * CONTROL_STEP}))
+    assert (len(earlier) - 1, earlier[-1].discount) == (steps - 1, 1.0)
+
+
+def test_a_success_that_ends_an_episode_has_discount_0():
+    @dataclasses.dataclass(frozen=True)
+    class Down(Hover):
+        name = "down"
+
+        def terminated(self, now):
+            return now.state.position[..., 2] < -1.0
+
+        def succeeded(self, now, end):
+            return end.terminated
+
+    environment = dm_control.make(Down(time_limit=2.0), random=0)
+    assert fly(environment)[-1].discount == 0.0
+    assert environment.task.transition.is_success[0]
+    assert fly(environment, np.zeros(4))[-1].discount == 1.0
+    assert not environment.task.transition.is_success[0]
+
+
+@pytest.mark.parametrize("kwargs", [{"control_timestep": 0.02}, {"n_sub_steps": 2}])
+def test_the_control_step_can_be_chosen(kwargs):
+    # Two of the physics steps of 0.01 s, of an episode of 0.2 s: ten actions.
+    environment = quadrl.load("hover", environment_kwargs=kwargs | {"time_limit": 0.2})
+    assert environment.control_timestep() == pytest.approx(0.02)
+    assert len(fly(environment)) - 1 == 10
+    assert environment.physics.time() == pytest.approx(0.2)
+
+
+def test_the_flat_observation_has_the_order_of_the_terms():
+    flat = quadrl.load("hover", {"random": 1}, {"flat_observation": True}).reset().observation
+    terms = quadrl.load("hover", {"random": 1}).reset().observation
+    np.testing.assert_array_equal(flat["observations"], np.concatenate(list(terms.values())))
+
+
+@pytest.mark.parametrize("control_mode", ["rotor", "velocity"])
+def test_without_the_legacy_step_the_numbers_are_the_same(control_mode):
+    task_kwargs = {"random": 2, "control_mode": control_mode, "time_limit": 1.0}
+    plain = fly(quadrl.load("hover", task_kwargs, {"legacy_step": False}))
+    legacy = fly(quadrl.load("hover", task_kwargs))
+    assert [step.reward for step in plain] == [step.reward for step in legacy]
+
+
+def test_task_options_vehicle_and_wind_arrive():
+    heavy = dataclasses.replace(quadrl.Vehicle(), mass=1.3)
+    environment = quadrl.load("hover", {"vehicle": heavy, "max_distance": 0.8, "random": 0})
+    assert environment.physics.model.body_mass.sum() == pytest.approx(1.3)
+    assert len(fly(environment)) < len(fly(quadrl.load("hover", {"random": 0})))
+    windy = quadrl.load("hover", {"random": 0, "ranges": {"wind": ((3, 0, 0), (4, 0, 0))}})
+    windy.reset()
+    assert 3 < windy.task.environment.engine.air[0, 0] < 4
+    assert windy.step(np.zeros(4)).observation["velocity"].any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (("quadrotor", "hoover"), "task_name"),
+        (("cartpole", "balance"), "domain_name"),
+        (("quadrotor", "hover", None, {"flat": True}), "environment_kwargs"),
+        (
+            ("quadrotor", "hover", None, {"control_timestep": 0.02, "n_sub_steps": 2}),
+            "n_sub_steps",
+        ),
+    ],
+)
+def test_an_unknown_name_is_refused(arguments, name):
+    with pytest.raises(QuadrlError) as caught:
+        suite.load(*arguments)
+    assert caught.value.name == name
+
+
+def test_the_reward_colours_the_aircraft_when_asked():
+    def colours(visualize):
+        environment = quadrl.load("hover", {"random": 0}, visualize_reward=visualize)
+        rgba = environment.physics.named.model.mat_rgba
+        environment.reset()
+        before = rgba["self"].copy()
+        reward = environment.step(np.zeros(4)).reward
+        assert reward > 1  # clipped to 1: all highlight
+        return before, rgba["self"].copy(), rgba["self_default"], rgba["self_highlight"]
+
+    before, after, default, highlight = colours(True)
+    np.testing.assert_allclose(before, default)
+    np.testing.assert_allclose(after, highlight)
+    before, after, default, _ = colours(False)
+    np.testing.assert_allclose(after, default)
+    assert not np.allclose(default, highlight)
+
+
+def test_a_random_state_seeds_the_episodes():
+    def start(random):
+        return quadrl.load("hover", {"random": random}).reset().observation["position"]
+
+    one, same, other = (start(np.random.RandomState(seed)) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
+
+
+def test_a_reset_leaves_the_solver_no_memory():
+    # As in a fresh MjData, from which a plain loop starts.
+    environment = quadrl.load("landing")
+    fly(environment)
+    environment.reset()
+    assert not environment.physics.data.qacc_warmstart.any()
+
+
+def test_free_flight_flies_the_same_and_shows_what_it_flies():
+    one = quadrl.load("hover", {"random": 0, "engine": "free_flight"})
+    other = quadrl.load("hover", {"random": 0})
+    one.reset(), other.reset()
+    for action in np.random.default_rng(0).uniform(-1, 1, (10, 4)):
+        flown, expected = one.step(action), other.step(action)
+        np.testing.assert_allclose(flown.reward, expected.reward, rtol=1e-5)
+        height = one.physics.named.data.xpos["aircraft", "z"]
+        assert height == one.physics.data.qpos[2]
+        assert one.physics.time() == pytest.approx(other.physics.time())
+
+
+@pytest.mark.parametrize("first", ["", "import dm_control.suite; "])
+def test_physics_render_draws_without_a_screen_and_leaves_no_variable(first):
+    # In a process of its own: dm_control chooses what draws once.
+    ignore = "import warnings; warnings.simplefilter('ignore'); " if first else ""
+    code = (
+        "import os, quadrl; before = dict(os.environ);"
+        "environment = quadrl.load('hover'); environment.reset();"
+        "assert dict(os.environ) == before;"
+        "picture = environment.physics.render(96, 128, camera_id='track');"
+        "assert picture.shape == (96, 128, 3), picture.shape;"
+        "assert picture.reshape(-1, 3).std(axis=0).min() > 5, 'blank';"
+        "assert 'MUJOCO_GL' not in os.environ; environment.physics.free()"
+    )
+    run("-c", ignore + first + code)

@@ -1,0 +1,245 @@
+"""The equations twice: in C (both engines) and in the array API (`quadrl/dynamics.py`)."""
+
+import dataclasses
+import math
+
+import helpers
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from quadrl import dynamics, mjcf
+from quadrl.engines.mujoco import BatchEngine, DataEngine
+from quadrl.parameters import Parameters, rows
+from quadrl.rotation import quaternion_product
+from quadrl.vehicle import GRAVITY, Vehicle, plus
+
+COUNT = 9  # more than free flight takes at a time
+FIELDS = [field.name for field in dataclasses.fields(dynamics.Motion)]
+every_layout = pytest.mark.parametrize("name", helpers.LAYOUTS)
+
+
+@dataclasses.dataclass
+class Case:
+    """Aircraft that all differ, in motions that all differ, each in a wind of its own."""
+
+    vehicle: Vehicle
+    table: np.ndarray
+    motion: helpers.Motion
+    command: np.ndarray
+
+    @classmethod
+    def of(cls, name):
+        vehicle = helpers.LAYOUTS[name]
+        motion = helpers.random_motion(vehicle, COUNT, speed=6.0, turn=6.0, wind=5.0, rotor=0.4)
+        motion.position += helpers.UP
+        command = helpers.random_commands(vehicle, COUNT, 1, rotor=0.6)[0]
+        rising = command > motion.rotor_speed
+        assert rising.any() and not rising.all()
+        return cls(vehicle, helpers.parameter_rows(vehicle, COUNT), motion, command)
+
+    def equations(self, function, *more, array=np.asarray):
+        """What a function of `dynamics` gives, in NumPy or with tensors."""
+        p = Parameters.of(self.table).map(array)
+        motion = dynamics.Motion(*(array(getattr(self.motion, name)) for name in FIELDS))
+        given = (array(self.command), array(self.motion.wind), -GRAVITY, *more)
+        return function(p, motion, *given)
+
+
+def tensor(array):
+    return torch.tensor(np.ascontiguousarray(array))
+
+
+def assert_close(got, expected, tolerance=1e-12):
+    """Every field of two motions, over the largest number in it."""
+    for name in FIELDS:
+        value = np.asarray(getattr(expected, name))
+        atol = tolerance * np.abs(value).max()
+        np.testing.assert_allclose(getattr(got, name), value, rtol=0, atol=atol, err_msg=name)
+
+
+def batch(case, engine):
+    flying = BatchEngine(case.vehicle, COUNT, altitude=3.0, engine=engine, per_row=True)
+    flying.write_parameters(np.arange(COUNT), case.table)
+    helpers.put(flying, case.motion, origin=0)
+    flying.ctrl[:] = case.command
+    return flying
+
+
+@every_layout
+def test_a_step_of_free_flight_is_that_of_the_equations(name):
+    case = Case.of(name)
+    flying = batch(case, "free_flight")
+    flying.advance(1)
+    step = case.equations(dynamics.step, case.vehicle.physics_timestep)
+    assert_close(helpers.taken(flying, origin=0), step)
+    # It is a step: what it changes is far more than the tolerance.
+    for field in FIELDS:
+        assert np.abs(getattr(step, field) - getattr(case.motion, field)).min() > 0
+
+
+@every_layout
+def test_the_rate_of_free_flight_is_the_derivative(name):
+    # Of a step h: (x(h) - x(0)) / h is the derivative but for h / 2 times the second one.
+    case = Case.of(name)
+    case.vehicle = dataclasses.replace(case.vehicle, physics_timestep=1e-7, control_timestep=1e-7)
+    flying = batch(case, "free_flight")
+    flying.advance(1)
+    after, rate = helpers.taken(flying, origin=0), case.equations(dynamics.derivative)
+    for field in FIELDS:
+        expected = getattr(rate, field)
+        moved = (getattr(after, field) - getattr(case.motion, field)) / 1e-7
+        atol = 1e-5 * np.abs(expected).max()
+        np.testing.assert_allclose(moved, expected, rtol=0, atol=atol, err_msg=field)
+
+
+@every_layout
+def test_the_accelerations_of_mujoco_are_the_derivative(name):
+    case = Case.of(name)
+    model = mjcf.compile_model(case.vehicle, drawn=False)
+    data = mujoco.MjData(model)
+    one = DataEngine(case.vehicle, model, data, altitude=3.0)
+    rate = case.equations(dynamics.derivative)
+    acceleration = np.empty((COUNT, 6))
+    spin_up = np.empty_like(case.command)
+    for row in range(COUNT):
+        one.write_parameters(np.array([0]), case.table[row : row + 1])
+        motion = helpers.Motion(*(x[row : row + 1] for x in vars(case.motion).values()))
+        helpers.put(one, motion, origin=0)
+        one.ctrl[:] = case.command[row]
+        mujoco.mj_forward(model, data)
+        acceleration[row], spin_up[row] = data.qacc, data.act_dot
+    expected = (rate.velocity, rate.body_rate, rate.rotor_speed)
+    for got, value in zip(
+        (acceleration[:, :3], acceleration[:, 3:], spin_up), expected, strict=True
+    ):
+        np.testing.assert_allclose(got, value, rtol=0, atol=1e-12 * np.abs(value).max())
+
+
+def mujoco_step(case):
+    """MuJoCo's Runge-Kutta step on the equations: it turns the attitude by mean body rates."""
+    step = case.vehicle.physics_timestep
+    p, start = Parameters.of(case.table), case.motion
+
+    def moved(rate, time):
+        angle = time * np.linalg.norm(rate.body_turn, axis=-1, keepdims=True)
+        axis = rate.body_turn / np.linalg.norm(rate.body_turn, axis=-1, keepdims=True)
+        turn = np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=-1)
+        return dynamics.Motion(
+            position=start.position + time * rate.position,
+            quaternion=quaternion_product(start.quaternion, turn),
+            velocity=start.velocity + time * rate.velocity,
+            body_rate=start.body_rate + time * rate.body_rate,
+            rotor_speed=start.rotor_speed + time * rate.rotor_speed,
+        )
+
+    @dataclasses.dataclass
+    class Rate:
+        position: np.ndarray
+        body_turn: np.ndarray
+        velocity: np.ndarray
+        body_rate: np.ndarray
+        rotor_speed: np.ndarray
+
+    def rate_at(motion):
+        d = dynamics.derivative(p, motion, case.command, start.wind, -GRAVITY)
+        return Rate(motion.velocity, motion.body_rate, d.velocity, d.body_rate, d.rotor_speed)
+
+    first = rate_at(dynamics.Motion(*(getattr(start, name) for name in FIELDS)))
+    second = rate_at(moved(first, step / 2))
+    third = rate_at(moved(second, step / 2))
+    fourth = rate_at(moved(third, step))
+    mean = Rate(
+        *(
+            (
+                getattr(first, f)
+                + 2 * getattr(second, f)
+                + 2 * getattr(third, f)
+                + getattr(fourth, f)
+            )
+            / 6
+            for f in Rate.__dataclass_fields__
+        )
+    )
+    return moved(mean, step)
+
+
+@every_layout
+def test_a_step_of_mujoco_is_its_runge_kutta_of_the_equations(name):
+    case = Case.of(name)
+    flying = batch(case, "mujoco")
+    flying.advance(1)
+    assert_close(helpers.taken(flying, origin=0), mujoco_step(case))
+
+
+@every_layout
+def test_tensors_give_the_same_numbers(name):
+    case = Case.of(name)
+    for function, more in (
+        (dynamics.derivative, ()),
+        (dynamics.step, (case.vehicle.physics_timestep,)),
+    ):
+        got = case.equations(function, *more, array=tensor)
+        assert all(getattr(got, field).dtype == torch.float64 for field in FIELDS)
+        assert_close(got, case.equations(function, *more), tolerance=1e-14)
+
+
+@every_layout
+def test_the_wrench_of_the_rotors_is_the_mixer(name):
+    vehicle = helpers.LAYOUTS[name]
+    speed = helpers.random_motion(vehicle, COUNT, rotor=0.9).rotor_speed
+    force, moment = dynamics.thrust_wrench(Parameters.of(rows(vehicle, COUNT)), speed)
+    mixed = speed**2 @ vehicle.mixer.T
+    np.testing.assert_allclose(force[:, 2], mixed[:, 0], rtol=1e-13)
+    np.testing.assert_allclose(moment, mixed[:, 1:], rtol=0, atol=1e-14 * np.abs(mixed).max())
+
+
+# -------------------------------------------------------------------------------- worked numbers
+
+# Up with a time constant of 0.1 s, down with 0.3 s; no drag. 1 - 1/e = 0.632121.
+UNEVEN = Vehicle(
+    rotors=plus(
+        0.23,
+        thrust_coefficient=3.13e-5,
+        torque_coefficient=7.5e-7,
+        lag_up=10.0,
+        lag_down=1 / 0.3,
+        max_speed=320.0,
+    ),
+    drag_coefficient=0.0,
+    moment_coefficient=0.0,
+    physics_timestep=0.002,
+)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_rotors_speed_up_and_slow_down_at_rates_of_their_own(engine):
+    flying = BatchEngine(UNEVEN, 1, altitude=3.0, engine=engine)
+    flying.qpos[:, 2] = 100.0
+    flying.act[:] = 200.0
+    flying.ctrl[:] = (300.0, 200.0, 100.0, 0.0)
+    flying.advance(50)  # 0.1 s
+    # 200 + 100 (1 - e^-1) = 263.2121; 200 - 100 (1 - e^(-1/3)) = 171.6531; 200 e^(-1/3) = 143.3063.
+    np.testing.assert_allclose(flying.act, [[263.2121, 200, 171.6531, 143.3063]], atol=1e-4)
+    flying.advance(100)  # 0.3 s
+    up, down = math.exp(-3), math.exp(-1)
+    expected = [[300 - 100 * up, 200, 100 + 100 * down, 200 * down]]
+    np.testing.assert_allclose(flying.act, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_a_rotor_at_its_command_stays_there(engine):
+    flying = BatchEngine(UNEVEN, 1, altitude=3.0, engine=engine)
+    flying.qpos[:, 2] = 100.0
+    flying.act[:] = flying.ctrl[:] = 123.456
+    flying.advance(20)
+    np.testing.assert_array_equal(flying.act, 123.456)
+
+
+def test_acceleration_of_a_rotor_by_hand():
+    # -10 (200 - 300) = 1000; -(1/0.3) (200 - 140) = -200 rad/s^2. 320 rad/s is the fastest: of a
+    # command of 900, -10 (200 - 320) = 1200.
+    speed, command = np.full((1, 4), 200.0), np.array([[300.0, 200.0, 140.0, 900.0]])
+    got = dynamics.rotor_acceleration(Parameters.of(rows(UNEVEN)), speed, command)
+    np.testing.assert_allclose(got, [[1000, 0, -200, 1200]], rtol=1e-12)

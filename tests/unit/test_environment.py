@@ -1,0 +1,265 @@
+"""Transitions: rows and single environments, rewards, ends, success; faults: test_faults.py."""
+
+import helpers
+import numpy as np
+import pytest
+from helpers import begun, idle
+
+from quadrl import control, tasks
+from quadrl.environment import Environment
+from quadrl.task import total
+from quadrl.tasks.hover import Hover
+
+
+def held(environment, positions):
+    """A step that ends at positions (N, 3) or (3,), task frame, at rest and level."""
+    start = helpers.level(environment.num_envs, environment.vehicle, position=positions)
+    environment.engine.place(np.arange(environment.num_envs), start)
+    return idle(environment)
+
+
+# ------------------------------------------------------------------- one definition of the numbers
+
+
+@pytest.mark.parametrize(("name", "engine"), helpers.SHORT_CASES)
+def test_row_i_is_the_single_environment_seeded_with_seed_plus_i(name, engine):
+    actions = helpers.random_actions(40, 5)
+    batch = begun(helpers.SHORT[name], 5, seed=40, engine=engine)
+    first = helpers.observed(batch)
+    records = helpers.fly(batch, actions)
+    ends = np.array([r["terminated"] | r["truncated"] for r in records])
+    assert (ends.sum(0) >= 3).all()
+    for i in range(5):
+        single = begun(helpers.SHORT[name], seed=40 + i, engine=engine, num_threads=1)
+        for key, value in helpers.observed(single).items():
+            np.testing.assert_array_equal(value[0], first[key][i], err_msg=key)
+        helpers.assert_records(helpers.fly(single, actions[:, i : i + 1]), records, [i])
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_threads_and_neighbours_do_not_matter(num_threads):
+    actions = helpers.random_actions(30, 5)
+    five = helpers.fly(begun(helpers.SHORT["hover"], 5, seed=7), actions)
+    two = begun(helpers.SHORT["hover"], 2, seed=9, num_threads=num_threads)
+    helpers.assert_records(helpers.fly(two, actions[:, 2:4]), five, slice(2, 4))
+
+
+def test_seeding_again_gives_the_same_episodes_and_another_seed_others():
+    actions = helpers.random_actions(10, 2)
+    environment = begun(num_envs=2, seed=5)
+    once = helpers.fly(environment, actions)
+    assert environment.seed(5) == 5
+    environment.reset()
+    helpers.assert_records(helpers.fly(environment, actions), once)
+    environment.seed(6)
+    environment.reset()
+    other = helpers.fly(environment, actions)
+    assert (once[0]["coordinates"] != other[0]["coordinates"]).any()
+    assert len({Environment("hover").seed() for _ in range(3)}) == 3
+    # Some rows alone: row 1 begins the episodes of seed 5 + 1 anew, row 0 goes on.
+    environment.seed(5, np.array([1]))
+    environment.reset()
+    new = begun(num_envs=2, seed=5)
+    equal = (environment.engine.qpos == new.engine.qpos).all(axis=1)
+    assert equal.tolist() == [False, True]
+
+
+def test_a_reset_of_some_leaves_the_others_bit_by_bit():
+    left, touched = begun(num_envs=4, seed=2), begun(num_envs=4, seed=2)
+    for k, action in enumerate(helpers.random_actions(12, 4)):
+        expected, got = (helpers.recorded(e, e.step(action)) for e in (left, touched))
+        for name, value in expected.items():
+            np.testing.assert_array_equal(got[name][[0, 3]], value[[0, 3]], err_msg=name)
+        if k == 4:
+            observation = touched.reset(np.array([False, True, True, False]))
+            assert observation["position"].shape == (2, 3)
+            np.testing.assert_array_equal(touched.snapshot.time > 0, [True, False, False, True])
+        if k == 7:
+            touched.reset(np.array([2]))
+    np.testing.assert_allclose(touched.snapshot.time, [0.6, 0.35, 0.2, 0.6])
+
+
+def test_what_a_step_told_is_not_changed_by_a_reset():
+    for task in tasks.TASKS:
+        environment = begun(task, 4)
+        for action in helpers.random_actions(3, 4):
+            now = environment.step(action)
+        kept = {k: v for k, v in helpers.recorded(environment, now).items() if "." not in k}
+        environment.reset(np.array([1, 2]))
+        for name in ("reward", "error", *helpers.FLAGS):
+            np.testing.assert_array_equal(getattr(now, name), kept[name], err_msg=f"{task} {name}")
+
+
+def test_the_episodes_of_an_aircraft_do_not_depend_on_when_it_is_reset():
+    early, late = begun(num_envs=2, seed=3), begun(num_envs=2, seed=3)
+    first = early.reset(np.array([1]))
+    for action in helpers.random_actions(5, 2):
+        late.step(action)
+    late.reset(np.array([0]))
+    second = late.reset(np.array([1]))
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name], err_msg=name)
+
+
+# ------------------------------------------------------------------------------- reward and goals
+
+
+@pytest.mark.parametrize("name", tasks.TASKS)
+def test_the_reward_is_exactly_the_sum_of_its_terms_in_order(name):
+    environment = begun(name, 3)
+    for action in helpers.random_actions(20, 3):
+        now = environment.step(action)
+        assert tuple(now.reward_terms) == environment.term_names
+        assert environment.term_names[0] == "progress"
+        assert all(term.shape == (3,) for term in now.reward_terms.values())
+        np.testing.assert_array_equal(now.reward, total(now.reward_terms))
+
+
+def test_progress_is_a_hundred_for_a_metre_gained():
+    # Level at hover speed and 1 m/s for 0.05 s, towards the origin from 2 m east, away from it, and
+    # past it. The drag slows it by 9e-3 / 0.65 * 1 = 0.0138 m/s^2: 0.05 - 0.0138 * 0.00125 =
+    # 0.049983 m; past it, sqrt(4 + 0.05^2) - 2 = 6.2e-4 m are lost.
+    velocity = [(-1, 0, 0), (1, 0, 0), (0, 1, 0)]
+    terms = idle(helpers.placed(count=3, position=(2, 0, 0), velocity=velocity)).reward_terms
+    np.testing.assert_allclose(terms["progress"], [4.9983, -4.9983, -0.0625], atol=1e-3)
+    # Speed lost: 0.0138 m/s^2 * 0.05 s = 6.9e-4 m/s, at 2 for each m/s.
+    assert terms["speed"][0] == pytest.approx(2 * 6.9e-4, rel=0.02)
+    for name in ("attitude", "spin", "control"):
+        np.testing.assert_allclose(terms[name], 0, atol=1e-9, err_msg=name)
+
+
+def test_control_costs_the_square_of_the_deviation():
+    # sum((35 * (1, -1, 0.5, 0))^2) / 319.157^2 = 1225 * 2.25 / 101861 = 0.027059; beyond +-1 it is
+    # the clipped command that costs: 1225 * 4 / 101861 = 0.048105.
+    now = helpers.placed(count=2).step(np.array([[1, -1, 0.5, 0], [9.0] * 4]))
+    np.testing.assert_allclose(now.reward_terms["control"], [-0.027059, -0.048105], atol=1e-6)
+    np.testing.assert_array_equal(now.reward_terms["survival"], 10.0)
+
+
+def test_weights_weigh():
+    options = {"progress_weight": 7.0, "survival_weight": 0.5}
+    moving = helpers.placed(position=(2, 0, 0), velocity=(-1, 0, 0), options=options)
+    terms = idle(moving).reward_terms
+    assert terms["progress"][0] == pytest.approx(7 * 0.049983, abs=1e-5)
+    assert terms["survival"][0] == 0.5
+
+
+def test_a_new_goal_is_seen_at_once_and_costs_nothing():
+    # The first waypoint is reached on the first step. The policy sees the second, 2 m up, from
+    # then on, and the way to it, 20 times as long, is not taken for a step away.
+    options = {"waypoints": ((0, 0, 0.1), (0, 0, 2)), "reach": 0.2}
+    environment = helpers.placed("static_waypoint", velocity=(0, 0, 1), options=options)
+    first = idle(environment)
+    height = float(environment.snapshot.state.position[0, 2])
+    assert first.reward_terms["progress"][0] == pytest.approx(100 * height, rel=1e-9)
+    np.testing.assert_allclose(first.observation["goal"], [[0, 0, 2 - height]], atol=1e-12)
+    second = idle(environment)
+    gained = float(environment.snapshot.state.position[0, 2]) - height
+    assert second.reward_terms["progress"][0] == pytest.approx(100 * gained, rel=1e-9)
+    assert 0.04 < gained < 0.05
+
+
+@pytest.mark.parametrize("vehicle", ["paper", "hexa"])
+@pytest.mark.parametrize("name", tasks.TASKS)
+def test_the_flat_observation_is_that_of_the_documentation(name, vehicle):
+    environment = begun(name, 4, vehicle=vehicle)
+    rotors = environment.vehicle.rotor_count
+    now = environment.step(helpers.random_actions(1, 4, rotors)[0])
+    flat, state = environment.flatten(now.observation), environment.snapshot.state
+    speed = state.rotor_speed / environment.vehicle.max_speed
+    parts = [state.position, state.sin_attitude, state.cos_attitude, state.body_velocity]
+    whole = np.concatenate([*parts, state.body_rate, speed], axis=-1).astype(np.float32)
+    width = 15 + rotors
+    np.testing.assert_array_equal(flat[:, :width], whole)
+    # Then the goal vector, body frame: back in the world it leads to the goal.
+    lead = np.einsum("nij,nj->ni", state.rotation, flat[:, width : width + 3])
+    np.testing.assert_allclose(state.position + lead + [0, 0, environment.origin[2]],
+                               environment.goals(), atol=1e-5)  # fmt: skip
+    moving = 3 * (name in ("straight_and_level", "target_following"))
+    assert flat.shape == (4, width + 3 + moving) == (4, environment.size)
+    assert flat.dtype == np.float32
+
+
+# ------------------------------------------------------------------------------- how episodes end
+
+
+@pytest.mark.parametrize("name", tasks.TASKS)
+def test_an_episode_is_never_terminated_and_truncated(name):
+    environment = begun(tasks.make(name, time_limit=0.5), 8)
+    for action in helpers.random_actions(30, 8):
+        now = environment.step(action)  # flies on past the time limit
+        assert not (now.terminated & now.truncated).any()
+        assert (now.terminated | now.truncated | ~now.is_success).all()
+
+
+@pytest.mark.parametrize(
+    ("time_limit", "steps"), [(0.05, 1), (0.5, 10), (10.0, 200), (0.07, 1), (0.01, 1), (0.3, 6)]
+)
+def test_truncated_at_exactly_the_time_limit(time_limit, steps):
+    # Control steps of 0.05 s; a limit in between is rounded, and is never nothing.
+    environment = helpers.placed(options={"time_limit": time_limit})
+    assert environment.time_limit_steps == steps
+    for k in range(1, steps + 1):
+        now = idle(environment)
+        assert not now.terminated[0] and now.truncated[0] == (k == steps)
+    assert environment.snapshot.time[0] == pytest.approx(steps * 0.05)
+
+
+def test_a_crash_on_the_last_step_is_a_crash():
+    # From 2.95 m east at 3 m/s: 3 m are past on the first step, which is also the last.
+    position, velocity = [(0, 0, 0), (2.95, 0, 0)], [(0, 0, 0), (3, 0, 0)]
+    options = {"time_limit": 0.05}
+    now = idle(helpers.placed(count=2, position=position, velocity=velocity, options=options))
+    np.testing.assert_array_equal(now.terminated, [False, True])
+    np.testing.assert_array_equal(now.truncated, [True, False])
+    assert not (now.is_success & now.terminated).any()
+
+
+def test_what_ends_a_hover_early():
+    # 3.1 m away; on the ground; 1.7 rad about x, past 90 degrees; and none of these.
+    environment = helpers.placed(count=4, options={"max_distance": 3.05})
+    engine = environment.engine
+    engine.qpos[0, 1], engine.qpos[1, 2] = 3.1, 0.06
+    engine.qpos[2, 3:5] = np.cos(0.85), np.sin(0.85)
+    now = idle(environment)
+    np.testing.assert_array_equal(now.terminated, [True, True, True, False])
+    assert not now.truncated.any() and not now.is_success.any() and not now.diverged.any()
+
+
+@pytest.mark.parametrize("name", ["hover", "static_waypoint", "random_waypoint"])
+def test_success_at_the_end_of_a_flight_that_is_held_at_the_goal(name):
+    environment = Environment(name, num_envs=6, seed=0)
+    fly = control.make("geometric", environment.task, environment.vehicle)
+    seen = environment.flatten(environment.reset())
+    for k in range(200):
+        now = environment.step(fly(seen))
+        seen = environment.flatten(now.observation)
+        assert not now.terminated.any()
+        assert (now.is_success == (k == 199)).all()
+    assert now.truncated.all() and (now.error < 0.05).all()
+
+
+def test_success_is_judged_on_the_mean_of_the_last_two_seconds():
+    # Of 10 s, in the last 2 s (40 steps) 0.52 m away for the first n of them: a mean of 0.52 n / 40
+    # is below 0.1 m for n = 7 (0.091), and above for n = 9 (0.117). What was before does not count,
+    # not even the step before (n = 8 would be above). Row 2 is 0.2 m away all the time, row 3 5 cm.
+    environment, last = begun(num_envs=4), np.array([7, 9, 0, 0])
+    beside = np.array([[0.0] * 3, [0.0] * 3, [0, 0.2, 0], [0, 0, -0.05]])
+    for k in range(200):
+        away = (159 <= k) & (k < 160 + last) & (last > 0)
+        now = held(environment, beside + away[:, None] * [0.52, 0, 0])
+    np.testing.assert_array_equal(now.truncated, True)
+    np.testing.assert_array_equal(now.is_success, [True, False, False, True])
+    np.testing.assert_allclose(now.error, [0, 0, 0.2, 0.05], atol=1e-4)
+
+
+def test_errors_of_the_last_episode_do_not_weigh_on_the_next():
+    environment = begun(Hover(time_limit=2.0), 2)  # 40 steps, all of them within the last 2 s
+    for k in range(60):
+        now = held(environment, [[0, 0, 0], [2.0 * (k < 20), 0, 0]])
+        if k == 19:
+            environment.reset(np.array([1]))
+        if k == 39:
+            np.testing.assert_array_equal(now.is_success, [True, False])
+            environment.reset(np.array([0]))
+    np.testing.assert_array_equal(now.is_success, [False, True])

@@ -1,0 +1,55 @@
+"""Flights of every layout against the exact solution of the paper's equations, in both engines.
+
+The ends of the flights were integrated by tests/reference.py and stored (tests/data/README.md).
+"""
+
+import dataclasses
+
+import helpers
+import numpy as np
+import pytest
+import reference
+
+# Ratios of the errors of a step and of a quarter of it. MuJoCo's RK4 turns the attitude once a step
+# by the mean of the stages' body rates, so the attitude and what follows from it are of second
+# order, 1/16; body rates and rotor speeds know no attitude and are of fourth order, 1/256, as all
+# of free flight is. A wrong coefficient would leave an error that stays.
+ORDERS = {
+    "mujoco": dict.fromkeys(("position", "attitude", "velocity", "body_velocity"), 16),
+    "free_flight": dict.fromkeys(reference.QUANTITIES[:5], 256),
+}
+# Largest errors of a flight of 20 control steps, 1 s of the paper's aircraft, by share of the step.
+# With the velocity in the body frame, as the paper has it, the error of the attitude times the
+# speed, up to 19 m/s, comes on top.
+LIMITS = {1: 2.5e-3, 1 / 4: 1.5e-4}
+BODY_LIMITS = {1: 7e-3, 1 / 4: 4.5e-4}
+
+
+def worst(engine, name, share):
+    """Largest deviation of the flights of a name, by quantity."""
+    vehicle = helpers.LAYOUTS.get(name, helpers.LAYOUTS["paper"])
+    finer = dataclasses.replace(vehicle, physics_timestep=vehicle.physics_timestep * share)
+    apart = helpers.deviations(finer, engine, name, 20 * vehicle.control_timestep)
+    return dict(zip(reference.QUANTITIES, apart.max(axis=0), strict=True))
+
+
+@pytest.mark.parametrize("engine", ORDERS)
+@pytest.mark.parametrize("name", helpers.LAYOUTS)
+def test_flights_converge_to_the_exact_solution(name, engine):
+    coarse, fine = (worst(engine, name, share) for share in LIMITS)
+    for error, share in ((coarse, 1), (fine, 1 / 4)):
+        assert error.pop("body_velocity") < BODY_LIMITS[share]
+        assert max(error.values()) < LIMITS[share], (share, error)
+    for quantity, ratio in ORDERS[engine].items():
+        if quantity in coarse:
+            assert coarse[quantity] / fine[quantity] == pytest.approx(ratio, rel=0.2), quantity
+    assert max(fine["body_rate"], fine["rotor_speed"]) < 1e-7
+
+
+def test_the_flights_are_worth_the_name():
+    for name, vehicle in helpers.LAYOUTS.items():
+        flights = helpers.exact(name)
+        turned = np.abs(flights["end"][:, 3:7] - flights["start"][:, 3:7]).max(axis=1)
+        assert np.median(turned) > 0.3, name
+        share = flights["end"][:, 13:] / vehicle.hover_speed
+        assert share.min() < 0.75 and share.max() > 1.25, name

@@ -1,0 +1,236 @@
+"""Faults and hostile values: divergence, saved environments, and what is refused."""
+
+import dataclasses
+
+import helpers
+import numpy as np
+import pytest
+from helpers import begun, idle
+
+from quadrl import tasks
+from quadrl.environment import MAX_ENVS, Environment
+from quadrl.errors import QuadrlError
+from quadrl.tasks.hover import Hover
+from quadrl.vehicle import Vehicle
+
+# ----------------------------------------------------------------------------------------- faults
+
+
+@pytest.mark.parametrize(
+    ("value", "column", "mode", "engine"),
+    [
+        (np.nan, 0, "rotor", "mujoco"),
+        (np.nan, 4, "velocity", "free_flight"),
+        (np.inf, 0, "velocity", "mujoco"),
+        (np.inf, 4, "rotor", "free_flight"),
+        (-1e12, 0, "rotor", "free_flight"),
+        (1e9, 4, "rotor", "mujoco"),
+        (1e6, 0, "velocity", "free_flight"),
+        (1e6, 4, "velocity", "mujoco"),
+    ],
+)
+def test_a_diverged_aircraft_is_terminated_and_disturbs_nobody(value, column, mode, engine):
+    ranges = {"wind": (-1.0, 1.0)} if column else None
+    settings = {"num_envs": 4, "seed": 1, "engine": engine, "control_mode": mode, "ranges": ranges}
+    sound, faulty = begun(**settings), begun(**settings)
+    row, others, actions = 2, [0, 1, 3], helpers.random_actions(8, 4) * 0.2
+    for action in actions[:3]:
+        sound.step(action), faulty.step(action)
+    last, wind = np.array(faulty.snapshot.state.position[row]), faulty.engine.air.copy()
+
+    def both(action):
+        expected, got = (helpers.recorded(e, e.step(action)) for e in (sound, faulty))
+        for name, part in got.items():
+            assert np.isfinite(part).all(), name
+            np.testing.assert_array_equal(part[others], expected[name][others], err_msg=name)
+        return got
+
+    faulty.engine.qvel[row, column] = value
+    got = both(actions[3])
+    assert got["diverged"][row] and got["terminated"][row]
+    assert not got["truncated"][row] and not got["is_success"][row]
+    if mode == "rotor":
+        # It is shown where it was last in order, and flies on from there: no fresh episode, neither
+        # one of the task's nor MuJoCo's own (which would be on the ground at the origin).
+        np.testing.assert_array_equal(got["observation.position"][row], last)
+        np.testing.assert_array_equal(faulty.engine.qpos[row, :3], last + [0, 0, 3])
+    assert faulty.snapshot.time[row] == pytest.approx(4 * 0.05)
+    np.testing.assert_array_equal(faulty.engine.air, wind)
+    for action in actions[4:]:
+        assert np.linalg.norm(both(action)["observation.position"][row] - last) < 0.4
+    # A reset makes it whole: the same next episode as that of the aircraft that stayed sound.
+    fresh, regular = faulty.reset(np.array([row])), sound.reset(np.array([row]))
+    for name, part in regular.items():
+        np.testing.assert_array_equal(fresh[name], part, err_msg=name)
+    for action in actions:
+        np.testing.assert_array_equal(sound.step(action).reward, faulty.step(action).reward)
+
+
+def test_a_fault_that_stays_is_reported_at_every_step():
+    environment = begun(num_envs=3, seed=1)
+    for _ in range(4):
+        environment.engine.qvel[1, 0] = np.nan
+        now = idle(environment)
+        np.testing.assert_array_equal(now.diverged, [False, True, False])
+        np.testing.assert_array_equal(now.terminated, [False, True, False])
+
+
+def test_a_fault_on_the_last_step_is_terminated_and_no_success():
+    class Easy(Hover):
+        def succeeded(self, now, end):
+            return end.terminated | end.truncated
+
+    for task, success in (
+        (Hover(time_limit=0.1), [False] * 2),
+        (Easy(time_limit=0.1), [False, True]),
+    ):
+        environment = begun(task, 2, seed=1)
+        idle(environment)
+        environment.engine.act[0, 0] = np.nan
+        now = idle(environment)
+        np.testing.assert_array_equal(now.terminated, [True, False])
+        np.testing.assert_array_equal(now.truncated, [False, True])
+        np.testing.assert_array_equal(now.is_success, success)
+
+
+@pytest.mark.parametrize("task", ["static_waypoint", "straight_and_level"])
+def test_whoever_turns_faster_than_the_step_resolves_has_diverged(task):
+    # In tasks that do not end by the tilt. The moment slows the turn, omega / (1 + omega k_M t /
+    # J_z): after 0.05 s 41.9, 49.7 and 62.7 rad/s, of 50 resolved.
+    environment = begun(task, 3)
+    environment.engine.qvel[:, 3:] = [[0, 0, 49.0], [0, 0, 60.0], [0, 0, 80.0]]
+    now = idle(environment)
+    assert now.diverged.tolist() == now.terminated.tolist() == [False, False, True]
+    assert not now.is_success.any() and not now.truncated.any()
+
+
+def test_whoever_flies_faster_than_the_step_resolves_has_diverged():
+    vehicle = Vehicle(control_timestep=0.01)
+    environment = begun("static_waypoint", 2, vehicle=vehicle)
+    environment.engine.qvel[:, 0] = [3000.0, 20000.0]
+    # The drag slows it: v / (1 + v k_D t / m), to 2120 and 5306 m/s, of 3611 resolved.
+    now = idle(environment)
+    assert now.diverged.tolist() == [False, True]
+    speed = environment.snapshot.state.speed
+    assert 2000 < speed[0] < 2200 and speed[1] < 1  # as it was
+
+
+# ----------------------------------------------------------------------------------------- saving
+
+
+@pytest.mark.parametrize(("name", "engine"), helpers.SHORT_CASES)
+def test_a_restored_environment_continues_bit_by_bit(name, engine, tmp_path):
+    # Of contacts, the solver's warm start is part of what is saved.
+    task, actions = helpers.SHORT[name], helpers.random_actions(30, 4)
+    environment = begun(task, 4, seed=3, engine=engine)
+    helpers.fly(environment, actions[:11])
+    np.savez(tmp_path / "saved.npz", **environment.save())
+    seen = helpers.observed(environment)
+    expected = helpers.fly(environment, actions[11:])  # with resets, so that the streams matter
+    with np.load(tmp_path / "saved.npz") as file:
+        saved = dict(file)
+    kept = {name: value.copy() for name, value in saved.items()}
+    other = begun(task, 4, seed=77, engine=engine)
+    helpers.fly(other, actions[:5])
+    fresh = Environment(task, num_envs=4, seed=78, engine=engine)  # never reset
+    for restored in (other, fresh, environment):
+        observation = restored.restore(saved)
+        for part, value in seen.items():
+            np.testing.assert_array_equal(observation[part], value, err_msg=part)
+        helpers.assert_records(helpers.fly(restored, actions[11:]), expected)
+    for name, value in kept.items():  # what is saved does not change any more
+        np.testing.assert_array_equal(saved[name], value, err_msg=name)
+
+
+def test_a_saved_environment_of_another_shape_is_refused():
+    environment = begun(num_envs=2)
+    kept = environment.save()
+    before = helpers.coordinates(environment.engine)
+    for name, value in kept.items():
+        for wrong in (value[..., :1], np.zeros(7), value.astype(np.complex128), None):
+            if wrong is None or (wrong.shape, wrong.dtype) != (value.shape, value.dtype):
+                changed = {k: v for k, v in (kept | {name: wrong}).items() if v is not None}
+                with pytest.raises(QuadrlError) as caught:
+                    environment.restore(changed)
+                assert caught.value.name == name and str(value.shape) in caught.value.allowed
+    np.testing.assert_array_equal(helpers.coordinates(environment.engine), before)
+    for other in (begun(num_envs=3), begun("landing", 2), begun(num_envs=2, vehicle="hexa")):
+        with pytest.raises(QuadrlError):
+            other.restore(kept)
+
+
+# --------------------------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 4), (3, 5), (4, 3), (), (3, 4, 1)])
+def test_an_action_of_the_wrong_shape_is_refused(shape):
+    with pytest.raises(QuadrlError) as caught:
+        begun(num_envs=3).step(np.zeros(shape))
+    error = caught.value
+    assert (error.name, error.value, error.allowed) == ("action shape", shape, "(3, 4)")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_not_finite_is_refused_by_name(value):
+    environment, action = begun(num_envs=5), np.zeros((5, 4))
+    before = helpers.coordinates(environment.engine)
+    action[3, 2] = value
+    with pytest.raises(QuadrlError) as caught:
+        environment.step(action)
+    assert caught.value.name == "action[3, 2]"
+    np.testing.assert_array_equal(caught.value.value, value)
+    np.testing.assert_array_equal(helpers.coordinates(environment.engine), before)
+    assert environment.snapshot.time[3] == 0
+
+
+NUMBERS = [0, -1, 10**9, 1.5, MAX_ENVS + 1, "4", True, None]
+REFUSED = [("num_envs", value, "1 and 1048576") for value in NUMBERS]
+REFUSED += [("num_threads", value, "0 and 1024") for value in (-1, 1.5, 1025)]
+REFUSED += [
+    ("task", "hoover", "did you mean hover?"),
+    ("control_mode", "rotr", "did you mean rotor?"),
+    ("engine", "warp", "mujoco, free_flight"),
+    ("vehicle", "papr", "did you mean paper?"),
+    ("seed", -1, "0"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "allowed"), REFUSED)
+def test_an_argument_that_cannot_be_is_refused_with_the_choices(name, value, allowed):
+    with pytest.raises(QuadrlError) as caught:
+        Environment(**{"task": "hover", name: value})
+    error = caught.value
+    assert error.name == name and error.value is value and allowed in error.allowed
+
+
+OPTIONS = [
+    ({"raduis": 1.0}, "hover option", "raduis", "did you mean radius?"),
+    ({"time_limit": 0.0}, "hover time_limit", 0.0, "positive"),
+    ({"time_limit": -1.0}, "hover time_limit", -1.0, "positive"),
+    ({"time_limit": "5"}, "hover time_limit", "5", "number"),
+    ({"time_limit": 10**400}, "hover time_limit", 10**400, ""),
+    ({"altitude": np.inf}, "hover altitude", np.inf, "finite"),
+    ({"altitude": 1e12}, "hover altitude", 1e12, ""),
+    ({"radius": np.nan}, "hover radius", ..., "finite"),
+    ({"settle_time": 1e308}, "hover settle_time", 1e308, ""),
+]
+
+
+@pytest.mark.parametrize(("options", "name", "value", "allowed"), OPTIONS)
+def test_an_option_that_means_nothing_is_refused_by_name(options, name, value, allowed):
+    with pytest.raises(QuadrlError) as caught:
+        tasks.make("hover", **options)
+    error = caught.value
+    assert error.name == name and allowed in error.allowed
+    assert value is ... or error.value == value
+    if "option" in name:
+        assert all(field.name in error.allowed for field in dataclasses.fields(Hover))
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    environment = Environment("hover", num_envs=2, seed=0)
+    for early in (lambda: idle(environment), environment.save, lambda: environment.reset([0])):
+        with pytest.raises(RuntimeError):
+            early()
+    environment.reset(np.array([True, True]))
+    idle(environment)

@@ -1,0 +1,210 @@
+"""The free-flight engine: beside MuJoCo, whatever flies beside it, and where it hands over.
+
+tests/unit/test_exact.py holds both engines against the exact solution.
+"""
+
+import dataclasses
+
+import helpers
+import mujoco
+import numpy as np
+import pytest
+
+from quadrl import mjcf, tasks
+from quadrl.engines.free_flight import MARGIN
+from quadrl.engines.mujoco import BatchEngine, DataEngine
+from quadrl.environment import Environment
+from quadrl.errors import QuadrlError
+from quadrl.vehicle import VEHICLES, Vehicle
+
+PAPER = Vehicle()
+
+
+@pytest.mark.parametrize("task", tasks.TASKS)
+def test_both_engines_come_together_on_every_task(task):
+    """The same episode in both, at the aircraft's own step and at a quarter of it."""
+    apart = []
+    for step in (0.01, 0.0025):
+        vehicle = dataclasses.replace(PAPER, physics_timestep=step)
+        states = []
+        for engine in ("mujoco", "free_flight"):
+            environment = Environment(task, num_envs=16, seed=5, vehicle=vehicle, engine=engine)
+            environment.reset()
+            for action in np.random.default_rng(0).uniform(-1, 1, (20, 16, 4)):
+                environment.step(action)
+            states.append(helpers.coordinates(environment.engine))
+        apart.append(np.abs(states[0] - states[1]).max())
+    assert apart[0] < 2e-3 and apart[1] < 1e-4, apart
+    assert apart[0] / apart[1] == pytest.approx(16, rel=0.2), apart  # MuJoCo's second order
+
+
+@pytest.mark.parametrize("per_row", [False, True])
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("name", ["paper", "eight"])
+def test_an_aircraft_flies_the_same_whatever_flies_beside_it(name, threads, per_row):
+    count, vehicle = 1030, helpers.LAYOUTS[name]  # several threads' worth, no whole lanes
+    settings = dict(altitude=3.0, engine="free_flight")
+    batch = BatchEngine(vehicle, count, num_threads=threads, per_row=per_row, **settings)
+    table = helpers.parameter_rows(vehicle, count)
+    if per_row:
+        batch.write_parameters(np.arange(count), table)
+    motion = helpers.random_motion(vehicle, count, wind=3.0, rotor=0.3)
+    helpers.put(batch, motion)
+    batch.ctrl[:] = command = helpers.random_commands(vehicle, count, 1, rotor=0.3)[0]
+    batch.advance(5)
+    model = mjcf.compile_model(vehicle)
+    one = DataEngine(vehicle, model, mujoco.MjData(model), **settings)
+    chosen = [0, 1, 7, 8, 511, 1023, 1024, 1029]
+    for row in chosen:
+        if per_row:
+            one.write_parameters(np.array([0]), table[row : row + 1])
+        helpers.put(one, helpers.Motion(*(x[row : row + 1] for x in vars(motion).values())))
+        one.ctrl[:] = command[row]
+        one.advance(5)
+        np.testing.assert_array_equal(helpers.coordinates(one)[0], helpers.coordinates(batch)[row])
+    assert one.data.time == pytest.approx(len(chosen) * 5 * vehicle.physics_timestep)
+
+
+# ------------------------------------------------------------------------------ near the ground
+
+
+def test_what_could_touch_the_ground_is_mujocos_bit_by_bit():
+    # From one state both engines make the same step of every aircraft that is near the ground,
+    # and not of those that are not: each is flown by the engine that it should be.
+    free, whole = (BatchEngine(PAPER, 32, altitude=0.07, contact=True, engine=e)
+                   for e in ("free_flight", "mujoco"))  # fmt: skip
+    helpers.put(free, helpers.random_motion(PAPER, 32, speed=1.0, turn=1.0), origin=0)
+    free.qpos[:, 2] = np.linspace(0.07, 3.0, 32)
+    touched, warm = 0, free.batch.bind("qacc_warmstart")
+    for command in helpers.random_commands(PAPER, 32, 10):
+        warm[:] = 7.0
+        whole.restore(free.save())  # the warm start of the contacts as well
+        free.ctrl[:] = whole.ctrl[:] = command
+        free.advance(5), whole.advance(5)
+        near = (helpers.coordinates(free) == helpers.coordinates(whole)).all(axis=-1)
+        height = free.qpos[:, 2]
+        assert near[height < 0.34].all()  # 0.292 m to the edge of a rotor's disc, and MARGIN
+        assert not near[height > 1.5].any()
+        # What was in contact long ago is forgotten: the next contact does not depend on it.
+        assert not warm[~near].any()
+        touched += near.sum()
+    assert touched > 20
+
+
+@pytest.mark.parametrize("name", helpers.LAYOUTS)
+def test_nothing_that_free_flight_takes_comes_near_the_ground_in_a_step(name):
+    # The wildest flights: fast, tilted, in wind, at any height. Whoever is handed over is flown
+    # exactly as MuJoCo flies it; all others stay clear of the ground by more than their reach. For
+    # the long control step, thrust and drag have their time to push it down.
+    vehicle, count = dataclasses.replace(helpers.LAYOUTS[name], control_timestep=0.2), 1000
+    wild = helpers.random_motion(vehicle, count, speed=12.0, turn=8.0, wind=12.0, rotor=0.4)
+    reach = max(np.linalg.norm(r.position) + r.radius for r in vehicle.rotors)
+    highest = reach + 30.0 * vehicle.control_timestep
+    wild.position[:, 2] = np.random.default_rng(4).uniform(0.1, highest, count)
+    command = helpers.random_commands(vehicle, count, 1, rotor=0.9)[0]
+    # Every other one is on its back, at its fastest: nothing is pushed down more.
+    wild.quaternion[::2], wild.body_rate[::2] = (0, 1, 0, 0), 0.0
+    wild.rotor_speed[::2], command[::2] = vehicle.max_speed, vehicle.max_speed
+    ends = []
+    for engine in ("free_flight", "mujoco"):
+        batch = BatchEngine(vehicle, count, altitude=3.0, contact=True, engine=engine)
+        helpers.put(batch, wild, origin=0)
+        batch.ctrl[:] = command
+        batch.advance(vehicle.substeps)
+        ends.append(helpers.coordinates(batch))
+    near = (ends[0] == ends[1]).all(axis=-1)
+    assert 0.1 < near.mean() < 0.95
+    assert (ends[0][~near, 2] > reach + MARGIN).all()
+
+
+def test_landing_ends_as_it_does_in_mujoco():
+    ends = []
+    for engine in ("mujoco", "free_flight"):
+        environment = Environment("landing", num_envs=32, seed=0, engine=engine)
+        environment.reset()
+        environment.engine.qpos[:, 2] = 0.5
+        over, heights = np.zeros(32, dtype=bool), []
+        for _ in range(40):  # rotors slowed by a tenth: down it goes
+            over |= environment.step(np.full((32, 4), -0.6)).terminated
+            heights.append(environment.engine.qpos[:, 2].copy())
+        ends.append((over, np.array(heights)))
+    np.testing.assert_array_equal(ends[0][0], ends[1][0])
+    assert ends[0][0].all()
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=5e-3)
+
+
+# ---------------------------------------------------------------------------------- what it refuses
+
+
+def wall(spec):
+    spec.worldbody.add_geom(name="wall", type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 0.1, 1])
+
+
+def load(spec):
+    body = spec.body("aircraft").add_body(name="load", pos=[0, 0, -0.3])
+    body.add_geom(size=[0.05, 0, 0], mass=0.1)
+
+
+def off_centre(spec):
+    spec.body("aircraft").ipos = (0.01, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("edit", "named"),
+    [(wall, "wall"), (load, "no other body"), (off_centre, "centre of mass")],
+)
+def test_refuses_what_the_equations_do_not_describe(edit, named):
+    spec = mjcf.spec(PAPER, contact=True)
+    edit(spec)
+    model = spec.compile()
+    with pytest.raises(QuadrlError, match=named) as caught:
+        DataEngine(PAPER, model, mujoco.MjData(model), altitude=3.0, engine="free_flight")
+    assert caught.value.name == "engine" and "mujoco" in caught.value.allowed
+    # MuJoCo itself takes it.
+    DataEngine(PAPER, model, mujoco.MjData(model), altitude=3.0)
+
+
+def test_a_task_that_builds_a_wall_is_refused_in_free_flight_and_flown_in_mujoco():
+    class Walled(type(tasks.make("hover"))):
+        def scene(self, spec):
+            spec.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 5, 5], pos=[0.8, 0, 3], contype=1
+            )
+
+    class Touching(Walled):
+        contact = True
+
+    def reached(task):
+        environment = helpers.placed(task, velocity=(3, 0, 0))
+        for _ in range(8):
+            environment.step(np.zeros((1, 4)))
+        return environment.engine.qpos[0, 0]
+
+    # At 3 m/s for 0.4 s it is 1.2 m on, but for a wall at 0.7 m whose face stops its rotors.
+    assert reached(tasks.make("hover")) > 1.1 and reached(Touching()) < 0.5
+    with pytest.raises(QuadrlError) as caught:
+        Environment(Touching(), engine="free_flight")
+    assert caught.value.name == "engine"
+
+
+def test_an_unknown_engine_lists_the_choices():
+    with pytest.raises(QuadrlError) as caught:
+        Environment("hover", engine="warp")  # pyright: ignore
+    assert caught.value.name == "engine" and caught.value.value == "warp"
+    assert "mujoco, free_flight" in caught.value.allowed
+
+
+def test_free_flight_of_every_preset_is_one_of_mujoco_to_its_order():
+    for name, vehicle in VEHICLES.items():
+        motion = helpers.random_motion(vehicle, 8, wind=5.0)
+        commands = helpers.random_commands(vehicle, 8, 1)
+        free, whole, calm = (
+            helpers.flown(vehicle, engine, given, commands, 20)
+            for engine, given in (
+                ("free_flight", motion),
+                ("mujoco", motion),
+                ("free_flight", dataclasses.replace(motion, wind=0 * motion.wind)),
+            )
+        )
+        assert np.abs(free.velocity - whole.velocity).max() < 2e-3, name
+        assert np.abs(free.velocity - calm.velocity).max(axis=1).min() > 5e-3, name

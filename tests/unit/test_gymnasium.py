@@ -1,0 +1,219 @@
+"""Gymnasium, single and vector; what all APIs have in common is in contract/."""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode
+
+import quadrl
+from quadrl import envs
+from quadrl.errors import QuadrlError
+from quadrl.tasks import TASKS
+from quadrl.testing import varied_actions
+
+IDS = {name: f"quadrl/{name.title().replace('_', '')}-v0" for name in TASKS}
+HOVER = "quadrl/Hover-v0"
+HEAVY = dataclasses.replace(quadrl.Vehicle(), mass=1.3, control_timestep=0.02)
+every_mode = pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
+
+
+def test_every_task_has_an_id():
+    registered = dict(gym.registry)
+    assert {id for id in registered if id.startswith("quadrl/")} == set(IDS.values())
+    for name, id in IDS.items():
+        assert gym.make(id).unwrapped.environment.task == TASKS[name]()
+        assert gym.make_vec(id, num_envs=2).environment.task == TASKS[name]()
+    envs.register_ids()  # Gymnasium would warn of an id that is registered twice
+    assert dict(gym.registry) == registered
+
+
+def test_a_step_returns_pythons_own_types_and_the_terms_of_the_reward():
+    environment = gym.make(HOVER)
+    observation, info = environment.reset(seed=0)
+    assert observation.dtype == np.float32
+    assert info == {}
+    for action in varied_actions(10, 1)[:, 0]:
+        observation, reward, terminated, truncated, info = environment.step(action)
+        assert observation.dtype == np.float32
+        assert type(reward) is float
+        assert type(terminated) is type(truncated) is bool
+        assert set(info) == {"reward_terms", "is_success", "error", "diverged"}
+        assert type(info["is_success"]) is type(info["diverged"]) is bool
+        assert type(info["error"]) is float
+        assert all(type(term) is float for term in info["reward_terms"].values())
+        assert sum(info["reward_terms"].values()) == reward
+
+
+def test_an_action_may_be_a_list():
+    one, same = gym.make(HOVER), gym.make(HOVER)
+    one.reset(seed=0), same.reset(seed=0)
+    given, expected = one.step([0.1, 0.2, 0.3, 0.4]), same.step(np.array([0.1, 0.2, 0.3, 0.4]))
+    assert data_equivalence(given, expected)
+
+
+def test_reward_terms_can_be_left_out():
+    environment = gym.make(HOVER, reward_terms=False)
+    environment.reset()
+    assert "reward_terms" not in environment.step(np.zeros(4))[4]
+    vector = gym.make_vec(HOVER, num_envs=2, reward_terms=False)
+    vector.reset()
+    assert not {"reward_terms", "_reward_terms"} & set(vector.step(np.zeros((2, 4)))[4])
+
+
+@every_mode
+@pytest.mark.parametrize("name", ["hover", "landing", "target_following"])
+def test_the_vector_is_gymnasiums_own_vector_of_single_ones(name, mode):
+    settings = {"time_limit": 2.4}
+    ours = gym.make_vec(IDS[name], num_envs=4, autoreset_mode=mode, **settings)
+    sync = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
+    theirs = gym.make_vec(IDS[name], num_envs=4, **sync, **settings)
+    assert ours.autoreset_mode == ours.metadata["autoreset_mode"] == mode
+    for space in ("observation", "action", "single_observation", "single_action"):
+        assert getattr(ours, f"{space}_space") == getattr(theirs, f"{space}_space")
+    assert data_equivalence(ours.reset(seed=3), theirs.reset(seed=3))
+    ends = 0
+    for action in varied_actions(110, 4):
+        *got, info = ours.step(action)
+        *expected, their_info = theirs.step(action)
+        assert data_equivalence(got, expected)
+        # Where no row has something, Gymnasium's lacks the name, and ours masks every row.
+        for key in set(info) - set(their_info):
+            assert not info[key if key.startswith("_") else f"_{key}"].any()
+        assert set(their_info) <= set(info)
+        for key, value in their_info.items():
+            given = tuple(info[key]) if key == "final_obs" else info[key]
+            assert data_equivalence(given, tuple(value) if key == "final_obs" else value), key
+        over = got[2] | got[3]
+        ends += over.sum()
+        if mode == AutoresetMode.DISABLED and over.any():
+            reset = [vector.reset(options={"reset_mask": over.copy()}) for vector in (ours, theirs)]
+            assert data_equivalence(*reset)
+    assert ends >= 8
+
+
+def test_a_mask_resets_and_seeds_its_rows_alone():
+    def second_start(seed):
+        environment = gym.make(HOVER)
+        environment.reset(seed=seed)
+        return environment.reset()[0]
+
+    vector = gym.make_vec(HOVER, num_envs=3, autoreset_mode="DISABLED")
+    vector.reset(seed=0)
+    met = vector.step(np.zeros((3, 4)))[0]
+    mask = np.array([False, True, False])
+    after, _ = vector.reset(seed=40, options={"reset_mask": mask})
+    np.testing.assert_array_equal(after[~mask], met[~mask])
+    np.testing.assert_array_equal(after[1], gym.make(HOVER).reset(seed=41)[0])
+    second, _ = vector.reset()
+    np.testing.assert_array_equal(second[0], second_start(seed=0))
+    np.testing.assert_array_equal(second[1], second_start(seed=41))
+
+
+@pytest.mark.parametrize("mask", [np.zeros(3, dtype=bool), np.ones(2, dtype=bool), np.ones(3)])
+def test_an_impossible_mask_is_refused(mask):
+    vector = gym.make_vec(HOVER, num_envs=3, autoreset_mode="DISABLED")
+    vector.reset()
+    with pytest.raises(QuadrlError) as caught:
+        vector.reset(options={"reset_mask": mask})
+    assert caught.value.name == "reset_mask"
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+def test_vehicle_task_options_ranges_and_the_time_limit_arrive(make):
+    ranges = {"mass": (1.2, 1.25)}
+    settings = {"time_limit": 0.06} if make is gym.make else {"max_episode_steps": 3, "num_envs": 2}
+    made = make(HOVER, vehicle=HEAVY, tolerance=9.0, num_threads=1, ranges=ranges, **settings)
+    core = made.unwrapped.environment
+    assert core.vehicle.mass == 1.3
+    assert core.task.tolerance == 9.0
+    assert made.unwrapped.metadata["render_fps"] == 50
+    made.reset(seed=0)
+    assert (core.engine.parameters["mass"] != 1.3).all()
+    flown = [made.step(np.zeros(made.action_space.shape)) for _ in range(3)]  # of 0.02 s
+    assert [np.all(step[3]) for step in flown] == [False, False, True]
+    # Success is reported at the end alone.
+    assert [np.all(step[4]["is_success"]) for step in flown] == [False, False, True]
+
+
+def test_the_crazyflie_and_a_hexacopter_have_spaces_of_their_own():
+    for name, rotors in (("crazyflie", 4), ("hexa", 6)):
+        environment = gym.make(HOVER, vehicle=name)
+        assert environment.action_space.shape == (rotors,)
+        assert environment.observation_space.shape == (18 + rotors,)
+        environment.reset(seed=0)
+        assert environment.step(np.zeros(rotors))[4]["error"] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        (envs.gymnasium.QuadrotorEnv, "render_mode", "human"),
+        (envs.gymnasium.QuadrotorEnv, "max_episode_steps", 0),
+        (envs.gymnasium.QuadrotorVectorEnv, "autoreset_mode", "same"),
+        (envs.gymnasium.QuadrotorVectorEnv, "num_envs", 0),
+    ],
+)
+def test_an_impossible_setting_is_refused(kind, name, value):
+    with pytest.raises(QuadrlError) as caught:
+        kind(**{name: value})
+    assert (caught.value.name, caught.value.value) == (name, value)
+
+
+# ------------------------------------------------------------------------------------ pictures
+
+PICTURE = {"render_mode": "rgb_array", "width": 160, "height": 96}
+
+
+def alike(one, other):
+    """Whether two pictures show the same; software rendering is off by a level here and there."""
+    return np.abs(one.astype(int) - other).max() <= 8
+
+
+@pytest.mark.parametrize("id", IDS.values(), ids=IDS)
+def test_render_draws_the_flight_and_two_environments_take_turns(id):
+    one, other = (gym.make(id, **PICTURE) for _ in range(2))
+    one.reset(seed=0)
+    other.reset(seed=1)
+    first, between = one.render(), other.render()
+    assert first.shape == (96, 160, 3)
+    assert first.dtype == np.uint8
+    assert first.reshape(-1, 3).std(axis=0).min() > 5  # not blank
+    assert alike(one.render(), first)
+    assert not alike(first, between)
+    for _ in range(10):
+        one.step(np.ones(4, dtype=np.float32))
+    assert not alike(one.render(), first)
+    assert alike(other.render(), between)
+    one.close()
+    assert alike(other.render(), between)
+    other.close()
+
+
+def test_the_goal_is_drawn():
+    # Seen from where it does not move with the aircraft, the goal of hover is all that is green.
+    environment = gym.make(HOVER, camera="fixed", **PICTURE | {"width": 480, "height": 288})
+    environment.reset(seed=0)
+    red, green, blue = environment.render().astype(int).reshape(-1, 3).T
+    assert ((green > red + 20) & (green > blue + 20)).sum() > 5
+    environment.close()
+
+
+def test_render_of_a_vector_has_a_picture_per_row():
+    single, vector = gym.make(HOVER, **PICTURE), gym.make_vec(HOVER, num_envs=2, **PICTURE)
+    single.reset(seed=4)
+    vector.reset(seed=3)
+    frames = vector.render()
+    assert len(frames) == 2
+    assert alike(frames[1], single.render())
+    assert not alike(*frames)
+    single.close()
+    vector.close()
+
+
+def test_without_a_render_mode_nothing_is_drawn():
+    for environment in (gym.make(HOVER).unwrapped, gym.make_vec(HOVER, num_envs=2)):
+        environment.reset()
+        assert environment.render() is None

@@ -1,0 +1,355 @@
+"""Hostile input: whatever is given, it works or is refused with one clear line of quadrl's own.
+
+Never a crash, a hang, somebody else's exception, or a number that is silently wrong. Hypothesis
+makes the input, the same at every run (`derandomize`).
+"""
+
+import contextlib
+import dataclasses
+import math
+
+import helpers
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import quadrl
+from quadrl import tasks
+from quadrl.environment import Environment
+from quadrl.envs.gymnasium import QuadrotorEnv, QuadrotorVectorEnv
+from quadrl.envs.torchrl import QuadrotorEnv as TorchEnv
+from quadrl.errors import QuadrlError
+from quadrl.learning.config import ALGORITHM_CONFIGS, TrainConfig
+from quadrl.randomization import RANGES
+from quadrl.task import Task
+from quadrl.tasks.hover import Hover
+from quadrl.vehicle import PAPER_ROTORS, VEHICLES, Vehicle
+
+EXAMPLES = 25
+profile = settings(
+    max_examples=EXAMPLES,
+    derandomize=True,
+    database=None,
+    deadline=None,  # a slow machine is no fault
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+ODD = st.sampled_from(
+    [None, True, "", "5", "abc", b"5", (), [], {}, 10**400, -(10**400), 5j, math.nan, math.inf]
+    + [-math.inf, 1e308, -1e308, 5e-324, -0.0, 0, -1, np.float32(2), np.array(2.0), np.ones(3)]
+    + [(1, 2), ((1, 2, 3), (4,)), [[1, "x", 3]], float, object(), 2**63, np.int64(3)]
+)
+VALUES = st.one_of(ODD, st.floats(), st.integers(), st.text(max_size=5))
+
+
+@contextlib.contextmanager
+def refusal():
+    """What is refused, is with an error of quadrl's in one line that says something."""
+    try:
+        yield
+    except QuadrlError as error:
+        text = str(error)
+        assert len(text) > 10 and "\n" not in text.strip(), text
+        assert len(text) < 1000, f"{len(text)} characters"
+
+
+# ---------------------------------------------------------------------------------------- actions
+
+DTYPES = st.sampled_from(["f2", "f4", "f8", "g", "c16", "i1", "i8", "u8", "?", "O", "U3", "m8[s]"])
+ARRAYS = DTYPES.flatmap(
+    lambda dtype: hnp.arrays(
+        np.dtype(dtype),
+        st.sampled_from([(4,), (2, 4), (), (0,), (3,), (4, 1), (1, 4), (2, 4, 1), (3, 4)]),
+        elements=st.one_of(VALUES, st.none()) if dtype == "O" else None,
+    )
+)
+LISTS = st.lists(st.one_of(VALUES, st.lists(VALUES, max_size=2)), min_size=3, max_size=5)
+ACTIONS = st.one_of(ARRAYS, ARRAYS, LISTS, VALUES)
+
+
+def core():
+    environment = helpers.begun(num_envs=2)
+    return environment, environment.step, lambda now: [now.reward, *now.observation.values()]
+
+
+def gymnasium(made):
+    made.reset(seed=0)
+    return made.environment, made.step, lambda now: now[:2]
+
+
+def dm_control():
+    made = quadrl.load("hover", {"random": 0})
+    made.reset()
+    return None, made.step, lambda now: [now.reward, *now.observation.values()]
+
+
+def torchrl():
+    made = TorchEnv("hover", 2, seed=0)
+    met = made.reset()
+
+    def step(action):
+        tensor = action if isinstance(action, torch.Tensor) else torch.as_tensor(action)
+        return made._step(met.clone().set("action", tensor, non_tensor=False))
+
+    return made.environment, step, lambda now: [now["reward"].numpy(), now["observation"].numpy()]
+
+
+APIS = {  # and the shape of an action
+    "core": (core, (2, 4)),
+    "gymnasium": (lambda: gymnasium(QuadrotorEnv()), (4,)),
+    "gymnasium vector": (
+        lambda: gymnasium(QuadrotorVectorEnv("hover", 2, autoreset_mode="DISABLED")),
+        (2, 4),
+    ),
+    "dm_control": (dm_control, (4,)),
+}
+
+
+@pytest.mark.parametrize("api", APIS)
+def test_an_action_is_flown_or_refused(api):
+    make, expected = APIS[api]
+    environment, step, numbers = make()
+    flown = []
+
+    @profile
+    @given(ACTIONS)
+    @example(np.full(expected, 1e308))
+    @example(np.full(expected, np.inf))
+    @example(np.full(expected, 0.1j))
+    @example(np.full(expected, 0.5))
+    def check(action):
+        before = environment and environment.engine.qpos.copy()
+        accepted = False
+        with refusal():
+            now = step(action)
+            accepted = True
+        if not accepted:
+            if environment:
+                np.testing.assert_array_equal(environment.engine.qpos, before)
+            return
+        array = np.asarray(action)
+        assert array.dtype.kind in "fiub" and np.isfinite(array.astype(float)).all()
+        assert array.shape == expected
+        assert all(np.isfinite(part).all() for part in numbers(now))
+        flown.append(action)
+
+    check()
+    assert len(flown) >= 2
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64, torch.int64])
+def test_torchrl_takes_a_tensor_or_refuses_it(dtype):
+    _, step, numbers = torchrl()
+    with refusal():
+        assert all(np.isfinite(part).all() for part in numbers(step(torch.ones(2, 4).to(dtype))))
+    for value in (math.nan, -math.inf, 1j):
+        with pytest.raises(QuadrlError):
+            step(torch.full((2, 4), value))
+
+
+def test_a_refused_action_leaves_the_flight_as_it_was():
+    def fly(hostile):
+        environment = helpers.begun(num_envs=2, seed=3)
+        for k in range(10):
+            for bad in (np.full((2, 4), np.nan), "abc", np.zeros(4)) if hostile else ():
+                with pytest.raises(QuadrlError):
+                    environment.step(bad)
+            environment.step(np.full((2, 4), 0.1 * k - 0.5))
+        return helpers.coordinates(environment.engine)
+
+    np.testing.assert_array_equal(fly(True), fly(False))
+
+
+# ---------------------------------------------------------------------- options and environments
+
+
+def fly_briefly(task, **settings):
+    """Two steps; every number finite, whatever diverges is terminated and counted."""
+    environment = Environment(task, num_envs=2, seed=0, **settings)
+    rotors = environment.vehicle.rotor_count
+    seen = [environment.flatten(environment.reset())]
+    for _ in range(2):
+        now = environment.step(np.array([np.resize((0.3, -0.1, 0.2), rotors), np.ones(rotors)]))
+        seen += [environment.flatten(now.observation), now.reward, now.error]
+        assert (now.terminated >= now.diverged).all()
+    assert all(np.isfinite(part).all() for part in seen)
+
+
+def some_of(names):
+    return st.dictionaries(st.sampled_from(list(names)), VALUES, min_size=1, max_size=2)
+
+
+def fields(kind):
+    return [field.name for field in dataclasses.fields(kind)]
+
+
+@pytest.mark.parametrize("name", list(tasks.TASKS))
+def test_options_of_a_task_fly_or_are_refused(name):
+    @profile
+    @given(some_of(fields(tasks.TASKS[name])))
+    def check(options):
+        with refusal():
+            fly_briefly(tasks.make(name, **options))
+
+    check()
+
+
+@pytest.mark.parametrize(
+    ("task", "option"),
+    [
+        ("target_following", {"climb_share": 2}),
+        ("target_following", {"slowest": 0}),
+        ("target_following", {"fastest": 0.1}),
+        ("straight_and_level", {"line_speed": 0}),
+        ("static_waypoint", {"waypoints": 5}),
+        ("static_waypoint", {"waypoints": ((1, 2, "x"),)}),
+        ("static_waypoint", {"waypoints": ((1, 2, 3e300),)}),
+        ("hover", {"radius": 1e300}),
+    ],
+)
+def test_an_option_that_came_through_once_is_refused(task, option):
+    with pytest.raises(QuadrlError) as caught:
+        tasks.make(task, **option)
+    assert caught.value.name.startswith(f"{task} {next(iter(option))}")
+
+
+ARGUMENTS = {"num_envs": 2, "seed": 0, "vehicle": None, "num_threads": 1, "control_mode": "rotor"}
+ARGUMENTS |= {"engine": "mujoco", "task": "hover", "ranges": None}
+SMALL = VALUES.filter(lambda v: not (isinstance(v, int) and 100 < v <= 1 << 20))
+
+
+@profile
+@given(st.sampled_from(list(ARGUMENTS)), SMALL)
+@example("seed", -1)
+@example("vehicle", "racer")
+@example("vehicle", [])
+@example("num_threads", 1.5)
+@example("ranges", 5)
+@example("ranges", "mass")
+@example("ranges", [("mass", (1, 2))])
+def test_arguments_of_an_environment_work_or_are_refused(name, value):
+    with refusal():
+        environment = Environment(**(ARGUMENTS | {name: value}))
+        assert np.isfinite(environment.reset()["position"]).all()
+
+
+@profile
+@given(
+    st.dictionaries(
+        st.sampled_from(RANGES),
+        st.one_of(VALUES, st.tuples(VALUES, VALUES), st.tuples(st.floats(0, 1), st.floats(0, 1))),
+        min_size=1,
+        max_size=2,
+    )
+)
+@example({"wind": (0.0, 100.0)})
+@example({"mass": (0.65, 0.65), "max_speed": (226.0, 1e6)})
+def test_ranges_fly_or_are_refused(ranges):
+    with refusal():
+        fly_briefly("hover", ranges=ranges)
+
+
+@profile
+@given(
+    st.one_of(
+        hnp.arrays(
+            st.sampled_from([np.int64, np.float64, np.bool_, object]), hnp.array_shapes(max_dims=2)
+        ),
+        st.lists(VALUES, max_size=3),
+        st.lists(st.integers(-1, 3), max_size=3),
+    )
+)
+@example(np.array([True]))
+@example(np.array([0.5]))
+def test_rows_to_reset_are_numbers_or_a_mask(rows):
+    environment = helpers.begun(num_envs=3)
+    before = environment.engine.qpos.copy()
+    try:
+        array = np.asarray(rows)
+    except (ValueError, OverflowError):
+        return
+    with refusal():
+        environment.reset(array)
+        if array.dtype == bool and array.shape == (3,):
+            named = set(np.flatnonzero(array))
+        else:
+            assert array.dtype.kind in "iu" or not len(array)
+            named = set(array.tolist())
+        changed = (environment.engine.qpos != before).any(axis=1)
+        assert set(np.flatnonzero(changed)) == named
+
+
+# ------------------------------------------------------------------------------------- parameters
+
+NUMBERS = ("mass", "drag_coefficient", "moment_coefficient", "action_scale", "control_timestep")
+ROTOR_NUMBERS = ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed")
+NEAR = st.dictionaries(
+    st.sampled_from(NUMBERS + ROTOR_NUMBERS), st.floats(0.01, 100), min_size=1, max_size=2
+)
+
+
+def vehicle(changes):
+    """The paper's aircraft with parameters of its own or of all its rotors changed."""
+    rotor = {n: v for n, v in changes.items() if n in fields(PAPER_ROTORS[0])}
+    rotors = tuple(dataclasses.replace(r, **rotor) for r in PAPER_ROTORS)
+    return Vehicle(**{"rotors": rotors} | {n: v for n, v in changes.items() if n not in rotor})
+
+
+@profile
+@given(some_of({*fields(Vehicle), *fields(PAPER_ROTORS[0])}) | NEAR, st.sampled_from([True, False]))
+@example({"mass": 1e-15, "inertia": (1e-15,) * 3}, True)
+@example({"mass": 1e10, "inertia": (1e10,) * 3}, False)
+@example({"thrust_coefficient": 1e-15}, True)
+@example({"lag_up": 1e10, "drag_coefficient": 1e10, "moment_coefficient": 1e10}, True)
+def test_parameters_of_an_aircraft_fly_or_are_refused(changes, free):
+    near = {n: v * getattr(Vehicle() if n in NUMBERS else PAPER_ROTORS[0], n)
+            for n, v in changes.items() if n in NUMBERS + ROTOR_NUMBERS
+            and isinstance(v, float) and 0.01 <= v <= 100}  # fmt: skip
+    with refusal():
+        made = vehicle(changes | near)
+        fly_briefly("hover", vehicle=made, engine="free_flight" if free else "mujoco")
+
+
+@pytest.mark.parametrize("name", list(VEHICLES))
+def test_every_aircraft_keeps_its_parameters(name):
+    # Checking turns whole numbers into floats and nothing else.
+    own = VEHICLES[name]
+    assert Vehicle(**{field: getattr(own, field) for field in fields(Vehicle)}) == own
+
+
+@pytest.mark.parametrize("name", ["train", *ALGORITHM_CONFIGS])
+def test_a_configuration_is_sound_or_refused(name):
+    kind = TrainConfig if name == "train" else ALGORITHM_CONFIGS[name]
+    accepted = []
+
+    @profile
+    @given(some_of(fields(kind)))
+    @example({})
+    def check(values):
+        with refusal():
+            accepted.append(config := kind(**values))
+            for field in dataclasses.fields(config):
+                value, default = getattr(config, field.name), field.default
+                if isinstance(default, int):
+                    assert isinstance(value, int) and not isinstance(value, bool)
+                elif isinstance(default, float):
+                    assert isinstance(value, (int, float)) and math.isfinite(value)
+
+    check()
+    assert accepted
+
+
+@profile
+@given(VALUES)
+@example(Hover())
+@example(type("Nameless", (Task,), {}))
+@example(type("Odd", (Hover,), {"name": "two words"}))
+@example(type("Taken", (Hover,), {"name": "landing"}))
+def test_what_is_no_task_is_not_registered(kind):
+    before = dict(tasks.TASKS)
+    with pytest.raises(QuadrlError):
+        tasks.register(kind)
+    assert before == tasks.TASKS

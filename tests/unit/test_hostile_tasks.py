@@ -1,0 +1,162 @@
+"""Tasks and models of a user's own: they are flown, or refused with what is wrong with them."""
+
+import dataclasses
+import math
+
+import helpers
+import mujoco
+import numpy as np
+import pytest
+
+from quadrl import mjcf
+from quadrl.engines.mujoco import DataEngine
+from quadrl.errors import QuadrlError
+from quadrl.task import TaskState
+from quadrl.tasks.hover import Hover
+from quadrl.vehicle import VEHICLES, Vehicle
+
+# ------------------------------------------------------------------------------- a user's own task
+
+
+def hostile_task(**methods):
+    """Hover with some methods replaced."""
+    body = {"name": "hostile", "__annotations__": {}, **methods}
+    return dataclasses.dataclass(frozen=True)(type("Hostile", (Hover,), body))()
+
+
+def changed_start(**changes):
+    def begin(self, rng, parameters):
+        start, state = Hover.begin(self, rng, parameters)
+        return dataclasses.replace(start, **{k: f(start) for k, f in changes.items()}), state
+
+    return {"begin": begin}
+
+
+def changed(method, function):
+    """A method of Hover whose result goes through a function."""
+
+    def replaced(self, *args):
+        return function(getattr(Hover, method)(self, *args))
+
+    return {method: replaced}
+
+
+def with_term(function):
+    return changed("reward", lambda terms: terms | {"own": function(terms["progress"])})
+
+
+HOSTILE = {  # methods, and what the error names
+    "start of another shape": (changed_start(velocity=lambda s: s.velocity[:, :2]), "velocity"),
+    "start for a batch": (changed_start(velocity=lambda s: np.zeros((5, 3))), "velocity"),
+    "start that is NaN": (changed_start(velocity=lambda s: s.velocity * np.nan), "velocity"),
+    "start that is far": (changed_start(position=lambda s: s.position + 1e11), "position"),
+    "quaternion of length 2": (changed_start(quaternion=lambda s: 2 * s.quaternion), "quaternion"),
+    "no start": (changed("begin", lambda pair: pair[0]), "begin"),
+    "a goal that is none": (changed("begin", lambda pair: (pair[0], TaskState(None))), "goal"),
+    "reward that is NaN": (with_term(lambda p: p * np.nan), "reward"),
+    "reward that is infinite": (with_term(lambda p: p + np.inf), "reward"),
+    "reward of another shape": (with_term(lambda p: np.zeros((3, 1))), "own"),
+    "reward that is text": (with_term(lambda p: np.full(np.shape(p), "a")), "own"),
+    "no reward": (changed("reward", lambda terms: {}), "reward"),
+    "a part missing": (changed("observe", lambda p: dict(list(p.items())[1:])), "observe"),
+    "a part too wide": (changed("observe", lambda p: p | {"goal": p["velocity"][:, :2]}), "goal"),
+    "parts in disorder": (changed("observe", lambda p: dict(sorted(p.items()))), "observe"),
+    "an end that is no bool": (changed("terminated", lambda end: 1.0 * end), "terminated"),
+    "an end of another shape": (changed("terminated", lambda end: end[:, None]), "terminated"),
+    "an error of another shape": (changed("error", lambda error: np.zeros(5)), "error"),
+    "a success of another shape": (changed("succeeded", lambda done: done[0]), "succeeded"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_task_that_gives_what_none_may_is_refused(case):
+    methods, name = HOSTILE[case]
+    with pytest.raises(QuadrlError) as caught:
+        helpers.idle(helpers.begun(hostile_task(**methods), 3))
+    assert name in caught.value.name and caught.value.allowed
+
+
+def test_a_reward_that_is_nan_later_is_refused_too():
+    def late(self, before, now, end):
+        terms = Hover.reward(self, before, now, end)
+        return terms | {"late": np.where(now.state.speed > 0.5, np.nan, 0.0)}
+
+    environment = helpers.begun(hostile_task(reward=late), 3)
+    with pytest.raises(QuadrlError) as caught:
+        for _ in range(40):  # four rotors at full command: more than 0.5 m/s within a second
+            environment.step(np.ones((3, 4)))
+    assert "reward" in caught.value.name and math.isnan(caught.value.value["late"])
+
+
+def test_what_a_task_raises_is_its_own_and_the_environment_goes_on():
+    failing = [False]
+
+    def terminated(self, now):
+        if failing[0]:
+            raise ZeroDivisionError("mine")
+        return Hover.terminated(self, now)
+
+    environment, other = (
+        helpers.begun(hostile_task(terminated=terminated), 2),
+        helpers.begun("hover", 2),
+    )
+    failing[0] = True
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        helpers.idle(environment)
+    failing[0] = False
+    environment.reset(), other.reset()
+    for _ in range(5):
+        now, expected = (e.step(np.full((2, 4), 0.2)) for e in (environment, other))
+        np.testing.assert_array_equal(now.reward, expected.reward)
+
+
+# ------------------------------------------------------------------------------ a user's own model
+
+PENDULUM = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="hinge"/>
+<geom size="0.1" pos="0.3 0 0"/></body></worldbody>
+<actuator><motor joint="hinge"/></actuator></mujoco>"""
+BRICK = """<mujoco><option timestep="0.01"/><worldbody><body><freejoint/><site name="s"/>
+<geom size="0.1"/></body></worldbody><actuator>{}</actuator></mujoco>""".format(
+    '<general site="s" dyntype="filter" gear="0 0 1"/>' * 4
+)
+
+
+def edited(edit):
+    spec = mjcf.spec(Vehicle(), drawn=False)
+    edit(spec)
+    return spec.compile()
+
+
+def with_body(spec):
+    body = spec.worldbody.add_body(name="more", mass=0.1, inertia=[1e-3] * 3, explicitinertial=True)
+    body.add_freejoint()
+
+
+MODELS = {
+    "empty": lambda: mujoco.MjModel.from_xml_string("<mujoco/>"),
+    "pendulum": lambda: mujoco.MjModel.from_xml_string(PENDULUM),
+    "brick": lambda: mujoco.MjModel.from_xml_string(BRICK),
+    "hexa": lambda: mjcf.compile_model(VEHICLES["hexa"]),
+    "body": lambda: edited(with_body),
+    "step": lambda: edited(lambda spec: setattr(spec.option, "timestep", 0.02)),
+    "unmarked": lambda: edited(lambda spec: setattr(spec.body("aircraft"), "userdata", (0, 0, 0))),
+    "no air": lambda: edited(lambda spec: setattr(spec, "nuserdata", 0)),
+}
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_that_is_no_aircraft_is_refused(name, engine):
+    model = MODELS[name]()
+    with pytest.raises(QuadrlError, match="a model to fly needs"):
+        DataEngine(Vehicle(), model, mujoco.MjData(model), altitude=3.0, engine=engine)
+
+
+def test_a_users_scene_is_flown():
+    spec = mjcf.spec(Vehicle(), contact=True)
+    spec.worldbody.add_geom(
+        name="wall", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 1, 1], pos=[3, 0, 1]
+    )
+    model = spec.compile()
+    engine = DataEngine(Vehicle(), model, mujoco.MjData(model), altitude=3.0)
+    assert np.isfinite(helpers.idle(helpers.begun("hover", engine=engine)).reward).all()

@@ -1,0 +1,157 @@
+"""The settings of a training: where defaults come from, what is refused, what is saved."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+from runs import TINY, refused
+
+from quadrl import tasks
+from quadrl.learning.config import PPOConfig, TrainConfig, TRPOConfig, VPGConfig
+from quadrl.learning.folder import read_config, write_json
+from quadrl.tasks.hover import Hover
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuned(Hover):
+    """A task with training defaults of its own."""
+
+    name = "tuned"
+    training = {"gamma": 0.5, "num_envs": 32, "hidden": (8, 8), "vpg": {"critic_rate": 0.25}}
+
+
+@pytest.fixture
+def tuned(monkeypatch):
+    monkeypatch.setitem(tasks.TASKS, "tuned", Tuned)
+
+
+def test_defaults_are_the_tasks_own(tuned):
+    config = TrainConfig("tuned")
+    assert (config.gamma, config.num_envs, config.hidden) == (0.5, 32, (8, 8))
+    assert (config.rollout, config.steps) == (TrainConfig.rollout, TrainConfig.steps)
+    assert config.vpg == VPGConfig(critic_rate=0.25) and config.ppo == PPOConfig()
+    given = TrainConfig("tuned", gamma=0.7, vpg={"critic_epochs": 3}, hidden=None)
+    assert (given.gamma, given.hidden) == (0.7, (8, 8))
+    assert given.vpg == VPGConfig(critic_rate=0.25, critic_epochs=3)
+
+
+def test_an_algorithm_has_its_own_defaults(tuned):
+    # One step of the policy per batch: batches are smaller.
+    assert (TrainConfig(algo="vpg").num_envs, TrainConfig(algo="vpg").rollout) == (128, 8)
+    assert (TrainConfig().num_envs, TrainConfig().rollout) == (256, 16)
+    assert TrainConfig("tuned", algo="vpg").num_envs == 32  # the task's goes first
+    assert TrainConfig(algo="gae") == TrainConfig(algo="vpg")
+
+
+def test_an_aircraft_that_is_controlled_more_often_learns_as_many_seconds():
+    paper, racer = TrainConfig("hover"), TrainConfig("hover", vehicle="racer")
+    # 0.02 s instead of 0.05 s: 2.5 times as many steps, and 0.9^(1/2.5) = 0.9587.
+    assert (racer.rollout, racer.steps) == (2.5 * paper.rollout, 2.5 * paper.steps)
+    assert racer.gamma == 0.9587 and racer.iterations == paper.iterations
+    given = TrainConfig("hover", vehicle="racer", gamma=0.9, steps=4096)
+    assert (given.gamma, given.steps, given.rollout) == (0.9, 4096, 40)
+
+
+def test_every_task_trains_by_default():
+    for name, task in tasks.TASKS.items():
+        config = TrainConfig(name)
+        for setting, value in task.training.items():
+            if not isinstance(value, dict):
+                assert getattr(config, setting) == value
+
+
+@pytest.mark.parametrize("seed", [0, 1000, 2**32 - 1])
+def test_any_32_bit_seed_is_good(seed):
+    assert TrainConfig(seed=seed).seed == seed
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "value"),
+    [
+        ({"gamma": 2.0}, "gamma", 2.0),
+        ({"seed": -1}, "seed", -1),
+        ({"seed": 2**32}, "seed", 2**32),
+        ({"seed": 1.0}, "seed", 1.0),
+        ({"num_envs": 0}, "num_envs", 0),
+        ({"num_envs": 2**20, "rollout": 100}, "num_envs * rollout", 100 * 2**20),
+        ({"num_envs": 1, "rollout": 1}, "num_envs * rollout", 1),
+        ({"steps": -5}, "steps", -5),
+        ({"hidden": (16, 0)}, "width of a hidden layer", 0),
+        ({"hidden": 16}, "hidden", 16),
+        ({"initial_deviation": 0.0}, "initial_deviation", 0.0),
+        ({"reward_scale": 0.0}, "reward_scale", 0.0),
+        ({"num_threads": -1}, "num_threads", -1),
+        ({"algo": "sac"}, "algo", "sac"),
+        ({"vehicle": "paprr"}, "vehicle", "paprr"),
+        ({"control_mode": "thrust"}, "control_mode", "thrust"),
+        ({"engine": "flight"}, "engine", "flight"),
+        ({"task": "hovver"}, "task", "hovver"),
+        ({"gama": 0.9}, "setting", "gama"),
+        ({"ppo": {"clp": 0.2}}, "setting of ppo", "clp"),
+        ({"ppo": {"epochs": 0}}, "ppo.epochs", 0),
+        ({"ppo": 3}, "ppo", 3),
+        ({"task_options": {"horizn": 5}}, "hover option", "horizn"),
+        ({"task_options": {"time_limit": "long"}}, "hover time_limit", "long"),
+        ({"task_options": {"time_limit": -1}}, "hover time_limit", -1),
+        ({"task_options": "time_limit=5"}, "task_options", "time_limit=5"),
+    ],
+)
+def test_settings_that_cannot_be_trained_are_refused(change, name, value):
+    with refused(name, value):
+        TrainConfig(**change)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        (PPOConfig, {"minibatch": -1}),
+        (PPOConfig, {"learning_rate": math.inf}),
+        (PPOConfig, {"clip": 0.0}),
+        (PPOConfig, {"entropy": -0.1}),
+        (TRPOConfig, {"max_kl": 0.0}),
+        (TRPOConfig, {"iterations": 0.5}),
+        (VPGConfig, {"critic_rate": math.nan}),
+    ],
+)
+def test_settings_of_an_algorithm_that_cannot_be_are_refused(kind, change):
+    ((name, value),) = change.items()
+    with refused() as caught:
+        kind(**change)
+    assert caught.value.name.endswith(f".{name}") and caught.value.value is value
+    assert PPOConfig(entropy=0.0).entropy == 0.0
+
+
+def test_an_unknown_training_default_of_a_task_is_refused(tuned, monkeypatch):
+    monkeypatch.setattr(Tuned, "training", {"gama": 0.9})
+    with refused(value="gama"):
+        TrainConfig("tuned")
+
+
+def test_the_settings_of_a_run_are_found_again(tmp_path):
+    write_json(tmp_path / "config.json", TINY.resolved())
+    assert TrainConfig.of_folder(tmp_path) == TINY
+    saved = read_config(tmp_path)
+    assert saved["resolved_task"]["time_limit"] == 0.5
+    assert saved["resolved_task"]["radius"] == 0.5
+    assert saved["resolved_vehicle"]["mass"] == 0.65
+    assert len(saved["resolved_vehicle"]["rotors"]) == 4
+    assert set(saved["versions"]) == {"quadrl", "mujoco", "torch", "torchrl", "numpy"}
+
+
+@pytest.mark.parametrize("text", [None, "", "{", "[]", "{}", '{"task": "hover"}'])
+def test_damaged_settings_are_refused(tmp_path, text):
+    if text is not None:
+        (tmp_path / "config.json").write_text(text)
+    with refused() as caught:
+        TrainConfig.of_folder(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize(("part", "name"), [("task", "radius"), ("vehicle", "mass")])
+def test_a_run_of_a_task_or_an_aircraft_that_has_changed_is_not_continued(tmp_path, part, name):
+    config = TINY.resolved()
+    config[f"resolved_{part}"][name] *= 2
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with refused():
+        TrainConfig.of_folder(tmp_path)

@@ -1,0 +1,348 @@
+"""Training: the same seed, checkpoints that lose nothing, what the critic sees, the metrics."""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from runs import TINY, assert_same_run, changed, contents, metrics, refused, stopped, train
+from safetensors.torch import save as to_safetensors
+from tensordict import TensorDict
+
+import quadrl
+from quadrl.environment import Environment
+from quadrl.learning import checkpoint
+from quadrl.learning.config import ALGORITHMS
+from quadrl.learning.figures import learning_curve, read_metrics
+from quadrl.learning.figures import trajectory as draw_trajectory
+from quadrl.learning.train import SEED_STRIDE, Training
+from quadrl.rollout import fly
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run that nobody disturbed; not to be written to."""
+    return train(TINY, tmp_path_factory.mktemp("runs") / "finished")
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    return Path(shutil.copytree(finished, tmp_path / "copy"))
+
+
+# --------------------------------------------------------------------------- the same seed
+
+
+def test_same_seed_same_run_on_any_threads_of_torch(finished, tmp_path):
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        assert_same_run(finished, train(TINY, tmp_path / "run"))
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(("engine", "num_envs"), [("mujoco", 8), ("free_flight", 600)])
+def test_threads_of_the_simulation_change_nothing(tmp_path, engine, num_envs):
+    # A thread of free flight is worth 256 aircraft; landing's come down into MuJoCo's hands.
+    settings = dict(
+        task="landing",
+        task_options={"time_limit": 0.5, "start_height": 0.3},
+        engine=engine,
+        num_envs=num_envs,
+        steps=num_envs * 4 * 3,
+        ppo={"epochs": 1, "minibatch": num_envs},
+    )
+    one, *others = (train(changed(**settings, num_threads=n), tmp_path / str(n)) for n in (1, 2, 3))
+    for other in others:
+        assert_same_run(one, other)
+
+
+@pytest.mark.parametrize("seed", [1, 1000, 2**32 - 1])
+def test_another_seed_is_another_run(finished, tmp_path, seed):
+    other = train(changed(seed=seed), tmp_path / "other")
+    ours, theirs = quadrl.Policy.load(finished), quadrl.Policy.load(other)
+    for a, b in zip(ours.weights, theirs.weights, strict=True):
+        assert (a != b).mean() > 0.9
+    assert (ours.mean != theirs.mean).all()  # the episodes are others, too
+    assert theirs.metadata["seed"] == seed
+
+
+def test_a_hexacopter_and_another_control_mode_train(tmp_path):
+    for k, (mode, actions) in enumerate((("rotor", 6), ("velocity", 4))):
+        config = changed(vehicle="hexa", control_mode=mode)
+        policy = quadrl.Policy.load(train(config, tmp_path / str(k)))
+        assert (policy.size, policy.action_size, policy.control_mode) == (24, actions, mode)
+        assert (policy.metadata["vehicle"], policy.metadata["rotors"]) == ("hexa", 6)
+
+
+# --------------------------------------------------------------------------- checkpoints
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_algorithm_continues_where_it_was_stopped(tmp_path, algo):
+    config = changed(algo=algo, task="target_following")  # with a state of its own
+    alone = train(config, tmp_path / "alone")
+    stopped(config, tmp_path / "run", 1)
+    stopped(config, tmp_path / "run", 3, resume=True)
+    folder = stopped(config, tmp_path / "run", 6, resume=True)
+    assert len(metrics(folder)) == 6 and not (folder / "policy.safetensors").exists()
+    assert_same_run(alone, train(config, tmp_path / "run", resume=True))
+    assert quadrl.Policy.load(alone).metadata["algo"] == algo
+
+
+def test_stopped_again_and_again_between_rare_checkpoints(finished, tmp_path):
+    rare = changed(checkpoint_seconds=1e9)
+    folder = stopped(rare, tmp_path / "run", 4)
+    assert not (folder / checkpoint.CHECKPOINT).exists()  # before the first: from the start
+    stopped(TINY, folder, 4, resume=True)
+    assert checkpoint.load(folder / checkpoint.CHECKPOINT)[1]["iteration"] == 3
+    stopped(rare, folder, 6, resume=True)
+    with open(folder / "metrics.csv", "a") as file:
+        file.write("99,99,nonsense\n5,160,0.1")
+    # What lies after the checkpoint is written again.
+    training = Training(TINY, folder, resume=True)
+    assert training.iteration == 3
+    training.run()
+    assert_same_run(finished, folder)
+
+
+def test_resuming_a_finished_run_changes_nothing(finished, copy):
+    before = contents(copy)
+    training = Training(TINY, copy, resume=True)
+    policy = training.run()
+    assert contents(copy) == before and training.seconds > 0
+    for a, b in zip(policy.weights, quadrl.Policy.load(finished).weights, strict=True):
+        np.testing.assert_array_equal(a, b)
+    # Stopped between its last checkpoint and the policy, it writes the policy.
+    (copy / "policy.safetensors").unlink()
+    assert_same_run(finished, train(TINY, copy, resume=True))
+
+
+def test_two_trainings_do_not_share_a_folder(finished, tmp_path):
+    folder = stopped(TINY, tmp_path / "run", 4)
+    first = Training(TINY, folder, resume=True)
+    before = contents(folder)
+    for resume in (True, False):  # a new run does not touch an old one either
+        with refused():
+            Training(TINY, folder, resume=resume)
+    assert contents(folder) == before
+    first.run()
+    assert_same_run(finished, folder)
+    train(TINY, folder, resume=True)  # its end has unlocked it
+
+
+def half(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def rewritten(change):
+    def damage(path):
+        tensors, numbers = checkpoint.load(path)
+        change(tensors, numbers)
+        checkpoint.save(path, tensors, numbers)
+
+    return damage
+
+
+DAMAGES = {
+    "truncated": half,
+    "foreign": lambda path: path.write_bytes(to_safetensors({"weight": torch.zeros(3)})),
+    "missing": Path.unlink,
+    "networks": rewritten(lambda t, n: t.update(actor={k: torch.zeros(17) for k in t["actor"]})),
+    "part": rewritten(lambda t, n: t.pop("environment")),
+    "settings": rewritten(lambda t, n: n.pop("config")),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_is_refused_and_nothing_is_touched(copy, damage):
+    DAMAGES[damage](copy / checkpoint.CHECKPOINT)
+    before = contents(copy)
+    with refused() as caught:
+        Training(TINY, copy, resume=True)
+    assert str(copy / checkpoint.CHECKPOINT) in str(caught.value)
+    assert contents(copy) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "value"),
+    [
+        ({"task": "random_waypoint"}, "task", "hover"),
+        ({"task_options": {}}, "task_options.time_limit", 0.5),
+        ({"vehicle": "racer"}, "vehicle", "paper"),
+        ({"gamma": 0.5}, "gamma", TINY.gamma),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused(copy, tmp_path, change, name, value):
+    # The networks are of one size, so nothing else would notice.
+    other = stopped(changed(**change), tmp_path / "other", 2)
+    shutil.copy(other / checkpoint.CHECKPOINT, copy)
+    with refused(name, value):
+        Training(TINY, copy, resume=True)
+
+
+def test_a_checkpoint_of_another_version_is_refused(copy):
+    rewritten(lambda t, n: n["config"]["versions"].update(torch="0.0.7"))(
+        copy / checkpoint.CHECKPOINT
+    )
+    with refused("versions.torch", allowed="'0.0.7'"):
+        Training(TINY, copy, resume=True)
+
+
+@pytest.mark.parametrize("name", [checkpoint.CHECKPOINT, "policy.safetensors", "metrics.csv"])
+def test_a_full_disk_does_not_destroy_what_is_there(finished, tmp_path, monkeypatch, name):
+    folder = stopped(TINY, tmp_path / "run", 4)
+    before = contents(folder)
+    replace = os.replace
+
+    def full(written, path):
+        if path.name == name:
+            raise OSError(28, "No space left on device")
+        replace(written, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", full)
+        with pytest.raises(OSError):
+            Training(TINY, folder, resume=True).run()
+    if name in before:
+        assert (folder / name).read_bytes() == before[name]
+    assert not list(folder.glob("*.part"))
+    assert_same_run(finished, train(TINY, folder, resume=True))
+
+
+def test_checkpoints_keep_every_kind_of_number(tmp_path):
+    tensors = {
+        "a": {"b": torch.arange(6).reshape(2, 3).T, "c": {"d": torch.tensor(2.5).double()}},
+        "state": np.array([[2**64 - 1]], dtype=np.uint64),
+        "flags": np.array([True, False]),
+        "none": {},
+    }
+    checkpoint.save(tmp_path / "c", tensors, {"iteration": 3})
+    got, numbers = checkpoint.load(tmp_path / "c")
+    assert numbers == {"iteration": 3} and "none" not in got
+    assert torch.equal(got["a"]["b"], tensors["a"]["b"])
+    assert got["a"]["c"]["d"] == 2.5 and got["a"]["c"]["d"].dtype == torch.float64
+    assert got["state"].numpy()[0, 0] == 2**64 - 1
+    assert got["flags"].tolist() == [True, False]
+
+
+def test_a_diverged_training_says_so_and_keeps_no_policy(tmp_path):
+    wild = changed(ppo={"learning_rate": 1e30, "epochs": 2, "minibatch": 16})
+    with refused():
+        train(wild, tmp_path / "run")
+    assert not (tmp_path / "run" / "policy.safetensors").exists()
+    assert not (tmp_path / "run" / checkpoint.CHECKPOINT).exists()
+
+
+# --------------------------------------------------------------------------- the algorithm
+
+
+def test_values_continue_at_truncation_and_not_at_termination(tmp_path):
+    training = Training(changed(gamma=0.5, gae_lambda=0.5), tmp_path / "run")
+    for parameter in training.critic.parameters():
+        parameter.data.zero_()
+    list(training.critic.parameters())[-1].data.fill_(10.0)  # every value is 10
+
+    def targets(terminated, truncated):
+        """Value targets of two steps of one aircraft with rewards 1 and 2."""
+
+        def column(values, kind):
+            return torch.tensor(values, dtype=kind).reshape(1, 2, 1)
+
+        observation = torch.zeros(1, 2, training.env.environment.size)
+        terminated, truncated = (column(x, torch.bool) for x in (terminated, truncated))
+        after = {
+            "observation": observation.clone(),
+            "reward": column([1.0, 2.0], torch.float32),
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+        batch = TensorDict({"observation": observation}, [1, 2], names=[None, "time"])
+        batch["next"] = TensorDict(after, [1, 2])
+        with torch.no_grad():
+            training.advantages(batch)
+        return batch["value_target"].flatten().tolist()
+
+    # Two steps of one episode: delta_1 = 2 + 5 - 10 = -3, so A_1 = -3 and the target is 7;
+    # delta_0 = 1 + 5 - 10 = -4, A_0 = -4 + 0.25 * -3 = -4.75: 5.25.
+    assert targets([False, False], [False, False]) == [5.25, 7.0]
+    # The second is cut off by the clock: the value of where it was counts as before.
+    assert targets([False, False], [False, True]) == [5.25, 7.0]
+    # The second ends it: delta_1 = 2 - 10 = -8: 2, and A_0 = -4 + 0.25 * -8 = -6: 4.
+    assert targets([False, True], [False, False]) == [4.0, 2.0]
+    # The first step ends its episode or is cut off: the second belongs to another and does not
+    # count; A_0 = delta_0 = 1 - 10 = -9, or 1 + 5 - 10 = -4.
+    assert targets([True, False], [False, False]) == [1.0, 7.0]
+    assert targets([False, False], [True, False]) == [6.0, 7.0]
+
+
+def test_the_critic_sees_the_last_observation_of_an_episode_not_the_next_first(tmp_path):
+    training = Training(TINY, tmp_path / "run")
+    seen = []
+    learn = training._learn
+    training._learn = lambda batch: (seen.append(batch.clone()), learn(batch))[1]
+    training.run()
+    environment = Environment(
+        TINY.make_task(), num_envs=8, seed=TINY.seed * SEED_STRIDE, engine=TINY.engine
+    )
+    observation = environment.flatten(environment.reset())
+    ends = 0
+    for batch in seen:
+        for t in range(TINY.rollout):
+            row = batch[:, t]
+            np.testing.assert_array_equal(row["observation"], observation)
+            now = environment.step(row["action"].numpy())
+            final = environment.flatten(now.observation)
+            np.testing.assert_array_equal(row["next", "observation"], final)
+            np.testing.assert_array_equal(row["next", "terminated"][:, 0], now.terminated)
+            np.testing.assert_array_equal(row["next", "truncated"][:, 0], now.truncated)
+            over, observation = now.terminated | now.truncated, final.copy()
+            if over.any():
+                observation[over] = environment.flatten(environment.reset(over))
+                assert (observation[over] != final[over]).any(-1).all()
+                ends += over.sum()
+    assert ends == 16  # 24 steps of 8 aircraft, whose episodes last 10
+
+
+def test_the_metrics_are_those_of_the_episodes(finished):
+    rows = metrics(finished)
+    assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 4, 5, 6]
+    assert [int(row["steps"]) for row in rows] == [32, 64, 96, 128, 160, 192]
+    # 8 aircraft with episodes of 10 steps in batches of 4: they end in the third and the fifth.
+    assert [float(row["episodes"]) for row in rows] == [0, 0, 8, 0, 8, 0]
+    assert [row["length"] for row in rows] == ["", "", "10", "", "10", ""]
+    assert all(row["survival"] == "1" for row in rows[2::2])
+    # 10 points a step for being in the air, and the progress of an episode on top of it.
+    assert 0 < float(rows[2]["return"]) < 200
+
+
+# --------------------------------------------------------------------------- figures
+
+
+def test_figures_are_pictures(finished, tmp_path):
+    curve = read_metrics(finished / "metrics.csv")
+    path = learning_curve(curve, "title", tmp_path / "a" / "b.png")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    rollout = fly(quadrl.Policy.load(finished), "hover", episodes=2)
+    draw_trajectory(rollout, "title", tmp_path / "c.pdf")
+    assert (tmp_path / "c.pdf").read_bytes().startswith(b"%PDF")
+    with refused(value="xyz"):
+        learning_curve(curve, "title", tmp_path / "c.xyz")
+    assert sorted(os.listdir(tmp_path)) == ["a", "c.pdf"]
+
+
+@pytest.mark.parametrize(
+    "text", [None, "", "iteration,steps\n", "iteration,steps\n1,32\n", "iteration,steps\n1,many\n"]
+)
+def test_metrics_that_cannot_be_drawn_are_refused(tmp_path, text):
+    path = tmp_path / "metrics.csv"
+    if text is not None:
+        path.write_text(text)
+    with refused() as caught:
+        read_metrics(path)
+    assert str(path) in str(caught.value)

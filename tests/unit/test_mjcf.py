@@ -1,0 +1,111 @@
+"""The models: what is drawn, what can touch, and that the lean one flies like the drawn one."""
+
+import math
+
+import helpers
+import mujoco
+import numpy as np
+import pytest
+
+from quadrl import mjcf
+from quadrl.rendering import Renderer
+from quadrl.vehicle import DRAWN_ROTOR_HEIGHT, VEHICLES
+
+PAPER = VEHICLES["paper"]
+layouts = pytest.mark.parametrize("vehicle", helpers.LAYOUTS.values(), ids=helpers.LAYOUTS)
+
+
+@layouts
+def test_every_layout_is_drawn(vehicle):
+    """Each rotor in its place, turning the way that its blades are pitched for."""
+    model = mjcf.compile_model(vehicle)
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 512, 0
+    assert model.nbody == 2 and model.nu == vehicle.rotor_count
+    assert all("" not in names(model, kind) for kind in KINDS)
+    with Renderer(model, 160, 120) as renderer:
+        pictures = [renderer.frame([0, y, 3, 1, 0, 0, 0], camera="fixed") for y in (0, 50)]
+        closer = renderer.frame([0, 0, 3, 1, 0, 0, 0])
+    assert closer.std() > 10 and (pictures[0] != pictures[1]).any()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for k, rotor in enumerate(vehicle.rotors):
+        axis, place = np.array(rotor.axis), data.site(f"rotor_{k + 1}").xpos
+        np.testing.assert_allclose(data.site(f"rotor_{k + 1}").xmat[2::3], axis, atol=1e-12)
+        hub = data.geom(f"rotor_{k + 1}_hub").xpos
+        height = DRAWN_ROTOR_HEIGHT * vehicle.scale
+        np.testing.assert_allclose(hub, place + height * axis, atol=1e-9)
+        for side in "ab":
+            corners = vertices(model, data, f"rotor_{k + 1}_blade_{side}") - hub
+            reach = np.linalg.norm(corners, axis=1)
+            assert reach.max() == pytest.approx(rotor.radius * 58 / 60, rel=0.01)
+            along = corners[reach.argmax()] / reach.max()
+            ahead = corners @ (rotor.spin * np.cross(axis, along))  # in the direction of its turn
+            root = corners @ along < rotor.radius / 2
+            leading, trailing = (corners[root & (sign * ahead > 0)] @ axis for sign in (1, -1))
+            assert leading.mean() > trailing.mean()
+
+
+KINDS = "geom site cam light mat mesh tex".split()
+
+
+def names(model, kind):
+    """Of the elements of a kind."""
+    return [getattr(model, kind)(k).name for k in range(getattr(model, f"n{kind}"))]
+
+
+def vertices(model, data, name):
+    """(n, 3) [m] of a mesh, world frame."""
+    mesh, geom = model.mesh(model.geom(name).dataid[0]), data.geom(name)
+    first, count = mesh.vertadr[0], mesh.vertnum[0]
+    return model.mesh_vert[first : first + count] @ geom.xmat.reshape(3, 3).T + geom.xpos
+
+
+@layouts
+@pytest.mark.parametrize("contact", [False, True])
+def test_the_lean_model_flies_like_the_drawn_one_bit_for_bit(vehicle, contact):
+    flights = []
+    for drawn in (True, False):
+        model = mjcf.compile_model(vehicle, contact=contact, drawn=drawn, scene=table)
+        assert ("ghost" in names(model, "geom")) == drawn
+        data = mujoco.MjData(model)
+        data.qpos[:7] = (0.1, 0.2, 1.6, *helpers.random_quaternions(np.random.default_rng(0), 1)[0])
+        data.qvel[:], data.act[:] = (0, 1, -3, 0.5, -1, 2), vehicle.hover_speed
+        data.userdata[:3] = (1, -2, 0.5)  # wind [m/s]
+        touched = 0
+        for command in helpers.random_commands(vehicle, 1, 150, rotor=0.4)[:, 0]:
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data)
+            touched += data.ncon
+        flights.append(np.concatenate([data.qpos, data.qvel, data.act, [touched]]))
+    np.testing.assert_array_equal(*flights)
+    assert np.isfinite(flights[0]).all() and bool(flights[0][-1]) == contact  # of the table
+
+
+def table(spec):
+    """Add something to hit and something that is only seen."""
+    box, ghost = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
+    spec.worldbody.add_geom(name="table", type=box, size=(2, 2, 0.5), pos=(0, 0, 0.5), contype=1)
+    spec.worldbody.add_geom(name="ghost", type=ghost, size=(1, 0, 0), contype=0, conaffinity=0)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_the_feet_touch_first_and_then_what_must_not(name):
+    """Level over the ground, a tenth of a millimetre too high and too low for each part."""
+    vehicle = VEHICLES[name]
+    model = mjcf.compile_model(vehicle, contact=True, drawn=False)
+    data = mujoco.MjData(model)
+
+    def touching(height, roll=0.0):
+        data.qpos[:7] = (0, 0, height, math.cos(roll / 2), math.sin(roll / 2), 0, 0)
+        mujoco.mj_forward(model, data)
+        return {model.geom(k).name for contact in data.contact for k in contact.geom} - {"ground"}
+
+    foot, hull = -vehicle.foot[2], vehicle.hull[2]
+    assert touching(foot + 1e-4) == set()
+    assert touching(foot - 1e-4) == {f"foot_{k}" for k in range(1, 5)}
+    assert "strike_hull" not in touching(hull + 1e-4) and "strike_hull" in touching(hull - 1e-4)
+    # On its side the lowest rotor is the one farthest to the right, its disc upright.
+    y, radius = min((rotor.position[1], rotor.radius) for rotor in vehicle.rotors)
+    side = {f"strike_{k + 1}" for k, r in enumerate(vehicle.rotors) if r.position[1] < y + 1e-9}
+    assert touching(radius - y - 1e-4, math.pi / 2) == side
+    assert touching(radius - y + 1e-4, math.pi / 2) == set()

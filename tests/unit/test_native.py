@@ -1,0 +1,305 @@
+"""The compiled callbacks: harmless to others, never silently absent, built for this mujoco."""
+
+import shutil
+from pathlib import Path
+
+import helpers
+import mujoco
+import numpy as np
+import pytest
+from mujoco import rollout
+
+import quadrl
+from quadrl import mjcf, native
+from quadrl.vehicle import Vehicle
+
+INCLUDE = Path(mujoco.__file__).parent / "include"
+HOVER = Vehicle().hover_speed
+
+
+def remove_callbacks(names=native.CALLBACKS):
+    for name in names:
+        getattr(mujoco, f"set_mjcb_{name}")(None)
+
+
+@pytest.fixture(autouse=True)
+def callbacks():
+    """Each test begins and ends with ours."""
+    remove_callbacks()
+    native.install()
+    yield
+    remove_callbacks()
+    native.install()
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of compiled libraries; the compiler does not take its time."""
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("QUADRL_CACHE", str(folder))
+    monkeypatch.setenv("QUADRL_CFLAGS", "-O0")
+    return folder
+
+
+# --------------------------------------------------------------------------- other people's models
+
+SOMEBODY_ELSES = """
+<mujoco>
+  <option timestep="0.005" integrator="{integrator}" wind="1 2 3" density="1.2" viscosity="0.01"/>
+  <size nuserdata="5"/>
+  <worldbody>
+    <body name="pendulum" {user} pos="0 0 1" gravcomp="0.5">
+      <joint name="hinge" axis="0 1 0" damping="0.1" stiffness="2"/>
+      <geom size="0.1" pos="0.3 0 0"/>
+    </body>
+    <body name="brick" {user} pos="2 0 1" gravcomp="1">
+      <freejoint/>
+      <geom type="box" size="0.1 0.2 0.3"/>
+      <site name="corner" pos="0.1 0 0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <general joint="hinge" dyntype="user" gaintype="user" actdim="1" dynprm="1 2 3 4 5 6 7 8 9 10"/>
+    <general joint="hinge" dyntype="user" gaintype="user" actdim="3" dynprm="1 2 3"/>
+    <general site="corner" dyntype="filter" gaintype="user" dynprm="0.2" gear="0 0 1 0 0 0.1"/>
+    <general joint="hinge" dyntype="none" gaintype="user" biastype="user"/>
+    <general site="corner" dyntype="user" gaintype="user" actdim="1"
+      dynprm="0 0 0 0 0 0 0 0 0 1903518052"/>
+  </actuator>
+</mujoco>
+"""
+# Short and long, with our mark and without, and one of our length with the mark but another size.
+USERS = ["", "5 6", "0 0.5 9", "1903518052 9", "1 2 3 4", "0 " * 200, "1903518052 9 " + "1 " * 200]
+
+
+def fly_somebody_elses(user, integrator):
+    """Everything that a callback could touch, over 50 steps of a model that uses them all."""
+    user = f'user="{user}"' if user else ""
+    xml = SOMEBODY_ELSES.format(user=user, integrator=integrator)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    data.act[:], data.qvel[:] = rng.uniform(-1, 1, model.na), rng.uniform(-1, 1, model.nv)
+    steps = []
+    for _ in range(50):
+        data.ctrl[:] = rng.uniform(-1, 1, model.nu)
+        data.act_dot[:] = 7.0  # what is left there must not be taken for an answer
+        mujoco.mj_step(model, data)
+        forces = data.qfrc_passive, data.qfrc_actuator, data.actuator_force, data.act_dot
+        steps.append(np.concatenate([data.qpos, data.qvel, data.act, *forces]))
+    return np.array(steps)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
+@pytest.mark.parametrize("user", USERS)
+def test_another_model_moves_as_if_there_were_no_callbacks(user, integrator):
+    remove_callbacks()
+    without = fly_somebody_elses(user, integrator)
+    native.install()
+    assert np.ptp(without, axis=0)[:8].min() > 1e-3  # it does move
+    np.testing.assert_array_equal(fly_somebody_elses(user, integrator), without)
+
+
+def test_somebody_elses_parts_in_our_model_are_left_alone():
+    def fly(spec):
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.act[:4], data.ctrl[:4] = 200.0, (210, 190, 220, 180)
+        if model.nu > 4:
+            data.ctrl[4], data.qpos[7] = 0.3, 0.5
+        mujoco.mj_step(model, data, 50)
+        return model, data
+
+    alone, flown = fly(mjcf.spec(Vehicle(), drawn=False))
+    spec = mjcf.spec(Vehicle(), drawn=False)
+    pendulum = spec.worldbody.add_body(
+        name="pendulum", mass=0.1, ipos=[0.3, 0, 0], inertia=[1e-3] * 3, explicitinertial=True
+    )
+    pendulum.add_joint(name="hinge", axis=[0, 1, 0])
+    actuator = spec.add_actuator(
+        name="motor", target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT, actdim=1
+    )
+    actuator.dyntype = mujoco.mjtDyn.mjDYN_USER
+    actuator.gaintype = mujoco.mjtGain.mjGAIN_USER
+    model, data = fly(spec)
+    assert model.nu == alone.nu + 1
+    np.testing.assert_allclose(data.qpos[:7], flown.qpos, atol=1e-12)
+    np.testing.assert_array_equal(data.act[:4], flown.act)
+    # MuJoCo without callbacks: no activation rate, gain one, so no torque at all from the motor.
+    assert data.act[4] == data.actuator_force[4] == 0
+    assert data.qfrc_passive[6] == 0
+
+
+def test_a_model_without_room_for_wind_flies_in_calm_air():
+    # `nuserdata` of a model that somebody strips. Past its end stand the sensors, here a height of
+    # 5 m, which must not be taken for a wind.
+    spec = mjcf.spec(Vehicle(), drawn=False)
+    spec.nuserdata = 0
+    body, position = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtSensor.mjSENS_FRAMEPOS
+    spec.add_sensor(name="height", type=position, objtype=body, objname="aircraft")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[2], data.act[:], data.ctrl[:] = 5.0, HOVER, HOVER
+    mujoco.mj_step(model, data, 10)
+    assert data.qpos[2] == pytest.approx(5.0, abs=1e-6)
+
+
+# ------------------------------------------------------------------------- who owns the callbacks
+
+
+def gain(model, data, actuator):
+    return 3.0
+
+
+def test_install_does_not_take_over_a_foreign_callback():
+    mujoco.set_mjcb_act_gain(gain)
+    for make in (native.install, lambda: mjcf.compile_model(Vehicle())):
+        with pytest.raises(native.NativeError, match="mjcb_act_gain"):
+            make()
+    assert mujoco.get_mjcb_act_gain() is gain
+    with pytest.warns(UserWarning, match="mjcb_act_gain"):
+        native.install(replace=True)
+    native.check_installed()
+
+
+def test_every_foreign_callback_is_named_and_those_of_other_kinds_are_left():
+    def control(model, data):
+        pass
+
+    mujoco.set_mjcb_control(control)
+    try:
+        before = [getattr(mujoco, f"get_mjcb_{name}")() for name in native.CALLBACKS]
+        native.install()  # again: nothing changes
+        assert [getattr(mujoco, f"get_mjcb_{name}")() for name in native.CALLBACKS] == before
+        assert mujoco.get_mjcb_control() is control
+    finally:
+        mujoco.set_mjcb_control(None)
+    mujoco.set_mjcb_passive(lambda model, data: None)
+    mujoco.set_mjcb_act_dyn(gain)
+    for refusing in (native.install, native.check_installed):
+        with pytest.raises(native.NativeError, match="mjcb_act_dyn, mjcb_passive"):
+            refusing()
+
+
+@pytest.mark.parametrize("name", native.CALLBACKS)
+def test_without_one_of_the_callbacks_nothing_steps(name):
+    environment = helpers.begun(num_envs=2)
+    through_dm_control = quadrl.load("hover", {"random": 0})
+    through_dm_control.reset()
+    before = environment.engine.qpos.copy()
+    remove_callbacks([name])
+    for step in (
+        native.check_installed,
+        lambda: helpers.idle(environment),
+        lambda: through_dm_control.step(np.zeros(4)),
+    ):
+        with pytest.raises(native.NativeError, match=f"mjcb_{name}"):
+            step()
+    np.testing.assert_array_equal(environment.engine.qpos, before)
+
+
+# --------------------------------------------------------------- our models without the callbacks
+
+
+def test_a_model_of_ours_without_callbacks_does_not_fly_silently():
+    model = mjcf.compile_model(Vehicle())
+    remove_callbacks()
+    data = mujoco.MjData(model)
+    data.qpos[2], data.act[:], data.ctrl[:] = 5.0, HOVER, HOVER
+    for _ in range(10):
+        mujoco.mj_step(model, data)
+        # MuJoCo meets an acceleration that is not a number, says so, starts over (its counters
+        # too) and meets it again. What it leaves passes for no flight.
+        assert data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 1
+        assert np.isnan(data.qpos[2])
+    native.install()
+    mujoco.mj_resetData(model, data)
+    data.qpos[2], data.act[:], data.ctrl[:] = 5.0, HOVER, HOVER
+    mujoco.mj_step(model, data, 10)
+    assert sum(warning.number for warning in data.warning) == 0
+    assert data.qpos[2] == pytest.approx(5.0, abs=1e-6)
+
+
+def test_rollout_runs_the_callbacks_without_python():
+    # mujoco.rollout refuses nothing, but would be wrong with other numbers than mj_step.
+    model = mjcf.compile_model(Vehicle(), drawn=False)
+    datas = [mujoco.MjData(model) for _ in range(2)]
+    state = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    initial = np.zeros((3, mujoco.mj_stateSize(model, state)))
+    data = mujoco.MjData(model)
+    data.qpos[2], data.act[:] = 5.0, 220.0
+    mujoco.mj_getState(model, data, initial[0], state)
+    initial[:] = initial[0]
+    commands = np.random.default_rng(0).uniform(150, 300, (3, 40, 4))
+    states, _ = rollout.rollout(model, datas, initial, commands)
+    for command in commands[2]:
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+    mujoco.mj_getState(model, data, initial[0], state)
+    np.testing.assert_array_equal(states[2, -1], initial[0])
+
+
+# -------------------------------------------------------------------------------------- the build
+
+
+def test_a_library_for_another_mujoco_is_refused(tmp_path, cache):
+    shutil.copytree(INCLUDE, tmp_path / "include")
+    header = tmp_path / "include" / "mujoco" / "mujoco.h"
+    running = mujoco.mj_version()
+    line = f"#define mjVERSION_HEADER {running}"
+    assert line in header.read_text()
+    header.write_text(header.read_text().replace(line, line + "0"))
+    path = native.build(include=tmp_path / "include")
+    with pytest.raises(native.NativeError, match=rf"{running}0.*{running}\b"):
+        native.load(path)
+    # The one for this mujoco stands beside it under another name.
+    right = native.build()
+    assert right != path
+    assert native.load(right).quadrl_mujoco_version() == running
+
+
+def test_without_a_compiler_the_error_says_what_to_install(cache, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    with pytest.raises(native.NativeError, match="apt-get install build-essential"):
+        native.build()
+    assert list(cache.iterdir()) == []  # nothing half-made
+
+
+def test_cc_names_the_compiler_and_what_it_says_is_quoted(cache, monkeypatch, tmp_path):
+    chosen = tmp_path / "broken-cc"
+    chosen.write_text("#!/bin/sh\necho 'no such target: toaster' >&2\nexit 1\n")
+    chosen.chmod(0o755)
+    monkeypatch.setenv("CC", str(chosen))
+    assert native.compiler() == str(chosen)
+    with pytest.raises(native.NativeError, match="no such target: toaster"):
+        native.build()
+    assert list(cache.iterdir()) == []
+
+
+def test_the_cache_is_used_and_other_flags_make_another_library(cache, monkeypatch, tmp_path):
+    path = native.build()
+    assert list(cache.iterdir()) == [path]
+    built = path.stat().st_mtime_ns
+    monkeypatch.setenv("QUADRL_CFLAGS", "-O0 -DQUADRL_SAID='a word'")
+    assert native.flags()[-2:] == ("-O0", "-DQUADRL_SAID=a word")
+    assert native.build() != path and len(list(cache.iterdir())) == 2
+    monkeypatch.setenv("QUADRL_CFLAGS", "-O0")
+    monkeypatch.setenv("PATH", str(tmp_path))  # no compiler any more
+    monkeypatch.delenv("CC", raising=False)
+    assert native.build() == path
+    assert path.stat().st_mtime_ns == built
+
+
+@pytest.mark.parametrize("kind", ["read-only", "unreadable"])
+def test_a_cache_that_cannot_be_written_is_done_without(cache, tmp_path, monkeypatch, kind):
+    # Root may write everywhere, so both stand in: a folder under a file cannot be made, and a
+    # name past the file system's limit cannot even be asked for.
+    impossible = tmp_path / "file" / "quadrl" if kind == "read-only" else tmp_path / ("x" * 300)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setenv("QUADRL_CACHE", str(impossible))
+    path = native.build()
+    assert path.is_relative_to(tmp_path / "tmp")
+    assert native.load(path).quadrl_mujoco_version() == mujoco.mj_version()

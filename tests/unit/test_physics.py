@@ -1,0 +1,249 @@
+"""Statements about flight that anyone can check by hand, in MuJoCo and in the equations."""
+
+import dataclasses
+import math
+
+import helpers
+import mujoco
+import numpy as np
+import pytest
+
+from quadrl import dynamics, mjcf
+from quadrl.engines.mujoco import BatchEngine, DataEngine
+from quadrl.parameters import Parameters, rows
+from quadrl.vehicle import PAPER_ROTORS, Vehicle
+
+PAPER = Vehicle()
+VACUUM = Vehicle(drag_coefficient=0.0, moment_coefficient=0.0)
+HOVER = math.sqrt(0.65 * 9.81 / (4 * 3.13e-5))  # = 225.678 rad/s
+INERTIA = np.array([7.5e-3, 7.5e-3, 1.3e-2])
+UPRIGHT = (1, 0, 0, 0)
+both = pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+
+
+def aircraft(engine, vehicle=PAPER, *, height=100.0, rate=(0, 0, 0), velocity=(0, 0, 0), speed=0.0):
+    """One level aircraft in an engine; its rotors are commanded the speed that they have."""
+    flying = BatchEngine(vehicle, 1, altitude=3.0, engine=engine)
+    flying.qpos[:] = (0, 0, height, *UPRIGHT)
+    flying.qvel[:] = (*velocity, *rate)
+    flying.act[:] = flying.ctrl[:] = speed
+    return flying
+
+
+def accelerations(
+    vehicle=PAPER,
+    *,
+    speed=0.0,
+    velocity=(0, 0, 0),
+    rate=(0, 0, 0),
+    wind=(0, 0, 0),
+    attitude=UPRIGHT,
+):
+    """World linear (3,) and body angular (3,) acceleration, the same from MuJoCo and by NumPy."""
+    model = mjcf.compile_model(vehicle)
+    one = DataEngine(vehicle, model, mujoco.MjData(model), altitude=3.0)
+    one.qpos[:], one.qvel[:] = (0, 0, 100, *attitude), (*velocity, *rate)
+    one.act[:], one.air[:] = speed, wind
+    mujoco.mj_forward(model, one.data)
+    moving = (one.qpos[:, :3], one.qpos[:, 3:], one.qvel[:, :3], one.qvel[:, 3:], one.act)
+    p = Parameters.of(rows(vehicle))
+    motion = dynamics.derivative(p, dynamics.Motion(*moving), one.act, one.air, -9.81)
+    for equation, engine in ((motion.velocity, slice(0, 3)), (motion.body_rate, slice(3, 6))):
+        np.testing.assert_allclose(equation[0], one.data.qacc[engine], rtol=1e-12, atol=1e-12)
+    return motion.velocity[0], motion.body_rate[0]
+
+
+# ---------------------------------------------------------------------------------------- forces
+
+
+@both
+def test_free_fall_without_drag_is_minus_g(engine):
+    falling = aircraft(engine, VACUUM)
+    falling.advance(100)  # 1 s
+    np.testing.assert_allclose(falling.qvel, [[0, 0, -9.81, 0, 0, 0]], atol=1e-12)
+    # 100 m - 9.81/2 m
+    np.testing.assert_allclose(falling.qpos[0, :3], [0, 0, 95.095], atol=1e-10)
+
+
+@both
+def test_four_rotors_at_hover_speed_carry_the_weight(engine):
+    hovering = aircraft(engine, speed=HOVER)
+    hovering.advance(1000)  # 10 s
+    np.testing.assert_allclose(hovering.qpos, [[0, 0, 100, *UPRIGHT]], atol=1e-9)
+    np.testing.assert_allclose(hovering.qvel, 0, atol=1e-10)
+
+
+@both
+@pytest.mark.parametrize("name", helpers.LAYOUTS)
+def test_every_layout_hovers_at_its_hover_speed(name, engine):
+    vehicle = helpers.LAYOUTS[name]
+    hovering = aircraft(engine, vehicle, speed=vehicle.hover_speed)
+    hovering.advance(round(2 / vehicle.physics_timestep))
+    # Rotors that lean may push it sideways.
+    np.testing.assert_allclose(hovering.qpos[:, 2:], [[100, *UPRIGHT]], atol=1e-8)
+
+
+def test_thrust_is_up_in_the_body_frame():
+    # Nose down by 30 deg about +y at hover speed: 9.81 sin 30 = 4.905 ahead (east), and
+    # 9.81 (cos 30 - 1) = -1.3143 of what is left against gravity.
+    nose_down = (math.cos(math.pi / 12), 0, math.sin(math.pi / 12), 0)
+    linear, _ = accelerations(attitude=nose_down, speed=HOVER)
+    np.testing.assert_allclose(linear, [4.905, 0, -1.31429], atol=1e-5)
+
+
+@both
+def test_the_speed_of_a_fall_and_its_limit(engine):
+    # m g = k_D v^2: v_t = sqrt(0.65 * 9.81 / 9e-3) = sqrt(708.5) = 26.61767 m/s, and
+    # v = v_t tanh(g t / v_t): 16.6954 m/s after 2 s; after 30 s tanh(11.06) lacks 5e-10 of one.
+    falling = aircraft(engine, height=1000.0)
+    falling.advance(200)
+    assert falling.qvel[0, 2] == pytest.approx(-26.61767 * math.tanh(19.62 / 26.61767), abs=1e-5)
+    falling.advance(2800)
+    assert falling.qvel[0, 2] == pytest.approx(-math.sqrt(0.65 * 9.81 / 9e-3), abs=1e-6)
+
+
+def test_drag_opposes_the_motion_through_the_air_and_grows_with_its_square():
+    # |v| = 5: F = -9e-3 * 5 * (3, 4, 0) = (-0.135, -0.18, 0); over 0.65 kg.
+    linear, angular = accelerations(velocity=(3, 4, 0))
+    np.testing.assert_allclose(linear, [-0.135 / 0.65, -0.18 / 0.65, -9.81], rtol=1e-12)
+    np.testing.assert_array_equal(angular, 0)
+    drifting, _ = accelerations(velocity=(3, 4, 0), wind=(3, 4, 0))
+    np.testing.assert_allclose(drifting, [0, 0, -9.81], atol=1e-14)
+    # At rest in a west wind of 5 m/s: 9e-3 * 25 / 0.65 = 0.346154 to the east.
+    pushed, angular = accelerations(wind=(5, 0, 0))
+    np.testing.assert_allclose(pushed, [0.225 / 0.65, 0, -9.81], rtol=1e-12)
+    np.testing.assert_array_equal(angular, 0)
+
+
+def test_the_wind_is_one_of_the_world():
+    # The nose to the north, a wind to the east: it is pushed to the east all the same.
+    north = (math.sqrt(0.5), 0, 0, math.sqrt(0.5))
+    pushed, _ = accelerations(wind=(5, 0, 0), attitude=north)
+    np.testing.assert_allclose(pushed, [0.225 / 0.65, 0, -9.81], atol=1e-12)
+
+
+def test_the_aerodynamic_moment_opposes_the_turn_and_grows_with_its_square():
+    # |omega| = 5, about x and y, where J is equal, so that omega x J omega has only a z part, 0.
+    # M = -9e-4 * 5 * (3, 4, 0) = (-0.0135, -0.018, 0); over 7.5e-3: (-1.8, -2.4, 0).
+    _, angular = accelerations(rate=(3, 4, 0))
+    np.testing.assert_allclose(angular, [-1.8, -2.4, 0], atol=1e-12)
+
+
+# ---------------------------------------------------------------------------------------- torques
+
+
+@pytest.mark.parametrize(
+    ("speeds", "expected"),
+    [
+        # Roll and pitch: l k_T (210^2 - 190^2) = 0.23 * 3.13e-5 * 8000 = 0.057592 N m; over
+        # 7.5e-3: 7.678933. The pair together has 210^2 + 190^2 - 2 * 200^2 = 200 more than the
+        # other: a yaw of 7.5e-7 * 200 = 1.5e-4 N m; over 1.3e-2: 0.011538.
+        ((200, 210, 200, 190), (7.678933, 0, 0.011538)),  # more on the left: to the right, +x
+        ((200, 190, 200, 210), (-7.678933, 0, 0.011538)),
+        ((190, 200, 210, 200), (0, 7.678933, -0.011538)),  # more behind: nose down, +y
+        ((210, 200, 190, 200), (0, -7.678933, -0.011538)),
+        # Yaw: k_Q 2 (210^2 - 190^2) = 7.5e-7 * 16000 = 0.012 N m; over 1.3e-2: 0.923077.
+        ((190, 210, 190, 210), (0, 0, 0.923077)),  # 2 and 4 yaw to the left, +z
+        ((210, 190, 210, 190), (0, 0, -0.923077)),
+    ],
+)
+def test_sign_and_size_of_each_torque(speeds, expected):
+    _, angular = accelerations(speed=speeds)
+    np.testing.assert_allclose(angular, expected, atol=1e-6)
+
+
+def test_one_rotor_alone():
+    # Rotor 1 (ahead) at 200 rad/s: 3.13e-5 * 4e4 = 1.252 N at x = 0.23 m.
+    # tau = (0, -0.23 * 1.252, -7.5e-7 * 4e4) = (0, -0.28796, -0.03) N m.
+    linear, angular = accelerations(speed=(200, 0, 0, 0))
+    np.testing.assert_allclose(linear, [0, 0, 1.252 / 0.65 - 9.81], rtol=1e-12)
+    np.testing.assert_allclose(angular, [0, -0.28796 / 7.5e-3, -0.03 / 1.3e-2], rtol=1e-12)
+
+
+def test_one_tilted_rotor_alone():
+    # Rotor 1 leans back by 30 degrees, 0.1 m above the centre: axis (-0.5, 0, 0.866025).
+    # 1.252 N along it: (-0.626, 0, 1.084264) N. Moment about the centre of (0.23, 0, 0.1) m:
+    # (0, 0.1 * -0.626 - 0.23 * 1.084264, 0) = (0, -0.311981, 0) N m; the reaction, -0.03 N m
+    # about the axis: (0.015, 0, -0.025981) N m.
+    leaning = dataclasses.replace(
+        PAPER_ROTORS[0], position=(0.23, 0, 0.1), axis=(-0.5, 0, math.sqrt(0.75))
+    )
+    vehicle = dataclasses.replace(VACUUM, rotors=(leaning, *PAPER_ROTORS[1:]))
+    linear, angular = accelerations(vehicle, speed=(200, 0, 0, 0))
+    np.testing.assert_allclose(linear, [-0.626 / 0.65, 0, 1.084264 / 0.65 - 9.81], atol=1e-6)
+    expected = np.array([0.015, -0.311981, -0.025981]) / INERTIA
+    np.testing.assert_allclose(angular, expected, rtol=2e-5)
+
+
+def test_yaw_reaction_is_not_rounded():
+    # The torque of a rotor over its thrust is k_Q / k_T = 7.5e-7 / 3.13e-5 to the last digit.
+    reaction = mjcf.compile_model(PAPER).actuator_gear[:, 5]
+    np.testing.assert_array_equal(reaction, np.array([-1, 1, -1, 1]) * (7.5e-7 / 3.13e-5))
+
+
+def test_gyroscopic_coupling_has_the_sign_of_euler():
+    # J domega = -omega x J omega, omega = (1, 0, 2), J = (7.5, 7.5, 13)e-3:
+    # omega x J omega = (0, 2 * 7.5e-3 - 1 * 26e-3, 0) = (0, -11e-3, 0), so domega_y = +11/7.5.
+    _, angular = accelerations(VACUUM, rate=(1, 0, 2))
+    np.testing.assert_allclose(angular, [0, 11 / 7.5, 0], atol=1e-12)
+
+
+# --------------------------------------------------------------------------- energy and momentum
+
+
+def energies(flying):
+    """Kinetic of the flight, potential, and kinetic of the turning [J]."""
+    velocity, rate = flying.qvel[0, :3], flying.qvel[0, 3:]
+    flight, height = 0.5 * 0.65 * (velocity @ velocity), 0.65 * 9.81 * flying.qpos[0, 2]
+    return np.array([flight, height, 0.5 * (INERTIA @ rate**2)])
+
+
+@both
+def test_energy_is_conserved_without_thrust_and_drag(engine):
+    tumbling = aircraft(engine, VACUUM, velocity=(3, -2, 8), rate=(1, -2, 1.5))
+    flight, height, turning = energies(tumbling)
+    for _ in range(200):
+        tumbling.advance(1)
+        flight_now, height_now, turning_now = energies(tumbling)
+        assert flight_now + height_now == pytest.approx(flight + height, rel=1e-12)
+        assert turning_now == pytest.approx(turning, rel=1e-9)
+    assert abs(flight_now - flight) > 10  # there was something to exchange
+
+
+@both
+def test_angular_momentum_is_conserved_in_torque_free_tumbling(engine):
+    finer = dataclasses.replace(VACUUM, physics_timestep=0.001)
+    tumbling = aircraft(engine, finer, rate=(1, -2, 1.5))
+    before = INERTIA * tumbling.qvel[0, 3:]  # level: the body frame is the world's
+    tumbling.advance(2000)
+    turn = helpers.matrices(tumbling.qpos[0, 3:])
+    assert np.arccos((np.trace(turn) - 1) / 2) > 0.5
+    np.testing.assert_allclose(turn @ (INERTIA * tumbling.qvel[0, 3:]), before, atol=2e-8)
+
+
+@both
+def test_drag_takes_as_much_energy_as_its_work(engine):
+    finer = dataclasses.replace(PAPER, physics_timestep=0.001)
+    flying = aircraft(engine, finer, velocity=(6, -3, 8), rate=(2, -1, 3))
+    energy, power = [], []
+    for step in range(2001):
+        energy.append(energies(flying).sum())
+        speed, turn = (np.linalg.norm(part) for part in (flying.qvel[0, :3], flying.qvel[0, 3:]))
+        power.append(9e-3 * speed**3 + 9e-4 * turn**3)  # [W]
+        if step < 2000:
+            flying.advance(1)
+    assert (np.diff(energy) < 0).all()
+    work = np.trapezoid(power, dx=0.001)
+    assert energy[0] - energy[-1] == pytest.approx(work, rel=1e-6)
+    assert work > 1.0
+
+
+@both
+def test_thrust_adds_as_much_energy_as_its_work(engine):
+    # Climbing straight up at a constant rotor speed of 300, drag off: the net force is
+    # 4 * 3.13e-5 * 9e4 - 0.65 * 9.81 = 11.268 - 6.3765 = 4.8915 N, 7.525385 m/s^2.
+    climbing = aircraft(engine, VACUUM, speed=300.0)
+    climbing.advance(100)
+    expected = [0, 0, 7.525385, 0, 0, 0]
+    np.testing.assert_allclose(climbing.qvel[0], expected, atol=1e-5)
+    assert climbing.qpos[0, 2] == pytest.approx(100 + 7.525385 / 2, abs=1e-5)

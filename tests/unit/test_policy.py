@@ -1,0 +1,307 @@
+"""The policy as numbers: what it computes, what it refuses to read, what it does not import."""
+
+import json
+import os
+import pickle
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import refused
+from safetensors.numpy import save
+
+import quadrl
+from quadrl.policy import FIRST_FORMAT, FORMAT, SHIPPED, Policy, shipped
+from quadrl.rollout import fly
+
+SIZE = 3
+HEADER = {"format": FORMAT, "task": "hover", "metadata": {}}
+
+
+def make_policy(**changes) -> Policy:
+    """A network small enough to be worked out by hand: 3 inputs, 2 hidden units, 4 actions."""
+    values = dict(
+        weights=(
+            np.array([[1, 0, 0], [0, 1, 0]], np.float32),
+            np.array([[1, 0], [0, 1], [1, 1], [9, 9], [0, 0], [0, 0], [0, 0], [0, 0]], np.float32),
+        ),
+        biases=(np.zeros(2, np.float32), np.array([0, 0.5, 0, 0, -1, -1, -1, -1], np.float32)),
+        mean=np.array([1, 2, 3], np.float32),
+        deviation=np.array([2, 4, 1], np.float32),
+        task="hover",
+        metadata={"algo": "ppo", "seed": 3, "task_options": {"time_limit": 5}},
+    )
+    return Policy(**{**values, **changes})
+
+
+def linear(inputs: int, actions: int, **metadata) -> Policy:
+    """One layer of zeros, for any layout."""
+    zeros = np.zeros(2 * actions, np.float32)
+    weights = (np.zeros((2 * actions, inputs), np.float32),)
+    mean = np.zeros(inputs, np.float32)
+    return Policy(weights, (zeros,), mean, mean + 1, "hover", metadata)
+
+
+def write(path, arrays, header):
+    """A safetensors file with any content."""
+    path.write_bytes(save(arrays, metadata={"quadrl": json.dumps(header)}))
+    return path
+
+
+def parts(policy: Policy) -> dict[str, np.ndarray]:
+    arrays = {"mean": policy.mean, "deviation": policy.deviation}
+    for k in range(len(policy.weights)):
+        arrays |= {f"weight_{k}": policy.weights[k], f"bias_{k}": policy.biases[k]}
+    return arrays
+
+
+# ---------------------------------------------------------------------------- what it computes
+
+
+def test_mean_action_by_hand():
+    # Normalised: ((2-1)/2, (0-2)/4, (3-3)/1) = (0.5, -0.5, 0); hidden: tanh(0.5) = 0.46212,
+    # -0.46212; means: 0.46212, -0.46212 + 0.5 = 0.03788, 0, 0; the log-variances are left out.
+    expected = [0.46211716, 0.03788284, 0.0, 0.0]
+    np.testing.assert_allclose(make_policy()(np.array([2.0, 0.0, 3.0])), expected, atol=1e-7)
+    batch = make_policy()(np.tile([2.0, 0.0, 3.0], (5, 6, 1)))
+    np.testing.assert_allclose(batch, np.tile(expected, (5, 6, 1)), atol=1e-7)
+
+
+def test_actions_and_observations_are_clipped():
+    # Normalised, both are far above 10 and clipped; tanh(10) = 1, so the fourth mean is 18.
+    far = make_policy()(np.array([1e6, 1e6, 0.0]))
+    np.testing.assert_array_equal(far, [1.0, 1.0, 1.0, 1.0])
+    # One linear layer: 0.05 * (10 + 0 + 0) = 0.5 however far away the first entry is.
+    one = make_policy(weights=(np.full((8, 3), 0.05, np.float32),), biases=(np.zeros(8, "f"),))
+    np.testing.assert_allclose(one(np.array([1e6, 2.0, 3.0])), np.full(4, 0.5), rtol=1e-6)
+
+
+def test_sampled_actions_are_normal_around_the_mean():
+    # Log-variance -1: deviation exp(-0.5) = 0.6065; the second mean is 0.0379, the third 0.
+    actions = make_policy().sampled(0)(np.tile([2.0, 0.0, 3.0], (20_000, 1)))
+    assert np.abs(actions).max() == 1.0
+    assert np.abs(np.median(actions[:, 1:3], axis=0) - [0.0379, 0.0]).max() < 0.02
+    # 68.3 % of a normal distribution lie within one deviation, here inside the bounds.
+    assert (np.abs(actions[:, 2]) < 0.6065).mean() == pytest.approx(0.683, abs=0.01)
+
+
+@pytest.mark.parametrize("shape", [(2,), (4,), (3, 2), ()])
+def test_an_observation_of_another_size_is_refused(shape):
+    with refused(name="observation shape", value=shape):
+        make_policy()(np.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    ("policy", "settings", "name", "value", "needed"),
+    [
+        (linear(25, 4), {}, "observation size", 25, "22"),
+        (linear(22, 6), {}, "action size", 6, "4"),
+        # 22 numbers, 4 of them rotor speeds; the hexacopter has two more of those.
+        (linear(22, 4), {"vehicle": "hexa"}, "observation size", 22, "24"),
+        (linear(24, 4), {"vehicle": "hexa"}, "action size", 4, "6"),
+        (linear(24, 6, control_mode="velocity"), {"vehicle": "hexa"}, "action size", 6, "4"),
+    ],
+)
+def test_a_policy_for_another_layout_is_refused(policy, settings, name, value, needed):
+    with refused(value=value) as caught:
+        fly(policy, "hover", episodes=1, **settings)
+    assert caught.value.name.startswith(name) and caught.value.allowed.startswith(f"{needed} ")
+
+
+def test_a_policy_flies_any_number_of_rotors(tmp_path):
+    linear(24, 6, vehicle="hexa").save(tmp_path / "policy.safetensors")
+    policy = Policy.load(tmp_path)
+    assert (policy.size, policy.action_size) == (24, 6)
+    rollout = fly(policy, "hover", episodes=2, vehicle="hexa")
+    assert rollout.action.shape[2] == rollout.rotor_speed.shape[2] == 6
+
+
+# -------------------------------------------------------------------------- saved and loaded
+
+
+def test_saved_and_loaded_it_is_the_same(tmp_path):
+    policy = make_policy()
+    policy.save(tmp_path / "policy.safetensors")
+    for path in (tmp_path, tmp_path / "policy.safetensors", str(tmp_path)):
+        loaded = quadrl.Policy.load(path)
+        assert (loaded.task, loaded.metadata) == (policy.task, policy.metadata)
+        for name, array in parts(policy).items():
+            np.testing.assert_array_equal(parts(loaded)[name], array)
+    assert [p.name for p in tmp_path.iterdir()] == ["policy.safetensors"]
+
+
+def test_the_same_policy_is_the_same_file(tmp_path):
+    # Ten times: with several entries in its table, safetensors shuffles them.
+    contents = set()
+    for k in range(10):
+        make_policy().save(tmp_path / f"{k}.safetensors")
+        contents.add((tmp_path / f"{k}.safetensors").read_bytes())
+    assert len(contents) == 1
+
+
+def test_files_of_the_first_format_are_read(tmp_path):
+    options = {"horizon": 5, "settle": 1, "radius": 0.2}
+    metadata = {"vehicle": "paper", "action": "velocity", "task_options": options}
+    header = HEADER | {"format": FIRST_FORMAT, "metadata": metadata}
+    policy = Policy.load(write(tmp_path / "old.safetensors", parts(make_policy()), header))
+    assert policy.control_mode == "velocity"
+    renamed = {"time_limit": 5, "settle_time": 1, "radius": 0.2}
+    assert policy.metadata["task_options"] == renamed
+    policy.save(tmp_path / "new.safetensors")
+    assert Policy.load(tmp_path / "new.safetensors").metadata == policy.metadata
+
+
+# ------------------------------------------------------------------------ what is refused
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        None,
+        b"",
+        b"PK\x03\x04 a zip archive, such as torch.save writes",
+        b"\x00" * 1000,
+        struct.pack("<Q", 1 << 62) + b"{}",
+        b"import os",
+        save({"weight": np.zeros((2, 2), np.float32)}),
+        save(parts(make_policy()), metadata={"quadrl": json.dumps(HEADER)})[:-1],
+        save(parts(make_policy()), metadata={"quadrl": json.dumps(HEADER | {"format": "9"})}),
+    ],
+)
+def test_what_is_no_policy_is_refused(tmp_path, content):
+    path = tmp_path / "policy.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    with refused() as caught:
+        Policy.load(tmp_path)
+    assert str(path) in str(caught.value)
+
+
+def test_every_flipped_byte_of_the_header_is_refused_or_harmless(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    make_policy().save(path)
+    content = path.read_bytes()
+    count = 0
+    for k in range(8 + int.from_bytes(content[:8], "little")):
+        path.write_bytes(content[:k] + bytes([content[k] ^ 0x15]) + content[k + 1 :])
+        try:
+            Policy.load(path)
+        except quadrl.policy.QuadrlError as error:
+            assert "\n" not in str(error)
+            count += 1
+    assert count > 300  # of about 600; the others are in names and numbers of the metadata
+
+
+class Attack:
+    """Unpickled, it writes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (open, (str(self.path), "w"))
+
+
+def test_a_pickle_is_refused_and_not_run(tmp_path):
+    trap = tmp_path / "trap"
+    attack = pickle.dumps(Attack(trap))
+    pickle.loads(attack).close()
+    assert trap.exists()  # the attack works where pickles are read
+    trap.unlink()
+    header = json.dumps({"__metadata__": {"quadrl": attack.decode("latin1")}}).encode()
+    for content in (attack, struct.pack("<Q", len(header)) + header):
+        (tmp_path / "policy.safetensors").write_bytes(content)
+        with refused():
+            Policy.load(tmp_path)
+    assert not trap.exists()
+
+
+def replaced(name, value):
+    return lambda arrays: arrays | {name: np.asarray(value, np.float32)}
+
+
+def without(name):
+    return lambda arrays: {key: value for key, value in arrays.items() if key != name}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without("mean"),
+        without("weight_0"),
+        without("bias_1"),
+        lambda arrays: {},
+        replaced("weight_9", np.zeros((2, 2))),
+        replaced("weight_0", np.zeros((2, 4))),
+        replaced("weight_0", np.zeros(6)),
+        replaced("bias_0", np.zeros((2, 1))),
+        replaced("bias_0", 0.0),
+        replaced("mean", np.zeros(4)),
+        replaced("mean", 0.0),
+        replaced("mean", np.zeros((1, 3))),
+        replaced("deviation", [1, 0, 1]),
+        replaced("deviation", [1, -1, 1]),
+        replaced("deviation", [1, np.inf, 1]),
+        replaced("weight_1", np.full((8, 2), np.nan)),
+        replaced("weight_1", np.full((8, 2), 3e38)),  # sums that single precision does not hold
+        replaced("bias_1", np.full(8, np.inf)),
+        lambda arrays: arrays | {"weight_1": np.zeros((7, 2), "f"), "bias_1": np.zeros(7, "f")},
+        lambda arrays: arrays | {"mean": np.zeros(3)},
+    ],
+)
+def test_arrays_that_make_no_network_are_refused(tmp_path, change):
+    path = write(tmp_path / "policy.safetensors", parts(make_policy()), HEADER)
+    Policy.load(path)
+    write(path, change(parts(make_policy())), HEADER)
+    with refused():
+        Policy.load(path)
+
+
+@pytest.mark.parametrize(
+    "header", [{"task": 3}, {"metadata": []}, {"metadata": {"task_options": "time_limit=5"}}]
+)
+def test_what_it_was_trained_for_must_be_readable(tmp_path, header):
+    with refused():
+        Policy.load(write(tmp_path / "p.safetensors", parts(make_policy()), HEADER | header))
+
+
+# ------------------------------------------------------- the policies that come with the package
+
+
+@pytest.mark.parametrize("algo", ["ppo", "gae", "vpg"])
+def test_pretrained_is_the_file_that_ships(algo):
+    policy = Policy.pretrained("hover", algo)
+    name = "hover_ppo" if algo == "ppo" else "hover_gae"
+    loaded = Policy.load(SHIPPED / f"{name}.safetensors")
+    for part, array in parts(loaded).items():
+        np.testing.assert_array_equal(parts(policy)[part], array)
+
+
+@pytest.mark.parametrize(("task", "algo"), [("hovr", "ppo"), ("hover", "sac"), ("../hover", "ppo")])
+def test_a_policy_that_does_not_ship(task, algo):
+    with refused(name="pretrained policy", value=f"{task}_{algo}") as caught:
+        Policy.pretrained(task, algo)
+    assert all(file.stem in caught.value.allowed for file in shipped())
+
+
+def imported(code: str) -> set[str]:
+    """The modules of a fresh interpreter after some code."""
+    code += "\nimport sys; print(' '.join(sys.modules))"
+    environment = os.environ | {"PYTHONPATH": str(Path(quadrl.__file__).parents[1])}
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+    return set(done.stdout.decode().split())
+
+
+def test_a_policy_and_its_evaluation_stay_light(tmp_path):
+    make_policy().save(tmp_path / "policy.safetensors")
+    code = f"import quadrl, quadrl.rollout\nquadrl.Policy.load({str(tmp_path)!r})([1, 2, 3])"
+    modules = imported(code)
+    assert "quadrl.policy" in modules
+    heavy = {"torch", "tensordict", "torchrl", "matplotlib", "mediapy", "PIL", "quadrl.rendering"}
+    assert not heavy & modules
+    assert not [name for name in modules if name.startswith("dm_control")]

@@ -1,0 +1,432 @@
+"""Pictures and videos: what is drawn is where it should be, and nothing is left half done."""
+
+import ctypes
+import importlib.util
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import mujoco
+import numpy as np
+import pytest
+from scipy import ndimage
+
+import quadrl
+from quadrl import mjcf, rendering
+from quadrl.errors import QuadrlError, RenderingUnavailable
+from quadrl.markers import Marker
+from quadrl.rendering import Renderer, gl, render_trajectory, write_video
+from quadrl.rendering.camera import aircraft_scale, follow_cameras, in_view
+from quadrl.rendering.overlay import Panel
+from quadrl.vehicle import VEHICLES
+
+SIZE = 200  # [pixels], of square pictures
+PER_METRE = SIZE / 2 / math.tan(math.radians(21)) / 4  # [pixels] 4 m away, the field of view 42 deg
+POSE = np.array([0, 0, 3, 1, 0, 0, 0], float)
+ELSEWHERE = np.array([0, 50, 3, 1, 0, 0, 0], float)  # out of the pictures that look for a shape
+CAMERAS = ("follow", "fixed", "track", "chase", "onboard")
+SMALL = dict(width=160, height=120)
+
+
+@pytest.fixture(scope="module")
+def model():
+    """The paper's aircraft, cheaper to draw."""
+    model = mjcf.compile_model(VEHICLES["paper"])
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 512, 0
+    return model
+
+
+@pytest.fixture(scope="module")
+def renderer(model):
+    with Renderer(model, SIZE, SIZE) as opened:
+        yield opened
+
+
+def yawed(angle):
+    return np.array([0, 0, 3, math.cos(angle / 2), 0, 0, math.sin(angle / 2)])
+
+
+def looking(lookat=(0, 0, 3), distance=4.0, elevation=0.0):
+    """A camera that looks along +y: east is to the right, up is up."""
+    camera = mujoco.MjvCamera()
+    camera.type, camera.azimuth = mujoco.mjtCamera.mjCAMERA_FREE, 90.0
+    camera.lookat, camera.distance, camera.elevation = lookat, distance, elevation
+    return camera
+
+
+def changed(a, b, by=12):
+    """Which pixels differ visibly, (height, width); Mesa's threads round some of them anew."""
+    return np.abs(a.astype(int) - b.astype(int)).max(-1) > by
+
+
+def drawn(renderer, camera, **what):
+    """Rows and columns of the pixels that something changes."""
+    pictures = [renderer.frame(ELSEWHERE, camera=camera, **k) for k in ({}, what)]
+    return np.nonzero(changed(*pictures))
+
+
+def flight(states=4, **values):
+    """Flight to the north-east, a metre east and a quarter of a turn to the left in each state."""
+    k = np.arange(states)
+    qpos = np.stack([yawed(math.pi / 2 * i) for i in k])
+    qpos[:, 0], qpos[:, 1] = k, 2 * k
+    values = dict(rotor_speed=np.outer(k, [100.0, 200.0, 300.0, 400.0]), goal=qpos[:, :3]) | values
+    return rendering.Trajectory(
+        time=0.05 * (k + 1),
+        qpos=qpos,
+        error=10.0 - k,
+        reward=k + 1.0,
+        control_timestep=0.05,
+        max_rotor_speed=400.0,
+        task="hover",
+        **values,
+    )
+
+
+def refusal(call, *given, **options):
+    """Name and value of what a call refuses, and what is allowed."""
+    with pytest.raises(QuadrlError) as caught:
+        call(*given, **options)
+    return caught.value.name, caught.value.value, str(caught.value.allowed)
+
+
+# ------------------------------------------------------------------------------------- pictures
+
+
+def test_every_camera_shows_which_way_the_aircraft_heads(renderer):
+    assert renderer.cameras == CAMERAS
+    for camera in CAMERAS:
+        front, back, again = (renderer.frame(yawed(a), camera=camera) for a in (0, math.pi, 0))
+        assert front.shape == (SIZE, SIZE, 3) and front.dtype == np.uint8
+        assert front.std() > 10 and not changed(front, again).any(), camera
+        assert changed(front, back).sum() > 20 or camera == "onboard", camera
+
+
+def test_the_front_rotor_is_orange_and_the_rear_one_blue(renderer):
+    camera = looking(distance=0.9)  # heads east: the front is to the right
+    picture = renderer.frame(POSE, camera=camera).astype(int)
+    aircraft = changed(picture, renderer.frame(ELSEWHERE, camera=camera))
+    difference = picture[..., 0] - picture[..., 2]
+    orange, blue = (np.nonzero(aircraft & (sign * difference > 60))[1] for sign in (1, -1))
+    assert len(orange) > 20 and orange.mean() > SIZE / 2 + 25
+    assert len(blue) > 20 and blue.mean() < SIZE / 2 - 25
+
+
+def test_the_goal_is_where_it_should_be(model, renderer):
+    assert model.vis.global_.fovy == 42.0
+    rows, columns = drawn(renderer, looking(), goal=[0.5, 0, 3.3])
+    # A radius of 0.08 m is 5.2 pixels; below hang the drop line and, further down, the ring.
+    middle, ball = SIZE / 2 - 0.3 * PER_METRE, rows < SIZE / 2 - 0.22 * PER_METRE
+    assert ball.sum() > 30
+    assert columns[ball].mean() == pytest.approx(SIZE / 2 + 0.5 * PER_METRE - 0.5, abs=1)
+    assert rows.min() == pytest.approx(middle - 0.08 * PER_METRE, abs=1.5)
+    assert rows[ball].mean() == pytest.approx(middle - 0.5, abs=1)
+
+
+LINE = dict(position=(-0.5, 0, 3), size=0.02, end=(0.5, 0, 3))
+ROUND = dict(position=(0, 0, 3), size=0.4, end=(0, 1, 3))  # faces the camera
+
+
+@pytest.mark.parametrize(
+    ("kind", "half", "options"),  # half of the width [m]; a circle is thicker than its radius
+    [("goal", 0.1, {}), ("sphere", 0.1, {}), ("ring", 0.41, ROUND), ("pad", 0.41, ROUND)]
+    + [("line", 0.5, LINE), ("arrow", 0.5, LINE)]
+    + [("path", 0.5, dict(size=0.02, points=((-0.5, 0, 3), (0, 0, 3.2), (0.5, 0, 3))))],
+)
+def test_markers_are_where_they_should_be(renderer, kind, half, options):
+    red = Marker(kind, **{"position": (0, 0, 3), "rgba": (1.0, 0.0, 0.0, 1.0)} | options)
+    _, columns = drawn(renderer, looking(), markers=[red])
+    assert len(columns) >= 10 and columns.mean() == pytest.approx(SIZE / 2, abs=4)
+    assert np.ptp(columns) == pytest.approx(2 * half * PER_METRE, abs=6)
+
+
+def test_a_pad_without_an_end_lies_on_the_ground(renderer):
+    # Seen from 4 m above the ground; its circle adds 0.02 * 0.5 + 0.003 = 0.013 m to the radius.
+    above = looking((0, 0, 0), elevation=-90.0)
+    for extent in drawn(renderer, above, markers=[Marker("pad", (0, 0, 3), 0.5)]):
+        assert np.ptp(extent) == pytest.approx(2 * 0.513 * PER_METRE, abs=2.5)
+
+
+def test_a_trail_shows_where_it_has_been_and_a_label_what_it_is(renderer):
+    path = np.stack([np.linspace(-0.5, 0.5, 30), np.zeros(30), np.full(30, 3.2)], -1)
+    rows, columns = drawn(renderer, looking(), trail=path)
+    assert columns.max() == pytest.approx(SIZE / 2 + 0.5 * PER_METRE, abs=2)
+    np.testing.assert_allclose(rows, SIZE / 2 - 0.2 * PER_METRE, atol=2)
+    markers = [[Marker("sphere", (0, 0, 3), label=label)] for label in ("", "7")]
+    pictures = [renderer.frame(ELSEWHERE, camera=looking(), markers=m) for m in markers]
+    assert 5 < changed(*pictures).sum() < 400
+
+
+@pytest.mark.parametrize("rotor", [0, 1])
+def test_blades_turn_counter_clockwise_by_their_angle(renderer, rotor):
+    """Seen from above, whichever way the rotor spins in flight."""
+    x, y, _ = VEHICLES["paper"].rotors[rotor].position
+    camera, angles = looking((x, y, 3), 0.25, -90.0), np.zeros(4)
+    still = renderer.frame(POSE, camera=camera, rotor_angles=angles).astype(float)
+    angles[rotor] = math.radians(40)
+    turned = renderer.frame(POSE, camera=camera, rotor_angles=angles)
+    disc = np.hypot(*(np.indices((SIZE, SIZE)) - SIZE / 2)) < 45
+    errors = [
+        np.abs(ndimage.rotate(still, degrees, reshape=False) - turned)[disc].mean()
+        for degrees in (40, -40)
+    ]
+    assert errors[0] < 0.6 * errors[1]
+
+
+def test_what_cannot_be_drawn_is_refused(model, renderer):
+    allowed = "one of follow, fixed, track, chase, onboard"
+    assert refusal(renderer.frame, POSE, camera="sky") == ("camera", "sky", allowed)
+    for size, name, limit in (((1922, 9), "width", "1920"), ((9, 0), "height", "1080")):
+        *refused, allowed = refusal(Renderer, model, *size)
+        assert refused == [name, size[name == "height"]] and limit in allowed
+    many = [Marker("ring")] * 50  # of 48 shapes each
+    assert refusal(renderer.frame, POSE, markers=many)[:2] == ("shapes to draw", 2001)
+    assert refusal(Marker, "cube")[:2] == ("kind", "cube")
+    assert refusal(Marker, "line")[:2] == ("end", None)
+
+
+def test_follow_keeps_what_matters_in_view():
+    # It looks half way to the goal, from 0.75 m + twice half of the separation: 0.75 + 3 = 3.75.
+    (camera,) = follow_cameras(POSE[None, :3], [np.array([[3.0, 0.0, 3.0]])])
+    np.testing.assert_allclose([*camera.lookat, camera.distance], [1.5, 0.0, 3.0, 3.75])
+    # No farther than 7 m away, and then the aircraft stays within 7 / 4 m of the middle.
+    (camera,) = follow_cameras(POSE[None, :3], [np.array([[0.0, 0.0, 10.0]])])
+    np.testing.assert_allclose([*camera.lookat, camera.distance], [0.0, 0.0, 4.75, 7.0])
+    # Goals to come: a box of 1 m by 2 m, and half of its diagonal, twice, is sqrt(5).
+    ahead, later = np.array([1.0, 0.0, 3.0]), Marker("sphere", (0.0, 2.0, 3.0))
+    points = in_view(ahead, [later, Marker("line", end=(9.0, 0.0, 3.0))])
+    np.testing.assert_array_equal(points, [ahead, later.position])
+    (camera,) = follow_cameras(POSE[None, :3], [points])
+    np.testing.assert_allclose(camera.distance, 0.75 + math.sqrt(5))
+    # Arms of 0.046 m and the drawn ones of 0.23 m: it comes five times nearer than 1.35 m.
+    small = aircraft_scale(mjcf.compile_model(VEHICLES["crazyflie"]))
+    (camera,) = follow_cameras(POSE[None, :3], [POSE[None, :3]], scale=small)
+    assert (small, camera.distance) == pytest.approx((0.2, 0.27))
+
+
+# -------------------------------------------------------------------------- flights and videos
+
+
+def test_resampled():
+    # States at 0.05, 0.10, 0.15 and 0.20 s; 40 frames a second are two a state.
+    goal = np.array([[0, 0, 3], [0.1, 0, 3], [1.1, 0, 3], [1.1, 0, 3]], float)
+    markers = [(Marker("sphere", (float(k), 0, 3)),) for k in range(4)]
+    twice = flight(goal=goal, markers=markers).resampled(40)
+    half = np.arange(7) / 2  # states
+    np.testing.assert_allclose(twice.time, 0.05 * (1 + half))
+    np.testing.assert_allclose(twice.qpos[:, :2], half[:, None] * (1, 2), atol=1e-9)
+    yaw = np.unwrap(2 * np.arctan2(twice.qpos[:, 6], twice.qpos[:, 3]))
+    np.testing.assert_allclose(np.degrees(yaw), 90 * half, atol=1e-6)
+    np.testing.assert_allclose(twice.rotor_speed[:, 3], 400 * half)
+    np.testing.assert_allclose(twice.error, 10 - half)
+    np.testing.assert_allclose(twice.reward, [1, 1, 2, 2, 3, 3, 4])  # shown until the next one
+    # From 0 to 0.1 m the goal moves at 2 m/s; from 0.1 to 1.1 m, at 20 m/s, it jumps.
+    np.testing.assert_allclose(twice.goal[:, 0], [0, 0.05, 0.1, 0.1, 1.1, 1.1, 1.1], atol=1e-9)
+    np.testing.assert_allclose([m[0].position[0] for m in twice.markers], half, atol=1e-9)
+    assert flight(markers=markers[2:3]).resampled(40).markers == markers[2:3]
+
+
+def test_a_flight_is_drawn_as_it_was_flown(model, monkeypatch):
+    asked = []
+    monkeypatch.setattr(gl, "open_renderer", lambda *_: None)
+    monkeypatch.setattr(gl, "close", lambda _: None)
+    monkeypatch.setattr(Renderer, "frame", lambda *given, **options: asked.append(options))
+    for states, fps in ((7, 20), (7, 10), (1, 20)):
+        constant = flight(states, rotor_speed=np.full((states, 4), 31.4))
+        list(render_trajectory(constant, model, **SMALL, fps=fps, overlay=False))
+    assert len(asked) == 7 + 4 + 1
+    for k, one in enumerate(asked[:7]):  # 31.4 rad/s are a quarter of a turn in a state
+        np.testing.assert_allclose(one["rotor_angles"], 1.57 * k * np.array([1, -1, 1, -1]))
+    for few, many in zip(asked[7:11], asked[:7:2], strict=True):  # every other picture, the same
+        for name in ("rotor_angles", "trail", "goal"):
+            np.testing.assert_allclose(few[name], many[name], atol=1e-9)
+        np.testing.assert_allclose(few["camera"].lookat, many["camera"].lookat)
+
+
+@pytest.mark.parametrize("rotors", [4, 8])
+def test_the_panel_shows_rotor_speeds_in_its_corner(rotors):
+    panel, blank = Panel(240, "hover", [(1.0, 0.42, 0.1)] * rotors), np.full((240, 320, 3), 128)
+    slow, fast = (blank.astype(np.uint8) for _ in range(2))
+    for picture, share in ((slow, 0.0), (fast, 1.0)):
+        panel.draw(picture, [("error", "0.12 m")], np.full(rotors, share))
+    rows, columns = np.nonzero(changed(blank, slow, by=3))
+    # 18 pixels of margin, 138 of height and 202 + 21 a rotor of width, times 0.72.
+    assert 12 <= min(rows.min(), columns.min()) and rows.max() <= 13 + 99
+    assert columns.max() == pytest.approx(0.72 * (18 + 202 + 21 * rotors), abs=2)
+    bars = changed(slow, fast) & (fast[..., 0] > 200)
+    assert bars.sum() == pytest.approx(rotors * 12 * 86 * 0.72**2, rel=0.15)
+
+
+# mediapy and imageio_ffmpeg leave pipes of processes that are over to the garbage collector.
+leaves_pipes = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@leaves_pipes
+def test_a_video_plays(model, tmp_path):
+    # States at 0.05 to 0.25 s: 0.2 s at 20 frames a second are 5 frames.
+    path = write_video(flight(5), model, tmp_path / "new" / "a.mp4", fps=20, **SMALL)
+    assert list(path.parent.iterdir()) == [path]
+    meta, *frames = imageio_ffmpeg.read_frames(str(path))
+    assert (meta["size"], meta["fps"], meta["codec"]) == ((160, 120), 20.0, "h264")
+    assert meta["pix_fmt"].startswith("yuv420p") and len(frames) == 5
+    picture = next(render_trajectory(flight(5), model, fps=20, **SMALL)).astype(int)
+    video = np.frombuffer(frames[0], np.uint8).reshape(picture.shape)
+    assert np.abs(video - picture).mean() < 8  # lossy, but that picture
+    assert path.read_bytes().index(b"moov") < path.read_bytes().index(b"mdat")  # plays at once
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("width", 161), ("height", 1), ("width", 0), ("width", 100_000), ("height", -2)]
+    + [("fps", 0.0), ("fps", 1e9), ("fps", math.nan), ("camera", "sky"), ("path", "a.gif")],
+)
+def test_what_cannot_be_a_video_is_refused_before_anything_is_written(model, name, value):
+    options = SMALL | {"path": "new/a.mp4", name: value}
+    refused = refusal(write_video, flight(), model, **options)
+    np.testing.assert_equal(refused[:2], (name, value))
+    assert not list(Path().iterdir())
+
+
+@pytest.mark.parametrize("error", [ValueError("half way"), KeyboardInterrupt()])
+@pytest.mark.parametrize("frames", [0, 3])
+def test_a_failure_leaves_nothing_and_keeps_the_old_video(model, monkeypatch, error, frames):
+    def broken(*_, **__):
+        yield from np.zeros((frames, 120, 160, 3), np.uint8)
+        raise error
+
+    monkeypatch.setattr("quadrl.rendering.video.render_trajectory", broken)
+    path = Path("a.mp4")
+    path.write_text("the old one")
+    with pytest.raises(type(error)) as caught:
+        write_video(flight(), model, path)
+    assert caught.value is error and path.read_text() == "the old one"
+    assert list(Path().iterdir()) == [path]
+
+
+@leaves_pipes
+def test_an_encoder_that_fails_is_quoted(model, monkeypatch, tmp_path):
+    program = tmp_path / "encoder"
+    program.write_text("#!/bin/sh\necho no room >&2\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("mediapy._get_ffmpeg_path", lambda: str(program))
+    with pytest.raises(RenderingUnavailable, match="no room"):
+        write_video(flight(), model, "new/a.mp4", **SMALL)
+    assert not list(Path("new").iterdir())
+
+
+# ------------------------------------------------------------------------------ graphics library
+
+
+def test_no_graphics_library_is_reported(model, monkeypatch):
+    class Broken:
+        __module__ = mujoco.Renderer.__module__
+
+        def __init__(self, *_):
+            raise RuntimeError("no display")
+
+    monkeypatch.setattr("mujoco.Renderer", Broken)
+    with pytest.raises(RenderingUnavailable, match="no display"):
+        Renderer(model, **SMALL)
+
+
+PREAMBLE = """
+import os, mujoco, numpy as np
+before = dict(os.environ)
+import quadrl
+assert dict(os.environ) == before
+def ours():
+    from quadrl import mjcf
+    from quadrl.rendering import Renderer
+    model = mjcf.compile_model(quadrl.Vehicle())
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 256, 0  # cheaper to draw
+    return Renderer(model, 80, 60)
+pose = [0, 0, 3, 1, 0, 0, 0]
+def check(a, b):  # Mesa's threads round some pixels differently
+    np.testing.assert_allclose(a.astype(int), b.astype(int), atol=3)
+"""
+OURS = """
+renderer = ours()
+first = renderer.frame(pose)
+"""
+MUJOCO = """
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+other = mujoco.Renderer(model, 60, 80)
+other.update_scene(data)
+draw = other.render
+before = draw()
+"""
+DM_CONTROL = """
+environment = quadrl.load("hover", task_kwargs={"random": 0})
+environment.reset()
+draw = lambda: environment.physics.render(48, 64)
+before = draw()
+"""
+BOTH = """
+check(draw(), before)
+check(renderer.frame(pose), first)
+with ours() as second:
+    check(second.frame(pose), first)
+check(draw(), before)
+check(renderer.frame(pose), first)
+assert before.std() > 10 and first.std() > 10
+"""
+headless = pytest.mark.skipif(sys.platform != "linux", reason="only Linux draws without a screen")
+
+
+def run(code, **variables):
+    """Run code in a process without a screen, warnings being errors; its end must be clean."""
+    names = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")
+    kept = {name: value for name, value in os.environ.items() if name not in names}
+    places = [str(Path(quadrl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    environment = kept | {"PYTHONPATH": os.pathsep.join(filter(None, places))} | variables
+    command = [sys.executable, "-W", "error", "-c", PREAMBLE + code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr, done.stdout) == (0, "", "")
+
+
+@headless
+@pytest.mark.parametrize(
+    "code",
+    [OURS + MUJOCO + BOTH + "other.close()" + DM_CONTROL + BOTH, DM_CONTROL + OURS + BOTH],
+    ids=["first", "second"],
+)
+def test_without_a_screen_it_draws_beside_other_renderers(code):
+    """Each draws what it should and none spoils another's end, though mujoco was imported first."""
+    run(code)
+
+
+@headless
+def test_triton_is_loaded_by_itself_before_the_first_context(model, monkeypatch, tmp_path):
+    library = tmp_path / "triton" / "_C" / "libtriton.so"
+    library.parent.mkdir(parents=True)
+    library.write_text("not one: that it cannot be loaded does no harm")
+    (tmp_path / "triton" / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "triton", raising=False)
+    events, load, begin = [], ctypes.CDLL, mujoco.Renderer.__init__
+
+    def record_load(name, mode=0):
+        events.append((name, bool(mode & os.RTLD_DEEPBIND)))
+        return load(name, mode=mode)
+
+    def record_begin(*given):
+        events.append("context")
+        begin(*given)
+
+    gl.shield_triton.cache_clear()
+    monkeypatch.setattr("ctypes.CDLL", record_load)
+    monkeypatch.setattr("mujoco.Renderer.__init__", record_begin)
+    with Renderer(model, **SMALL):
+        assert events == [(str(library), True), "context"]
+
+
+@headless
+@pytest.mark.skipif(not importlib.util.find_spec("triton"), reason="triton is not installed")
+@pytest.mark.parametrize("code", [OURS, DM_CONTROL, MUJOCO + "import quadrl.learning"])
+def test_triton_can_be_imported_after_a_picture(code):
+    run(code + "\nimport triton\n", MUJOCO_GL="egl")

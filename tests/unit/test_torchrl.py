@@ -1,0 +1,144 @@
+"""TorchRL's batched environment, and TorchRL's wrappers of the other APIs."""
+
+import gymnasium as gym
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import DMControlEnv, DMControlWrapper, EnvBase, GymWrapper
+from torchrl.envs.utils import check_env_specs
+
+import quadrl
+from quadrl.envs.torchrl import QuadrotorEnv
+from quadrl.tasks import TASKS
+from quadrl.testing import varied_actions
+
+COUNT = 4
+ACTIONS = torch.from_numpy(varied_actions(60, COUNT))
+
+
+def policy(actions, sees="observation"):
+    """Gives one action after the other, whatever it sees."""
+    turn = iter(actions)
+    return TensorDictModule(lambda _: next(turn), in_keys=[sees], out_keys=["action"])
+
+
+def rollout(environment):
+    """A rollout of ACTIONS, [N, T]; resets are in between."""
+    return environment.rollout(len(ACTIONS), policy(ACTIONS), break_when_any_done=False)
+
+
+def test_set_seed_gives_the_episodes():
+    one = rollout(QuadrotorEnv("hover", COUNT, seed=3, max_episode_steps=10))
+    same, other = (QuadrotorEnv("hover", COUNT, time_limit=0.5) for _ in range(2))
+    same.set_seed(3)
+    other.set_seed(3 + COUNT)
+    assert torch.equal(one["next", "observation"], rollout(same)["next", "observation"])
+    assert not torch.equal(one["observation"][:, 0], rollout(other)["observation"][:, 0])
+
+
+def test_shapes_types_and_flags_are_those_of_torchrl():
+    environment = QuadrotorEnv("hover", COUNT, seed=0, time_limit=0.5, tolerance=9.0)
+    flown = rollout(environment)
+    assert environment.num_envs == COUNT
+    assert environment.batch_size == torch.Size([COUNT])
+    assert flown["action"].shape == (COUNT, 60, 4)
+    after = flown["next"]
+    assert after["observation"].dtype == after["reward"].dtype == torch.float32
+    assert after["reward"].shape == after["done"].shape == (COUNT, 60, 1)
+    over = after["terminated"] | after["truncated"]
+    assert torch.equal(after["done"], over)
+    assert not (after["terminated"] & after["truncated"]).any()
+    # Episodes of ten steps, all of them successful with such a tolerance.
+    every_tenth = (torch.arange(60) % 10 == 9).expand(COUNT, 60)[..., None]
+    assert torch.equal(after["truncated"], every_tenth)
+    assert torch.equal(after["is_success"], every_tenth)
+    # The final observation stays, and the next step meets that of the new episode.
+    end, start = after["observation"][:, :-1], flown["observation"][:, 1:]
+    assert torch.equal((end != start).any(-1), every_tenth[:, :-1, 0])
+
+
+def test_the_terms_of_the_reward_add_up():
+    after = rollout(QuadrotorEnv("hover", COUNT, seed=0, reward_terms=True))["next"]
+    terms = after["reward_terms"]
+    assert {"progress", "control", "survival"} <= set(terms.keys())
+    torch.testing.assert_close(sum(terms.values()), after["reward"], rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("task", ["hover", "target_following"])
+def test_episodes_begin_anew_as_torchrl_itself_would_have_it(task):
+    one, other = (QuadrotorEnv(task, COUNT, seed=0, time_limit=0.6) for _ in range(2))
+    met = again = one.reset()
+    other.reset()
+    memory = torch.rand(COUNT, 3, 2)  # of a policy: it ends with its episode
+    begun = 0
+    for t, action in enumerate(ACTIONS[:40]):
+        now = one.step(met.set("action", action).set("memory", memory))
+        same = other.step(again.set("action", action).set("memory", memory))
+        assert (now == same).all()
+        begun += int(now["next", "done"].sum())
+        met, again = one.step_mdp(now), other.step_mdp(same)
+        if t == 20:  # some of them over at other times than the rest
+            for flags in (met, again):
+                flags.set("done", torch.tensor([[True], [False], [False], [True]]))
+        met, again = one.maybe_reset(met), EnvBase.maybe_reset(other, again)
+        assert set(met.keys()) == set(again.keys())
+        for name in met.keys():  # noqa: SIM118
+            assert torch.equal(met[name], again[name]), (t, name)
+    assert begun > COUNT
+
+
+def test_a_restored_environment_goes_on_where_it_was_saved():
+    environment = QuadrotorEnv("hover", COUNT, seed=0, time_limit=0.5)
+    met = environment.reset()
+    for action in ACTIONS[:14]:
+        _, met = environment.step_and_maybe_reset(met.set("action", action))
+    other = QuadrotorEnv("hover", COUNT, seed=99, time_limit=0.5)
+    other.restore(environment.environment.save())
+    again = other.reset()
+    assert torch.equal(met["observation"], again["observation"])
+    for action in ACTIONS[14:40]:
+        one, met = environment.step_and_maybe_reset(met.set("action", action))
+        same, again = other.step_and_maybe_reset(again.set("action", action))
+        for name in ("observation", "reward", "done"):
+            assert torch.equal(one["next", name], same["next", name])
+        assert torch.equal(met["observation"], again["observation"])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"autoreset_mode": "DISABLED"}, {"autoreset_mode": "SAME_STEP", "reward_terms": False}],
+)
+@pytest.mark.parametrize("name", ["hover", "target_following"])
+def test_torchrls_gymnasium_wrapper_sees_the_same_episodes(name, settings):
+    # With SAME_STEP the wrapper resets once more when every row ends at once, Gymnasium's own
+    # vectors too; here the climb and the dive end before the others.
+    limit = 2.4
+    ours = rollout(QuadrotorEnv(name, COUNT, seed=5, time_limit=limit))
+    assert 3 <= ours["next", "done"].sum()
+    assert not ours["next", "done"].all(0).any()
+    id = f"quadrl/{name.title().replace('_', '')}-v0"
+    vector = gym.make_vec(id, num_envs=COUNT, time_limit=limit, **settings)
+    environment = GymWrapper(vector)
+    check_env_specs(environment)
+    vector.environment.seed(5)  # environment.set_seed would use up the first episodes
+    theirs = rollout(environment)
+    for key in ("observation", "reward", "done", "terminated", "truncated"):
+        assert torch.equal(theirs["next", key], ours["next", key]), key
+    assert torch.equal(theirs["observation"], ours["observation"])
+
+
+def test_torchrls_dm_control_environment_after_register():
+    quadrl.suite.register()
+    for name in TASKS:
+        environment = DMControlEnv("quadrotor", name)
+        check_env_specs(environment)
+        assert environment.rollout(5)["next", "goal"].shape == (5, 3)
+
+
+@pytest.mark.parametrize(("time_limit", "crashed"), [(10.0, True), (0.2, False)])
+def test_torchrls_dm_control_wrapper_tells_a_crash_from_the_clock(time_limit, crashed):
+    environment = DMControlWrapper(quadrl.load("hover", {"random": 0, "time_limit": time_limit}))
+    dive = torch.full((1000, 4), -1.0, dtype=torch.float64)
+    last = environment.rollout(1000, policy(dive, sees="goal"))[-1]["next"]
+    flags = [last[name].item() for name in ("done", "terminated", "truncated")]
+    assert flags == [True, crashed, not crashed]

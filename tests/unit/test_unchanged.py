@@ -1,0 +1,134 @@
+"""The paper's aircraft flies as it did: episodes recorded before the redesign, flown again.
+
+tests/data/README.md says what was recorded. Numbers may differ by rounding: what is allowed is a
+share of the largest number of the same kind in the record. Flags must be the same.
+"""
+
+import functools
+import json
+from pathlib import Path
+
+import helpers
+import numpy as np
+import pytest
+
+from quadrl import tasks
+from quadrl.environment import Environment
+from quadrl.state import Start
+from quadrl.vehicle import Vehicle, plus
+
+EVERY = 6  # control steps between two recorded observations
+TOLERANCE = 4e-12
+# Rounding grows by a factor of 10 or so in what tumbles for seconds or flies by feedback, and by a
+# factor of 1e4 where rotors and feet strike the ground: what follows a crash is compared until it
+# is chaos.
+AFTER_A_CRASH = 5  # control steps
+
+
+@functools.cache
+def recorded():
+    with np.load(Path(__file__).parents[1] / "data" / "episodes.npz") as file:
+        arrays = {name: file[name] for name in file.files}
+    return json.loads(str(arrays.pop("cases"))), arrays
+
+
+def vehicle_of(old):
+    """A plus quadrotor of the parameters that `Vehicle` had."""
+    rotors = plus(
+        old["arm_length"],
+        thrust_coefficient=old["thrust_coefficient"],
+        torque_coefficient=old["torque_coefficient"],
+        lag_up=old["lag_rate"],
+        lag_down=old["lag_rate"],
+        max_speed=old["max_speed"],
+        radius=old["rotor_radius"],
+    )
+    kept = ("name", "mass", "inertia", "drag_coefficient", "moment_coefficient", "action_scale")
+    steps = dict(physics_timestep=old["physics_step"], control_timestep=old["control_step"])
+    return Vehicle(rotors=rotors, **{name: old[name] for name in kept}, **steps)
+
+
+def flown(case, arrays):
+    """The episode again: arrays by the names of the record."""
+
+    def part(prefix):
+        return {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
+
+    task = tasks.make(case["task"], **case["options"])
+    task = helpers.starting(task, Start(**part("start/")), part("task/"))
+    environment = Environment(
+        task,
+        num_envs=3,
+        seed=0,
+        vehicle=vehicle_of(case["vehicle"]),
+        engine=case["engine"],
+        control_mode=case["control_mode"],
+    )
+
+    def flat(observation):
+        return np.concatenate(list(observation.values()), axis=-1)
+
+    seen = [flat(environment.reset())]
+    if case["wind"]:
+        environment.engine.air[:] = case["wind"]
+    log = {name: [] for name in arrays if "start" not in name and not name.startswith("task/")}
+    for k, action in enumerate(arrays["action"]):
+        now = environment.step(action)
+        for name in log:
+            if name in ("qpos", "qvel", "act"):
+                log[name].append(getattr(environment.engine, name).copy())
+            elif name.startswith("terms/"):
+                log[name].append(np.array(now.reward_terms[name.removeprefix("terms/")]))
+            elif name not in ("action", "observation"):
+                log[name].append(np.array(getattr(now, name)))
+        if (k + 1) % EVERY == 0:
+            seen.append(flat(now.observation))
+    del log["action"]
+    assert set(now.reward_terms) == set(part("terms/"))
+    return {name: np.array(value) for name, value in log.items()} | {"observation": np.array(seen)}
+
+
+def trusted(case, arrays):
+    """Control steps of each row until which it can be compared, (3,)."""
+    steps = len(arrays["action"])
+    if case["task"] != "landing":
+        return np.full(3, steps)
+    crashed = arrays["terminated"] & ~arrays["is_success"]
+    return np.where(crashed.any(0), crashed.argmax(0) + AFTER_A_CRASH, steps)
+
+
+@pytest.mark.parametrize("name", recorded()[0])
+def test_episodes_are_what_they_were(name):
+    cases, every = recorded()
+    arrays = {k.removeprefix(f"{name}/"): v for k, v in every.items() if k.startswith(f"{name}/")}
+    until = trusted(cases[name], arrays)
+    got = flown(cases[name], arrays)
+    assert got.keys() == arrays.keys() - {
+        k for k in arrays if k.split("/")[0] in ("start", "task")
+    } - {"action"}
+    for row in range(3):
+        for quantity, value in got.items():
+            last = until[row] // EVERY if quantity == "observation" else until[row]
+            new, old = value[:last, row], arrays[quantity][:last, row]
+            if old.dtype == bool:
+                np.testing.assert_array_equal(new, old, err_msg=f"{quantity} of row {row}")
+                continue
+            scale = np.abs(arrays[quantity]).max() + 1e-3
+            np.testing.assert_allclose(
+                new, old, rtol=0, atol=TOLERANCE * scale, err_msg=f"{quantity} of row {row}"
+            )
+
+
+def test_the_record_holds_every_kind_of_end():
+    cases, arrays = recorded()
+    ends = {
+        (case["task"], kind)
+        for name, case in cases.items()
+        for kind in ("terminated", "truncated", "is_success")
+        if arrays[f"{name}/{kind}"].any()
+    }
+    for task in tasks.TASKS:
+        assert (task, "terminated") in ends and (task, "is_success") in ends
+        assert (task, "truncated") in ends or task == "landing"
+    route = arrays["static_waypoint/mujoco/observation"]
+    assert len(np.unique(np.diff(route[:, 1, 19:22], axis=0).round(1), axis=0)) > 3

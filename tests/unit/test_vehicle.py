@@ -1,0 +1,271 @@
+"""The aircraft: its numbers, what follows from them, and what no aircraft can be."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from quadrl.errors import QuadrlError
+from quadrl.vehicle import PAPER_ROTORS, VEHICLES, Rotor, Vehicle, plus, resolve, ring
+
+PAPER = Vehicle()
+
+
+def rotors(**changed):
+    """The paper's rotors with some numbers changed in all."""
+    return tuple(dataclasses.replace(rotor, **changed) for rotor in PAPER_ROTORS)
+
+
+def ringed(bearings, spins, radius=0.23):
+    """Rotors of the paper's numbers at other places."""
+    paper = dataclasses.asdict(PAPER_ROTORS[0])
+    kept = {name: paper[name] for name in paper if name not in ("position", "spin", "axis")}
+    return ring(bearings, spins, radius, **kept)
+
+
+def placed(*positions):
+    """The paper's rotors moved to other points (x, y) of the plane."""
+    return tuple(
+        dataclasses.replace(rotor, position=(*point, 0.0))
+        for rotor, point in zip(PAPER_ROTORS, positions, strict=True)
+    )
+
+
+# -------------------------------------------------------------------------------- what follows
+
+
+def test_the_default_is_the_aircraft_of_the_paper():
+    # sqrt(0.65 * 9.81 / (4 * 3.13e-5)) = sqrt(50930.5) = 225.678, times sqrt(2) = 319.157.
+    assert VEHICLES["paper"] == resolve(None) == resolve("paper") == PAPER
+    np.testing.assert_allclose(PAPER.hover_speed, 225.678, atol=5e-4)
+    np.testing.assert_allclose(PAPER.max_speed, 319.157, atol=5e-4)
+    assert (PAPER.rotor_count, PAPER.substeps, PAPER.size, PAPER.scale) == (4, 5, 0.23, 1.0)
+    positions = [(0.23, 0, 0), (0, 0.23, 0), (-0.23, 0, 0), (0, -0.23, 0)]
+    assert [rotor.position for rotor in PAPER.rotors] == positions
+    assert [rotor.spin for rotor in PAPER.rotors] == [1, -1, 1, -1]
+
+
+def test_the_mixer_is_equation_7():
+    # l k_T = 0.23 * 3.13e-5 = 7.199e-6.
+    moments = [[0, 7.199e-6, 0, -7.199e-6], [-7.199e-6, 0, 7.199e-6, 0]]
+    yaw = np.array([-1, 1, -1, 1]) * 7.5e-7
+    np.testing.assert_allclose(PAPER.mixer, [[3.13e-5] * 4, *moments, yaw], rtol=1e-14, atol=0)
+
+
+def test_the_mixer_of_tilted_rotors():
+    # Rotors 1 and 3 lean towards each other by 30 degrees, 0.1 m above the centre of mass. Of
+    # rotor 1 at (0.23, 0, 0.1), axis (-0.5, 0, 0.866025): position x axis =
+    # (0, -0.05 - 0.199186, 0) m; the reaction is -7.5e-7 times the axis.
+    leaning = []
+    for k, way in ((0, 1.0), (2, -1.0)):
+        axis = (-0.5 * way, 0.0, math.sqrt(0.75))
+        leaning.append(
+            dataclasses.replace(PAPER_ROTORS[k], position=(0.23 * way, 0, 0.1), axis=axis)
+        )
+    vehicle = Vehicle(rotors=(leaning[0], PAPER_ROTORS[1], leaning[1], PAPER_ROTORS[3]))
+    pitch = 3.13e-5 * (-0.05 - 0.23 * math.sqrt(0.75))
+    expected = [3.13e-5 * math.sqrt(0.75), 3.75e-7, pitch, -7.5e-7 * math.sqrt(0.75)]
+    np.testing.assert_allclose(vehicle.mixer[:, 0], expected, rtol=1e-13)
+    np.testing.assert_allclose(vehicle.mixer[:, 2], expected * np.array([1, -1, -1, 1]), rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_every_preset_hovers_without_turning(name):
+    vehicle = VEHICLES[name]
+    wrench = vehicle.mixer @ vehicle.hover_speed**2
+    scale = np.abs(vehicle.mixer) @ vehicle.hover_speed**2
+    np.testing.assert_allclose(wrench / scale, [1, 0, 0, 0], atol=1e-12)
+    assert wrench[0] == pytest.approx(vehicle.mass * 9.81, rel=1e-12)
+    assert (vehicle.hover_speed + vehicle.action_scale * 0.5 < vehicle.max_speed).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "places"),
+    [
+        # Crazyflie: 1 ahead on the right, counter-clockwise, and so on clockwise.
+        ("crazyflie", [(1, -1, 1), (-1, -1, -1), (-1, 1, 1), (1, 1, -1)]),
+        # Betaflight: 1 behind on the right, clockwise; 2 ahead of it; 3 and 4 on the left.
+        ("racer", [(-1, -1, -1), (1, -1, 1), (-1, 1, 1), (1, 1, -1)]),
+    ],
+)
+def test_motors_are_numbered_as_the_autopilot_does(name, places):
+    rotors = VEHICLES[name].rotors
+    assert [(*np.sign(rotor.position[:2]), rotor.spin) for rotor in rotors] == places
+
+
+@pytest.mark.parametrize(
+    ("physics_timestep", "control_timestep", "substeps"),
+    [(0.01, 0.01, 1), (0.0025, 0.05, 20), (0.05, 0.15, 3), (1 / 240, 1 / 48, 5)],
+)
+def test_substeps(physics_timestep, control_timestep, substeps):
+    vehicle = Vehicle(physics_timestep=physics_timestep, control_timestep=control_timestep)
+    assert vehicle.substeps == substeps
+
+
+def test_a_variant_leaves_the_original_alone():
+    # 1.9 times the mass hovers at sqrt(1.9) of the speed.
+    heavy = dataclasses.replace(PAPER, mass=0.65 * 1.9)
+    np.testing.assert_allclose(heavy.hover_speed, math.sqrt(1.9) * PAPER.hover_speed, rtol=1e-12)
+    assert PAPER.mass == 0.65
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        PAPER.mass = 1.0  # pyright: ignore
+
+
+def test_what_the_physics_step_resolves():
+    # 2 k_D v dt / m = 1 at 0.65 / (2 * 9e-3 * 0.01) = 3611.11 m/s; |omega| dt = 0.5 at 50 rad/s,
+    # before 2 k_M omega dt / J = 1 at 7.5e-3 / (2 * 9e-4 * 0.01) = 416.7 rad/s.
+    assert PAPER.resolved_speed == pytest.approx(3611.11, abs=0.01)
+    assert PAPER.resolved_turn == pytest.approx(50.0)
+    assert Vehicle(moment_coefficient=0.1, physics_timestep=0.005).resolved_turn == 7.5
+    free = Vehicle(drag_coefficient=0.0, moment_coefficient=0.0)
+    assert (free.resolved_turn, free.resolved_speed) == (50.0, 1e10)
+
+
+def test_rotor_command_by_worked_numbers():
+    hover = 225.678
+    # 225.678 + 35 a; 35 * 0.2 = 7. Beyond +-1 the action is clipped.
+    action = np.array([[0.0, 1.0, -1.0, 0.2], [2.0, -7.0, -0.2, 1e300]])
+    expected = [[hover, hover + 35, hover - 35, hover + 7], [hover + 35, hover - 35, hover - 7]]
+    expected[1].append(hover + 35)
+    np.testing.assert_allclose(PAPER.rotor_command(action), expected, atol=5e-4)
+    # 225.678 +- 300 is clipped to 0 and to 319.157; +- 90 to 315.678 and 135.678.
+    strong = Vehicle(action_scale=300.0)
+    command = strong.rotor_command(np.array([[-1.0, 1.0, 0.3, -0.3]]))
+    np.testing.assert_allclose(command, [[0, 319.157, 315.678, 135.678]], atol=5e-4)
+    assert command[0, 0] == 0.0 and command[0, 1] == strong.max_speed[1]
+
+
+# ------------------------------------------------------------------------------ what is refused
+
+
+def refusal(**parameters):
+    with pytest.raises(QuadrlError) as caught:
+        Vehicle(**parameters)
+    return caught.value
+
+
+NOT_NUMBERS = (0.0, -1.0, math.nan, math.inf, -math.inf, None, "1", True)
+
+
+@pytest.mark.parametrize("field", ["mass", "action_scale", "physics_timestep", "control_timestep"])
+@pytest.mark.parametrize("value", NOT_NUMBERS)
+def test_a_parameter_that_no_aircraft_has_is_refused_by_name(field, value):
+    error = refusal(**{field: value})
+    assert error.name == field and error.value is value and error.allowed
+
+
+@pytest.mark.parametrize(
+    "field",
+    ["thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed", "radius"],
+)
+@pytest.mark.parametrize("value", NOT_NUMBERS)
+def test_a_number_that_no_rotor_has_is_refused_by_name(field, value):
+    with pytest.raises(QuadrlError) as caught:
+        rotors(**{field: value})
+    assert caught.value.name == f"rotor {field}" and caught.value.value is value
+
+
+@pytest.mark.parametrize("field", ["drag_coefficient", "moment_coefficient"])
+def test_drag_may_be_zero_and_nothing_less(field):
+    assert getattr(Vehicle(**{field: 0}), field) == 0.0
+    for value in (-1e-9, math.nan, math.inf):
+        assert refusal(**{field: value}).name == field
+
+
+J = 7.5e-3
+BAD = [  # parameters, name, value (... for any)
+    # No body has one moment above the sum of the others; a flat plate has it equal.
+    (dict(inertia=(J, J, 1.6e-2)), "inertia", (J, J, 1.6e-2)),
+    (dict(inertia=(J, J)), "inertia", (J, J)),
+    (dict(inertia=(J, J, J, J)), "inertia", (J, J, J, J)),
+    (dict(inertia=0.1), "inertia", 0.1),
+    (dict(inertia=(0.0, J, J)), "inertia[0]", 0.0),
+    (dict(inertia=(J, -J, J)), "inertia[1]", -J),
+    (dict(inertia=(J, J, math.nan)), "inertia[2]", ...),
+    (dict(name=5), "name", 5),
+    (dict(name=""), "name", ""),
+    # 2 k_M |omega| dt / J = 1 at 7.5e-3 / (2 * 0.1 * 0.01) = 3.75 rad/s: not a turn a second.
+    (dict(moment_coefficient=0.1), "physics_timestep", 0.01),
+    # 2 k_D |v| dt / m = 1 at 0.65 / (2 * 200 * 0.01) = 0.1625 m/s; it falls at 0.179 m/s.
+    (dict(drag_coefficient=200.0), "physics_timestep", 0.01),
+    # Past 2.785 the Runge-Kutta method is unstable; at 2 it is off by 0.2 rad/s.
+    (dict(rotors=rotors(lag_up=101.0)), "physics_timestep", 0.01),
+    (dict(rotors=rotors(lag_down=101.0)), "physics_timestep", 0.01),
+    (dict(control_timestep=0.055), "control_timestep", 0.055),
+    (dict(control_timestep=0.0501), "control_timestep", 0.0501),
+    (dict(control_timestep=0.005), "control_timestep", 0.005),
+    (dict(physics_timestep=1e-6), "control_timestep", 0.05),  # 50,000 physics steps
+    # Rotors.
+    (dict(rotors=PAPER_ROTORS[:3]), "number of rotors", 3),
+    (dict(rotors=()), "number of rotors", 0),
+    (dict(rotors=ringed(range(0, 360, 40), [1, -1] * 4 + [1])), "number of rotors", 9),
+    (dict(rotors=None), "rotors", None),
+    (dict(rotors=[(0.23, 0, 0)] * 4), "rotors", [(0.23, 0, 0)] * 4),
+    (dict(rotors=rotors(spin=1)), "rotor spins", [1.0] * 4),
+    (dict(rotors=rotors(spin=-1)), "rotor spins", [-1.0] * 4),
+    # All on the x axis: no roll. All behind the centre: no pitching up, and no hover.
+    (dict(rotors=placed((0.2, 0), (0.1, 0), (-0.1, 0), (-0.2, 0))), "rotor positions", ...),
+    (dict(rotors=placed((0, 0.2), (0, 0.1), (0, -0.1), (0, -0.2))), "rotor positions", ...),
+    (dict(rotors=placed((-0.1, 0.2), (-0.3, 0.2), (-0.1, -0.2), (-0.3, -0.2))), ..., ...),
+    # Spins 1, 1, -1, -1 around an X: yaw is a multiple of pitch, so one of them is not free.
+    (dict(rotors=ringed((45, 315, 135, 225), (1, 1, -1, -1))), "rotor positions", ...),
+    (dict(rotors=ringed((45, 135, 315, 225), (1, 1, -1, -1))), "rotor positions", ...),
+    # A plus moved ahead by more than its arm would need a negative thrust to hover.
+    (dict(rotors=placed((0.5, 0), (0.3, 0.2), (-0.01, 0), (0.3, -0.2))), "rotor positions", ...),
+    # Hover needs 225.678 rad/s of each.
+    (dict(rotors=rotors(max_speed=225.0)), ..., 225.0),
+    (dict(mass=1.31), ..., ...),  # more than twice the paper's
+]
+
+
+@pytest.mark.parametrize(("parameters", "name", "value"), BAD)
+def test_an_aircraft_that_cannot_be_is_refused(parameters, name, value):
+    error = refusal(**parameters)
+    assert error.name == name if name is not ... else "rotor" in str(error.name)
+    assert value is ... or error.value == value
+    assert error.allowed and error.allowed in str(error)
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [
+        (dict(spin=0), "rotor spin"),
+        (dict(spin=2), "rotor spin"),
+        (dict(spin=math.nan), "rotor spin"),
+        (dict(axis=(0, 0, 2)), "rotor axis"),
+        (dict(axis=(0, 0, 0)), "rotor axis"),
+        (dict(axis=(0, 1)), "rotor axis"),
+        (dict(position=(1, 2)), "rotor position"),
+        (dict(position=(math.inf, 0, 0)), "rotor position[0]"),
+    ],
+)
+def test_a_rotor_that_cannot_be_is_refused(changed, name):
+    with pytest.raises(QuadrlError) as caught:
+        rotors(**changed)
+    assert caught.value.name == name
+
+
+def test_what_is_just_allowed():
+    assert Vehicle(inertia=(0.1, 0.2, 0.1 + 0.2)).inertia[2] == pytest.approx(0.3)
+    assert Vehicle(rotors=rotors(lag_up=100.0)).rotors[0].lag_up == 100.0
+    assert Vehicle(rotors=ringed(range(0, 360, 45), [1, -1] * 4)).rotor_count == 8
+    assert Vehicle(rotors=ringed(range(0, 360, 72), [1, -1, 1, -1, 1])).rotor_count == 5
+    finer = Vehicle(rotors=rotors(lag_up=1000.0), physics_timestep=0.001)
+    assert finer.substeps == 50
+
+
+@pytest.mark.parametrize("vehicle", ["papr", 5, Rotor, {"mass": 1}])
+def test_an_unknown_vehicle_lists_the_choices(vehicle):
+    with pytest.raises(QuadrlError) as caught:
+        resolve(vehicle)
+    assert caught.value.name == "vehicle" and caught.value.value is vehicle
+    assert "paper" in caught.value.allowed
+
+
+def test_plus_is_a_ring():
+    numbers = dict(thrust_coefficient=1e-5, torque_coefficient=1e-7, max_speed=1e3)
+    lag = dict(lag_up=10.0, lag_down=5.0)
+    assert plus(0.2, **numbers, **lag) == ring(
+        (0, 90, 180, 270), (1, -1, 1, -1), 0.2, **numbers, **lag
+    )
