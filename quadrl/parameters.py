@@ -15,15 +15,8 @@ from typing import Any
 import numpy as np
 
 from quadrl.rotation import Array
-from quadrl.vehicle import (
-    MAX_ROTORS,
-    Rotor,
-    Vehicle,
-    hover_squares,
-    mixer,
-    resolved_speed,
-    resolved_turn,
-)
+from quadrl.rotors import Rotor, hover_squares, mixer
+from quadrl.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
 
 AIR = 3
 """Numbers of a row of air, in the simulation's `userdata`: the wind [m/s], world frame."""

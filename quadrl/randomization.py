@@ -11,8 +11,9 @@ import numpy as np
 from quadrl import parameters
 from quadrl.errors import QuadrlError
 from quadrl.rng import Rng
+from quadrl.rotors import MAX, Rotor
 from quadrl.validation import keys, numbers
-from quadrl.vehicle import MAX, Rotor, Vehicle, check_inertia
+from quadrl.vehicle import Vehicle, check_inertia
 
 AIRCRAFT = ("mass", "inertia", "drag_coefficient", "moment_coefficient")
 ROTOR = ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed")

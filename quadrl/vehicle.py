@@ -1,7 +1,8 @@
 """The aircraft: its numbers with their units and sources, and what follows from them.
 
 Body frame: x forward, y left, z up, the origin at the centre of mass. `quadrl.parameters` makes
-the rows of numbers from it that the engines fly, `quadrl.mjcf` the MuJoCo model.
+the rows of numbers from it that the engines fly, `quadrl.mjcf` the MuJoCo model. The file is longer
+than others because it also holds every aircraft that is known by name, with its sources.
 """
 
 from __future__ import annotations
@@ -10,24 +11,30 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
 
-import mujoco
 import numpy as np
 
 from quadrl.errors import QuadrlError
 from quadrl.rotation import Array
+from quadrl.rotors import (
+    GRAVITY,
+    MAX,
+    MIN,
+    Rotor,
+    Vector,
+    hover_squares,
+    mixer,
+    plus,
+    ring,
+)
 from quadrl.validation import choice, number, numbers
 
-GRAVITY = 9.81  # [m/s^2]
 MIN_ROTORS, MAX_ROTORS = 4, 8
 DRAWN_SIZE = 0.23  # [m], distance of a rotor from the centre in the drawings of assets/
 DRAWN_FOOT = (0.08, 0.08, -0.07)  # [m], lowest point of a foot there
 DRAWN_HULL = (0.075, 0.060, 0.045)  # [m], semi-axes
 DRAWN_ROTOR_HEIGHT = 0.030  # [m], of a rotor's disc over the point where its thrust acts
 
-MIN, MAX = mujoco.mjMINVAL, mujoco.mjMAXVAL  # what MuJoCo takes for zero, and for unstable
-LENGTHS = (1e-3, 1e3)  # [m]; the meshes of a smaller one have no volume to MuJoCo
 MAX_SUBSTEPS = 10_000
 # What a physics step resolves (tests/slow/test_divergence.py): the angle turned in it [rad], and
 # the rates of drag and aerodynamic moment times the step. An aircraft must be able to turn once a
@@ -36,72 +43,6 @@ TURN, DAMPING = 0.5, 1.0
 SLOWEST_TURN = 2 * math.pi  # [rad/s]
 SINGULAR = 1e-9
 """Smallest singular value of a mixer over its largest; each row over its largest entry."""
-
-Vector = tuple[float, float, float]
-
-
-@dataclasses.dataclass(frozen=True)
-class Rotor:
-    """One rotor. Every number but the radius stands in the aircraft's row of parameters."""
-
-    position: Vector
-    """Where its thrust acts [m]."""
-    thrust_coefficient: float
-    """k_T [N s^2]: thrust over the square of the rotor speed."""
-    torque_coefficient: float
-    """k_Q [N m s^2]: torque over the square of the rotor speed."""
-    lag_up: float
-    """k_c [1/s]: inverse time constant of the rotor speed while it rises."""
-    lag_down: float
-    """The same while it falls [1/s]."""
-    max_speed: float
-    """Largest speed that can be commanded [rad/s]."""
-    spin: float = 1.0
-    """1 if it turns counter-clockwise about its axis, -1 if clockwise; the aircraft feels the
-    opposite torque."""
-    axis: Vector = (0.0, 0.0, 1.0)
-    """Unit vector along the thrust."""
-    radius: float = 0.06
-    """[m], drawn, and what strikes the ground."""
-
-    def __post_init__(self) -> None:
-        """Validate the numbers."""
-        for name in ("position", "axis"):
-            object.__setattr__(self, name, numbers(f"rotor {name}", getattr(self, name), 3))
-        for name in ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed"):
-            object.__setattr__(self, name, number(f"rotor {name}", getattr(self, name), MIN, MAX))
-        object.__setattr__(self, "radius", number("rotor radius", self.radius, *LENGTHS))
-        if self.spin not in (1, -1):
-            raise QuadrlError(name="rotor spin", value=self.spin, allowed="1 or -1")
-        if abs(math.hypot(*self.axis) - 1) > 1e-9:
-            raise QuadrlError(name="rotor axis", value=self.axis, allowed="a unit vector")
-        object.__setattr__(self, "spin", float(self.spin))
-
-
-def ring(
-    bearings: Sequence[float], spins: Sequence[float], arm_length: float, **rotor: Any
-) -> tuple[Rotor, ...]:
-    """Level rotors on a circle around the centre of mass.
-
-    Args:
-        bearings: Of each rotor [deg], counter-clockwise from ahead.
-        spins: Of each rotor, 1 or -1.
-        arm_length: Radius of the circle [m].
-        **rotor: The other parameters of `Rotor`, the same for all.
-    """
-    number("arm_length", arm_length, *LENGTHS)
-    rotors = []
-    for bearing, spin in zip(bearings, spins, strict=True):
-        # Rounded, so that a rotor straight ahead stands at y = 0 exactly.
-        cosine, sine = (round(f(math.radians(bearing)), 15) + 0.0 for f in (math.cos, math.sin))
-        rotors.append(Rotor((cosine * arm_length, sine * arm_length, 0.0), spin=spin, **rotor))
-    return tuple(rotors)
-
-
-def plus(arm_length: float, **rotor: Any) -> tuple[Rotor, ...]:
-    """Four rotors ahead, left, behind and right; those ahead and behind turn counter-clockwise."""
-    return ring((0, 90, 180, 270), (1, -1, 1, -1), arm_length, **rotor)
-
 
 PAPER_ROTORS = plus(
     0.23,  # l [m] (gym-aero)
@@ -319,39 +260,6 @@ class Vehicle:
         """Whether no action commands a speed below zero or above the largest."""
         room = np.minimum(self.hover_speed, self.max_speed - self.hover_speed)
         return bool((self.action_scale <= room).all())
-
-
-def mixer(
-    position: np.ndarray, axis: np.ndarray, spin: np.ndarray, thrust: np.ndarray, torque: np.ndarray
-) -> np.ndarray:
-    """Squares of the rotor speeds to thrust along z and moments: equation 7 for any layout.
-
-    moment = k_T position x axis - spin k_Q axis.
-
-    Args:
-        position: (..., R, 3) [m], body frame.
-        axis: (..., R, 3) unit vectors.
-        spin: (..., R), 1 or -1.
-        thrust: k_T (..., R) [N s^2].
-        torque: k_Q (..., R) [N m s^2].
-
-    Returns:
-        (..., 4, R).
-    """
-    moment = thrust[..., None] * np.cross(position, axis) - (spin * torque)[..., None] * axis
-    lift = (thrust * axis[..., 2])[..., None]
-    return np.swapaxes(np.concatenate([lift, moment], axis=-1), -1, -2) + 0.0
-
-
-def hover_squares(mixer: np.ndarray, mass: Array) -> np.ndarray:
-    """Smallest squares of the rotor speeds (..., R) that carry a mass (...) without a moment."""
-    # Each row over its largest entry, since they differ by orders of magnitude.
-    scale = np.abs(mixer).max(axis=-1, keepdims=True)
-    rows = mixer / scale
-    weight = np.zeros((*rows.shape[:-1], 1))
-    weight[..., 0, 0] = np.asarray(mass) * GRAVITY / scale[..., 0, 0]
-    across = np.swapaxes(rows, -1, -2)
-    return (across @ np.linalg.solve(rows @ across, weight))[..., 0]
 
 
 def resolved_speed(mass: Array, drag_coefficient: Array, timestep: float) -> Array:

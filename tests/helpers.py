@@ -1,19 +1,16 @@
 """What tests share. Each heading has the helpers of one kind of test."""
 
 import dataclasses
-import functools
 import math
-from pathlib import Path
 
 import numpy as np
-import reference
 from scipy.spatial.transform import Rotation
 
 from quadrl import parameters, tasks
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
 from quadrl.state import Start
-from quadrl.vehicle import VEHICLES, Vehicle, ring
+from quadrl.vehicle import VEHICLES, Vehicle, resolve, ring
 
 # ------------------------------------------------------------------- motions, flown by an engine
 
@@ -192,6 +189,40 @@ def vehicle_of_row(vehicle, row):
     return dataclasses.replace(vehicle, rotors=rotors, **own | {"inertia": tuple(own["inertia"])})
 
 
+WIND = ((-2.0, -1.0, 0.0), (2.0, 1.0, 0.5))
+
+
+def ranges_of(vehicle, spread=0.1):
+    """Every parameter within a share of what is specified, in wind."""
+
+    def around(value):
+        return (1 - spread) * np.array(value), (1 + spread) * np.array(value)
+
+    given = {n: around(getattr(vehicle, n)) for n in PARAMETERS}
+    # J_z is next to J_x + J_y, and must not be larger.
+    given["inertia"] = tuple(np.array(vehicle.inertia) * [[1.0, 1.0, 1 - spread], [1 + spread] * 3])
+    given["inertia"][1][2] = vehicle.inertia[2]
+    rotor = vehicle.rotors[0]
+    given |= {n: around(getattr(rotor, n)) for n in ROTOR_PARAMETERS}
+    return given | {"wind": WIND}
+
+
+def drawn(environment):
+    """Parameters and air of every row, (N, k), a copy."""
+    table, air = environment.engine.parameters, environment.engine.air
+    rows = np.ascontiguousarray(table).view(np.float64).reshape(len(table), -1)
+    return np.concatenate([np.broadcast_to(rows, (len(air), rows.shape[1])), air], axis=1)
+
+
+def flying(task="hover", *, count=4, seed=3, reset=True, **settings):
+    """An environment whose rows draw every parameter, and wind, unless `ranges` says others."""
+    settings = {"ranges": ranges_of(resolve(settings.get("vehicle")))} | settings
+    environment = Environment(task, num_envs=count, seed=seed, **settings)
+    if reset:
+        environment.reset()
+    return environment
+
+
 def level(count=1, vehicle=None, *, position=(0, 0, 0), velocity=(0, 0, 0)):
     """A Start of `count` level aircraft that head east, their rotors at hover speed."""
     vehicle = vehicle or Vehicle()
@@ -269,28 +300,3 @@ def assert_records(got, expected, rows=slice(None)):
             mine = value[fresh] if name.startswith("fresh.") else value[chosen]
             if not name.startswith("fresh.") or len(fresh):
                 np.testing.assert_array_equal(now[name], mine, err_msg=f"{name}, step {step}")
-
-
-# ------------------------------------------------------------------- against the exact solution
-
-DATA = Path(__file__).parent / "data"
-
-
-@functools.cache
-def exact(name):
-    """Arrays of tests/data/exact.npz under a name, or the array of that name."""
-    with np.load(DATA / "exact.npz") as file:
-        if name in file:
-            return file[name]
-        prefix = f"{name}/"
-        return {k.removeprefix(prefix): file[k] for k in file.files if k.startswith(prefix)}
-
-
-def deviations(vehicle, engine, name, seconds):
-    """How far an engine is at the end of the flights of a name, as `reference.deviation` has it."""
-    flights = exact(name)
-    batch = BatchEngine(vehicle, len(flights["start"]), altitude=3.0, engine=engine)
-    batch.qpos[:], batch.qvel[:], batch.act[:] = reference.to_mujoco(flights["start"])
-    batch.ctrl[:], batch.air[:] = flights["command"], flights["wind"]
-    batch.advance(round(seconds / vehicle.physics_timestep))
-    return reference.deviation(batch.qpos, batch.qvel, batch.act, flights["end"])

@@ -8,6 +8,7 @@ import helpers
 import numpy as np
 import pytest
 import reference
+import solutions
 
 sys.path.append(str(Path(__file__).parents[1] / "data"))
 
@@ -32,7 +33,7 @@ def test_a_thousand_flights_converge_to_the_exact_solution(air):
     for engine in ("mujoco", "free_flight"):
         for share, (limit, in_body) in SHARES.items():
             vehicle = dataclasses.replace(PAPER, physics_timestep=0.01 * share)
-            apart = helpers.deviations(vehicle, engine, air, 1.0)
+            apart = solutions.deviations(vehicle, engine, air, 1.0)
             body = reference.QUANTITIES.index("body_velocity")
             others = np.delete(apart, body, axis=1).max(axis=1)
             worst[engine, share] = apart.max(axis=0)
@@ -51,13 +52,13 @@ def test_a_thousand_flights_converge_to_the_exact_solution(air):
 @pytest.mark.parametrize("name", ["leaning", "hexa"])
 def test_the_stored_ends_are_what_an_integration_gives_today(name):
     for part, array in make_reference.flights(name).items():
-        np.testing.assert_allclose(helpers.exact(name)[part], array, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(solutions.exact(name)[part], array, rtol=1e-9, atol=1e-9)
 
 
 def test_the_stored_extreme_flights_are_what_an_integration_gives_today():
     vehicle = extreme.vehicles(make_reference.AIRCRAFT)[5]
     fresh = make_reference.extreme_flights(vehicle)
-    np.testing.assert_allclose(helpers.exact("extreme/5"), fresh, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(solutions.exact("extreme/5"), fresh, rtol=1e-7, atol=1e-7)
 
 
 def test_more_extreme_flights_are_right_or_ended():

@@ -10,6 +10,7 @@ import helpers
 import numpy as np
 import pytest
 import reference
+import solutions
 
 from quadrl.environment import Environment
 
@@ -20,7 +21,7 @@ AIRCRAFT = 12
 @pytest.mark.parametrize("engine", ENGINES)
 def test_extreme_flights_are_right_or_ended(engine):
     results = [
-        extreme.flown(vehicle, engine, helpers.exact(f"extreme/{k}"))
+        extreme.flown(vehicle, engine, solutions.exact(f"extreme/{k}"))
         for k, vehicle in enumerate(extreme.vehicles(AIRCRAFT))
     ]
     worst, trusted, within, ended = map(np.array, zip(*results, strict=True))

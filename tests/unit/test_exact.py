@@ -9,6 +9,7 @@ import helpers
 import numpy as np
 import pytest
 import reference
+import solutions
 
 # Ratios of the errors of a step and of a quarter of it. MuJoCo's RK4 turns the attitude once a step
 # by the mean of the stages' body rates, so the attitude and what follows from it are of second
@@ -29,7 +30,7 @@ def worst(engine, name, share):
     """Largest deviation of the flights of a name, by quantity."""
     vehicle = helpers.LAYOUTS.get(name, helpers.LAYOUTS["paper"])
     finer = dataclasses.replace(vehicle, physics_timestep=vehicle.physics_timestep * share)
-    apart = helpers.deviations(finer, engine, name, 20 * vehicle.control_timestep)
+    apart = solutions.deviations(finer, engine, name, 20 * vehicle.control_timestep)
     return dict(zip(reference.QUANTITIES, apart.max(axis=0), strict=True))
 
 
@@ -48,7 +49,7 @@ def test_flights_converge_to_the_exact_solution(name, engine):
 
 def test_the_flights_are_worth_the_name():
     for name, vehicle in helpers.LAYOUTS.items():
-        flights = helpers.exact(name)
+        flights = solutions.exact(name)
         turned = np.abs(flights["end"][:, 3:7] - flights["start"][:, 3:7]).max(axis=1)
         assert np.median(turned) > 0.3, name
         share = flights["end"][:, 13:] / vehicle.hover_speed

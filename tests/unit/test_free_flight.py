@@ -15,7 +15,7 @@ from quadrl.engines.free_flight import MARGIN
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
 from quadrl.errors import QuadrlError
-from quadrl.vehicle import VEHICLES, Vehicle
+from quadrl.vehicle import Vehicle
 
 PAPER = Vehicle()
 
@@ -96,7 +96,7 @@ def test_nothing_that_free_flight_takes_comes_near_the_ground_in_a_step(name):
     # The wildest flights: fast, tilted, in wind, at any height. Whoever is handed over is flown
     # exactly as MuJoCo flies it; all others stay clear of the ground by more than their reach. For
     # the long control step, thrust and drag have their time to push it down.
-    vehicle, count = dataclasses.replace(helpers.LAYOUTS[name], control_timestep=0.2), 1000
+    vehicle, count = dataclasses.replace(helpers.LAYOUTS[name], control_timestep=0.2), 300
     wild = helpers.random_motion(vehicle, count, speed=12.0, turn=8.0, wind=12.0, rotor=0.4)
     reach = max(np.linalg.norm(r.position) + r.radius for r in vehicle.rotors)
     highest = reach + 30.0 * vehicle.control_timestep
@@ -192,19 +192,3 @@ def test_an_unknown_engine_lists_the_choices():
         Environment("hover", engine="warp")  # pyright: ignore
     assert caught.value.name == "engine" and caught.value.value == "warp"
     assert "mujoco, free_flight" in caught.value.allowed
-
-
-def test_free_flight_of_every_preset_is_one_of_mujoco_to_its_order():
-    for name, vehicle in VEHICLES.items():
-        motion = helpers.random_motion(vehicle, 8, wind=5.0)
-        commands = helpers.random_commands(vehicle, 8, 1)
-        free, whole, calm = (
-            helpers.flown(vehicle, engine, given, commands, 20)
-            for engine, given in (
-                ("free_flight", motion),
-                ("mujoco", motion),
-                ("free_flight", dataclasses.replace(motion, wind=0 * motion.wind)),
-            )
-        )
-        assert np.abs(free.velocity - whole.velocity).max() < 2e-3, name
-        assert np.abs(free.velocity - calm.velocity).max(axis=1).min() > 5e-3, name

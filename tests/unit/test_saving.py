@@ -1,0 +1,164 @@
+"""Resets of some rows, saving and restoring, and what a task remembers."""
+
+import dataclasses
+
+import helpers
+import numpy as np
+import pytest
+from helpers import WIND, drawn, flying, ranges_of
+
+from quadrl import tasks
+from quadrl.errors import QuadrlError
+from quadrl.task import TaskState
+from quadrl.tasks.hover import Hover
+from quadrl.vehicle import Vehicle
+
+ENGINES = ("mujoco", "free_flight")
+PAPER = Vehicle()
+
+
+def test_a_reset_of_some_rows_renews_all_that_is_theirs_and_nothing_else():
+    environment = flying("target_following", control_mode="velocity")
+    for action in helpers.random_actions(6, 4):
+        environment.step(action)
+
+    def everything():
+        now = environment.snapshot
+        parts = {"time": now.time, "action": now.action, "rotor_command": now.rotor_command}
+        parts |= {"goal": environment.goals(), "drawn": drawn(environment)}
+        parts |= {f"task.{f.name}": getattr(now.task, f.name) for f in dataclasses.fields(now.task)}
+        parts |= {
+            f.name: getattr(now.potentials, f.name) for f in dataclasses.fields(now.potentials)
+        }
+        parts |= {"coordinates": helpers.coordinates(environment.engine)}
+        return {name: np.array(value) for name, value in parts.items()}
+
+    before = everything()
+    environment.reset(np.array([1, 2]))
+    after, others = everything(), [0, 3]
+    for name, value in before.items():
+        np.testing.assert_array_equal(after[name][others], value[others], err_msg=name)
+        if name not in (
+            "task.goal",
+            "distance",
+        ):  # the task has a path, at 1 m from where it starts
+            changed = (after[name][[1, 2]] != value[[1, 2]]).reshape(2, -1).any(axis=1)
+            assert changed.all(), name
+    now = environment.snapshot
+    np.testing.assert_allclose(now.time, [0.3, 0, 0, 0.3], rtol=1e-15)
+    np.testing.assert_array_equal(now.action[[1, 2]], 0)
+    np.testing.assert_array_equal(now.rotor_command[[1, 2]], now.state.rotor_speed[[1, 2]])
+    np.testing.assert_array_equal(
+        now.state.time if hasattr(now.state, "time") else now.time, now.time
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_the_buffer_of_the_caller_is_not_kept(dtype):
+    environment, action = flying(ranges=None), np.full((4, 4), 0.25, dtype=dtype)
+    environment.step(action)
+    action[:] = -1.0
+    np.testing.assert_array_equal(environment.snapshot.action, 0.25)
+    action[:] = 7.0  # beyond +-1 as well: what is remembered is what was asked
+    environment.step(action)
+    np.testing.assert_array_equal(environment.snapshot.action, 7.0)
+    np.testing.assert_array_equal(action, 7.0)
+
+
+def resumed(task, path, **settings):
+    """Records of a flight, and of two that go on from its middle, through a file."""
+    actions = helpers.random_actions(30, 4)
+    environment = flying(task, **settings)
+    helpers.fly(environment, actions[:11])
+    np.savez(path, **environment.save())
+    expected = helpers.fly(environment, actions[11:])  # with resets, so that the streams matter
+    with np.load(path) as file:
+        saved = dict(file)
+    fresh, used = flying(task, seed=77, reset=False, **settings), flying(task, seed=78, **settings)
+    helpers.fly(used, actions[:5])
+    for other in (fresh, used, environment):
+        other.restore(saved)
+        yield other, helpers.fly(other, actions[11:]), expected
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("ranges", [ranges_of(PAPER), {"wind": WIND}], ids=["all", "wind"])
+def test_parameters_and_wind_survive_save_and_restore(ranges, engine, tmp_path):
+    for task in (tasks.make("hover", time_limit=0.6), helpers.SHORT["a low landing"]):
+        settings = {"engine": engine, "ranges": ranges}
+        for _, got, expected in resumed(task, tmp_path / "saved.npz", **settings):
+            helpers.assert_records(got, expected)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_wind_that_somebody_sets_survives_save_and_restore(engine):
+    # The wind of a batch used to be a field of the model, which no state of MuJoCo's holds.
+    environment, other = (flying(ranges=None, engine=engine, seed=s) for s in (1, 2))
+    environment.engine.air[:] = np.arange(12.0).reshape(4, 3) / 4
+    environment.step(np.zeros((4, 4)))
+    saved = environment.save()
+    other.restore(saved)
+    np.testing.assert_array_equal(other.engine.air, environment.engine.air)
+    calm = flying(ranges=None, engine=engine, seed=3)
+    calm.restore(saved)
+    calm.engine.air[:] = 0.0
+    for action in helpers.random_actions(5, 4):
+        records = [helpers.recorded(e, e.step(action)) for e in (environment, other, calm)]
+    helpers.assert_records(records[1:2], records[:1])
+    apart = np.abs(records[2]["coordinates"] - records[0]["coordinates"])
+    assert (apart[1:, 7:10].max(axis=1) > 1e-3).all()  # [m/s]
+
+
+def test_parameters_of_another_aircraft_are_not_restored():
+    saved = flying(ranges=None).save()
+    other = flying(ranges=None, vehicle=dataclasses.replace(PAPER, mass=0.7))
+    before = drawn(other)
+    with pytest.raises(QuadrlError) as caught:
+        other.restore(saved)
+    assert "parameters" in caught.value.name
+    np.testing.assert_array_equal(drawn(other), before)
+
+
+@dataclasses.dataclass(frozen=True)
+class Trail(TaskState):
+    """Where the aircraft was after the last two steps, and the fastest that it has been."""
+
+    last: np.ndarray  # (N, 3) [m]
+    older: np.ndarray  # (N, 3) [m]
+    fastest: np.ndarray  # (N,) [m/s]
+
+
+@dataclasses.dataclass(frozen=True)
+class Remembering(Hover):
+    """Keeps arrays of the live state, without a copy of its own."""
+
+    def begin(self, rng, parameters):
+        start, state = super().begin(rng, parameters)
+        zero = 0 * start.position
+        return start, Trail(state.goal, start.position, start.position, fastest=zero[:, 0])
+
+    def update(self, before, now):
+        fastest = np.maximum(now.task.fastest, now.state.speed)
+        return Trail(now.task.goal, now.state.position, now.task.last, fastest)
+
+    def reward(self, before, now, end):
+        terms = super().reward(before, now, end)
+        way = now.state.position - now.task.older  # over two control steps
+        return terms | {"way": np.sqrt((way**2).sum(-1)), "fastest": now.task.fastest}
+
+
+@pytest.mark.parametrize("control_mode", ["rotor", "position"])
+def test_what_a_task_remembers_of_the_live_state_stays_and_survives(control_mode, tmp_path):
+    task = Remembering(time_limit=0.6)
+    environment = flying(task, control_mode=control_mode)
+    been = [np.array(environment.snapshot.state.position)] * 2
+    for action in helpers.random_actions(8, 4):
+        now = environment.step(action)
+        been.append(np.array(environment.snapshot.state.position))
+        # It was the position two steps ago, and not a view of what is there by now.
+        way = np.sqrt(((been[-1] - been[-3]) ** 2).sum(-1))
+        np.testing.assert_allclose(now.reward_terms["way"], way, rtol=1e-12)
+        assert way.min() > 0
+    settings = {"control_mode": control_mode}
+    for _, got, expected in resumed(task, tmp_path / "saved.npz", **settings):
+        helpers.assert_records(got, expected)
