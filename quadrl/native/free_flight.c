@@ -1,8 +1,8 @@
 // Free flight: equations 3 to 10 of the paper, integrated by the classical Runge-Kutta method.
 //
-// Away from the ground the aircraft is this ordinary differential equation and nothing else, so
-// there is no need of a general engine. Attitude is fourth order here; MuJoCo's is second, since
-// it turns the quaternion once a step by the mean of the stages' body rates.
+// Away from the ground the aircraft is this ordinary differential equation and nothing else, so it
+// needs no general engine. The attitude is of fourth order here and of second in MuJoCo, which turns
+// the quaternion once per step by the mean of the stages' body rates.
 #include <math.h>
 #include <stdint.h>
 

@@ -48,9 +48,6 @@ def test_a_reset_of_some_rows_renews_all_that_is_theirs_and_nothing_else():
     np.testing.assert_allclose(now.time, [0.3, 0, 0, 0.3], rtol=1e-15)
     np.testing.assert_array_equal(now.action[[1, 2]], 0)
     np.testing.assert_array_equal(now.rotor_command[[1, 2]], now.state.rotor_speed[[1, 2]])
-    np.testing.assert_array_equal(
-        now.state.time if hasattr(now.state, "time") else now.time, now.time
-    )
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
