@@ -7,28 +7,25 @@ Row i of a batch seeded with s is the single environment seeded with s + i.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
-import mujoco
 import numpy as np
 
-from quadrl import mjcf, parameters, records, tasks, transition, validation
+from quadrl import parameters, records, tasks, transition, validation
 from quadrl.control import modes
-from quadrl.engines.mujoco import ENGINES, BatchEngine, DataEngine, Engine, EngineName
+from quadrl.engines import mujoco
+from quadrl.engines.engine import Engine, EngineName
 from quadrl.errors import QuadrlError
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.randomization import Ranges
 from quadrl.rng import PARAMETERS, Rng, check_seed
 from quadrl.rotation import Array
-from quadrl.task import Snapshot, Task
+from quadrl.task import Snapshot, Task, layout
 from quadrl.transition import Clock, Episode, Observation, Transition
 from quadrl.vehicle import Vehicle, resolve
 
-MAX_ENVS = 1 << 20
-MAX_THREADS = 1024
 MOMENT = ("action", "rotor_command", "time")
 """Arrays of a snapshot that are its own."""
 
@@ -72,26 +69,18 @@ class Environment:
         self.task = tasks.make(task)
         self.vehicle = engine.vehicle if isinstance(engine, Engine) else resolve(vehicle)
         self.ranges = Ranges(self.vehicle, ranges) if ranges else None
+        self._per_row = self.ranges is not None and self.ranges.per_row
         if not isinstance(engine, Engine):
-            validation.choice("engine", engine, ENGINES)
-            count = validation.number("num_envs", num_envs, 1, MAX_ENVS, whole=True)
-            threads = validation.number("num_threads", num_threads, 0, MAX_THREADS, whole=True)
-            altitude = max(self.task.altitude, self.vehicle.ground_clearance)
-            world = {"contact": self.task.contact, "scene": self.task.scene}
-            if count == 1:  # as `BatchEngine`, without a pool of threads
-                model = mjcf.compile_model(self.vehicle, drawn=False, **world)
-                data = mujoco.MjData(model)
-                engine = DataEngine(self.vehicle, model, data, altitude=altitude, engine=engine)
-            else:
-                engine = BatchEngine(
-                    self.vehicle,
-                    count,
-                    altitude=altitude,
-                    num_threads=threads,
-                    engine=engine,
-                    per_row=self.ranges is not None and self.ranges.per_row,
-                    **world,
-                )
+            engine = mujoco.make(
+                engine,
+                self.vehicle,
+                num_envs,
+                altitude=max(self.task.altitude, self.vehicle.ground_clearance),
+                contact=self.task.contact,
+                scene=self.task.scene,
+                num_threads=num_threads,
+                per_row=self._per_row,
+            )
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
         self.control_mode = modes.make(control_mode, self.vehicle)
         self.action_size = self.control_mode.size
@@ -100,18 +89,15 @@ class Environment:
         settle = min(max(1, round(self.task.settle_time / timestep)), self.time_limit_steps)
         self._clock = Clock(timestep, self.time_limit_steps, settle)
         nominal = Parameters.of(parameters.rows(self.vehicle), timestep)
-        self._nominal = nominal.map(np.ascontiguousarray)  # NumPy is faster with these
-        self.term_names = transition.check_task(
-            self.task, self._nominal, self.action_size, float(self.origin[2])
-        )
+        nominal = nominal.map(np.ascontiguousarray)  # NumPy is faster with these
+        height = float(self.origin[2])
+        self.term_names = transition.check_task(self.task, nominal, self.action_size, height)
         """Names of the reward's terms, in their order."""
-        self.layout: dict[str, slice] = {}
+        self.layout = layout(self.task.observation, self.vehicle.rotor_count)
         """Where each named term of the observation stands in the flat vector."""
-        self.size = 0
-        for name, term in self.task.observation.items():
-            width = term.width(self.vehicle.rotor_count)
-            self.layout[name] = slice(self.size, self.size + width)
-            self.size += width
+        self.size = max(part.stop for part in self.layout.values())
+        self._true = self.task.true_parameters and self._per_row
+        self._parameters = Parameters.of(engine.parameters, timestep) if self._true else nominal
         self._keys = np.zeros(self.num_envs, dtype=np.int64)  # (N,) seed of each row
         self._episodes = np.zeros(self.num_envs, dtype=np.int64)  # (N,) begun since it was seeded
         self._episode: Episode | None = None
@@ -159,6 +145,7 @@ class Environment:
         now, episode = transition.begin(self.task, state, task_state, seen, self.action_size)
         self._episodes[rows] += 1
         if len(rows) == self.num_envs:
+            now.parameters = self._parameters
             self._keep(now)
             self._episode = episode
         else:
@@ -169,19 +156,16 @@ class Environment:
     def _draw(self, rows: np.ndarray, rng: Rng) -> Parameters:
         """Draw the parameters of rows that begin; returns those that the task may see."""
         if self.ranges is None:
-            return self._nominal
+            return self._parameters
         table, self._air = self.ranges.draw(rng, len(rows))
-        if self.ranges.per_row:
+        if self._per_row:
             self.engine.write_parameters(rows, table)
-        if not self.task.true_parameters:
-            return self._nominal
-        return Parameters.of(table, self._clock.control_timestep)
+        return (
+            Parameters.of(table, self._clock.control_timestep) if self._true else self._parameters
+        )
 
     def _keep(self, now: Snapshot) -> None:
         """Take a snapshot as the present one."""
-        if self.task.true_parameters and self.ranges is not None and self.ranges.per_row:
-            own = Parameters.of(self.engine.parameters, self._clock.control_timestep)
-            now.parameters = own
         if self._episode is None or now.task is not self.snapshot.task:
             # What a task remembers must not be a view of buffers that the next steps write.
             now.task = records.owned(now.task)
@@ -248,8 +232,7 @@ class Environment:
             *(self.task, self._clock, self._episode, self.snapshot, self.engine.state),
             *(self._action, self._command, self._diverged),
         )
-        # One number that is not finite makes the sum so: cheaper than a test of each.
-        if not math.isfinite(np.add.reduce(done.reward)):
+        if np.count_nonzero(np.isfinite(done.reward)) < self.num_envs:
             row = int(np.flatnonzero(~np.isfinite(done.reward))[0])
             values = {name: float(term[row]) for name, term in done.reward_terms.items()}
             name = f"{self.task.name} reward of aircraft {row}"
@@ -288,20 +271,21 @@ class Environment:
         """
         if self._episode is None:
             self.reset()  # makes the records, which are filled below
+            self._episodes[:] = 0  # this episode does not count
         own = self.save()
         records.check_alike(saved, own)
         name = "engine.parameters"
-        if not (self.ranges and self.ranges.per_row or np.array_equal(saved[name], own[name])):
+        if not (self._per_row or np.array_equal(saved[name], own[name])):
             reason = "what was saved is of another aircraft"
             raise QuadrlError(reason, name=name, value=saved[name], allowed="this aircraft's")
         prefix = "engine."
         self.engine.restore({k[len(prefix) :]: v for k, v in saved.items() if k.startswith(prefix)})
         self._keys[:], self._episodes[:] = saved["keys"], saved["episodes"]
         self._episode = records.of_arrays("episode", self._episode, saved)
+        self._episode.longest = int(self._episode.steps.max())
         task_state = records.of_arrays("task", self.snapshot.task, saved)
         action, command, time = (np.array(saved[name]) for name in MOMENT)
-        seen = self.snapshot.parameters
-        now = Snapshot(self.engine.state, task_state, seen, action, command, time)
+        now = Snapshot(self.engine.state, task_state, self._parameters, action, command, time)
         now.potentials = self.task.measure(now)
         self._keep(now)
         return self.task.observe(now)

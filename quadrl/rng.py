@@ -25,6 +25,8 @@ MAX_SEED = (1 << 62) - 1
 FULL_TURN = 2 * math.pi
 # Streams of an episode. A new purpose takes a new number, so that the others stay as they are.
 START, PARAMETERS = 0, 1
+ADVANCE = 16
+"""Numbers that are drawn at once, about as many as a start takes."""
 _MASK = 0xFFFFFFFF
 
 
@@ -110,14 +112,19 @@ class Rng:
             stream: START, PARAMETERS, ...
         """
         self._keys, self._episodes, self._stream = keys, episodes, stream
-        self._used = 0
+        self._drawn: Array = None  # (n, k) numbers of the stream from `_first` on
+        self._first = self._end = self._used = 0
 
     def uniform(self, low: float, high: float, size: int | None = None) -> Array:
         """Uniform numbers in [low, high): (n,), or (n, size)."""
         count = 1 if size is None else size
-        taken = uniform(self._keys, self._episodes, self._stream, self._used, count)
+        if self._used + count > self._end:  # more than are asked for: each call costs as much
+            self._first, self._end = self._used, self._used + max(count, ADVANCE)
+            many = self._end - self._first
+            self._drawn = uniform(self._keys, self._episodes, self._stream, self._first, many)
+        at = self._used - self._first
         self._used += count
-        return low + (high - low) * (taken[..., 0] if size is None else taken)
+        return low + (high - low) * self._drawn[..., at if size is None else slice(at, at + count)]
 
     def direction(self) -> Array:
         """Unit vectors (n, 3), evenly over the sphere."""

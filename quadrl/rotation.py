@@ -33,7 +33,7 @@ def stack(*parts: Array) -> Array:
     whole = np.empty((len(parts), *first.shape), np.result_type(*parts))
     for k, part in enumerate(parts):
         whole[k] = part
-    return np.moveaxis(whole, 0, -1)
+    return whole.transpose(*range(1, whole.ndim), 0)
 
 
 def square_norm(vector: Array) -> Array:
@@ -115,11 +115,11 @@ def quaternion_from_heading_and_tilt(heading: Array, tilt: Array, direction: Arr
         direction: (...) [rad], of the axis of the tilt in the body's x-y plane, from x.
     """
     xp = namespace(heading)
-    zero = xp.zeros_like(heading)
-    turn = stack(xp.cos(heading / 2), zero, zero, xp.sin(heading / 2))
-    half = xp.sin(tilt / 2)
-    lean = stack(xp.cos(tilt / 2), half * xp.cos(direction), half * xp.sin(direction), zero)
-    return quaternion_product(turn, lean)
+    # Hamilton's product of the turn (c, 0, 0, s) and the lean (w, x, y, 0).
+    c, s = xp.cos(heading / 2), xp.sin(heading / 2)
+    w, half = xp.cos(tilt / 2), xp.sin(tilt / 2)
+    x, y = half * xp.cos(direction), half * xp.sin(direction)
+    return stack(c * w, c * x - s * y, c * y + s * x, s * w)
 
 
 def heading_of(rotation: Array) -> Array:

@@ -12,15 +12,16 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
+import itertools
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from quadrl.errors import QuadrlError
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng
-from quadrl.rotation import Array, namespace, norm, square_norm, to_body
+from quadrl.rotation import Array, norm, square_norm, to_body
 from quadrl.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
 from quadrl.state import Start
 from quadrl.validation import keys, like, number
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from quadrl.snapshot import Rollout
 
 REWARD_TIME = 0.05  # [s], the control step of the paper's aircraft
-CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +49,12 @@ class ObservationTerm:
     def width(self, rotors: int) -> int:
         """Numbers in it for an aircraft with some rotors."""
         return self.size * rotors if self.per_rotor else self.size
+
+
+def layout(terms: Mapping[str, ObservationTerm], rotors: int) -> dict[str, slice]:
+    """Where each term stands in the flat vector of an aircraft with some rotors."""
+    ends = list(itertools.accumulate(term.width(rotors) for term in terms.values()))
+    return dict(zip(terms, map(slice, [0, *ends], ends), strict=False))
 
 
 OBSERVATION = {
@@ -262,40 +268,3 @@ def reward_share(parameters: Parameters) -> float:
 def total(terms: dict[str, Array]) -> Array:
     """The sum of reward terms, from the first to the last."""
     return functools.reduce(operator.add, terms.values())
-
-
-def touches_ground(now: Snapshot) -> Array:
-    """Whether an aircraft that should fly has come down to the ground, (N,) bool."""
-    return now.state.height < -now.parameters.foot[..., 2]
-
-
-def stands(now: Snapshot) -> Array:
-    """Whether a foot is on the ground, (N,) bool."""
-    up, foot = now.state.rotation[..., 2, :], now.parameters.foot
-    # The lowest of four feet that mirror each other.
-    depth = (
-        abs(up[..., 0]) * foot[..., 0] + abs(up[..., 1]) * foot[..., 1] - up[..., 2] * foot[..., 2]
-    )
-    return now.state.height - depth < CONTACT_HEIGHT
-
-
-def strikes_ground(now: Snapshot) -> Array:
-    """Whether the hull or a rotor has hit the ground, (N,) bool."""
-    xp, rotor = namespace(now.state.height), now.parameters.rotor
-    up = now.state.rotation[..., 2, :]
-    depth = norm(up * now.parameters.hull)
-    centre = rotor.position + now.parameters.rotor_height[..., None, None] * rotor.axis
-    above = _along(up[..., None, :], centre)  # (N, R) [m], of the discs' centres
-    edge = rotor.radius * norm(_across(up[..., None, :], rotor.axis))
-    deepest = xp.max(edge - above, axis=-1)
-    return now.state.height < xp.maximum(depth, deepest)
-
-
-def _along(first: Array, second: Array) -> Array:
-    product = first * second
-    return product[..., 0] + product[..., 1] + product[..., 2]
-
-
-def _across(up: Array, axis: Array) -> Array:
-    """The part of `up` in the plane of a disc with an axis."""
-    return up - _along(up, axis)[..., None] * axis

@@ -33,6 +33,9 @@ class Episode:
     steps: Array  # control steps
     error_sum: Array  # [m], of the task's error
     final_sum: Array  # [m], of those in the settle time
+    longest: int = 0
+    """No row has more steps: a number of the host's, so that what happens only near the end of an
+    episode is left out before it without a look at data."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -74,7 +77,7 @@ def begin(
         actions: Numbers in an action.
     """
     xp = namespace(state.speed)
-    none = [xp.zeros_like(state.speed) for _ in range(4)]
+    none = [0.0 * state.speed for _ in range(4)]
     action = xp.stack([none[0]] * actions, axis=-1)
     now = Snapshot(state, task_state, parameters, action, state.rotor_speed + 0.0, none[0])
     episode = Episode(*none[1:])
@@ -108,22 +111,28 @@ def finish(
         The snapshot after it, how far the episodes are, and the transition.
     """
     xp = namespace(state.speed)
-    steps = episode.steps + 1.0
+    steps, longest = episode.steps + 1.0, episode.longest + 1
     time = steps * clock.control_timestep
     now = Snapshot(state, before.task, before.parameters, action, rotor_command, time)
     now.potentials = task.measure(now)
     terminated = task.terminated(now)
     if diverged is not None:
         terminated = terminated | diverged
-    truncated = (steps >= clock.time_limit_steps) & ~terminated
+    truncated = terminated ^ terminated
+    if longest >= clock.time_limit_steps:
+        truncated = (steps >= clock.time_limit_steps) & ~terminated
     error = task.error(now)
-    error_sum = episode.error_sum + error
-    settling = steps > clock.time_limit_steps - clock.settle_steps
-    final_sum = episode.final_sum + xp.where(settling, error, 0.0 * error)
+    error_sum, final_sum = episode.error_sum + error, episode.final_sum
+    flying = clock.time_limit_steps - clock.settle_steps
+    if longest > flying:
+        final_sum = final_sum + xp.where(steps > flying, error, 0.0 * error)
     end = EpisodeEnd(terminated, truncated, steps, error_sum, final_sum, clock.settle_steps)
-    end.succeeded = (terminated | truncated) & task.succeeded(now, end)
-    if diverged is not None:
-        end.succeeded = end.succeeded & ~diverged
+    end.succeeded = terminated | truncated
+    # Most steps end no episode. Elsewhere than in NumPy to ask would mean to wait for a device.
+    if xp is not np or np.count_nonzero(end.succeeded):
+        end.succeeded = end.succeeded & task.succeeded(now, end)
+        if diverged is not None:
+            end.succeeded = end.succeeded & ~diverged
     terms = task.reward(before, now, end)
     task_state = task.update(before, now)
     if task_state is not now.task:  # a goal may have moved on
@@ -139,7 +148,7 @@ def finish(
         diverged=terminated ^ terminated if diverged is None else diverged,
         error=error + 0.0,  # its own, since a reset writes into the potentials
     )
-    return now, Episode(steps, error_sum, final_sum), transition
+    return now, Episode(steps, error_sum, final_sum, longest), transition
 
 
 def check_task(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
+from quadrl.contact import touches_ground
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng, hovering
 from quadrl.rotation import Array, namespace
 from quadrl.state import Start
-from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, touches_ground
+from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,21 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quadrl.contact import stands, strikes_ground
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng
 from quadrl.rotation import Array, namespace, norm, square_norm, stack
 from quadrl.state import Start
-from quadrl.task import (
-    EpisodeEnd,
-    Snapshot,
-    Target,
-    Task,
-    TaskState,
-    reward_share,
-    stands,
-    strikes_ground,
-)
+from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, reward_share
 
 if TYPE_CHECKING:
     from quadrl.reading import Reading

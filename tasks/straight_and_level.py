@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quadrl.contact import touches_ground
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng
@@ -22,7 +23,6 @@ from quadrl.task import (
     Target,
     Task,
     TaskState,
-    touches_ground,
 )
 from quadrl.validation import number
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quadrl.contact import touches_ground
 from quadrl.errors import QuadrlError
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
@@ -23,7 +24,6 @@ from quadrl.task import (
     Target,
     Task,
     TaskState,
-    touches_ground,
 )
 from quadrl.validation import number
 

@@ -8,13 +8,16 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from quadrl import mjcf, native, parameters
+from quadrl import mjcf, native, parameters, validation
 from quadrl.engines.engine import ENGINES, Engine, EngineName
 from quadrl.engines.free_flight import FIELDS
 from quadrl.errors import QuadrlError
 from quadrl.vehicle import Vehicle
 
-__all__ = ["ENGINES", "BatchEngine", "DataEngine", "Engine", "EngineName"]
+__all__ = ["ENGINES", "BatchEngine", "DataEngine", "Engine", "EngineName", "make"]
+
+MAX_ENVS = 1 << 20
+MAX_THREADS = 1024
 
 
 class BatchEngine(Engine):
@@ -141,6 +144,34 @@ class DataEngine(Engine):
         spec = mujoco.mjtState.mjSTATE_INTEGRATION
         mujoco.mj_setState(self.model, self.data, saved["rows"][0], spec)
         self._restore_state(saved)
+
+
+def make(
+    name: str,
+    vehicle: Vehicle,
+    num_envs: int = 1,
+    *,
+    altitude: float,
+    contact: bool = False,
+    scene: mjcf.Scene | None = None,
+    num_threads: int = 0,
+    per_row: bool = False,
+) -> Engine:
+    """The engine of a name for N aircraft in a world, as `BatchEngine` takes them.
+
+    Raises:
+        QuadrlError: Unknown name, or a count that cannot be.
+    """
+    validation.choice("engine", name, ENGINES)
+    validation.number("num_envs", num_envs, 1, MAX_ENVS, whole=True)
+    validation.number("num_threads", num_threads, 0, MAX_THREADS, whole=True)
+    world: Any = {"altitude": altitude, "engine": name}
+    if num_envs > 1:
+        world |= {"contact": contact, "scene": scene, "num_threads": num_threads}
+        return BatchEngine(vehicle, num_envs, per_row=per_row, **world)
+    # One alone needs no pool of threads.
+    model = mjcf.compile_model(vehicle, contact=contact, drawn=False, scene=scene)
+    return DataEngine(vehicle, model, mujoco.MjData(model), **world)
 
 
 def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:

@@ -11,8 +11,7 @@ from typing import Any, ClassVar
 
 from quadrl import __version__, tasks
 from quadrl.control.modes import CONTROL_MODES
-from quadrl.engines.mujoco import ENGINES
-from quadrl.environment import MAX_ENVS, MAX_THREADS
+from quadrl.engines.mujoco import ENGINES, MAX_ENVS, MAX_THREADS
 from quadrl.errors import QuadrlError
 from quadrl.learning.folder import CONFIG, read_config
 from quadrl.rollout import MAX_SEED
@@ -194,25 +193,19 @@ class TrainConfig:
         self._check()
 
     def _check(self) -> None:
-        whole = {
-            "seed": (0, MAX_SEED),
-            "num_envs": (1, MAX_ENVS),
-            "rollout": (1, MAX_BATCH),
-            "steps": (1, math.inf),
-            "num_threads": (0, MAX_THREADS),
-        }
-        real = {
-            "gamma": (0, 1),
-            "gae_lambda": (0, 1),
-            "initial_deviation": (0.01, math.e),
-            "checkpoint_seconds": (0, math.inf),
-            "reward_scale": (0, math.inf),
-        }
-        for name, (low, high) in (whole | real).items():
-            value = getattr(self, name)
-            positive = name == "reward_scale"
-            checked = number(name, value, low, high, whole=name in whole, positive=positive)
-            object.__setattr__(self, name, checked)
+        for name, low, high, rest in (
+            ("seed", 0, MAX_SEED, {"whole": True}),
+            ("num_envs", 1, MAX_ENVS, {"whole": True}),
+            ("rollout", 1, MAX_BATCH, {"whole": True}),
+            ("steps", 1, math.inf, {"whole": True}),
+            ("num_threads", 0, MAX_THREADS, {"whole": True}),
+            ("gamma", 0, 1, {}),
+            ("gae_lambda", 0, 1, {}),
+            ("initial_deviation", 0.01, math.e, {}),
+            ("checkpoint_seconds", 0, math.inf, {}),
+            ("reward_scale", 0, math.inf, {"positive": True}),
+        ):
+            object.__setattr__(self, name, number(name, getattr(self, name), low, high, **rest))
         for name, kind in (("hidden", tuple), ("critic_hidden", tuple), ("task_options", dict)):
             if not isinstance(value := getattr(self, name), kind):
                 raise QuadrlError(name=name, value=value, allowed=f"a {kind.__name__}")

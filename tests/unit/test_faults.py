@@ -8,7 +8,8 @@ import pytest
 from helpers import begun, idle
 
 from quadrl import tasks
-from quadrl.environment import MAX_ENVS, Environment
+from quadrl.engines.mujoco import MAX_ENVS
+from quadrl.environment import Environment
 from quadrl.errors import QuadrlError
 from quadrl.tasks.hover import Hover
 from quadrl.vehicle import Vehicle
