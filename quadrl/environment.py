@@ -281,8 +281,8 @@ class Environment:
         prefix = "engine."
         self.engine.restore({k[len(prefix) :]: v for k, v in saved.items() if k.startswith(prefix)})
         self._keys[:], self._episodes[:] = saved["keys"], saved["episodes"]
-        self._episode = records.of_arrays("episode", self._episode, saved)
-        self._episode.longest = int(self._episode.steps.max())
+        self._episode = episode = records.of_arrays("episode", self._episode, saved)
+        episode.longest = int(episode.steps.max())
         task_state = records.of_arrays("task", self.snapshot.task, saved)
         action, command, time = (np.array(saved[name]) for name in MOMENT)
         now = Snapshot(self.engine.state, task_state, self._parameters, action, command, time)

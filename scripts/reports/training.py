@@ -20,12 +20,11 @@ from scripts.reports.report import Result, asked, factor, number, table
 
 HOVER_SEEDS = (50, 51, 52, 53, 54)  # not used for tuning, like those below
 SEEDS = (80, 81, 82)
-JOBS = 2  # at the same time, of the trainings whose wall clock is no record
 EPISODES = 100
 LONGEST = 300.0  # [s] that a training of any task may take
 
 
-def plan() -> dict[int, list[Run]]:
+def plan(jobs: int) -> dict[int, list[Run]]:
     """The trainings, by how many are made at the same time."""
     folder = report.RUNS / "training"
     alone = [
@@ -39,12 +38,16 @@ def plan() -> dict[int, list[Run]]:
         for seed in SEEDS
     ]
     name = "{0.task}-{0.vehicle}-{0.engine}-{0.seed}".format
-    return {k: [Run(c, folder / name(c)) for c in x] for k, x in ((1, alone), (JOBS, together))}
+    return {k: [Run(c, folder / name(c)) for c in x] for k, x in ((1, alone), (jobs, together))}
 
 
-def main() -> None:
-    """Train what is missing, evaluate it, write it down."""
-    planned = plan()
+def main(jobs: int = 2) -> None:
+    """Train what is missing, evaluate it, write it down.
+
+    Args:
+        jobs: Trainings at the same time, of those whose wall clock is no record.
+    """
+    planned = plan(jobs)
     for jobs, runs in planned.items():
         evaluation.train(runs, jobs, EPISODES)
     found = []
