@@ -35,10 +35,10 @@ class Tasks:
             return
         console.print(make_table(("task", "", ""), _texts(described)))
         head = ("observation", "numbers", "unit", "meaning and frame")
-        console.print(make_table(head, _observation(described)))
+        console.print(make_table(head, observation_rows(described)))
         console.print(f"\n[bold]action[/bold]  {escape(described[0]['action'])}\n", highlight=False)
         head = ("reward", "meaning", "weight", "" if self.task else "where it differs")
-        console.print(make_table(head, _reward(described)))
+        console.print(make_table(head, reward_rows(described)))
         if self.task:
             rows = [(o["name"], _text(o["value"]), o["meaning"]) for o in described[0]["options"]]
             console.print("", make_table(("option", "default", "meaning"), rows))
@@ -53,21 +53,21 @@ def _texts(described: list[dict[str, Any]]) -> Iterator[tuple[str, str, str]]:
         yield "", "ends early", task["ends"]
         yield "", "solved", task["solved"]
         yield "", "time limit", f"{task['time_limit']:g} s"
-        yield "", "trained with", ", ".join(_settings(task["training"])) or "the usual settings"
+        yield "", "trained with", ", ".join(settings(task["training"])) or "the usual settings"
         yield "", "", ""
 
 
-def _settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
+def settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
     """Nested settings as `quadrl train` takes them."""
     for name, value in values.items():
         word = prefix + name.replace("_", "-")
         if isinstance(value, dict):
-            yield from _settings(value, f"{word}.")
+            yield from settings(value, f"{word}.")
         else:
             yield f"{word} {value}"
 
 
-def _observation(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+def observation_rows(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
     """The terms of the flat observation, and the tasks that have them if not all do."""
     for term in {t["name"]: t for task in described for t in task["observation"]}.values():
         having = [task["name"] for task in described if term in task["observation"]]
@@ -76,7 +76,7 @@ def _observation(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
         yield term["name"], numbers, term["unit"], term["meaning"] + where
 
 
-def _reward(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+def reward_rows(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
     """The terms of the reward, the weight that the first task has, and where another has one."""
     usual = {term["name"]: term["weight"] for term in described[0]["reward"]}
     found: dict[str, tuple[str, list[str]]] = {}

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import inspect
 import typing
+from collections.abc import Iterable
 from typing import Any
 
 from quadrl import VEHICLES, cli, tasks
-from quadrl.cli import tasks as listing
+from quadrl.cli.tasks import observation_rows, reward_rows, settings
 from quadrl.control import CONTROL_MODES
 from quadrl.description import describe, describe_action, docstrings
 from quadrl.vehicle import GRAVITY, Rotor, Vehicle
@@ -27,9 +28,9 @@ def training_table() -> str:
     """What each task is trained with and what a policy must reach."""
     rows = []
     for name, task in tasks.TASKS.items():
-        settings = " ".join(f"`{setting}`" for setting in listing._settings(task.training))
+        words = " ".join(f"`{setting}`" for setting in settings(task.training))
         targets = "; ".join(f"{target.words}: {asked(target)}" for target in task.targets)
-        rows.append((f"`{name}`", settings, targets))
+        rows.append((f"`{name}`", words, targets))
     return table(("task", "settings other than the defaults", "counts as trained"), rows)
 
 
@@ -50,18 +51,23 @@ def control_modes() -> str:
 
 def observation() -> str:
     """The entries of the flat observation."""
-    return table(("observation", "numbers", "unit", "meaning and frame"), coded("observation"))
+    head = ("observation", "numbers", "unit", "meaning and frame")
+    return table(head, coded(observation_rows(described())))
 
 
 def reward() -> str:
     """The terms of the reward and their weights."""
-    return table(("reward", "meaning", "weight", "where it differs"), coded("reward"))
+    head = ("reward", "meaning", "weight", "where it differs")
+    return table(head, coded(reward_rows(described())))
 
 
-def coded(what: str) -> list[tuple[str, ...]]:
-    """The rows that `quadrl tasks` shows, with the names as code."""
-    described = [describe(tasks.make(name)) for name in tasks.TASKS]
-    rows = getattr(listing, f"_{what}")(described)
+def described() -> list[dict[str, Any]]:
+    """What `quadrl tasks` shows of each task."""
+    return [describe(tasks.make(name)) for name in tasks.TASKS]
+
+
+def coded(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Rows with their names as code."""
     return [(f"`{name}`", *rest) for name, *rest in rows]
 
 

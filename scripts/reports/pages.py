@@ -6,24 +6,10 @@ import sys
 
 import tyro
 
-from scripts.reports import (
-    cost,
-    describe,
-    examples,
-    kills,
-    memory,
-    paper,
-    peers,
-    report,
-    step_size,
-    training,
-    wall_clock,
-)
-from scripts.reports import speed as layers
+from scripts.reports import describe, examples, paper, peers, report, speed, step_size, training
 from scripts.reports.report import table
 
-MODULES = (cost, describe, examples, kills, layers, memory, paper, peers, step_size, training,
-           wall_clock)  # fmt: skip
+MODULES = (describe, examples, paper, peers, speed, step_size, training)
 
 
 def main(check: bool = False) -> None:
@@ -45,7 +31,7 @@ def main(check: bool = False) -> None:
 
 def figures() -> str:
     """The five figures of the README."""
-    result, speed = report.load("training"), report.load("speed")
+    result, measured = report.load("training"), report.load("speed")
     hover = [
         run
         for run in result["runs"]
@@ -59,12 +45,12 @@ def figures() -> str:
         f"{result['episodes']} episodes",
         "`scripts/report training`"
     )]  # fmt: skip
-    for row in speed["rates"]:
+    for row in measured["rates"]:
         if row["target"]:
             share = f"{row['share']:.2f} times bare `mj_step` on {row['of']}"
             rows.append((f"{row['what']}", f"{row['rate']:,.0f} control steps/s; {share}",
                          "`quadrl benchmark`"))  # fmt: skip
-    return f"{table(('what', 'figure', 'command'), rows)}\n\n{report.source(speed)}"
+    return f"{table(('what', 'figure', 'command'), rows)}\n\n{report.source(measured)}"
 
 
 if __name__ == "__main__":

@@ -15,18 +15,14 @@ from quadrl.policy import Policy
 from quadrl.rollout import fly, summarize
 from scripts.reports import (
     claims,
-    cost,
     evaluation,
     examples,
-    kills,
-    memory,
     paper,
     peers,
     report,
     ship,
     step_size,
     trial,
-    wall_clock,
 )
 
 
@@ -58,7 +54,7 @@ def test_results_keep_machine_commit_and_five_digits():
     assert report.spread([3.0, 1.0, math.nan, 2.0], "cm", 100) == "200 (100 to 300) cm"
 
 
-# ------------------------------------------------------------------------------ speed and endurance
+# ------------------------------------------------------------------------------ speed
 
 
 def test_shares_of_the_benchmark_are_of_bare_mj_step_within_one_turn():
@@ -75,39 +71,12 @@ def test_shares_of_the_benchmark_are_of_bare_mj_step_within_one_turn():
     assert len(benchmark.rows(measured)) == len(measured["rates"])
 
 
-def test_the_parts_of_a_training_add_up_to_all_of_it():
-    wall_clock.main(steps=8192)
-    for parts in report.load("wall_clock")["seconds"].values():
-        whole = parts.pop("all")
-        assert min(parts.values()) > 0 and sum(parts.values()) == pytest.approx(whole, rel=1e-3)
-
-
-def test_cost_and_step_size(monkeypatch):
-    for name, value in {"COUNTS": (1, 4), "COUNT": 4, "SLICE": 0.001}.items():
-        monkeypatch.setattr(cost, name, value)
-    cost.main()
-    assert "| 4 |" in cost.shown() and "`hover`, 22" in cost.shown()
+def test_step_size(monkeypatch):
     monkeypatch.setattr(step_size, "CONTROL_STEPS", 2)
     step_size.main((0.05, 0.5))
     for rows in report.load("step_size")["tables"].values():  # the nearer, the worse
         slow, fast = (row["errors"]["free_flight"]["position_m"] for row in rows)
         assert slow < fast < 0.01
-
-
-def test_a_leak_is_noticed(monkeypatch):
-    kept, opened = [], memory.OPENED["Environment"]
-    assert not memory.leaks(cost.alone(memory.growth, "Environment", 40))
-    monkeypatch.setitem(memory.OPENED, "Environment", lambda: kept.append(opened()) or kept[-1])
-    assert memory.leaks(cost.alone(memory.growth, "Environment", 40))
-    # 3 kB a second for the first 2 of 11 s, then half a kB: 30 kB/min.
-    time = np.arange(12.0)
-    curve = np.stack([time, np.where(time <= 2, 3 * time, 6 + 0.5 * (time - 2))], axis=-1)
-    assert memory.slope(curve.tolist()) == pytest.approx(30.0)
-
-
-def test_a_killed_training_ends_as_if_not():
-    row = kills.killed("ppo", "free_flight", 1)
-    assert (row["kills"], row["runs"], row["equal"]) == (1, 1, 1)
 
 
 # ------------------------------------------------------------------------------ others
