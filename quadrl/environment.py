@@ -7,12 +7,14 @@ Row i of a batch seeded with s is the single environment seeded with s + i.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from quadrl import parameters, records, tasks, transition, validation
+from quadrl.compiled import MOMENT, CompiledStep
 from quadrl.control import modes
 from quadrl.engines import mujoco
 from quadrl.engines.engine import Engine, EngineName
@@ -26,15 +28,9 @@ from quadrl.task import Snapshot, Task, layout
 from quadrl.transition import Clock, Episode, Observation, Transition
 from quadrl.vehicle import Vehicle, resolve
 
-MOMENT = ("action", "rotor_command", "time")
-"""Arrays of a snapshot that are its own."""
-
 
 class Environment:
     """A task flown by N aircraft; a single one is N = 1."""
-
-    snapshot: Snapshot
-    """What tasks see now: live, valid until the next step."""
 
     def __init__(
         self,
@@ -88,23 +84,27 @@ class Environment:
         self.time_limit_steps = max(1, round(self.task.time_limit / timestep))
         settle = min(max(1, round(self.task.settle_time / timestep)), self.time_limit_steps)
         self._clock = Clock(timestep, self.time_limit_steps, settle)
-        nominal = Parameters.of(parameters.rows(self.vehicle), timestep)
-        nominal = nominal.map(np.ascontiguousarray)  # NumPy is faster with these
-        height = float(self.origin[2])
-        self.term_names = transition.check_task(self.task, nominal, self.action_size, height)
+        self._true = self.task.true_parameters and self._per_row
+        nominal = parameters.rows(self.vehicle)
+        self._rows = engine.parameters if self._true else nominal  # those that the task sees
+        self._parameters, seen = (Parameters.of(k, timestep) for k in (self._rows, nominal))
+        self.term_names = transition.check_task(self.task, seen, self.action_size, self.origin[2])
         """Names of the reward's terms, in their order."""
         self.layout = layout(self.task.observation, self.vehicle.rotor_count)
         """Where each named term of the observation stands in the flat vector."""
         self.size = max(part.stop for part in self.layout.values())
-        self._true = self.task.true_parameters and self._per_row
-        self._parameters = Parameters.of(engine.parameters, timestep) if self._true else nominal
+        self._all = np.arange(self.num_envs)
         self._keys = np.zeros(self.num_envs, dtype=np.int64)  # (N,) seed of each row
         self._episodes = np.zeros(self.num_envs, dtype=np.int64)  # (N,) begun since it was seeded
         self._episode: Episode | None = None
+        self._snapshot: Snapshot | None = None
+        self.compiled: CompiledStep | None = None
+        """The task's step in C from the first reset on; None where it cannot be compiled."""
+        self._action = np.zeros((self.num_envs, self.action_size))
+        self._command = np.zeros((self.num_envs, self.vehicle.rotor_count))  # [rad/s]
         self._setpoint: Any = None
-        self._command: Any = None
         self._flown = 0  # physics steps of this control step that the mode's loops have flown
-        self._diverged: np.ndarray | None = None  # in them
+        self._diverged = np.zeros(self.num_envs, dtype=bool)  # in this control step
         self.seed(seed)
 
     def seed(self, seed: int | None = None, rows: np.ndarray | None = None) -> int:
@@ -116,8 +116,8 @@ class Environment:
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         seed = check_seed(seed)
-        rows = np.arange(self.num_envs) if rows is None else validation.rows(rows, self.num_envs)
-        self._keys[rows], self._episodes[rows] = seed + rows, 0
+        chosen = self._all if rows is None else validation.rows(rows, self.num_envs)
+        self._keys[chosen], self._episodes[chosen] = seed + chosen, 0
         return seed
 
     def reset(self, rows: np.ndarray | None = None) -> Observation:
@@ -133,43 +133,52 @@ class Environment:
             QuadrlError: A number of an aircraft that is not there, or one twice; or the task gives
                 arrays of the wrong shape, or a start that no aircraft can have.
         """
-        rows = np.arange(self.num_envs) if rows is None else validation.rows(rows, self.num_envs)
+        rows = self._all if rows is None else validation.rows(rows, self.num_envs)
         if self._episode is None and len(rows) < self.num_envs:
             raise RuntimeError("the first reset must be of every aircraft")
         place = self._keys[rows], self._episodes[rows]
-        seen = self._draw(rows, Rng(*place, PARAMETERS))
+        seen, air = self._parameters, None
+        if self.ranges is not None:
+            table, air = self.ranges.draw(Rng(*place, PARAMETERS), len(rows))
+            if self._per_row:
+                self.engine.write_parameters(rows, table)
+            if self._true:
+                seen = Parameters.of(table, self._clock.control_timestep)
         start, task_state = self.task.begin(Rng(*place), seen)
         state = self.engine.place(rows, start)
-        if self.ranges is not None:
-            self.engine.air[rows] = self._air
+        if air is not None:
+            self.engine.air[rows] = air
         now, episode = transition.begin(self.task, state, task_state, seen, self.action_size)
         self._episodes[rows] += 1
         if len(rows) == self.num_envs:
-            now.parameters = self._parameters
-            self._keep(now)
-            self._episode = episode
+            self._take(now, episode)
         else:
             records.put(self.snapshot, rows, now)
             records.put(self._episode, rows, episode)
         return self.task.observe(now)
 
-    def _draw(self, rows: np.ndarray, rng: Rng) -> Parameters:
-        """Draw the parameters of rows that begin; returns those that the task may see."""
-        if self.ranges is None:
-            return self._parameters
-        table, self._air = self.ranges.draw(rng, len(rows))
-        if self._per_row:
-            self.engine.write_parameters(rows, table)
-        return (
-            Parameters.of(table, self._clock.control_timestep) if self._true else self._parameters
-        )
+    @property
+    def snapshot(self) -> Snapshot:
+        """What tasks see now: live, valid until the next step."""
+        if self._snapshot is None:
+            assert self.compiled
+            self._snapshot, self._episode = self.compiled.snapshot()
+        return self._snapshot
 
-    def _keep(self, now: Snapshot) -> None:
-        """Take a snapshot as the present one."""
-        if self._episode is None or now.task is not self.snapshot.task:
-            # What a task remembers must not be a view of buffers that the next steps write.
-            now.task = records.owned(now.task)
-        self.snapshot = now
+    def _take(self, now: Snapshot, episode: Episode) -> None:
+        """Take a snapshot of all rows as the present one."""
+        # What a task remembers must not be a view of buffers that the next steps write.
+        now.task, now.parameters = records.owned(now.task), self._parameters
+        if self._episode is None and self.task.compiled:
+            inputs = self._action, self._command, self._diverged
+            loops = self.control_mode.has_loops
+            rows = self.engine, self._rows, inputs
+            with contextlib.suppress(Exception):  # whatever the functions of a task raise
+                self.compiled = CompiledStep(self.task, self._clock, *rows, now, episode, loops)
+        self._snapshot, self._episode = now, episode
+        if self.compiled:
+            self.compiled.begin(now, episode)
+            self._snapshot = None
 
     def step(self, action: Array) -> Transition:
         """Fly one control step.
@@ -198,50 +207,50 @@ class Environment:
         """First half of a step: the commands to the rotors, or the setpoint of the loops."""
         if self._episode is None:
             raise RuntimeError("call reset before the first step")
-        self._action = action = validation.action(action, (self.num_envs, self.action_size))
-        self._setpoint = self.control_mode.setpoint(self.engine.state, action)
-        self._flown, self._diverged = 0, None
+        self._action[:] = validation.action(action, (self.num_envs, self.action_size))
+        self._setpoint = self.control_mode.setpoint(self.engine.state, self._action)
+        self._flown, self._diverged[:] = 0, False
         if self.control_mode.has_loops:
-            self._command = np.zeros_like(self.engine.ctrl)
-            # The loops read the state at every physics step, past the life of its buffers.
-            self.snapshot = records.copied(self.snapshot)
+            self._command[:] = 0.0
+            if not self.compiled:
+                # The loops read the state at every physics step, past the life of its buffers.
+                self._snapshot = records.copied(self._snapshot)
         else:
-            self._command = self.engine.ctrl[:] = self._setpoint
+            self._command[:] = self.engine.ctrl[:] = self._setpoint
 
     def control(self) -> None:
-        """Before each physics step of a control mode with loops: the commands to the rotors.
-
-        The reward sees their mean over the control step.
-        """
-        if self._flown:
-            self._note(self.engine.read())
+        """Command the rotors before each physics step of a mode with loops; the mean is rewarded."""
+        if self._flown and (diverged := self.engine.read()) is not None:
+            self._diverged |= diverged
         command = self.control_mode.rotor_command(self.engine.state, self._setpoint)
         self.engine.ctrl[:] = command
         self._command += command / self.vehicle.substeps
         self._flown += 1
 
-    def _note(self, diverged: np.ndarray | None) -> None:
-        if diverged is not None:
-            self._diverged = diverged if self._diverged is None else self._diverged | diverged
-
     def finish(self) -> Transition:
         """Second half of a step, after the engine has advanced."""
-        self._note(self.engine.read())
+        if (diverged := self.engine.read()) is not None:
+            self._diverged |= diverged
         assert self._episode is not None
-        now, self._episode, done = transition.finish(
-            *(self.task, self._clock, self._episode, self.snapshot, self.engine.state),
-            *(self._action, self._command, self._diverged),
-        )
+        if self.compiled:
+            done, self._snapshot = self.compiled.finish(), None
+        else:
+            self._snapshot, self._episode, done = transition.finish(
+                *(self.task, self._clock, self._episode, self.snapshot, self.engine.state),
+                *(self._action.copy(), self._command.copy(), self._diverged.copy()),
+            )
+            self._snapshot.task = records.owned(self._snapshot.task)
         if np.count_nonzero(np.isfinite(done.reward)) < self.num_envs:
             row = int(np.flatnonzero(~np.isfinite(done.reward))[0])
             values = {name: float(term[row]) for name, term in done.reward_terms.items()}
             name = f"{self.task.name} reward of aircraft {row}"
             raise QuadrlError(name=name, value=values, allowed="finite in every term")
-        self._keep(now)
         return done
 
     def flatten(self, observation: Observation) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""
+        if self.compiled and observation is self.compiled.observation:
+            return self.compiled.flat()
         return np.concatenate(list(observation.values()), axis=-1, dtype=np.float32)
 
     def goals(self) -> np.ndarray:
@@ -278,14 +287,12 @@ class Environment:
         if not (self._per_row or np.array_equal(saved[name], own[name])):
             reason = "what was saved is of another aircraft"
             raise QuadrlError(reason, name=name, value=saved[name], allowed="this aircraft's")
-        prefix = "engine."
-        self.engine.restore({k[len(prefix) :]: v for k, v in saved.items() if k.startswith(prefix)})
+        self.engine.restore({key.removeprefix("engine."): saved[key] for key in saved})
         self._keys[:], self._episodes[:] = saved["keys"], saved["episodes"]
-        self._episode = episode = records.of_arrays("episode", self._episode, saved)
-        episode.longest = int(episode.steps.max())
+        episode = records.of_arrays("episode", self._episode, saved)
         task_state = records.of_arrays("task", self.snapshot.task, saved)
         action, command, time = (np.array(saved[name]) for name in MOMENT)
         now = Snapshot(self.engine.state, task_state, self._parameters, action, command, time)
         now.potentials = self.task.measure(now)
-        self._keep(now)
+        self._take(now, episode)
         return self.task.observe(now)

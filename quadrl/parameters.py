@@ -88,14 +88,18 @@ class Parameters:
         raise AttributeError(f"there is no parameter {name!r}")
 
     @classmethod
-    def of(cls, table: np.ndarray, control_timestep: float = 0.0) -> Parameters:
+    def of(
+        cls, table: np.ndarray, control_timestep: float = 0.0, rotors: int | None = None
+    ) -> Parameters:
         """Views of rows (N,).
 
         Args:
             table: Rows, which the views show live.
             control_timestep: Kept beside them, a float [s].
+            rotors: How many; None for what the rows say.
         """
-        rotor = table["rotor"][:, : int(table["rotor_count"][0])]
+        count = int(table["rotor_count"][0]) if rotors is None else rotors
+        rotor = table["rotor"][:, :count]
         arrays: dict[str, Any] = {n: table[n] for n in AIRCRAFT.names or () if n != "rotor"}
         arrays["rotor"] = {name: rotor[name] for name in ROTOR.names or ()}
         return cls(arrays | {"control_timestep": control_timestep})

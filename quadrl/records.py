@@ -50,14 +50,14 @@ def put(record: Any, rows: np.ndarray, fresh: Any) -> None:
 
 def arrays(prefix: str, record: Any) -> dict[str, np.ndarray]:
     """Copies of a record's arrays by name, "PREFIX.FIELD"."""
-    values = ((field.name, getattr(record, field.name)) for field in dataclasses.fields(record))
-    return {f"{prefix}.{n}": np.array(value) for n, value in values if hasattr(value, "dtype")}
+    fields = dataclasses.fields(record)
+    return {f"{prefix}.{field.name}": np.array(getattr(record, field.name)) for field in fields}
 
 
 def of_arrays(prefix: str, like: Any, saved: Mapping[str, np.ndarray]) -> Any:
     """The record of the kind of another that `arrays` took apart."""
-    names = (field.name for field in dataclasses.fields(like) if f"{prefix}.{field.name}" in saved)
-    return type(like)(**{name: np.array(saved[f"{prefix}.{name}"]) for name in names})
+    fields = dataclasses.fields(like)
+    return type(like)(**{field.name: np.array(saved[f"{prefix}.{field.name}"]) for field in fields})
 
 
 def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) -> None:

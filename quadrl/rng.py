@@ -76,12 +76,14 @@ def uniform(keys: Array, episodes: Array, stream: int, first: int, count: int) -
     if isinstance(keys, np.ndarray):
         from quadrl import native
 
-        keys, episodes = (np.ascontiguousarray(a, dtype=np.int64) for a in (keys, episodes))
+        words = np.array((keys, episodes), dtype=np.int64)
         out = np.empty((len(keys), count))
-        addresses = (array.ctypes.data for array in (keys, episodes))
-        native.library().quadrl_uniform(
-            len(keys), *addresses, stream, first, count, out.ctypes.data
-        )
+        if out.size:
+            keys, values = native.address(words), native.address(out)
+            episodes = keys + words.strides[0]
+            native.library().quadrl_uniform(
+                words.shape[1], keys, episodes, stream, first, count, values
+            )
         return out
     return uniform_array_api(keys, episodes, stream, first, count)
 

@@ -30,7 +30,7 @@ def stack(*parts: Array) -> Array:
     if not isinstance(first, np.ndarray):
         return namespace(first).stack(parts, axis=-1)
     # Each component contiguous, as in the tables of the state: NumPy's loops then run over rows.
-    whole = np.empty((len(parts), *first.shape), np.result_type(*parts))
+    whole = np.empty_like(first, np.result_type(*parts), shape=(len(parts), *first.shape))
     for k, part in enumerate(parts):
         whole[k] = part
     return whole.transpose(*range(1, whole.ndim), 0)

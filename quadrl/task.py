@@ -118,6 +118,9 @@ class Task(abc.ABC):
     """Whether the attitude error counts yaw against east (0), or only roll and pitch."""
     contact: ClassVar[bool] = False
     """Whether the aircraft can touch anything without the episode being over."""
+    compiled: ClassVar[bool] = True
+    """Whether its step may be compiled (`quadrl.compiled`); False for a task whose functions look
+    at anything but their arguments."""
     true_parameters: ClassVar[bool] = False
     """Whether snapshots show the parameters that were drawn, instead of the specified ones."""
 

@@ -33,9 +33,6 @@ class Episode:
     steps: Array  # control steps
     error_sum: Array  # [m], of the task's error
     final_sum: Array  # [m], of those in the settle time
-    longest: int = 0
-    """No row has more steps: a number of the host's, so that what happens only near the end of an
-    episode is left out before it without a look at data."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -93,7 +90,7 @@ def finish(
     state: State,
     action: Array,
     rotor_command: Array,
-    diverged: Array | None = None,
+    diverged: Array,
 ) -> tuple[Snapshot, Episode, Transition]:
     """The transition to a new state.
 
@@ -105,34 +102,24 @@ def finish(
         state: After it.
         action: (N, k) that was taken.
         rotor_command: (N, R) [rad/s], mean over the control step.
-        diverged: (N,) bool, where the simulation broke down; None for nowhere.
+        diverged: (N,) bool, where the simulation broke down.
 
     Returns:
         The snapshot after it, how far the episodes are, and the transition.
     """
     xp = namespace(state.speed)
-    steps, longest = episode.steps + 1.0, episode.longest + 1
+    steps = episode.steps + 1.0
     time = steps * clock.control_timestep
     now = Snapshot(state, before.task, before.parameters, action, rotor_command, time)
     now.potentials = task.measure(now)
-    terminated = task.terminated(now)
-    if diverged is not None:
-        terminated = terminated | diverged
-    truncated = terminated ^ terminated
-    if longest >= clock.time_limit_steps:
-        truncated = (steps >= clock.time_limit_steps) & ~terminated
+    terminated = task.terminated(now) | diverged
+    truncated = (steps >= clock.time_limit_steps) & ~terminated
     error = task.error(now)
-    error_sum, final_sum = episode.error_sum + error, episode.final_sum
-    flying = clock.time_limit_steps - clock.settle_steps
-    if longest > flying:
-        final_sum = final_sum + xp.where(steps > flying, error, 0.0 * error)
+    error_sum = episode.error_sum + error
+    settling = steps > clock.time_limit_steps - clock.settle_steps
+    final_sum = episode.final_sum + xp.where(settling, error, 0.0 * error)
     end = EpisodeEnd(terminated, truncated, steps, error_sum, final_sum, clock.settle_steps)
-    end.succeeded = terminated | truncated
-    # Most steps end no episode. Elsewhere than in NumPy to ask would mean to wait for a device.
-    if xp is not np or np.count_nonzero(end.succeeded):
-        end.succeeded = end.succeeded & task.succeeded(now, end)
-        if diverged is not None:
-            end.succeeded = end.succeeded & ~diverged
+    end.succeeded = (terminated | truncated) & task.succeeded(now, end) & ~diverged
     terms = task.reward(before, now, end)
     task_state = task.update(before, now)
     if task_state is not now.task:  # a goal may have moved on
@@ -145,10 +132,10 @@ def finish(
         terminated=terminated,
         truncated=truncated,
         is_success=end.succeeded,
-        diverged=terminated ^ terminated if diverged is None else diverged,
+        diverged=diverged,
         error=error + 0.0,  # its own, since a reset writes into the potentials
     )
-    return now, Episode(steps, error_sum, final_sum, longest), transition
+    return now, Episode(steps, error_sum, final_sum), transition
 
 
 def check_task(

@@ -58,14 +58,14 @@ class Engine(abc.ABC):
         self.air = fields["userdata"][:, : parameters.AIR]
         self._free_flight = FreeFlight(self.model, fields, threads) if name != "mujoco" else None
         # Two frames in turn: the last state stays whole while the next one is computed.
-        self._frames = [_Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
+        self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
         self._kernel = native.library().quadrl_state
         self._use_parameters()
 
     @property
     def state(self) -> State:
         """The current state, views of live buffers that are valid for one more step."""
-        return self._frames[0].state
+        return self.frames[0].state
 
     @abc.abstractmethod
     def _model_field(self, name: str) -> np.ndarray:
@@ -82,7 +82,7 @@ class Engine(abc.ABC):
         # As `Rows` in native/state.c.
         self._rows = np.array(
             [*(array.ctypes.data for array in arrays), self.qpos.strides[0] // 8, stride,
-             self._frames[0].columns]
+             self.frames[0].columns]
         )  # fmt: skip
         self._address = self._rows.ctypes.data
 
@@ -123,10 +123,10 @@ class Engine(abc.ABC):
             finite or that MuJoCo calls unstable, or faster than the physics step resolves
             (`Vehicle.resolved_speed`, `resolved_turn`). Those keep their last good state.
         """
-        self._frames.reverse()
+        self.frames.reverse()
         if not self._fill(None):
             return None
-        table, last = (frame.table for frame in self._frames)
+        table, last = (frame.table for frame in self.frames)
         sound = (np.abs(table) < mujoco.mjMAXVAL).all(axis=0)
         sound &= table[FIRST["speed"]] <= self.parameters["resolved_speed"]
         broken = ~(sound & (table[FIRST["angular_speed"]] <= self.parameters["resolved_turn"]))
@@ -157,7 +157,7 @@ class Engine(abc.ABC):
             self._refuse(rows, start)
         if len(rows) == self.num_envs:
             return self.state
-        return State.of_table(self._frames[0].table[:, rows])
+        return State.of_table(self.frames[0].table[:, rows])
 
     def _refuse(self, rows: np.ndarray, start: Start) -> None:
         """Say what is wrong with a start."""
@@ -201,16 +201,22 @@ class Engine(abc.ABC):
     def _fill(self, rows: np.ndarray | None) -> int:
         """Run the C kernel; how many aircraft are not sound."""
         count, ids = (self.num_envs, None) if rows is None else (len(rows), rows.ctypes.data)
-        return self._kernel(self._address, count, ids, self._frames[0].address)
+        return self._kernel(self._address, count, ids, self.frames[0].address)
 
 
-class _Frame:
+def padded(count: int) -> int:
+    """Columns of a table for some aircraft: a cache line more, against set conflicts between rows.
+
+    A few aircraft have none, and contiguous arrays are faster in NumPy.
+    """
+    return count + 8 * (1 + count // 8 % 2) if count > 8 else count
+
+
+class Frame:
     """One table of state with its named views and its address."""
 
     def __init__(self, count: int, rotors: int) -> None:
-        # Pad rows by one cache line, to avoid set conflicts between them. A few aircraft have none,
-        # and contiguous arrays are faster in NumPy.
-        self.columns = count + 8 * (1 + count // 8 % 2) if count > 8 else count
+        self.columns = padded(count)
         self.table = np.zeros((FIRST["rotor_speed"] + rotors, self.columns))[:, :count]
         self.state = State.of_table(self.table)
         self.address = self.table.ctypes.data

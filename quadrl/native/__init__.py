@@ -24,6 +24,7 @@ import warnings
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from quadrl.errors import NativeError
 from quadrl.parameters import c_structs
@@ -106,6 +107,30 @@ def build(include: Path | None = None) -> Path:
         digest.update((_FOLDER / name).read_bytes())
     digest.update((include / "mujoco" / "mujoco.h").read_bytes())
     name = f"quadrl-mujoco-{mujoco.__version__}-{digest.hexdigest()[:16]}.so"
+    sources = [str(_FOLDER / source) for source in SOURCES]
+    return _cached(name, [f"-I{include}", *sources], {"layout.h": layout})
+
+
+@functools.cache
+def compile_generated(source: str) -> ctypes.CDLL:
+    """A library of C that was generated, compiled unless the cache holds it.
+
+    Raises:
+        NativeError: There is no compiler, or it refused the source.
+    """
+    digest = hashlib.sha256(" ".join((*flags(), platform.machine(), source)).encode())
+    name = digest.hexdigest()[:16]
+    return ctypes.CDLL(str(_cached(f"quadrl-generated-{name}.so", [], {f"{name}.c": source})))
+
+
+def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
+    """A library of the cache, compiled first where it is missing.
+
+    Args:
+        name: Of its file, another one for other contents.
+        arguments: Further ones of the compiler.
+        written: Files that are written first, by name: headers, and sources to compile.
+    """
     folder = cache_folder()
     if os.path.exists(folder / name):  # False, too, for a folder that may not be looked into
         return folder / name
@@ -116,9 +141,11 @@ def build(include: Path | None = None) -> Path:
         folder = Path(tempfile.mkdtemp(prefix="quadrl-"))
         scratch = tempfile.mkdtemp(dir=folder)
     try:
-        Path(scratch, "layout.h").write_text(layout)
-        command = [compiler(), *flags(), f"-I{include}", f"-I{scratch}", "-o", f"{scratch}/{name}"]
-        command += [str(_FOLDER / source) for source in SOURCES] + ["-lm"]
+        for file, text in written.items():
+            Path(scratch, file).write_text(text)
+        sources = [f"{scratch}/{file}" for file in written if file.endswith(".c")]
+        command = [compiler(), *flags(), f"-I{scratch}", "-o", f"{scratch}/{name}"]
+        command += [*arguments, *sources, "-lm"]
         outcome = subprocess.run(command, capture_output=True, text=True)
         if outcome.returncode != 0:
             raise NativeError(
@@ -154,6 +181,14 @@ def load(path: Path) -> ctypes.CDLL:
         *(integer, _POINTER, _POINTER, integer, integer, integer, _POINTER),
     ]
     return opened
+
+
+def address(array: np.ndarray) -> int:
+    """Where an array's numbers stand; in a third of the time of `array.ctypes.data`.
+
+    It must be contiguous and writable, and not be empty.
+    """
+    return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
 
 
 @functools.cache

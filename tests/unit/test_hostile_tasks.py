@@ -97,7 +97,7 @@ def test_what_a_task_raises_is_its_own_and_the_environment_goes_on():
         return Hover.terminated(self, now)
 
     environment, other = (
-        helpers.begun(hostile_task(terminated=terminated), 2),
+        helpers.begun(hostile_task(terminated=terminated, compiled=False), 2),
         helpers.begun("hover", 2),
     )
     failing[0] = True

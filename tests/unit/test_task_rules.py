@@ -51,7 +51,8 @@ def finished(task, before, episode, *place, command=VEHICLE.hover_speed):
     """The snapshot after one control step to another place, how far they are, and what it gave."""
     where = state(task, *place)
     command = np.broadcast_to(command, where.rotor_speed.shape)
-    return transition.finish(task, CLOCK, episode, before, where, 0 * command, command)
+    diverged = np.zeros(len(command), dtype=bool)
+    return transition.finish(task, CLOCK, episode, before, where, 0 * command, command, diverged)
 
 
 def test_the_common_terms():

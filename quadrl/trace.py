@@ -1,0 +1,174 @@
+"""Symbols in place of numbers: what a pure function of arrays computes, as C.
+
+A function that never branches on data takes the same operations for every row. Called once with
+arrays of symbols, it writes them all down, one row's worth: the body of a loop over rows. The
+operations are NumPy's own, one by one and in the same order, so that the compiled loop gives the
+same bits (but sine and its like, which are the C library's).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from quadrl.rotation import Array
+
+C: dict[str, str] = {
+    "add": "{} + {}",
+    "subtract": "{} - {}",
+    "multiply": "{} * {}",
+    "divide": "{} / {}",
+    "negative": "-{}",
+    "absolute": "fabs({})",
+    "sqrt": "sqrt({})",
+    "sin": "sin({})",
+    "cos": "cos({})",
+    "exp": "exp({})",
+    "log": "log({})",
+    "tan": "tan({})",
+    "tanh": "tanh({})",
+    "arcsin": "asin({})",
+    "arccos": "acos({})",
+    "arctan": "atan({})",
+    "arctan2": "atan2({}, {})",
+    "maximum": "{0} >= {1} || {0} != {0} ? {0} : {1}",
+    "minimum": "{0} <= {1} || {0} != {0} ? {0} : {1}",
+    "where": "{} ? {} : {}",
+    "less": "{} < {}",
+    "less_equal": "{} <= {}",
+    "greater": "{} > {}",
+    "greater_equal": "{} >= {}",
+    "equal": "{} == {}",
+    "not_equal": "{} != {}",
+    "bitwise_and": "{} & {}",
+    "bitwise_or": "{} | {}",
+    "bitwise_xor": "{} ^ {}",
+    "logical_and": "{} & {}",
+    "logical_or": "{} | {}",
+    "invert": "!{}",
+    "logical_not": "!{}",
+}
+"""Operations by the names of NumPy's functions."""
+LOGICAL = set(list(C)[list(C).index("bitwise_and") :])
+"""Those of truth values."""
+FLAGS = LOGICAL | {name for name in C if name.startswith(("less", "greater", "equal", "not_"))}
+"""Those that give a truth value."""
+
+
+class Symbol:
+    """A number that is known when the loop runs; the same operation gives the same symbol."""
+
+    def __init__(self, trace: Trace, text: str, operands: tuple[str, ...], is_flag: bool) -> None:
+        """Name the result of a C expression of others."""
+        self.trace, self.text, self.operands, self.is_flag = trace, text, operands, is_flag
+        self.name = f"t{len(trace.known)}"
+
+
+class Trace:
+    """The operations of one row, in their order."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self.known: dict[tuple[str, ...], Symbol] = {}
+        self.constants: list[float] = []
+
+    def inputs(self, expressions: Array, is_flag: bool = False) -> Symbols:
+        """Symbols of C expressions that read memory, an array of any shape."""
+
+        def read(text: str) -> Symbol:
+            return self.known.setdefault((text,), Symbol(self, text, (), is_flag))
+
+        return symbols(np.frompyfunc(read, 1, 1)(expressions))
+
+    def operation(self, name: str, *values: Any) -> Symbol:
+        """The symbol of a result.
+
+        Raises:
+            TypeError: There is no such operation in C.
+        """
+        if name == "clip":
+            name, values = "minimum", (self.operation("maximum", *values[:2]), values[2])
+        elif name == "square" or (name == "power" and _is_two(values[1])):
+            name, values = "multiply", (values[0], values[0])
+        flags = [_is_flag(value) for value in values]
+        known = flags[0] if name == "where" else all(flags) == (name in LOGICAL)
+        if name not in C or not known:
+            raise TypeError(f"{name} cannot be compiled")
+        names = tuple(self.name_of(value) for value in values)
+        is_flag = name in FLAGS or (name == "where" and all(flags))
+        symbol = Symbol(self, C[name].format(*names), names, is_flag)
+        return self.known.setdefault((name, *names), symbol)
+
+    def name_of(self, value: Any) -> str:
+        """How C names an operand; numbers are constants, so that options change no code."""
+        if isinstance(value, Symbol):
+            return value.name
+        if _is_flag(value):
+            return str(int(value))
+        number = float(value)
+        same = (k for k, x in enumerate(self.constants) if str(x) == str(number))
+        k = next(same, len(self.constants))
+        if k == len(self.constants):
+            self.constants.append(number)
+        return f"c[{k}]"
+
+    def body(self, outputs: Mapping[str, Any]) -> str:
+        """C that computes some outputs, by the expressions that name their memory."""
+        stores = {place: self.name_of(value) for place, value in outputs.items()}
+        used, lines = set(stores.values()), []
+        for symbol in reversed(self.known.values()):
+            if symbol.name in used:  # in the end, by an output
+                used.update(symbol.operands)
+                kind = "int" if symbol.is_flag else "double"
+                lines.append(f"const {kind} {symbol.name} = {symbol.text};")
+        lines = lines[::-1] + [f"{place} = {value};" for place, value in stores.items()]
+        return "\n    ".join(lines)
+
+
+class Symbols(np.ndarray):
+    """An array of symbols and numbers that NumPy's functions take as they take any array."""
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        """Write an operation down for each element."""
+        if method == "__call__" and not any(x is not None for x in options.values()):
+            return elementwise(ufunc.__name__, *inputs)
+        if method == "reduce" and not options.get("keepdims"):
+            parts = np.moveaxis(np.asarray(inputs[0]), options.get("axis", 0), 0)
+            return functools.reduce(functools.partial(elementwise, ufunc.__name__), parts)
+        raise TypeError(f"{ufunc.__name__}.{method} cannot be compiled")
+
+    def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
+        """Choose between symbols, or arrange them."""
+        if function is np.where:
+            return elementwise("where", *args)
+        result = super().__array_function__(function, types, args, options)
+        return symbols(result) if isinstance(result, np.ndarray) else result
+
+
+def symbols(array: Any) -> Symbols:
+    """An array of objects as symbols."""
+    return np.asarray(array, dtype=object).view(Symbols)
+
+
+def elementwise(name: str, *arrays: Any) -> Symbols:
+    """An operation on each element of arrays that are broadcast."""
+
+    def operate(*operands: Any) -> Any:
+        trace = next((x.trace for x in operands if isinstance(x, Symbol)), None)
+        if trace is None:  # numbers alone, as NumPy computes them
+            return getattr(np, name)(*operands)
+        return trace.operation(name, *operands)
+
+    plain = (np.asarray(array, dtype=object) for array in arrays)
+    return symbols(np.frompyfunc(operate, len(arrays), 1)(*plain))
+
+
+def _is_two(value: Any) -> bool:
+    return not isinstance(value, Symbol) and value == 2
+
+
+def _is_flag(value: Any) -> bool:
+    return value.is_flag if isinstance(value, Symbol) else isinstance(value, (bool, np.bool_))
