@@ -280,13 +280,7 @@ def _collector(task: Task, num_envs: int, stack: contextlib.ExitStack) -> Work:
 
     config = TrainConfig(task.name)
     env = QuadrotorEnv(task, num_envs, seed=0)
-    actor, _, _ = make_actor_critic(
-        env.environment.size,
-        env.environment.action_size,
-        hidden=config.hidden,
-        critic_hidden=config.critic_hidden,
-        initial_deviation=config.initial_deviation,
-    )
+    actor, _, _ = make_actor_critic(env.environment.size, env.environment.action_size, config)
     collector = make_collector(env, actor, frames := num_envs * config.rollout)
     stack.callback(collector.shutdown)
     stack.callback(torch.set_num_threads, torch.get_num_threads())

@@ -22,12 +22,6 @@ class Motion:
     body_rate: Array  # (N, 3) [rad/s], body frame
     rotor_speed: Array  # (N, R) [rad/s]
 
-    def moved(self, rate: Motion, time: float) -> Motion:
-        """Along a rate of change for a time [s]."""
-        return Motion(
-            *(getattr(self, f) + time * getattr(rate, f) for f in Motion.__dataclass_fields__)
-        )
-
 
 def rotor_acceleration(p: Parameters, speed: Array, command: Array) -> Array:
     """Equation 10 (N, R) [rad/s^2]: the lag of the rotors, which may rise and fall differently.
@@ -95,21 +89,6 @@ def derivative(
         body_rate=(moment + damping - cross(rate, spin)) / p.inertia,
         rotor_speed=rotor_acceleration(p, speed, command),
     )
-
-
-def step(
-    p: Parameters, motion: Motion, command: Array, wind: Array, gravity: float, timestep: float
-) -> Motion:
-    """One step [s] of the classical Runge-Kutta method; arguments as for `derivative`."""
-    fixed = command, wind, gravity
-    k1 = derivative(p, motion, *fixed)
-    k2 = derivative(p, motion.moved(k1, timestep / 2), *fixed)
-    k3 = derivative(p, motion.moved(k2, timestep / 2), *fixed)
-    k4 = derivative(p, motion.moved(k3, timestep), *fixed)
-    rate = k1.moved(k2, 2).moved(k3, 2).moved(k4, 1)
-    after = motion.moved(rate, timestep / 6)
-    unit = after.quaternion / norm(after.quaternion)[..., None]
-    return dataclasses.replace(after, quaternion=unit)
 
 
 def cross(first: Array, second: Array) -> Array:

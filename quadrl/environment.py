@@ -219,7 +219,7 @@ class Environment:
             self._command[:] = self.engine.ctrl[:] = self._setpoint
 
     def control(self) -> None:
-        """Command the rotors before each physics step of a mode with loops; the mean is rewarded."""
+        """Command the rotors before each physics step of a mode with loops; their mean counts."""
         if self._flown and (diverged := self.engine.read()) is not None:
             self._diverged |= diverged
         command = self.control_mode.rotor_command(self.engine.state, self._setpoint)

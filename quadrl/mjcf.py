@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 from quadrl import native, parameters
-from quadrl.rotation import quaternion_product
 from quadrl.vehicle import DRAWN_SIZE, GRAVITY, Vehicle
 
 ASSETS = Path(__file__).parent / "assets"
@@ -154,9 +153,9 @@ def _draw(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
         x, y, z = rotor.position
         bearing, slope = math.atan2(y, x), math.atan2(z, math.hypot(x, y))
         level = _turn(bearing, (0, 0, 1))
-        turn = quaternion_product(_upright(rotor.axis), level)
+        turn = _product(_upright(rotor.axis), level)
         # The arm points at the centre of mass, however the rotor leans.
-        along = quaternion_product(level, _turn(-slope, (0, 1, 0)))
+        along = _product(level, _turn(-slope, (0, 1, 0)))
         arm = max(math.hypot(x, y, z), rotor.radius / 2) / DRAWN_SIZE
         # What turns has the rotor's radius, the motor one between that and the airframe's.
         disc = rotor.radius / DRAWN_RADIUS
@@ -167,7 +166,7 @@ def _draw(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
             factor = (wide, scale, 1) if upright else (wide, wide, scale)
             geom.size, geom.pos = np.asarray(geom.size) * factor, np.asarray(geom.pos) * scale
             if geom.meshname in ("arm", "sleeve"):
-                geom.quat = quaternion_product(turn * (1, -1, -1, -1), along)
+                geom.quat = _product(turn * (1, -1, -1, -1), along)
         for mesh in part.meshes:
             factor = (disc, disc * rotor.spin, scale)
             factor = (arm, scale, scale) if mesh.name in ("arm", "sleeve") else factor
@@ -179,6 +178,13 @@ def _draw(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
         for geom in body.geoms:  # the airframe's own materials are shared
             name = geom.material.removeprefix(prefix)
             geom.material = name if whole.material(name) is not None else geom.material
+
+
+def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Quaternion (4,) of the rotation `second` followed by `first`."""
+    quaternion = np.empty(4)
+    mujoco.mju_mulQuat(quaternion, first, second)
+    return quaternion
 
 
 def _turn(angle: float, axis: Sequence[float]) -> np.ndarray:

@@ -22,10 +22,6 @@ from safetensors.numpy import save
 from quadrl.errors import QuadrlError
 
 FORMAT = "quadrl-policy-2"
-FIRST_FORMAT = "quadrl-policy-1"
-"""The same arrays, with other names in the metadata; it can still be read."""
-RENAMED = {"action": "control_mode", "horizon": "time_limit", "settle": "settle_time"}
-"""Keys of the metadata and of its task options: names of the first format to present ones."""
 FILE = "policy.safetensors"
 CLIP = 10.0
 """Normalised observations are clipped to +-CLIP."""
@@ -164,13 +160,11 @@ class Policy:
                 f"there is no policy at {file}; give a run folder (quadrl train ... --out FOLDER "
                 "makes one) or a .safetensors file"
             )
-        arrays, header = read_safetensors(file, (FORMAT, FIRST_FORMAT), "numpy")
+        arrays, header = read_safetensors(file, FORMAT, "numpy")
         task, metadata = header.get("task"), header.get("metadata")
         options = metadata.get("task_options", {}) if isinstance(metadata, dict) else None
         if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
             raise QuadrlError(f"{file} does not say what its policy was trained for")
-        if header["format"] == FIRST_FORMAT:
-            metadata = _renamed(metadata) | {"task_options": _renamed(options)}
         layers = max(1, len(arrays) // 2 - 1)
         names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS))
         if set(arrays) != set(names):
@@ -204,10 +198,6 @@ class Policy:
 
 
 PARTS = ("weight", "bias")
-
-
-def _renamed(values: dict[str, Any]) -> dict[str, Any]:
-    return {RENAMED.get(name, name): value for name, value in values.items()}
 
 
 def _is_network(policy: Policy) -> bool:
@@ -247,13 +237,13 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def read_safetensors(
-    path: Path, formats: tuple[str, ...], framework: str
+    path: Path, wanted: str, framework: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Arrays of a safetensors file, and the header that quadrl wrote into its table.
 
     Args:
         path: The file.
-        formats: Accepted values of the header's format.
+        wanted: The header's format.
         framework: "numpy" or "pt".
 
     Raises:
@@ -263,10 +253,10 @@ def read_safetensors(
         with safe_open(path, framework=framework) as opened:
             header = json.loads((opened.metadata() or {}).get(HEADER, "{}"))
             written = header.get("format")
-            names = opened.keys() if written in formats else ()
+            names = opened.keys() if written == wanted else ()
             arrays = {name: opened.get_tensor(name) for name in names}
     except UNREADABLE as error:
         raise QuadrlError(f"{path} is damaged or not a safetensors file: {error}") from error
-    if written not in formats:
-        raise QuadrlError(name=f"format of {path}", value=written, allowed=" or ".join(formats))
+    if written != wanted:
+        raise QuadrlError(name=f"format of {path}", value=written, allowed=wanted)
     return arrays, header

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,6 @@ def fly(
     vehicle: Vehicle | str | None = None,
     control_mode: str | None = None,
     gusts: float = 0.0,
-    ranges: Mapping[str, Any] | None = None,
 ) -> Rollout:
     """Fly one episode of each of N aircraft.
 
@@ -50,7 +49,6 @@ def fly(
         control_mode: What actions mean; None for what the controller says, or "rotor".
         gusts: Standard deviation of the wind in each direction [m/s]; see `make_gusts`. The
             aircraft does not observe it, and each flies in a wind of its own, from its seed.
-        ranges: Of the vehicle's parameters, drawn anew for each aircraft; see `Environment`.
 
     Raises:
         QuadrlError: The controller's actions have another meaning or another size, or an argument
@@ -66,7 +64,6 @@ def fly(
         seed=seed,
         vehicle=vehicle,
         control_mode=control_mode or own or "rotor",
-        ranges=ranges,
     )
     task, timestep = environment.task, environment.vehicle.control_timestep
     if isinstance(controller, Policy):
@@ -75,7 +72,6 @@ def fly(
     observation = environment.flatten(environment.reset())
     seeds = range(seed, seed + episodes)
     winds = make_gusts(gusts, environment.time_limit_steps, timestep, seeds) if gusts else None
-    steady = environment.engine.air.copy()  # (N, 3) [m/s], drawn from the ranges
     history: dict[str, list[np.ndarray]] = {name: [] for name in HISTORY}
     alive = np.ones(episodes, dtype=bool)
     length = np.zeros(episodes, dtype=int)
@@ -84,7 +80,7 @@ def fly(
     while alive.any():
         taken = np.clip(controller(observation), -1.0, 1.0)
         if winds is not None:
-            environment.engine.air[:] = steady + winds[len(markers)]
+            environment.engine.air[:] = winds[len(markers)]
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         markers.append(environment.markers())

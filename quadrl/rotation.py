@@ -94,18 +94,6 @@ def sin_cos_attitude(rotation: Array) -> tuple[Array, Array]:
     return stack(*sines), stack(*cosines)
 
 
-def quaternion_product(first: Array, second: Array) -> Array:
-    """Hamilton product (..., 4): the rotation `second` followed by `first`."""
-    a, b, c, d = (first[..., k] for k in range(4))
-    w, x, y, z = (second[..., k] for k in range(4))
-    return stack(
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
-
-
 def quaternion_from_heading_and_tilt(heading: Array, tilt: Array, direction: Array) -> Array:
     """Unit quaternion (..., 4) of a heading, then a tilt about a level body axis.
 

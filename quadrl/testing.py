@@ -14,6 +14,8 @@ import dataclasses
 import functools
 import importlib
 import importlib.util
+import unittest
+import warnings
 from collections.abc import Callable, Generator
 from typing import Any
 
@@ -22,7 +24,6 @@ import numpy as np
 from quadrl import parameters, records, tasks
 from quadrl.description import docstrings
 from quadrl.environment import Environment
-from quadrl.envs import checks
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng
 from quadrl.rotation import Array
@@ -33,11 +34,13 @@ from quadrl.vehicle import Vehicle
 
 PAPER = Vehicle()
 ROWS = 4
+EPISODE = 2.4  # [s], the longest that is flown in the APIs
+SEED = 3
 COORDINATES = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
 
 
 def check_task(task: str | Task | type[Task]) -> None:
-    """Check everything that a task has to be, and that every API flies it alike.
+    """Check everything that a task has to be, alone and in every API.
 
     Args:
         task: A task, its class, or a name of the catalogue.
@@ -50,8 +53,15 @@ def check_task(task: str | Task | type[Task]) -> None:
     check_begin(task)
     check_functions(task)
     check_episodes(task)
-    size = Environment(task).action_size
-    checks.check_apis(task, varied_actions(200, 4, size)[:, 3])
+    short = task.replace(time_limit=min(task.time_limit, EPISODE))
+    environment = Environment(short)
+    steps = environment.time_limit_steps + 1  # past the end
+    actions = varied_actions(steps, ROWS, environment.action_size)[:, 3]
+    check_flight(short, actions)
+    check_dm_control(short, actions)
+    check_gymnasium(short)
+    if _optional("torchrl"):
+        check_torchrl(short)
 
 
 def check_declaration(task: Task) -> None:
@@ -91,8 +101,6 @@ def check_begin(task: Task) -> None:
         row = {name: value[i : i + 1] for name, value in batch.items()}
         message = f"{task.name}: begin of one aircraft and of a batch differ"
         _require_equal(begin(keys[i : i + 1], own), row, message)
-    for name, value in batch.items():
-        _require(np.isfinite(value).all(), f"{task.name}: begin gives {name} = {value}")
     varied = any(np.ptp(value, axis=0).any() for value in batch.values())
     _require(varied, f"{task.name}: every episode begins alike")
     if torch := _optional("torch"):
@@ -168,27 +176,96 @@ def check_tensors(
 def check_episodes(task: Task) -> None:
     """Whole episodes: finite numbers, and no entry of the observation that never changes."""
     environment = Environment(task, num_envs=ROWS, seed=1)
-    seen, terms = [environment.flatten(environment.reset())], []
+    seen, errors = [environment.flatten(environment.reset())], []
     with _blame(task, "markers"):
         environment.markers()
     for action in varied_actions(environment.time_limit_steps, ROWS, environment.action_size):
         with _blame(task, "a flight"):
             now = environment.step(action)
         seen.append(environment.flatten(now.observation))
-        terms.append(now.reward_terms | {"error": now.error})
+        errors.append(now.error)
         over = np.logical_or(now.terminated, now.truncated)
         if over.any():
             seen.append(environment.flatten(environment.reset(over)))
-    for name in terms[0]:
-        values = np.stack([step[name] for step in terms])
-        _require(np.isfinite(values).all(), f"{task.name}: {name} is not always finite")
-        _require(name != "error" or (values >= 0).all(), f"{task.name}: an error is negative")
+    _require(np.isfinite(errors).all(), f"{task.name}: an error is not finite")
+    _require(np.min(errors) >= 0, f"{task.name}: an error is negative")
     flat = np.concatenate(seen)
     for name, columns in environment.layout.items():
         term = flat[:, columns]
         _require(np.isfinite(term).all(), f"{task.name}: {name!r} is not always finite")
         constant = np.flatnonzero(np.ptp(term, axis=0) == 0).tolist()
         _require(not constant, f"{task.name}: entries {constant} of {name!r} never change")
+
+
+def check_flight(task: Task, actions: np.ndarray) -> None:
+    """Alone in dm_control's drawn model an aircraft flies as in a batch of the lean one.
+
+    Args:
+        task: The task.
+        actions: (T, k); the flight ends with the episode.
+
+    Raises:
+        AssertionError: The first difference that is found.
+    """
+    from quadrl.envs import dm_control
+
+    batch = Environment(task, num_envs=2, seed=SEED - 1)
+    alone = dm_control.make(task, random=SEED)
+    batch.reset()
+    alone.reset()
+    for action in actions:
+        now, step = batch.step(np.stack([0 * action, action])), alone.step(action)
+        own = now.observation | {"reward": now.reward, "discount": 1.0 - now.terminated}
+        own["last"] = now.terminated | now.truncated
+        given = step.observation | {"reward": step.reward, "discount": step.discount}
+        given["last"] = step.last()
+        row = {name: value[1] for name, value in own.items()}
+        _require_equal(given, row, f"{task.name}: dm_control and a batch differ")
+        if step.last():
+            return
+
+
+def check_dm_control(task: Task, actions: np.ndarray) -> None:
+    """dm_env's own tests of an environment; the actions (T, k) should lead past an end."""
+    from dm_env.test_utils import EnvironmentTestMixin
+
+    from quadrl.envs import dm_control
+
+    class Contract(EnvironmentTestMixin, unittest.TestCase):
+        def make_object_under_test(self, **_: Any) -> Any:
+            return dm_control.make(task, random=0)
+
+        def make_action_sequence(self) -> Generator[np.ndarray]:
+            yield from actions
+
+    result = unittest.TestResult()
+    unittest.defaultTestLoader.loadTestsFromTestCase(Contract).run(result)
+    faults = [text for _, text in result.failures + result.errors]
+    if faults or result.testsRun < 4:
+        raise AssertionError(f"{task.name}: against dm_env's contract\n{''.join(faults)}")
+
+
+def check_gymnasium(task: Task) -> None:
+    """Gymnasium's own check; only the warning that observations have no bounds may appear."""
+    from gymnasium.utils.env_checker import check_env
+
+    from quadrl.envs.gymnasium import QuadrotorEnv
+
+    with warnings.catch_warnings(), _blame(task, "Gymnasium's check_env"):
+        warnings.simplefilter("error")
+        for bound in ("minimum value is -infinity", "maximum value is infinity"):
+            warnings.filterwarnings("ignore", f".*A Box observation space {bound}")
+        check_env(QuadrotorEnv(task), skip_render_check=True)
+
+
+def check_torchrl(task: Task) -> None:
+    """TorchRL's own check of what is given against what is declared."""
+    from torchrl.envs import check_env_specs
+
+    from quadrl.envs.torchrl import QuadrotorEnv
+
+    with _blame(task, "TorchRL's check_env_specs"):
+        check_env_specs(QuadrotorEnv(task, 3, seed=0, reward_terms=True))
 
 
 def varied_actions(steps: int, count: int, size: int = 4) -> np.ndarray:
@@ -268,8 +345,6 @@ def _blame(task: Task, what: str) -> Generator[None]:
     """Report an exception as a fault of the task."""
     try:
         yield
-    except AssertionError:
-        raise
     except Exception as error:
         raise AssertionError(
             f"{task.name}: {what} fails: {type(error).__name__}: {error}"

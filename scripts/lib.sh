@@ -4,7 +4,7 @@
 REPOSITORY="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 ENVIRONMENT="$REPOSITORY/.venv"
 ENVIRONMENT_PYTHON="$ENVIRONMENT/bin/python"
-# First line: "incomplete", or the fingerprint of what was installed. Second line: the extras.
+# First line: the fingerprint of what was installed. Second line: the extras.
 STAMP="$ENVIRONMENT/quadrl-environment"
 
 say() { printf 'quadrl: %s\n' "$*" >&2; }
@@ -87,12 +87,7 @@ ensure_renderer() {
 
 # fingerprint: changes with anything that the environment is made from.
 fingerprint() {
-    "$1" - "$REPOSITORY" <<'END'
-import hashlib, pathlib, sys
-repository = pathlib.Path(sys.argv[1])
-parts = [(repository / name).read_bytes() for name in ("pyproject.toml", "constraints.txt")]
-print(hashlib.sha256(b"\0".join([str(repository).encode(), *parts])).hexdigest())
-END
+    (cd "$REPOSITORY" && { pwd && cat pyproject.toml constraints.txt; } | cksum)
 }
 
 make_venv() {
@@ -104,49 +99,30 @@ make_venv() {
         install_packages "$package" || die "$python cannot make environments: install '$package' (Debian, Ubuntu)"
     fi
     say "making the environment $ENVIRONMENT"
-    mkdir -p "$ENVIRONMENT"
-    echo incomplete >"$STAMP"
     "$python" -m venv "$ENVIRONMENT"
 }
 
 # ensure_environment EXTRA...: quadrl, editable, with these extras and the versions of constraints.txt in .venv.
-# An environment that an interrupted run left behind is made anew; one that is complete is used as it is.
+# Without a stamp that says so, pip goes over it again: that completes what an interrupted run left behind.
 ensure_environment() {
-    local complete=no extra installed="" wanted
+    local extra installed wanted
     ensure_compiler
-    if [ -f "$STAMP" ] && [ "$(head -n 1 "$STAMP")" = incomplete ]; then
-        say "removing an unfinished environment"
-        rm -rf "$ENVIRONMENT"
-    fi
-    if [ ! -f "$ENVIRONMENT/pyvenv.cfg" ]; then
-        make_venv
-    elif ! "$ENVIRONMENT_PYTHON" -c 'import pip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+    [ -f "$ENVIRONMENT/pyvenv.cfg" ] || make_venv
+    "$ENVIRONMENT_PYTHON" -c 'import pip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null ||
         die "$ENVIRONMENT has no Python 3.11 or later that works: remove it and run again"
-    fi
-
-    wanted="$(fingerprint "$ENVIRONMENT_PYTHON")"
-    if [ -f "$STAMP" ]; then
-        installed="$(sed -n 2p "$STAMP")"
-        [ "$(head -n 1 "$STAMP")" != "$wanted" ] || complete=yes
-    fi
+    installed="$(sed -n 2p "$STAMP" 2>/dev/null || true)"
     for extra in "$@"; do
         case " $installed " in
             *" $extra "*) ;;
-            *)
-                installed="${installed:+$installed }$extra"
-                complete=no
-                ;;
+            *) installed="${installed:+$installed }$extra" ;;
         esac
     done
-
-    if [ "$complete" = no ]; then
+    wanted="$(fingerprint; echo "$installed")"
+    if [ "$(cat "$STAMP" 2>/dev/null)" != "$wanted" ]; then
         say "installing quadrl[${installed// /,}]; the first time takes minutes and, with torch, some gigabytes"
-        # Without a stamp .venv is somebody else's: install into it, but never mark it for removal.
-        [ ! -f "$STAMP" ] || echo incomplete >"$STAMP"
         "$ENVIRONMENT_PYTHON" -m pip install --disable-pip-version-check \
             --constraint "$REPOSITORY/constraints.txt" --editable "${REPOSITORY}[${installed// /,}]" >&2
-        printf '%s\n%s\n' "$wanted" "$installed" >"$STAMP.new"
-        mv "$STAMP.new" "$STAMP"
+        echo "$wanted" >"$STAMP"
     fi
     ensure_renderer
 }

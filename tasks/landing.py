@@ -176,8 +176,6 @@ class Landing(Task):
 
     def _rest(self, now: Snapshot) -> Array:
         """Control steps at rest on the pad, this one included, (N,)."""
-        rests = stands(now) & now.state.at_rest & self._over_pad(now)
+        over_pad = square_norm(now.state.position[..., :2]) < self.pad_radius**2
+        rests = stands(now) & now.state.at_rest & over_pad
         return namespace(now.task.rest).where(rests, now.task.rest + 1, 0 * now.task.rest)
-
-    def _over_pad(self, now: Snapshot) -> Array:
-        return square_norm(now.state.position[..., :2]) < self.pad_radius**2

@@ -129,18 +129,14 @@ class StraightAndLevel(Task):
     def metrics(self, rollout: Rollout) -> dict[str, float]:
         """Altitude and cross-track error over the flight, speed error over its second half."""
         ahead = rollout.goal - rollout.position
-        direction = (
-            rollout.goal[..., :2] / np.linalg.norm(rollout.goal[..., :2], axis=-1)[..., None]
-        )
+        goal = rollout.goal[..., :2]
+        direction = goal / np.linalg.norm(goal, axis=-1, keepdims=True)
         across = ahead[..., 0] * direction[..., 1] - ahead[..., 1] * direction[..., 0]
         speed = (rollout.velocity[..., :2] * direction).sum(-1)[len(rollout.error) // 2 :]
-        off = (
-            np.abs(np.nanmean(speed, 0) / self.line_speed - 1)
-            if np.isfinite(speed).any()
-            else speed
-        )
+        flown = speed[:, np.isfinite(speed).any(0)]
+        off = np.abs(np.nanmean(flown, 0) / self.line_speed - 1)
         return {
             "altitude_rms_m": float(np.sqrt(np.nanmean(rollout.position[..., 2] ** 2))),
             "cross_track_rms_m": float(np.sqrt(np.nanmean(across**2))),
-            "speed_error_share": float(np.nanmean(off)) if np.isfinite(speed).any() else np.nan,
+            "speed_error_share": float(off.mean()) if len(off) else np.nan,
         }

@@ -67,7 +67,7 @@ def together(one):
 def by_mj_step(task, seed, mode):
     """Bare mj_step and the task's own functions: what every API has to give, bit for bit."""
     vehicle = VEHICLES["paper"]
-    model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene)
+    model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.scene)
     data = mujoco.MjData(model)
     control = modes.make(mode, vehicle)
     own = parameters.Parameters.of(parameters.rows(vehicle), vehicle.control_timestep)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import sys
 
 from quadrl.cli.console import console, make_table, say
 from quadrl.validation import number
@@ -36,7 +34,7 @@ class Benchmark:
             self.task, num_envs=self.num_envs, seconds=self.seconds, repeats=self.repeats
         )
         if self.json:
-            sys.stdout.write(json.dumps(measured) + "\n")
+            console.print_json(data=measured, indent=None)
             return
         head = ("what", "control steps/s", "median", "of bare mj_step", "target")
         console.print(make_table(head, rows(measured), numbers=4))

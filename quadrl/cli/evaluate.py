@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import sys
 
 from quadrl.cli.console import console, make_table
 from quadrl.cli.flown import Flown
@@ -33,7 +31,7 @@ class Evaluate(Flown):
         }
         first = next(iter(columns.values()))
         if self.json:
-            sys.stdout.write(json.dumps(first) + "\n")
+            console.print_json(data=first, indent=None)
             return
         rows = [(name, *(_text(metrics[name]) for metrics in columns.values())) for name in first]
         console.print(make_table(("", *columns), rows, numbers=len(columns)))

@@ -12,6 +12,7 @@ from quadrl import tasks
 from quadrl.control import CONTROLLERS
 from quadrl.control import make as make_controller
 from quadrl.errors import QuadrlError
+from quadrl.learning.config import tuples
 from quadrl.policy import Policy
 from quadrl.rollout import Controller
 from quadrl.task import Task
@@ -57,10 +58,8 @@ class Flown:
                 "or leave it out"
             )
         if not self.policy:
-            vehicle, task = (
-                resolve(self.vehicle or None),
-                tasks.make(self.task or "hover", **options),
-            )
+            vehicle = resolve(self.vehicle or None)
+            task = tasks.make(self.task or "hover", **options)
             return make_controller(self.controller, task, vehicle), task, vehicle
         policy = (
             Policy.pretrained(self.policy, self.algo or "ppo")
@@ -86,11 +85,7 @@ def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
             allowed = "NAME=VALUE, such as time_limit=5"
             raise QuadrlError(name="task option", value=pair, allowed=allowed)
         try:
-            options[name] = _tuples(json.loads(text))
+            options[name] = tuples(json.loads(text))
         except (ValueError, RecursionError):
             options[name] = text
     return options
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value

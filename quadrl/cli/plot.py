@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from tyro.conf import Positional
 
@@ -21,32 +21,25 @@ class Plot:
     """Run folders. Several are overlaid: a picture for each task, a curve for each algorithm with
     the spread over its runs."""
     out: Path | None = None
-    """The picture; by default learning_curve.png in the run folder, or, of several runs,
-    learning_curves_TASK.png here."""
-    format: Literal["png", "pdf", "svg"] | None = None
-    """Kind of the picture; by default what the name in --out ends in, or png."""
+    """The picture, its kind (png, pdf, svg) by its ending; by default learning_curve.png in the
+    run folder, or, of several runs, learning_curves_TASK.png here."""
 
     def run(self) -> None:
         """Write the pictures."""
-        out, suffix = self.out, f".{self.format or 'png'}"
         if not self.run_folders:
             raise QuadrlError("give a run folder, or several: quadrl plot runs/*")
-        if out and self.format and out.suffix != suffix:
-            reason = "leave out --out or --format"
-            raise QuadrlError(reason, name="--out", value=str(out), allowed=f"a {suffix} file")
         if len(self.run_folders) == 1:
-            from quadrl.learning.figures import draw_learning_curve
+            from quadrl.learning.figures import learning_curve
 
             (folder,) = self.run_folders
-            path = out or (folder / LEARNING_CURVE).with_suffix(suffix)
-            paths = [draw_learning_curve(folder, path)]
+            paths = [learning_curve(folder, self.out or folder / LEARNING_CURVE)]
         else:
-            paths = _overlay(self.run_folders, out or Path(f"learning_curves{suffix}"), bool(out))
+            paths = _overlay(self.run_folders, self.out)
         for path in paths:
             say(f"wrote {path}")
 
 
-def _overlay(folders: tuple[Path, ...], base: Path, named: bool) -> list[Path]:
+def _overlay(folders: tuple[Path, ...], out: Path | None) -> list[Path]:
     """Draw a picture for each task of several runs; the name stands where there is one task only.
 
     Raises:
@@ -64,7 +57,8 @@ def _overlay(folders: tuple[Path, ...], base: Path, named: bool) -> list[Path]:
         runs.setdefault(config["task"], {}).setdefault(config["algo"], []).append(metrics)
     if not runs:
         raise QuadrlError(f"none of the {len(folders)} folders holds a run to plot")
+    base = out or Path("learning_curves.png")
     paths = {task: base.with_name(f"{base.stem}_{task}{base.suffix}") for task in runs}
-    if named and len(runs) == 1:
-        paths = dict.fromkeys(runs, base)
+    if out and len(runs) == 1:
+        paths = dict.fromkeys(runs, out)
     return [learning_curves(groups, task, paths[task]) for task, groups in runs.items()]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -31,7 +29,7 @@ class Tasks:
         described = [describe(tasks.make(name)) for name in chosen]
         if self.json:
             whole = {task["name"]: task for task in described}
-            sys.stdout.write(json.dumps(whole[self.task] if self.task else whole) + "\n")
+            console.print_json(data=whole[self.task] if self.task else whole, indent=None)
             return
         console.print(make_table(("task", "", ""), _texts(described)))
         head = ("observation", "numbers", "unit", "meaning and frame")

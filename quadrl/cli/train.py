@@ -67,19 +67,17 @@ class Train:
 
     def run(self) -> None:
         """Train, evaluate, draw, sum up."""
-        config = None
-        if self.resume is None:
+        config, folder = None, self.resume
+        if folder is None:
             settings = dataclasses.asdict(self.settings)
             options = parse_options(settings.pop("task_options") or ())
             config = TrainConfig(**settings, task_options=options or None)
+            named = Path("runs") / f"{config.task}-{config.algo}-{config.seed}"
+            folder = self.out or named
         began = time.perf_counter()
         with console.status("importing torch and TorchRL"):
             from quadrl.learning.run import train
         imports = time.perf_counter() - began
-        folder = self.resume or self.out
-        if folder is None:
-            assert config is not None
-            folder = Path("runs") / f"{config.task}-{config.algo}-{config.seed}"
         go_on = f"continue it: {again('train --resume', folder)}"
         try:
             with ProgressBar() as bar:

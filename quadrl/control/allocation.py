@@ -30,8 +30,7 @@ class Allocation:
         """
         self._unit = inverse[:, 0]  # (R,) squares per newton of thrust
         self._low, self._high = low / self._unit, high / self._unit  # (R,) [N]
-        moments = inverse[:, 1:] / self._unit[:, None]  # (R, 3) [1/m]
-        self._moments = moments
+        self._moments = moments = inverse[:, 1:] / self._unit[:, None]  # (R, 3) [1/m]
         # (R, R) [N]: by how much rotor j can carry more than rotor i.
         self._room = self._high - self._low[:, None]
         self.thrust = float(self._low.max()), float(self._high.min())

@@ -42,7 +42,7 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     if not path.is_file():
         raise QuadrlError(f"there is no checkpoint at {path}")
-    flat, header = read_safetensors(path, (FORMAT,), "pt")
+    flat, header = read_safetensors(path, FORMAT, "pt")
     try:
         tensors = TensorDict(flat).unflatten_keys("/").to_dict()
     except (KeyError, RuntimeError, TypeError, ValueError) as error:

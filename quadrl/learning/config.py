@@ -189,7 +189,7 @@ class TrainConfig:
                 raise QuadrlError(name=name, value=given, allowed=f"a {kind.__name__} or a dict")
             settings[name] = given
         for name, value in (values | settings | {"algo": algo}).items():
-            object.__setattr__(self, name, _tuples(value))
+            object.__setattr__(self, name, tuples(value))
         self._check()
 
     def _check(self) -> None:
@@ -288,8 +288,8 @@ def _given(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value is not None}
 
 
-def _tuples(value: Any) -> Any:
+def tuples(value: Any) -> Any:
     """Lists as JSON has them to tuples, at any depth."""
     if isinstance(value, dict):
-        return {name: _tuples(item) for name, item in value.items()}
-    return tuple(map(_tuples, value)) if isinstance(value, (list, tuple)) else value
+        return {name: tuples(item) for name, item in value.items()}
+    return tuple(map(tuples, value)) if isinstance(value, (list, tuple)) else value

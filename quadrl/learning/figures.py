@@ -71,19 +71,14 @@ def read_metrics(path: Path) -> Metrics:
     return metrics
 
 
-def draw_learning_curve(folder: Path, path: Path) -> Path:
-    """Draw the learning curve of a run folder.
+def learning_curve(folder: Path, path: Path) -> Path:
+    """Draw return, success and error over the steps of a run; figure 3 of the paper.
 
     Raises:
         QuadrlError: The folder holds no run that has begun.
     """
-    config = read_config(folder)
+    config, metrics = read_config(folder), read_metrics(folder / METRICS)
     title = f"{config['task']}, {str(config['algo']).upper()}, seed {config['seed']}"
-    return learning_curve(read_metrics(folder / METRICS), title, path)
-
-
-def learning_curve(metrics: Metrics, title: str, path: Path) -> Path:
-    """Draw return, success and error over the steps of a training; figure 3 of the paper."""
     figure = Figure(figsize=(8.0, 7.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)
     steps = metrics["steps"] / 1e3
@@ -119,40 +114,34 @@ def learning_curves(
         groups: The metrics of the runs of each algorithm.
         title: Of the picture.
         path: The picture.
-        clocks: Of CLOCKS, a column each.
+        clocks: Of CLOCKS, a row each.
 
     Raises:
         QuadrlError: No episode has ended in any of the runs.
     """
-    panels = ("return", "success")
-    # With one clock the panels stand side by side.
-    one = len(clocks) == 1
-    size, shape = ((9.2, 3.2), (1, 2)) if one else ((4.6 * len(clocks), 5.4), (2, len(clocks)))
-    figure = Figure(figsize=size, layout="constrained")
-    grid: Any = figure.subplots(*shape, squeeze=False)
-    axes = grid.T if one else grid
+    panels = {"return": "return of an episode", "success": "success [share]"}
+    figure = Figure(figsize=(9.2, 0.6 + 2.6 * len(clocks)), layout="constrained")
+    axes: Any = figure.subplots(len(clocks), len(panels), squeeze=False)
     spare = iter(name for name in STYLE if name not in COLOURS.values())
     drawn = False
     for algo, runs in groups.items():
         colour = STYLE[COLOURS[algo] if algo in COLOURS else next(spare, "grey")]
         label = f"{algo.upper()}, {len(runs)} seed{'s' * (len(runs) > 1)}"
-        cells = itertools.product(enumerate(panels), enumerate(clocks))
-        for (row, panel), (column, clock) in cells:
+        for (clock, panel), axis in zip(itertools.product(clocks, panels), axes.flat, strict=True):
             if (band := spread(runs, panel, clock)) is None:
                 continue
             drawn = drawn or panel == "return"
             x, (low, median, high) = band[0] * CLOCKS[clock][1], band[1]
-            axis = axes[row, column]
             axis.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
             axis.plot(x, median, color=colour, lw=1.8, label=label)
-            axis.set_ylabel("return of an episode" if panel == "return" else "success [share]")
+            axis.set_ylabel(panels[panel])
             axis.set_xlabel(CLOCKS[clock][0])
     if not drawn:
         raise QuadrlError(f"nothing to plot yet for {title}: no episode has ended")
     for axis in axes.flat:
         _tidy(axis)
         axis.set_xlim(left=0)
-    for axis in axes[1]:
+    for axis in axes[:, 1]:
         axis.set_ylim(-0.03, 1.03)
     axes[0, 0].legend(frameon=False, loc="best")
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
@@ -208,7 +197,8 @@ def trajectory(rollout: Rollout, title: str, path: Path, episodes: int = 8) -> P
             axis.tick_params(labelbottom=False)
     rows[3].set_xlabel("time [s]")
     space.set(xlabel="x east [m]", ylabel="y north [m]", zlabel="z up [m]")
-    _equal_axes(space, rollout.position[:, :shown], goal)
+    space.set_box_aspect((1, 1, 1))
+    space.set_aspect("equal", adjustable="datalim")
     space.legend(frameon=False, loc="upper left")
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
     return save(figure, path)
@@ -244,13 +234,3 @@ def _steps_to_seconds(steps: np.ndarray, seconds: np.ndarray) -> tuple:
     forward = lambda s: np.where(s > x[-1], s * slope, np.interp(s, x, y))  # noqa: E731
     backward = lambda s: np.where(s > y[-1], s / slope, np.interp(s, y, x))  # noqa: E731
     return forward, backward
-
-
-def _equal_axes(axis: Any, *points: np.ndarray) -> None:
-    """The same scale on every axis, so that a path keeps its shape."""
-    everything = np.concatenate([p.reshape(-1, 3) for p in points])
-    low, high = np.nanmin(everything, 0), np.nanmax(everything, 0)
-    centre, half = (low + high) / 2, max((high - low).max() / 2, 0.1) * 1.05
-    for k, name in enumerate("xyz"):
-        getattr(axis, f"set_{name}lim")(centre[k] - half, centre[k] + half)
-    axis.set_box_aspect((1, 1, 1))

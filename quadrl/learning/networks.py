@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from quadrl.learning.config import TrainConfig
 from quadrl.policy import CLIP, LOG_VARIANCE, Policy
 
 
@@ -98,27 +99,20 @@ def make_network(
 
 
 def make_actor_critic(
-    size: int,
-    actions: int,
-    *,
-    hidden: tuple[int, ...],
-    critic_hidden: tuple[int, ...],
-    initial_deviation: float,
+    size: int, actions: int, config: TrainConfig
 ) -> tuple[ProbabilisticActor, OfObservation, Normaliser]:
     """Actor, critic and the normaliser that they share.
 
     Args:
         size: Numbers in an observation.
         actions: Numbers in an action, k.
-        hidden: Widths of the actor's hidden layers; the paper has (128,).
-        critic_hidden: Widths of the critic's hidden layers.
-        initial_deviation: Standard deviation of the actions at the start.
+        config: Has the widths of the hidden layers and the deviation of the first actions.
     """
     normaliser = Normaliser(size)
-    network = make_network(normaliser, hidden, 2 * actions, gain=0.01)
+    network = make_network(normaliser, config.hidden, 2 * actions, gain=0.01)
     bias: Any = network[-1].bias
     with torch.no_grad():
-        bias[actions:] = 2 * torch.tensor(initial_deviation).log()
+        bias[actions:] = 2 * torch.tensor(config.initial_deviation).log()
     actor = ProbabilisticActor(
         OfObservation(network.append(MeanAndDeviation()), "loc", "scale"),
         in_keys=["loc", "scale"],
@@ -126,8 +120,8 @@ def make_actor_critic(
         distribution_kwargs={"validate_args": False},
         return_log_prob=True,
     )
-    critic = OfObservation(make_network(normaliser, critic_hidden, 1, gain=1.0), "state_value")
-    return actor, critic, normaliser
+    network = make_network(normaliser, config.critic_hidden, 1, gain=1.0)
+    return actor, OfObservation(network, "state_value"), normaliser
 
 
 def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Policy:

@@ -9,7 +9,7 @@ from typing import Any
 from quadrl import mjcf
 from quadrl.errors import RenderingUnavailable
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.figures import draw_learning_curve, trajectory
+from quadrl.learning.figures import learning_curve, trajectory
 from quadrl.learning.folder import (
     EVALUATION,
     LEARNING_CURVE,
@@ -65,7 +65,7 @@ def draw(
     folder: Path, rollout: Rollout, vehicle: Vehicle, *, video: bool, report: Callable[[str], None]
 ) -> None:
     """Draw the pictures of a run; without a graphics library the video is left out, with a line."""
-    draw_learning_curve(folder, folder / LEARNING_CURVE)
+    learning_curve(folder, folder / LEARNING_CURVE)
     title = f"{rollout.task.name}: mean action of the policy"
     trajectory(rollout, title, folder / TRAJECTORY)
     if not video:

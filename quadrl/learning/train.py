@@ -7,6 +7,7 @@ moment continues and ends with the same policy, bit for bit.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import time
@@ -89,11 +90,7 @@ class Training:
             engine=config.engine,
         )
         self.actor, self.critic, self.normaliser = make_actor_critic(
-            self.env.environment.size,
-            self.env.environment.action_size,
-            hidden=config.hidden,
-            critic_hidden=config.critic_hidden,
-            initial_deviation=config.initial_deviation,
+            self.env.environment.size, self.env.environment.action_size, config
         )
         self.algorithm = ALGORITHMS[config.algo](
             self.actor, self.critic, getattr(config, config.algo)
@@ -135,26 +132,23 @@ class Training:
         Raises:
             QuadrlError: A weight is no longer finite.
         """
-        try:
-            return self._run(on_progress)
-        finally:
-            self._unlock()
-
-    def _run(self, on_progress: Callable[[Progress], None]) -> Policy:
         config = self.config
-        if self.iteration >= config.iterations and (self.folder / POLICY_FILE).exists():
-            return Policy.load(self.folder)
-        collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
-        if self._generator_state is not None:
-            torch.set_rng_state(self._generator_state)
-        # Networks this small gain nothing from a second thread and lose a lot when a core is busy,
-        # and with one the results are the same on any number of cores.
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        log = Log(self.folder, self.iteration)
-        started = saved = time.perf_counter()
-        before, batches = self.seconds, iter(collector)
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._unlock)
+            if self.iteration >= config.iterations and (self.folder / POLICY_FILE).exists():
+                return Policy.load(self.folder)
+            collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
+            stack.callback(collector.shutdown, close_env=False)
+            if self._generator_state is not None:
+                torch.set_rng_state(self._generator_state)
+            # Networks this small gain nothing from a second thread and lose a lot when a core is
+            # busy, and with one the results are the same on any number of cores.
+            stack.callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(1)
+            log = Log(self.folder, self.iteration)
+            stack.callback(log.close)
+            started = saved = time.perf_counter()
+            before, batches = self.seconds, iter(collector)
             while self.iteration < config.iterations:
                 metrics = self._learn(next(batches))
                 self.iteration += 1
@@ -174,10 +168,6 @@ class Training:
             policy = self.policy()
             policy.save(self.folder / POLICY_FILE)
             self.seconds = before + time.perf_counter() - started
-        finally:
-            log.close()
-            torch.set_num_threads(threads)
-            collector.shutdown(close_env=False)
         return policy
 
     def policy(self) -> Policy:

@@ -7,10 +7,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from scipy.sparse.linalg import LinearOperator, cg
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.distributions import kl_divergence
+from torch.nn.utils import vector_to_parameters
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.common import LossModule
 
@@ -53,36 +55,6 @@ class TRPOLoss(LossModule):
         # The base of an Independent(Normal): its closed form, summed over the actions.
         kl = kl_divergence(acting.base_dist, present.base_dist).sum(-1).mean()
         return surrogate, kl
-
-
-def conjugate_gradients(
-    product: Callable[[Tensor], Tensor], target: Tensor, iterations: int, tolerance: float = 1e-10
-) -> Tensor:
-    """Solve A x = b for a symmetric positive definite A that is only known by its products.
-
-    Args:
-        product: x (n,) to A x (n,).
-        target: b (n,), float64.
-        iterations: Their largest number.
-        tolerance: On the squared residual over that of b.
-
-    Returns:
-        x (n,), float64.
-    """
-    solution = torch.zeros_like(target)
-    residual, direction = target.clone(), target.clone()
-    square = residual @ residual
-    enough = tolerance * square
-    for _ in range(iterations):
-        if square <= enough:
-            break
-        image = product(direction)
-        step = square / (direction @ image)
-        solution += step * direction
-        residual -= step * image
-        last, square = square, residual @ residual
-        direction = residual + (square / last) * direction
-    return solution
 
 
 def fisher_product(
@@ -140,7 +112,12 @@ class TRPO(Algorithm):
         surrogate, kl = self.loss.surrogate_and_kl(batch)
         gradient = flat(torch.autograd.grad(surrogate, self.policy, retain_graph=True)).double()
         product = fisher_product(kl, self.policy, config.damping)
-        direction = conjugate_gradients(product, gradient, config.iterations)
+        matrix: Any = LinearOperator(
+            (len(gradient), len(gradient)),
+            lambda vector: product(torch.from_numpy(vector)).numpy(),
+            dtype=float,  # type: ignore[call-arg] - the class behind LinearOperator takes it
+        )
+        direction = torch.from_numpy(cg(matrix, gradient.numpy(), maxiter=config.iterations)[0])
         curvature = direction @ product(direction)
         start = flat([p.detach() for p in self.policy])
         before = surrogate.item()
@@ -149,17 +126,11 @@ class TRPO(Algorithm):
         full = direction * torch.sqrt(2 * config.max_kl / curvature)
         share = 1.0
         for _ in range(config.backtracks):
-            self._set(start + (share * full).to(start.dtype))
+            vector_to_parameters(start + (share * full).to(start.dtype), self.policy)
             with torch.no_grad():
                 after, divergence = (x.item() for x in self.loss.surrogate_and_kl(batch))
             if after > before and divergence <= config.max_kl:
                 return {"kl": divergence, "step": share, "surrogate_gain": after - before}
             share *= config.shrink
-        self._set(start)
+        vector_to_parameters(start, self.policy)
         return {"kl": 0.0, "step": 0.0, "surrogate_gain": 0.0}
-
-    @torch.no_grad()
-    def _set(self, vector: Tensor) -> None:
-        parts = vector.split([parameter.numel() for parameter in self.policy])
-        for parameter, part in zip(self.policy, parts, strict=True):
-            parameter.copy_(part.view_as(parameter))

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from quadrl.markers import Marker
+from quadrl.rotation import Array
 from quadrl.vehicle import DRAWN_SIZE
-
-Array = NDArray[np.floating[Any]]
 
 FOLLOW = "follow"
 AZIMUTH, ELEVATION = 30.0, -21.0  # [deg]

@@ -6,7 +6,6 @@ import contextlib
 import math
 import weakref
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,9 +15,8 @@ from quadrl.errors import QuadrlError
 from quadrl.markers import GOAL_RGBA, Marker
 from quadrl.rendering import gl
 from quadrl.rendering.camera import FOLLOW, aircraft_scale, follow_cameras, in_view
+from quadrl.rotation import Array
 from quadrl.validation import choice, number
-
-Array = NDArray[np.floating[Any]]
 
 MAX_SHAPES = 2000
 TRAIL_SEGMENTS = 120

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadrl.markers import Marker
-
-Array = NDArray[np.floating[Any]]
+from quadrl.rotation import Array
 
 FASTEST_GOAL = 10.0  # [m/s]; one that moves faster has jumped
 

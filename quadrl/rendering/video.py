@@ -37,7 +37,6 @@ def render_trajectory(
     fps: float = 25.0,
     camera: str = FOLLOW,
     overlay: bool = True,
-    trail: bool = True,
 ) -> Generator[NDArray[np.uint8]]:
     """Draw a flight.
 
@@ -49,7 +48,6 @@ def render_trajectory(
         fps: Pictures a second; the recorded states are interpolated.
         camera: "follow", or a camera of the model.
         overlay: Show time, error, speed, reward and rotor speeds.
-        trail: Show where the aircraft has been.
 
     Yields:
         Pictures (height, width, 3).
@@ -89,7 +87,7 @@ def render_trajectory(
                 camera=cameras[k],
                 rotor_angles=angles[k],
                 goal=flight.goal[k],
-                trail=position[max(0, k - round(TRAIL_SECONDS * rate)) : k + 1] if trail else None,
+                trail=position[max(0, k - round(TRAIL_SECONDS * rate)) : k + 1],
                 markers=markers[k],
             )
             if panel is not None:

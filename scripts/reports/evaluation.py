@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.signal import welch
 
-from quadrl.learning import study
 from quadrl.learning.figures import read_metrics
 from quadrl.learning.folder import EVALUATION, METRICS
-from quadrl.learning.study import Run
 from quadrl.policy import Policy
 from quadrl.rollout import EVALUATION_SEED, FINAL_STRETCH, Rollout, fly, summarize
-from scripts.reports.report import Result, say
+from scripts.reports.report import Result
+from scripts.reports.study import Run
 
 SMOOTHING = 0.05  # share of a training over which its curve is averaged for best and final
 NOISE_SEED = 0  # of sampled actions and of noise on the weights
@@ -24,16 +23,6 @@ WEIGHT_NOISE, WEIGHT_DRAWS = 0.2, 5  # of each neuron's weights, over their own 
 SEGMENT = 40  # control steps in a segment of a spectrum
 WOBBLE_HZ = 2.0  # body rates above it are wobble, not flight: a position loop is slower
 ROUGHNESS = ("action_variation_1_s", "body_rate_rad_s", "angular_acceleration_rad_s2", "jerk_m_s3")
-
-
-def train(runs: Iterable[Run], jobs: int, episodes: int) -> None:
-    """Make the runs that are not done; interrupted ones continue where they were.
-
-    Raises:
-        SystemExit: A training failed.
-    """
-    if failed := study.train(runs, jobs, episodes=episodes, report=say):
-        raise SystemExit("\n".join(["Not every training ended:", *failed]))
 
 
 def trained(run: Run) -> Result:

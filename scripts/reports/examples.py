@@ -17,9 +17,9 @@ import tyro
 
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import EVALUATION
-from quadrl.learning.study import Run
 from scripts.reports import evaluation, report
 from scripts.reports.report import ENVIRONMENT, Result, say, table
+from scripts.reports.study import Run
 
 EXAMPLES = ("torchrl_ppo", "cleanrl_ppo", "sb3_ppo")
 FIGURES = ("episodes", "success_rate", "survival_rate", "position_error_m")
@@ -57,10 +57,10 @@ def main(
 
 def train(seed: int, steps: int | None) -> Result:
     """A run of `quadrl train hover` in MuJoCo, where the examples fly too."""
-    settings = {"seed": seed} | ({"steps": steps} if steps else {})
     with tempfile.TemporaryDirectory() as scratch:
-        run = Run(TrainConfig("hover", engine="mujoco", **settings), Path(scratch) / "run")
-        call("-m", "quadrl", *run.command(100))
+        config = TrainConfig("hover", engine="mujoco", seed=seed, steps=steps)
+        run = Run(config, Path(scratch) / "run")
+        call(*run.command(100))
         summary = json.loads((run.folder / EVALUATION).read_text())
         trained = evaluation.trained(run)
     known = {"example": "quadrl train", "settings": "quadrl", "seed": seed}
@@ -71,13 +71,14 @@ def train(seed: int, steps: int | None) -> Result:
 def follow(name: str, seed: int, seconds: float, options: list[str]) -> Result:
     """A run of an example."""
     path = report.DOCS / "examples" / f"{name}.py"
-    run = json.loads(call(str(path), "--seed", str(seed), "--seconds", str(seconds), *options))
+    limits = ("--seed", str(seed), "--seconds", str(seconds))
+    run = json.loads(call(sys.executable, str(path), *limits, *options))
     return {"example": name} | {key: run[key] for key in ("seed", "steps", "seconds", *FIGURES)}
 
 
-def call(*arguments: str) -> str:
-    """Standard output of Python with this repository's package."""
-    return subprocess.check_output((sys.executable, *arguments), env=ENVIRONMENT, text=True)
+def call(*command: str) -> str:
+    """Standard output of a command, with this repository's package."""
+    return subprocess.check_output(command, env=ENVIRONMENT, text=True)
 
 
 def compared() -> str:

@@ -14,12 +14,12 @@ import tyro
 from matplotlib.figure import Figure
 
 from quadrl.control import make as make_controller
-from quadrl.learning import study
+from quadrl.learning.config import TrainConfig
 from quadrl.learning.figures import COLOURS, STYLE, learning_curves, read_metrics, save, trajectory
 from quadrl.learning.folder import METRICS
 from quadrl.policy import Policy
 from quadrl.rollout import fly, summarize
-from scripts.reports import evaluation, report
+from scripts.reports import evaluation, report, study
 from scripts.reports.claims import judged
 from scripts.reports.report import Result, factor, say, spread, table
 from scripts.reports.trial import LABELS, LEVEL, SOLVED, WAYS, Trial, column, trials
@@ -47,9 +47,17 @@ def main(
         name: Name of the result and of the folder of the runs.
     """
     began = time.perf_counter()
-    settings = {"num_threads": 1 if jobs > 1 else 0} | ({"steps": steps} if steps else {})
-    runs = study.plan(report.RUNS / name, TASKS, LABELS, range(seeds), **settings)
-    evaluation.train(runs, jobs, episodes)
+    settings = {"steps": steps, "num_threads": 1 if jobs > 1 else 0}
+    runs = [
+        study.Run(
+            TrainConfig(task, algo=algo, seed=seed, **settings),
+            report.RUNS / name / f"{task}-{algo}-{seed}",
+        )
+        for seed in range(seeds)  # seed by seed: one that is stopped has whole seeds
+        for task in TASKS
+        for algo in LABELS
+    ]
+    study.train(runs, jobs, episodes)
     result: Result = {"command": f"scripts/report paper --jobs {jobs}", "episodes": episodes}
     result["geometric"] = {task: yardstick(task, episodes) for task in TASKS}
     result["runs"] = []

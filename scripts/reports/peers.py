@@ -82,11 +82,9 @@ def main(
     result["versions"] = {name: found[0]["version"] for name, found in there.items()}
     for found in there.values():
         for rows in zip(*(answer["rows"] for answer in found), strict=True):
-            rates = [row["steps"] / row["seconds"] for row in rows]  # [control steps/s]
-            ended, steps = (sum(row[name] for row in rows) for name in ("ended", "steps"))
             known = {name: rows[0][name] for name in ("system", "what", "aircraft")}
-            known |= {"rates": rates, "episode_steps": steps / ended if ended else None}
-            result["rows"].append(known)
+            rates = [row["rate"] for row in rows]  # [control steps/s]
+            result["rows"].append(known | {"rates": rates})
     report.save("peers", result)
 
 

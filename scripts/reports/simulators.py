@@ -26,8 +26,8 @@ import numpy as np  # noqa: E402
 CHUNK = 10  # control steps of a single environment between two looks at the clock
 FLIGHT = 16  # control steps under random commands until bare aircraft are put back
 
-Work = Iterator[tuple[int, int]]
-"""Flies some control steps each time: how many (all aircraft), and how many episodes ended."""
+Work = Iterator[int]
+"""Flies some control steps each time: how many, of all aircraft."""
 Row = tuple[str, str, int, Callable[[], Work]]
 """System, what (one, batch or physics), number of aircraft, and what makes it."""
 
@@ -48,13 +48,11 @@ def fly_one(env: Any) -> Work:
     chosen = actions(env.action_space)
     env.reset(seed=0)
     while True:
-        ended = 0
         for _ in range(CHUNK):
             _, _, terminated, truncated, _ = env.step(next(chosen))
             if terminated or truncated:
-                ended += 1
                 env.reset()
-        yield CHUNK, ended
+        yield CHUNK
 
 
 def fly_batch(env: Any) -> Work:
@@ -62,8 +60,7 @@ def fly_batch(env: Any) -> Work:
     env.reset(seed=0)
     for action in actions(env.action_space):
         _, _, terminated, truncated, _ = env.step(action)
-        ended = int(np.count_nonzero(terminated | truncated))
-        yield env.num_envs - ended, ended
+        yield env.num_envs - int(np.count_nonzero(terminated | truncated))
 
 
 # -------------------------------------------------------------------------------------- simulators
@@ -86,7 +83,7 @@ def quadrl(sizes: list[int]) -> list[Row]:
             for _ in range(FLIGHT):
                 flown.ctrl[:] = next(commands)
                 flown.advance(vehicle.substeps)
-                yield count, 0
+                yield count
 
     rows: list[Row] = []
     for engine, system in (("mujoco", "quadrl, MuJoCo"), ("free_flight", "quadrl, free flight")):
@@ -114,7 +111,7 @@ def pyflyt(_: list[int]) -> list[Row]:
         while True:
             for _ in range(10):
                 aviary.step()
-            yield 10, 0
+            yield 10
 
     processes = {"id": task, "num_envs": cores, "vectorization_mode": "async"}
     return [
@@ -137,8 +134,8 @@ def rotorpy(sizes: list[int]) -> list[Row]:
         env = made(count)
         env.reset(seed=0)
         for action in cycle(-1, 1, (count, 4), np.float32):
-            _, _, done, _ = env.step(action)  # it resets a row on its last step
-            yield count, int(np.count_nonzero(done))
+            env.step(action)  # it resets a row on its last step
+            yield count
 
     def physics(count: int) -> Work:
         env = made(count)
@@ -149,7 +146,7 @@ def rotorpy(sizes: list[int]) -> list[Row]:
             state = copy.deepcopy(env.initial_states)
             for _ in range(FLIGHT):
                 state = env.quadrotors.step(state, next(commands), env.t_step)
-                yield count, 0
+                yield count
 
     def best_threaded(work: Work) -> Work:
         """With one of torch's threads or all: they spin, and beside other work all are slower."""
@@ -157,8 +154,7 @@ def rotorpy(sizes: list[int]) -> list[Row]:
         for threads in {1, torch.get_num_threads()}:
             torch.set_num_threads(threads)
             next(work)
-            tried = measure(work, 0.5)
-            speeds[threads] = tried["steps"] / tried["seconds"]
+            speeds[threads] = measure(work, 0.5)
         best = max(speeds, key=speeds.__getitem__)
         while True:
             torch.set_num_threads(best)
@@ -196,8 +192,7 @@ def crazyflow(sizes: list[int]) -> list[Row]:
         while True:  # it waits for the results only now and then, as a JAX policy would
             flown = [env.step(next(chosen)) for _ in range(CHUNK)]
             jax.block_until_ready(flown)
-            ended = sum(int(np.count_nonzero(step[2] | step[3])) for step in flown)
-            yield CHUNK * count - ended, ended
+            yield CHUNK * count - sum(int(np.count_nonzero(now[2] | now[3])) for now in flown)
 
     def physics(modelled: bool) -> Work:
         """The simulator of the environment, or that with rotors and RK4, nearest to quadrl's."""
@@ -214,7 +209,7 @@ def crazyflow(sizes: list[int]) -> list[Row]:
                 command(next(chosen))
                 sim.step(sim.freq // 50)
                 jax.block_until_ready(sim.data.states)
-                yield n, 0
+                yield n
 
     n = sizes[-1]
     rows: list[Row] = [
@@ -226,15 +221,12 @@ def crazyflow(sizes: list[int]) -> list[Row]:
     return [*rows, ("crazyflow, RK4", "physics", n, lambda: physics(modelled=True))]
 
 
-def measure(work: Work, seconds: float) -> dict[str, float]:
-    """Fly until the time is over: control steps, episodes that ended, seconds."""
-    steps = ended = 0
-    began = time.perf_counter()
+def measure(work: Work, seconds: float) -> float:
+    """Fly until the time is over: control steps per second."""
+    steps, began = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds or not steps:
-        flown, over = next(work)
-        steps += flown
-        ended += over
-    return {"steps": steps, "ended": ended, "seconds": elapsed}
+        steps += next(work)
+    return steps / elapsed
 
 
 SIMULATORS = {"quadrl": quadrl, "PyFlyt": pyflyt, "rotorpy": rotorpy, "crazyflow": crazyflow}
@@ -245,6 +237,6 @@ if __name__ == "__main__":
     for system, what, aircraft, make in SIMULATORS[name](sorted(map(int, sizes))):
         work = make()
         next(work)  # compiles
-        row = {"system": system, "what": what, "aircraft": aircraft}
-        said.append(row | measure(work, float(seconds)))
+        rate = measure(work, float(seconds))
+        said.append({"system": system, "what": what, "aircraft": aircraft, "rate": rate})
     print(json.dumps({"version": version(name), "rows": said}), file=ANSWER)

@@ -12,11 +12,11 @@ from quadrl import VEHICLES, tasks
 from quadrl.control import make as make_controller
 from quadrl.engines.mujoco import ENGINES
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.study import Run
 from quadrl.policy import Policy
 from quadrl.rollout import Controller, fly, summarize
-from scripts.reports import evaluation, report
+from scripts.reports import evaluation, report, study
 from scripts.reports.report import Result, asked, factor, number, table
+from scripts.reports.study import Run
 
 HOVER_SEEDS = (225, 226, 227, 228, 229)  # not used for tuning, like those below
 SEEDS = (230, 231, 232)
@@ -49,7 +49,7 @@ def main(jobs: int = 2) -> None:
     """
     planned = plan(jobs)
     for jobs, runs in planned.items():
-        evaluation.train(runs, jobs, EPISODES)
+        study.train(runs, jobs, EPISODES)
     found = []
     for run in (run for runs in planned.values() for run in runs):
         known = evaluation.trained(run)

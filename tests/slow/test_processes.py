@@ -1,4 +1,4 @@
-"""What concerns the whole process: builds at once, spawned workers, the clock that MuJoCo reads."""
+"""What concerns the whole process: builds, spawned workers, MuJoCo's clock, what is missing."""
 
 import multiprocessing
 import os
@@ -13,16 +13,17 @@ import quadrl
 from quadrl.environment import Environment
 
 REPOSITORY = Path(quadrl.__file__).parents[1]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(REPOSITORY)}
 
 
 def test_processes_that_build_at_once_do_not_disturb_each_other(tmp_path):
     settings = {"QUADRL_CACHE": str(tmp_path / "cache"), "QUADRL_CFLAGS": "-O0"}
-    environment = os.environ | settings | {"PYTHONPATH": str(REPOSITORY)}
+    environment = ENVIRONMENT | settings
     code = "from quadrl import native; print(native.build()); native.load(native.build())"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     command = [sys.executable, "-c", code]
     running = [subprocess.Popen(command, env=environment, **pipes) for _ in range(4)]
-    outcomes = [process.communicate(timeout=120) for process in running]
+    outcomes = [process.communicate(timeout=300) for process in running]
     assert [process.returncode for process in running] == [0] * 4, outcomes
     (path,) = {out.strip() for out, _ in outcomes}
     assert os.listdir(tmp_path / "cache") == [Path(path).name]  # and no scratch left
@@ -71,3 +72,37 @@ def test_the_clock_stands_still_unless_somebody_wants_it(before, after, moves):
     script = FLY.format(before=before, after=after)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, f"1 {moves}\n"), done.stderr
+
+
+# ------------------------------------------------------------------- machines that lack something
+
+
+def quadrl_line(*arguments, **environment):
+    """The one line of a command that fails."""
+    command = [sys.executable, "-W", "ignore", "-m", "quadrl", *arguments]
+    variables = ENVIRONMENT | environment
+    done = subprocess.run(command, env=variables, capture_output=True, text=True)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("quadrl: ")
+    return line
+
+
+def test_without_a_compiler_it_says_what_to_install(tmp_path):
+    nothing = {"PATH": str(tmp_path / "bin"), "CC": "", "QUADRL_CACHE": str(tmp_path / "cache")}
+    assert "apt-get install build-essential" in quadrl_line("evaluate", "hover", **nothing)
+
+
+def test_without_graphics_it_says_what_to_install(tmp_path):
+    assert "apt install libegl1" in quadrl_line("render", "hover", MUJOCO_GL="disabled")
+    assert not list(tmp_path.glob("*.mp4"))
+
+
+def test_the_contract_needs_neither_pytest_nor_torch():
+    code = (
+        "import sys; sys.modules.update(pytest=None, torch=None, torchrl=None, tensordict=None);"
+        "import quadrl; quadrl.testing.check_task('hover')"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from quadrl import benchmark
-from quadrl.learning import study
 from quadrl.learning.config import TrainConfig
 from quadrl.policy import Policy
 from quadrl.rollout import fly, summarize
@@ -22,6 +21,7 @@ from scripts.reports import (
     report,
     ship,
     step_size,
+    study,
     trial,
 )
 
@@ -127,10 +127,10 @@ def test_smoothness_by_hand():
 
 
 def test_a_run_is_measured_by_flying_its_policy(tmp_path):
-    (run,) = study.plan(tmp_path, ("hover",), ("ppo",), (0,), steps=4096, num_threads=1)
-    evaluation.train([run], 1, episodes=2)
+    run = study.Run(TrainConfig("hover", steps=4096, num_threads=1), tmp_path / "run")
+    study.train([run], 1, episodes=2)
     assert run.done
-    evaluation.train([run], 1, episodes=2)  # there is nothing left to do
+    study.train([run], 1, episodes=2)  # there is nothing left to do
     measured = evaluation.measure(run, episodes=3, gusts=(4.0,))
     policy = Policy.load(run.folder)
     assert summarize(fly(policy, "hover", episodes=3)).items() <= measured["mean"].items()

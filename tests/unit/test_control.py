@@ -360,7 +360,7 @@ def test_wild_actions_stay_within_the_rotors_limits_and_do_not_flip_the_aircraft
             assert not rates or (np.abs(flyer.state.body_rate) < 1.3 * flyer.mode.scale[1:]).all()
     assert np.min(share) > -1e-12 and np.max(share) == pytest.approx(1)  # and all of it is used
     assert rates or 0.5 < min(upright) < 0.99
-    flyer.fly(0.0, 4.0)
+    flyer.fly(0.0, 2.0 if rates else 3.2)
     assert flyer.state.angular_speed.max() < 0.02
     assert rates or flyer.state.rotation[:, 2, 2].min() > 0.999
 
@@ -411,10 +411,10 @@ def test_a_body_rate_is_reached_in_its_time_and_held(vehicle, axis):
 
 
 @presets
-@pytest.mark.parametrize("action", [-0.1, 1.0])
-def test_a_velocity_is_reached_in_its_time_and_held_at_any_heading(vehicle, action):
+def test_a_velocity_is_reached_in_its_time_and_held_at_any_heading(vehicle):
     """Velocity, tilt, body rate and lag make four poles; far off the acceleration is limited."""
-    flyer, actions = Flyer("velocity", vehicle, headings=(0.0, 2.0, 4.0)), action * np.eye(3, 4)
+    flyer = Flyer("velocity", vehicle, headings=(0.0, 2.0, 4.0) * 2)
+    actions = np.concatenate([-0.1 * np.eye(3, 4), np.eye(3, 4)])
     wanted = actions[:, :3] * flyer.mode.scale[:3]
     near = 0.05 * np.abs(wanted).max(axis=1, keepdims=True)
 
@@ -424,34 +424,39 @@ def test_a_velocity_is_reached_in_its_time_and_held_at_any_heading(vehicle, acti
 
     # At the limit p^2 times the largest angle is the largest angular acceleration.
     rates = Loops(vehicle, vehicle.physics_timestep, "velocity").max_body_rate
-    # The scale is the largest acceleration times a second.
-    flyer.fly(actions, settling(vehicle, 4, 1.3, min(rates[:2]) / 0.4) + abs(action))
-    assert (error() < near).all()
+    # The scale is the largest acceleration times a second: a tenth of it takes 0.1 s more.
+    flyer.fly(actions, settling(vehicle, 4, 1.3, min(rates[:2]) / 0.4) + 0.1)
+    assert (error() < near)[:3].all()
+    flyer.fly(actions, 0.9)
+    assert (error() < near)[3:].all()
     flyer.fly(actions, 2.0)
     assert (error() < near / 10).all()
 
 
 @presets
 def test_a_position_is_reached_and_held_without_overshoot_and_no_action_brakes(vehicle):
-    flyer = Flyer("position", vehicle, headings=(0.0, 0.8, -0.6))
-    place, east, share = np.array([4.0, -2.0, 0.7]), np.tile([1.0, 0.0], (3, 1)), []
+    # Three fly to a place; the fourth flies east, and no action brakes it.
+    velocity = np.outer([0, 0, 0, 1], [2.0, 0.0, 0.0])
+    flyer = Flyer("position", vehicle, headings=(0.0, 0.8, -0.6, 0.0), velocity=velocity)
+    place, east, share = np.array([4.0, -2.0, 0.7]), np.tile([1.0, 0.0], (4, 1)), []
 
     def action(state):
         back = heading_of(state.rotation) * [1, -1]
         x, y = turned(east, back).T
-        return np.column_stack([turned(place - state.position, back), np.arctan2(y, x)])
+        there = np.column_stack([turned(place - state.position, back), np.arctan2(y, x)])
+        return there * np.array([[1], [1], [1], [0]]) / flyer.mode.scale
 
-    for _ in range(16):
-        flyer.fly(lambda state: action(state) / flyer.mode.scale, 0.5)
-        share.append((flyer.state.position @ place / (place @ place)).max())
+    for step in range(16):
+        flyer.fly(action, 0.5)
+        share.append((flyer.state.position[:3] @ place / (place @ place)).max())
+        if step == 7:
+            assert flyer.state.speed[3] < 0.01
+            # Without lag 2 m/s over the rate of the velocity loop, 1.7 / s for the slowest
+            # aircraft: 1.2 m.
+            assert 0.2 < flyer.state.position[3, 0] < 2.4
     assert max(share) < 1.01
-    np.testing.assert_allclose(flyer.state.position, np.tile(place, (3, 1)), atol=0.01)
-    np.testing.assert_allclose(heading_of(flyer.state.rotation), east, atol=0.03)
-    flyer = Flyer("position", vehicle, velocity=np.array([[2.0, 0.0, 0.0]]))
-    flyer.fly(0.0, 4.0)
-    assert flyer.state.speed[0] < 0.01
-    # Without lag 2 m/s over the rate of the velocity loop, 1.7 / s for the slowest aircraft: 1.2 m.
-    assert 0.2 < flyer.state.position[0, 0] < 2.4
+    np.testing.assert_allclose(flyer.state.position[:3], np.tile(place, (3, 1)), atol=0.01)
+    np.testing.assert_allclose(heading_of(flyer.state.rotation)[:3], east[:3], atol=0.03)
 
 
 # ----------------------------------------------------------------------------- in the environment
@@ -463,13 +468,14 @@ def test_a_batch_flies_as_each_alone(name, vehicle):
     """Bit for bit, whatever the order in which the rows lie in memory."""
     setting = dict(vehicle=LAYOUTS[vehicle], control_mode=name)
     batch = Environment("hover", num_envs=5, seed=3, **setting)
-    singles = [Environment("hover", seed=3 + i, **setting) for i in range(5)]
+    rows = [0, 2, 4]
+    singles = [Environment("hover", seed=3 + i, **setting) for i in rows]
     for environment in (batch, *singles):
         environment.reset()
     for action in np.random.default_rng(0).uniform(-1, 1, (12, 5, 4)):
         reward = batch.step(action).reward
-        alone = [single.step(action[i : i + 1]).reward[0] for i, single in enumerate(singles)]
-        np.testing.assert_array_equal(reward, alone)
+        alone = [e.step(action[[i]]).reward[0] for i, e in zip(rows, singles, strict=True)]
+        np.testing.assert_array_equal(reward[rows], alone)
 
 
 @looped

@@ -29,7 +29,7 @@ def test_row_i_is_the_single_environment_seeded_with_seed_plus_i(name, engine):
     records = helpers.fly(batch, actions)
     ends = np.array([r["terminated"] | r["truncated"] for r in records])
     assert (ends.sum(0) >= 3).all()
-    for i in range(5):
+    for i in (0, 1, 4):  # the first, the one that dives, the last
         single = begun(helpers.SHORT[name], seed=40 + i, engine=engine, num_threads=1)
         for key, value in helpers.observed(single).items():
             np.testing.assert_array_equal(value[0], first[key][i], err_msg=key)

@@ -9,10 +9,10 @@ from tensordict import TensorDict
 from torch.func import functional_call, jacrev
 
 import quadrl
-from quadrl.learning.config import PPOConfig, TRPOConfig, VPGConfig
+from quadrl.learning.config import PPOConfig, TrainConfig, TRPOConfig, VPGConfig
 from quadrl.learning.networks import Normaliser, export, make_actor_critic
 from quadrl.learning.ppo import PPO
-from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
+from quadrl.learning.trpo import TRPO, fisher_product, flat
 from quadrl.learning.vpg import VPG
 
 SIZE, ACTIONS, ROWS = 5, 2, 24
@@ -30,10 +30,8 @@ def one_thread():
 
 def actor_critic(seed=0, size=SIZE, actions=ACTIONS, hidden=(6,)):
     torch.manual_seed(seed)
-    actor, critic, normaliser = make_actor_critic(
-        size, actions, hidden=hidden, critic_hidden=(6,), initial_deviation=0.5
-    )
-    return actor, critic, normaliser
+    config = TrainConfig(hidden=hidden, critic_hidden=(6,), initial_deviation=0.5)
+    return make_actor_critic(size, actions, config)
 
 
 def disturbed(actor):
@@ -206,17 +204,6 @@ def test_kl_of_two_normals_in_closed_form():
     losses = algorithm.loss(batch)
     assert losses["kl"] == kl
     assert losses["loss_critic"] == algorithm.loss.critic_loss(batch)
-
-
-def test_conjugate_gradients_solve():
-    generator = np.random.default_rng(0)
-    root = generator.normal(size=(30, 30))
-    matrix = torch.from_numpy(root @ root.T + np.eye(30))
-    target = torch.from_numpy(generator.normal(size=30))
-    solution = conjugate_gradients(lambda x: matrix @ x, target, 60, tolerance=1e-24)
-    torch.testing.assert_close(solution, torch.linalg.solve(matrix, target), rtol=1e-9, atol=1e-9)
-    few = conjugate_gradients(lambda x: matrix @ x, target, 3)
-    assert torch.linalg.norm(matrix @ few - target) > 1e-3  # the limit on iterations holds
 
 
 def test_the_step_is_the_exact_natural_gradient():

@@ -56,12 +56,11 @@ def test_threads_of_the_simulation_change_nothing(tmp_path, engine, num_envs):
         steps=num_envs * 4 * 3,
         ppo={"epochs": 1, "minibatch": num_envs},
     )
-    one, *others = (train(changed(**settings, num_threads=n), tmp_path / str(n)) for n in (1, 2, 3))
-    for other in others:
-        assert_same_run(one, other)
+    one, three = (train(changed(**settings, num_threads=n), tmp_path / str(n)) for n in (1, 3))
+    assert_same_run(one, three)
 
 
-@pytest.mark.parametrize("seed", [1, 1000, 2**32 - 1])
+@pytest.mark.parametrize("seed", [1, 2**32 - 1])
 def test_another_seed_is_another_run(finished, tmp_path, seed):
     other = train(changed(seed=seed), tmp_path / "other")
     ours, theirs = quadrl.Policy.load(finished), quadrl.Policy.load(other)
@@ -325,14 +324,13 @@ def test_the_metrics_are_those_of_the_episodes(finished):
 
 
 def test_figures_are_pictures(finished, tmp_path):
-    curve = read_metrics(finished / "metrics.csv")
-    path = learning_curve(curve, "title", tmp_path / "a" / "b.png")
+    path = learning_curve(finished, tmp_path / "a" / "b.png")
     assert path.read_bytes().startswith(b"\x89PNG")
     rollout = fly(quadrl.Policy.load(finished), "hover", episodes=2)
     draw_trajectory(rollout, "title", tmp_path / "c.pdf")
     assert (tmp_path / "c.pdf").read_bytes().startswith(b"%PDF")
     with refused(value="xyz"):
-        learning_curve(curve, "title", tmp_path / "c.xyz")
+        learning_curve(finished, tmp_path / "c.xyz")
     assert sorted(os.listdir(tmp_path)) == ["a", "c.pdf"]
 
 

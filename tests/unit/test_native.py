@@ -33,6 +33,16 @@ def callbacks():
 
 
 @pytest.fixture
+def copying_compiler(tmp_path, monkeypatch):
+    """A compiler that is done at once: it gives out a copy of the library that there is."""
+    program = tmp_path / "copying-cc"
+    copy = f'while [ "$1" != -o ]; do shift; done; cp "{native.build()}" "$2"'
+    program.write_text(f"#!/bin/sh\n{copy}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("CC", str(program))
+
+
+@pytest.fixture
 def cache(tmp_path, monkeypatch):
     """An empty cache of compiled libraries; the compiler does not take its time."""
     folder = tmp_path / "cache"
@@ -277,7 +287,9 @@ def test_cc_names_the_compiler_and_what_it_says_is_quoted(cache, monkeypatch, tm
     assert list(cache.iterdir()) == []
 
 
-def test_the_cache_is_used_and_other_flags_make_another_library(cache, monkeypatch, tmp_path):
+def test_the_cache_is_used_and_other_flags_make_another_library(
+    copying_compiler, cache, monkeypatch, tmp_path
+):
     path = native.build()
     assert list(cache.iterdir()) == [path]
     built = path.stat().st_mtime_ns
@@ -292,7 +304,9 @@ def test_the_cache_is_used_and_other_flags_make_another_library(cache, monkeypat
 
 
 @pytest.mark.parametrize("kind", ["read-only", "unreadable"])
-def test_a_cache_that_cannot_be_written_is_done_without(cache, tmp_path, monkeypatch, kind):
+def test_a_cache_that_cannot_be_written_is_done_without(
+    copying_compiler, cache, tmp_path, monkeypatch, kind
+):
     # Root may write everywhere, so both stand in: a folder under a file cannot be made, and a
     # name past the file system's limit cannot even be asked for.
     impossible = tmp_path / "file" / "quadrl" if kind == "read-only" else tmp_path / ("x" * 300)

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import refused
 from safetensors.numpy import save
 
 import quadrl
-from quadrl.policy import FIRST_FORMAT, FORMAT, SHIPPED, Policy, shipped
+from quadrl.policy import FORMAT, SHIPPED, Policy, shipped
 from quadrl.rollout import fly
+from runs import refused
 
 SIZE = 3
 HEADER = {"format": FORMAT, "task": "hover", "metadata": {}}
@@ -142,18 +142,6 @@ def test_the_same_policy_is_the_same_file(tmp_path):
     assert len(contents) == 1
 
 
-def test_files_of_the_first_format_are_read(tmp_path):
-    options = {"horizon": 5, "settle": 1, "radius": 0.2}
-    metadata = {"vehicle": "paper", "action": "velocity", "task_options": options}
-    header = HEADER | {"format": FIRST_FORMAT, "metadata": metadata}
-    policy = Policy.load(write(tmp_path / "old.safetensors", parts(make_policy()), header))
-    assert policy.control_mode == "velocity"
-    renamed = {"time_limit": 5, "settle_time": 1, "radius": 0.2}
-    assert policy.metadata["task_options"] == renamed
-    policy.save(tmp_path / "new.safetensors")
-    assert Policy.load(tmp_path / "new.safetensors").metadata == policy.metadata
-
-
 # ------------------------------------------------------------------------ what is refused
 
 
@@ -273,8 +261,8 @@ def test_what_it_was_trained_for_must_be_readable(tmp_path, header):
 
 @pytest.mark.parametrize("algo", ["ppo", "gae", "vpg"])
 def test_pretrained_is_the_file_that_ships(algo):
-    policy = Policy.pretrained("hover", algo)
-    name = "hover_ppo" if algo == "ppo" else "hover_gae"
+    policy = Policy.pretrained("static_waypoint", algo)
+    name = "static_waypoint_ppo" if algo == "ppo" else "static_waypoint_gae"
     loaded = Policy.load(SHIPPED / f"{name}.safetensors")
     for part, array in parts(loaded).items():
         np.testing.assert_array_equal(parts(policy)[part], array)

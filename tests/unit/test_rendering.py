@@ -1,10 +1,8 @@
 """Pictures and videos: what is drawn is where it should be, and nothing is left half done."""
 
 import ctypes
-import importlib.util
 import math
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-import quadrl
 from quadrl import mjcf, rendering
 from quadrl.errors import QuadrlError, RenderingUnavailable
 from quadrl.markers import Marker
@@ -32,11 +29,9 @@ SMALL = dict(width=160, height=120)
 
 
 @pytest.fixture(scope="module")
-def model():
-    """The paper's aircraft, cheaper to draw."""
-    model = mjcf.compile_model(VEHICLES["paper"])
-    model.vis.quality.shadowsize, model.vis.quality.offsamples = 512, 0
-    return model
+def model(cheap_pictures):
+    """The paper's aircraft."""
+    return mjcf.compile_model(VEHICLES["paper"])
 
 
 @pytest.fixture(scope="module")
@@ -332,72 +327,7 @@ def test_no_graphics_library_is_reported(model, monkeypatch):
         Renderer(model, **SMALL)
 
 
-PREAMBLE = """
-import os, mujoco, numpy as np
-before = dict(os.environ)
-import quadrl
-assert dict(os.environ) == before
-def ours():
-    from quadrl import mjcf
-    from quadrl.rendering import Renderer
-    model = mjcf.compile_model(quadrl.Vehicle())
-    model.vis.quality.shadowsize, model.vis.quality.offsamples = 256, 0  # cheaper to draw
-    return Renderer(model, 80, 60)
-pose = [0, 0, 3, 1, 0, 0, 0]
-def check(a, b):  # Mesa's threads round some pixels differently
-    np.testing.assert_allclose(a.astype(int), b.astype(int), atol=3)
-"""
-OURS = """
-renderer = ours()
-first = renderer.frame(pose)
-"""
-MUJOCO = """
-model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-other = mujoco.Renderer(model, 60, 80)
-other.update_scene(data)
-draw = other.render
-before = draw()
-"""
-DM_CONTROL = """
-environment = quadrl.load("hover", task_kwargs={"random": 0})
-environment.reset()
-draw = lambda: environment.physics.render(48, 64)
-before = draw()
-"""
-BOTH = """
-check(draw(), before)
-check(renderer.frame(pose), first)
-with ours() as second:
-    check(second.frame(pose), first)
-check(draw(), before)
-check(renderer.frame(pose), first)
-assert before.std() > 10 and first.std() > 10
-"""
 headless = pytest.mark.skipif(sys.platform != "linux", reason="only Linux draws without a screen")
-
-
-def run(code, **variables):
-    """Run code in a process without a screen, warnings being errors; its end must be clean."""
-    names = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")
-    kept = {name: value for name, value in os.environ.items() if name not in names}
-    places = [str(Path(quadrl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
-    environment = kept | {"PYTHONPATH": os.pathsep.join(filter(None, places))} | variables
-    command = [sys.executable, "-W", "error", "-c", PREAMBLE + code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stderr, done.stdout) == (0, "", "")
-
-
-@headless
-@pytest.mark.parametrize(
-    "code",
-    [OURS + MUJOCO + BOTH + "other.close()" + DM_CONTROL + BOTH, DM_CONTROL + OURS + BOTH],
-    ids=["first", "second"],
-)
-def test_without_a_screen_it_draws_beside_other_renderers(code):
-    """Each draws what it should and none spoils another's end, though mujoco was imported first."""
-    run(code)
 
 
 @headless
@@ -423,10 +353,3 @@ def test_triton_is_loaded_by_itself_before_the_first_context(model, monkeypatch,
     monkeypatch.setattr("mujoco.Renderer.__init__", record_begin)
     with Renderer(model, **SMALL):
         assert events == [(str(library), True), "context"]
-
-
-@headless
-@pytest.mark.skipif(not importlib.util.find_spec("triton"), reason="triton is not installed")
-@pytest.mark.parametrize("code", [OURS, DM_CONTROL, MUJOCO + "import quadrl.learning"])
-def test_triton_can_be_imported_after_a_picture(code):
-    run(code + "\nimport triton\n", MUJOCO_GL="egl")

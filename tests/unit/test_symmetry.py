@@ -57,17 +57,21 @@ def order_of(vehicle, body):
     for image in rotors:  # which rotor comes to stand here?
         for k, rotor in enumerate(rotors):
             there = [body @ np.array(x) for x in (rotor.position, rotor.axis)]
+            if not np.allclose(there, (image.position, image.axis), rtol=0, atol=1e-9):
+                continue
             moved = dataclasses.replace(
                 rotor,
                 position=image.position,
                 axis=image.axis,
                 spin=rotor.spin * helpers.sign(body),
             )
-            same = np.allclose(there, (image.position, image.axis), rtol=0, atol=1e-9)
-            if same and moved == image:
+            if moved == image:
                 order.append(k)
+                break
+        else:
+            return None
     inertia = np.diag(vehicle.inertia)
-    if len(order) < len(rotors) or not np.allclose(body @ inertia @ body.T, inertia, rtol=1e-9):
+    if not np.allclose(body @ inertia @ body.T, inertia, rtol=1e-9):
         return None
     return np.array(order)
 

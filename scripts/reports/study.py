@@ -1,22 +1,23 @@
-"""A study: trainings of several tasks, algorithms and seeds, each in a process of its own."""
+"""Trainings of several tasks, algorithms and seeds, each in a process of its own."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from quadrl.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import CONFIG, EVALUATION, FREE
+from scripts.reports.report import ENVIRONMENT, say
 
 POLL_SECONDS = 0.2
+NAMED = ("algo", "seed", "steps", "vehicle", "engine", "num_threads")
+"""Settings that the command of a run names: all others are those of its task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,70 +39,31 @@ class Run:
         free = {name: getattr(TrainConfig, name) for name in FREE}
         found = TrainConfig.of_folder(self.folder)
         if dataclasses.replace(found, **free) != dataclasses.replace(self.config, **free):
-            raise QuadrlError(
-                f"{self.folder} holds a run with other settings than this study's; choose "
-                "another --out"
-            )
+            raise QuadrlError(f"{self.folder} holds a run with other settings than this study's")
         return (self.folder / EVALUATION).exists()
 
     def command(self, episodes: int) -> list[str]:
-        """Arguments of `quadrl` that begin it, or continue it."""
-        config = self.config
+        """Begins it, or continues it."""
+        known = {name.replace("_", "-"): getattr(self.config, name) for name in NAMED}
+        named = [f"--{name}={value}" for name, value in known.items()]
+        begin = [self.config.task, *named, f"--out={self.folder}"]
+        again = ["--resume", str(self.folder)]
+        setting = again if (self.folder / CONFIG).exists() else begin
         ending = ["--no-video", "--episodes", str(episodes)]
-        if (self.folder / CONFIG).exists():
-            return ["train", "--resume", str(self.folder), *ending]
-        named = {
-            "--algo": config.algo,
-            "--seed": config.seed,
-            "--steps": config.steps,
-            "--vehicle": config.vehicle,
-            "--engine": config.engine,
-            "--num-threads": config.num_threads,
-            "--out": self.folder,
-        }
-        return ["train", config.task, *(str(word) for p in named.items() for word in p), *ending]
+        return [sys.executable, "-m", "quadrl", "train", *setting, *ending]
 
 
-def plan(
-    out: Path,
-    tasks: Iterable[str],
-    algorithms: Iterable[str],
-    seeds: Iterable[int],
-    **settings: Any,
-) -> list[Run]:
-    """The runs of a study, seed by seed, so that a study that is stopped has whole seeds.
-
-    Args:
-        out: Folder of the run folders.
-        tasks: Names of tasks.
-        algorithms: Names of algorithms.
-        seeds: Of the trainings.
-        **settings: Other settings of `TrainConfig` that `Run.command` names: steps, num_threads.
-    """
-    return [
-        Run(TrainConfig(task, algo=algo, seed=seed, **settings), out / f"{task}-{algo}-{seed}")
-        for seed in seeds
-        for task in tasks
-        for algo in algorithms
-    ]
-
-
-def train(
-    runs: Iterable[Run], jobs: int, *, episodes: int, report: Callable[[str], None]
-) -> list[str]:
+def train(runs: Iterable[Run], jobs: int, episodes: int) -> None:
     """Train and evaluate the runs that are not done, and continue those that are half done.
 
     Args:
         runs: The runs.
         jobs: Processes at a time.
         episodes: Of the evaluation at the end of each.
-        report: Is told, in a line, what begins and ends.
-
-    Returns:
-        A line for each run that failed.
 
     Raises:
         QuadrlError: A folder holds a run with other settings.
+        SystemExit: A training failed.
     """
     waiting = [run for run in runs if not run.done]
     going: dict[subprocess.Popen, tuple[str, Path]] = {}
@@ -112,31 +74,30 @@ def train(
                 run = waiting.pop(0)
                 log = run.folder.parent / "logs" / f"{run.folder.name}.txt"
                 going[_start(run.command(episodes), log)] = run.folder.name, log
-                report(f"{run.folder.name}: begun, {len(waiting)} waiting")
+                say(f"{run.folder.name}: begun, {len(waiting)} waiting")
             for process in [p for p in going if p.poll() is not None]:
                 name, log = going.pop(process)
                 if process.returncode:
                     last = (log.read_text().splitlines() or ["no output"])[-1]
                     failed.append(f"{name}: {last} (the rest is in {log})")
-                report(failed[-1] if process.returncode else f"{name}: done")
+                say(failed[-1] if process.returncode else f"{name}: done")
             time.sleep(POLL_SECONDS)
     finally:
         for process in going:  # after a Ctrl-C: each run can be continued
             process.send_signal(signal.SIGINT)
         for process in going:
             process.wait()
-    return failed
+    if failed:
+        raise SystemExit("\n".join(["Not every training ended:", *failed]))
 
 
-def _start(arguments: list[str], log: Path) -> subprocess.Popen:
-    """Start the command in a session of its own: a Ctrl-C reaches it once, from `train`."""
+def _start(command: list[str], log: Path) -> subprocess.Popen:
+    """Start a command in a session of its own: a Ctrl-C reaches it once, from `train`."""
     log.parent.mkdir(parents=True, exist_ok=True)
-    paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     with open(log, "w") as file:
         return subprocess.Popen(
-            [sys.executable, "-m", "quadrl", *arguments],
-            env=environment,
+            command,
+            env=ENVIRONMENT | {"OMP_NUM_THREADS": "1"},
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,

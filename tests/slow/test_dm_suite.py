@@ -1,0 +1,51 @@
+"""dm_control in processes of its own: its own suite test, and what draws its pictures."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from quadrl.tasks import TASKS
+
+TESTS = Path(__file__).parents[1]
+
+
+def run(*arguments):
+    """Output of a Python process that finds this repository's package, without a MUJOCO_GL."""
+    own = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", *arguments],
+        env=own | {"PYTHONPATH": str(TESTS.parent)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def test_dm_controls_own_suite_test_passes():
+    output = run(TESTS / "dm_control_conformance.py")
+    assert output.rstrip().endswith("OK"), output  # nothing skipped either
+    # One test of the constants, and nine of every task.
+    assert int(re.search(r"Ran (\d+) tests", output)[1]) == 1 + 9 * len(TASKS)
+    for name in TASKS:
+        assert output.count(f"task='{name}'") >= 2 * 8
+
+
+@pytest.mark.parametrize("first", ["", "import dm_control.suite; "])
+def test_physics_render_draws_without_a_screen_and_leaves_no_variable(first):
+    # In a process of its own: dm_control chooses what draws once.
+    ignore = "import warnings; warnings.simplefilter('ignore'); " if first else ""
+    code = (
+        "import os, quadrl; before = dict(os.environ);"
+        "environment = quadrl.load('hover'); environment.reset();"
+        "assert dict(os.environ) == before;"
+        "picture = environment.physics.render(96, 128, camera_id='track');"
+        "assert picture.shape == (96, 128, 3), picture.shape;"
+        "assert picture.reshape(-1, 3).std(axis=0).min() > 5, 'blank';"
+        "assert 'MUJOCO_GL' not in os.environ; environment.physics.free()"
+    )
+    run("-c", ignore + first + code)
