@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from runs import refused
 from safetensors.numpy import save
 
 import quadrl
 from quadrl.policy import FORMAT, SHIPPED, Policy, shipped
 from quadrl.rollout import fly
-from runs import refused
 
 SIZE = 3
 HEADER = {"format": FORMAT, "task": "hover", "metadata": {}}
