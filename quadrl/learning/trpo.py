@@ -7,12 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from scipy.sparse.linalg import LinearOperator, cg
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.distributions import kl_divergence
-from torch.nn.utils import vector_to_parameters
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.common import LossModule
 
@@ -55,6 +53,36 @@ class TRPOLoss(LossModule):
         # The base of an Independent(Normal): its closed form, summed over the actions.
         kl = kl_divergence(acting.base_dist, present.base_dist).sum(-1).mean()
         return surrogate, kl
+
+
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor], target: Tensor, iterations: int, tolerance: float = 1e-10
+) -> Tensor:
+    """Solve A x = b for a symmetric positive definite A that is only known by its products.
+
+    Args:
+        product: x (n,) to A x (n,).
+        target: b (n,), float64.
+        iterations: Their largest number.
+        tolerance: On the squared residual over that of b.
+
+    Returns:
+        x (n,), float64.
+    """
+    solution = torch.zeros_like(target)
+    residual, direction = target.clone(), target.clone()
+    square = residual @ residual
+    enough = tolerance * square
+    for _ in range(iterations):
+        if square <= enough:
+            break
+        image = product(direction)
+        step = square / (direction @ image)
+        solution += step * direction
+        residual -= step * image
+        last, square = square, residual @ residual
+        direction = residual + (square / last) * direction
+    return solution
 
 
 def fisher_product(
@@ -112,12 +140,7 @@ class TRPO(Algorithm):
         surrogate, kl = self.loss.surrogate_and_kl(batch)
         gradient = flat(torch.autograd.grad(surrogate, self.policy, retain_graph=True)).double()
         product = fisher_product(kl, self.policy, config.damping)
-        matrix: Any = LinearOperator(
-            (len(gradient), len(gradient)),
-            lambda vector: product(torch.from_numpy(vector)).numpy(),
-            dtype=float,  # type: ignore[call-arg] - the class behind LinearOperator takes it
-        )
-        direction = torch.from_numpy(cg(matrix, gradient.numpy(), maxiter=config.iterations)[0])
+        direction = conjugate_gradients(product, gradient, config.iterations)
         curvature = direction @ product(direction)
         start = flat([p.detach() for p in self.policy])
         before = surrogate.item()
@@ -126,11 +149,17 @@ class TRPO(Algorithm):
         full = direction * torch.sqrt(2 * config.max_kl / curvature)
         share = 1.0
         for _ in range(config.backtracks):
-            vector_to_parameters(start + (share * full).to(start.dtype), self.policy)
+            self._set(start + (share * full).to(start.dtype))
             with torch.no_grad():
                 after, divergence = (x.item() for x in self.loss.surrogate_and_kl(batch))
             if after > before and divergence <= config.max_kl:
                 return {"kl": divergence, "step": share, "surrogate_gain": after - before}
             share *= config.shrink
-        vector_to_parameters(start, self.policy)
+        self._set(start)
         return {"kl": 0.0, "step": 0.0, "surrogate_gain": 0.0}
+
+    @torch.no_grad()
+    def _set(self, vector: Tensor) -> None:
+        parts = vector.split([parameter.numel() for parameter in self.policy])
+        for parameter, part in zip(self.policy, parts, strict=True):
+            parameter.copy_(part.view_as(parameter))

@@ -268,7 +268,7 @@ def test_the_name_of_a_task_flies_the_policy_that_ships(capsys, refusal):
     refusal("evaluate", "./hover")
     refusal("evaluate", "./hover", "--algo", "ppo")
     assert refusal("evaluate", "hover", "--algo", "sac")[0].value == "hover_sac"
-    assert command("evaluate", "hover", "--algo", "vpg", *short) == 0
+    assert command("evaluate", "static_waypoint", "--algo", "vpg", *short) == 0
 
 
 def test_resume_takes_the_settings_of_the_run(run, copy, undrawn):

@@ -12,7 +12,7 @@ from quadrl.environment import Environment
 from quadrl.tasks.hover import Hover
 from quadrl.trace import FLAGS, LOGICAL, C, Trace
 
-STEPS = 70
+STEPS = 40
 
 
 def variant(base=Hover, options=None, **members):

@@ -12,7 +12,7 @@ import quadrl
 from quadrl.learning.config import PPOConfig, TrainConfig, TRPOConfig, VPGConfig
 from quadrl.learning.networks import Normaliser, export, make_actor_critic
 from quadrl.learning.ppo import PPO
-from quadrl.learning.trpo import TRPO, fisher_product, flat
+from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
 from quadrl.learning.vpg import VPG
 
 SIZE, ACTIONS, ROWS = 5, 2, 24
@@ -204,6 +204,17 @@ def test_kl_of_two_normals_in_closed_form():
     losses = algorithm.loss(batch)
     assert losses["kl"] == kl
     assert losses["loss_critic"] == algorithm.loss.critic_loss(batch)
+
+
+def test_conjugate_gradients_solve():
+    generator = np.random.default_rng(0)
+    root = generator.normal(size=(30, 30))
+    matrix = torch.from_numpy(root @ root.T + np.eye(30))
+    target = torch.from_numpy(generator.normal(size=30))
+    solution = conjugate_gradients(lambda x: matrix @ x, target, 60, tolerance=1e-24)
+    torch.testing.assert_close(solution, torch.linalg.solve(matrix, target), rtol=1e-9, atol=1e-9)
+    few = conjugate_gradients(lambda x: matrix @ x, target, 3)
+    assert torch.linalg.norm(matrix @ few - target) > 1e-3  # the limit on iterations holds
 
 
 def test_the_step_is_the_exact_natural_gradient():
