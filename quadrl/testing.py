@@ -4,7 +4,8 @@
     check_task(MyTask)
 
 A task that keeps it can be registered. The checks need no pytest; those of PyTorch and TorchRL are
-made where these are installed.
+made where these are installed. The file is longer than others because the checks of a task's
+functions and those of its flights share their samples, and stand in the order in which they run.
 """
 
 from __future__ import annotations
