@@ -1,6 +1,6 @@
 """The control step of a task, compiled: `transition.finish` as one loop over rows.
 
-The functions of a task are called once, with symbols (`quadrl.trace`); what they compute becomes
+The functions of a task are called twice, with symbols (`quadrl.trace`); what they compute becomes
 a C function, and NumPy's rows fly with it. One aircraft alone would spend more time in eighty
 calls of NumPy than in its simulation. A task whose functions do more than arithmetic cannot be
 compiled and is run as it is written, with the same results.

@@ -59,7 +59,7 @@ class Environment:
                 `quadrl.randomization.Ranges` takes them.
 
         Raises:
-            QuadrlError: An unknown name, or a value that cannot be.
+            QuadrlError: An unknown name or an impossible value.
             NativeError: The rotor callbacks cannot be built or installed.
         """
         self.task = tasks.make(task)
@@ -111,7 +111,7 @@ class Environment:
         """Begin the episodes of a seed anew: row i gets seed + i; rows (n,) or None for all.
 
         Raises:
-            QuadrlError: The seed is no whole number from 0 on.
+            QuadrlError: The seed is not a whole number from 0 on.
         """
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
@@ -285,7 +285,7 @@ class Environment:
         records.check_alike(saved, own)
         name = "engine.parameters"
         if not (self._per_row or np.array_equal(saved[name], own[name])):
-            reason = "what was saved is of another aircraft"
+            reason = "the state was saved with another aircraft"
             raise QuadrlError(reason, name=name, value=saved[name], allowed="this aircraft's")
         self.engine.restore({key.removeprefix("engine."): saved[key] for key in saved})
         self._keys[:], self._episodes[:] = saved["keys"], saved["episodes"]

@@ -1,4 +1,4 @@
-"""The exceptions of quadrl: what the user can mend, the C part, and the renderer."""
+"""The exceptions of quadrl: what the user can fix, the C part, and the renderer."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class QuadrlError(ValueError):
-    """Something that the caller can mend; the message is one line.
+    """Something that the caller can fix; the message is one line.
 
     Attributes:
         name: What was wrong: an option, a parameter, an argument; None where a file was.

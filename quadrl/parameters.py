@@ -23,7 +23,7 @@ AIR = 3
 MARK = 1903518052.0
 """Tells the actuators and bodies of quadrl from everybody else's: "quad" in ASCII."""
 SETTINGS = ("name", "rotors", "action_scale", "physics_timestep", "control_timestep")
-"""Fields of `Vehicle` that are no parameter of an aircraft's row."""
+"""Fields of `Vehicle` that are not a parameter of an aircraft's row."""
 DERIVED = ("foot", "hull", "ground_clearance", "rotor_height", "resolved_speed", "resolved_turn")
 """Properties of `Vehicle` that stand in a row."""
 

@@ -20,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from quadrl.errors import QuadrlError
+from quadrl.validation import choice
 
 FORMAT = "quadrl-policy-2"
 FILE = "policy.safetensors"
@@ -186,15 +187,9 @@ class Policy:
         Raises:
             QuadrlError: There is no such policy; the message lists those that there are.
         """
-        file = SHIPPED / f"{task}_{SHIPPED_AS.get(algo, algo)}.safetensors"
-        if file not in shipped():
-            raise QuadrlError(
-                f"or train one with quadrl train {task} --algo {algo}",
-                name="pretrained policy",
-                value=f"{task}_{algo}",
-                allowed=f"one of {', '.join(known.stem for known in shipped())}",
-            )
-        return cls.load(file)
+        known = [file.stem for file in shipped()]
+        name = choice("pretrained policy", f"{task}_{SHIPPED_AS.get(algo, algo)}", known)
+        return cls.load(SHIPPED / f"{name}.safetensors")
 
 
 PARTS = ("weight", "bias")

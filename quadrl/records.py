@@ -12,7 +12,7 @@ from quadrl.errors import QuadrlError
 
 
 def mapped(function: Callable[[Any], Any], record: Any) -> Any:
-    """A record with a function applied to each of its arrays; what is no array stays."""
+    """A record with a function applied to each of its arrays; what is not an array stays."""
     values = {}
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)

@@ -23,7 +23,7 @@ Vector = tuple[float, float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Rotor:
-    """One rotor. Every number but the radius stands in the aircraft's row of parameters."""
+    """One rotor. Every number is part of the aircraft's row of parameters."""
 
     position: Vector
     """Where its thrust acts [m]."""
@@ -43,7 +43,7 @@ class Rotor:
     axis: Vector = (0.0, 0.0, 1.0)
     """Unit vector along the thrust."""
     radius: float = 0.06
-    """[m], drawn, and what strikes the ground."""
+    """Radius of the disc [m], drawn and used for contact with the ground."""
 
     def __post_init__(self) -> None:
         """Validate the numbers."""

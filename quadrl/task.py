@@ -132,15 +132,15 @@ class Task(abc.ABC):
     """Height of the origin of the task's frame above the ground [m]; at least that of the
     aircraft's centre when it stands on its feet."""
     progress_weight: float = 100.0
-    """Reward for a metre of distance gained."""
+    """Reward per metre by which the distance to the goal falls."""
     attitude_weight: float = 30.0
-    """Reward for a unit of attitude error lost: with 10 the heading is learned last or not at all,
-    and a policy that knows no heading tips over now and then."""
+    """Reward per unit by which the attitude error falls. With 10 the heading is learned
+    late or never, and such policies sometimes tip over."""
     speed_weight: float = 2.0
-    """Reward for each m/s by which the speed falls, or that relative to a target (gym-aero has 0.1,
+    """Reward per m/s by which the speed falls, or the speed relative to a target (gym-aero has 0.1,
     with which hover takes twice the steps)."""
     spin_weight: float = 1.0
-    """Reward for each rad/s by which the body rate falls (gym-aero: 0.1)."""
+    """Reward per rad/s by which the body rate falls (gym-aero: 0.1)."""
     control_weight: float = 1.0
     """Cost of sum((Omega_c - Omega_hover)^2) / Omega_max^2, for each 0.05 s."""
     survival_weight: float = 10.0

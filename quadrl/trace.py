@@ -1,6 +1,6 @@
 """Symbols in place of numbers: what a pure function of arrays computes, as C.
 
-A function that never branches on data takes the same operations for every row. Called once with
+A function that never branches on data takes the same operations for every row. Called with
 arrays of symbols, it writes them all down, one row's worth: the body of a loop over rows. The
 operations are NumPy's own, one by one and in the same order, so that the compiled loop gives the
 same bits (but sine and its like, which are the C library's).

@@ -171,7 +171,7 @@ def check_task(
             raise QuadrlError(name=name, value=value, allowed=allowed)
     if not (abs(square_norm(start.quaternion) - 1) < 1e-6).all():
         name = f"{task.name} quaternion of begin"
-        raise QuadrlError(name=name, value=start.quaternion, allowed="of length 1")
+        raise QuadrlError(name=name, value=start.quaternion, allowed="of norm 1")
     start_state = {f.name: getattr(start, f.name) for f in dataclasses.fields(start)}
     state = State.of_coordinates(**start_state, origin_height=origin_height)
     now, _ = begin(task, state, task_state, parameters, actions)

@@ -28,7 +28,7 @@ def number(
     """A finite number between `low` and `high`, as a float, or as an int where `whole`.
 
     Raises:
-        QuadrlError: It is no number, not finite, or out of range.
+        QuadrlError: It is not a number, not finite, or out of range.
     """
     kind = abstract.Integral if whole else abstract.Real
     if isinstance(value, kind) and not isinstance(value, (bool, np.bool_)):
@@ -48,7 +48,7 @@ def numbers(
     """`size` numbers, each between `low` and `high`; of any count where `size` is None.
 
     Raises:
-        QuadrlError: It is no such sequence.
+        QuadrlError: It is not such a sequence.
     """
     try:
         items = None if isinstance(value, str) else tuple(value)
@@ -121,7 +121,7 @@ def rows(given: Any, count: int) -> np.ndarray:
     chosen = np.unique(array) if whole else np.zeros(0, dtype=np.int64)
     within = len(chosen) == 0 or (chosen[0] >= 0 and chosen[-1] < count)
     if not whole or len(chosen) != len(array) or not within:
-        allowed = f"different numbers from 0 to {count - 1}, or a mask ({count},)"
+        allowed = f"distinct numbers from 0 to {count - 1}, or a boolean mask of shape ({count},)"
         raise QuadrlError(name="rows", value=array.tolist(), allowed=allowed)
     return chosen.astype(np.int64)
 
@@ -137,7 +137,7 @@ def action(given: Any, shape: tuple[int, ...]) -> np.ndarray:
     except (TypeError, ValueError, RuntimeError) as error:
         raise QuadrlError(str(error), name="action", value=given, allowed="real numbers") from error
     if array.dtype.char not in "fd" and not np.can_cast(array.dtype, np.float64):
-        allowed = "of real numbers, such as float32 or float64"
+        allowed = "a real type, such as float32 or float64"
         raise QuadrlError(name="action dtype", value=str(array.dtype), allowed=allowed)
     if array.shape != shape:
         raise QuadrlError(name="action shape", value=array.shape, allowed=str(shape))

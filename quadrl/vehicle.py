@@ -36,7 +36,7 @@ DRAWN_HULL = (0.075, 0.060, 0.045)  # [m], semi-axes
 DRAWN_ROTOR_HEIGHT = 0.030  # [m], of a rotor's disc over the point where its thrust acts
 
 MAX_SUBSTEPS = 10_000
-# What a physics step resolves (tests/slow/test_divergence.py): the angle turned in it [rad], and
+# What a physics step resolves (tests/unit/test_divergence.py): the angle turned in it [rad], and
 # the rates of drag and aerodynamic moment times the step. An aircraft must be able to turn once a
 # second and to fall as fast as it can.
 TURN, DAMPING = 0.5, 1.0
@@ -99,11 +99,11 @@ class Vehicle:
         object.__setattr__(self, "rotors", tuple(rotors))
         count = len(rotors)
         if not MIN_ROTORS <= count <= MAX_ROTORS:
-            allowed = f"{MIN_ROTORS} to {MAX_ROTORS} rotors"
+            allowed = f"between {MIN_ROTORS} and {MAX_ROTORS}"
             raise QuadrlError(name="number of rotors", value=count, allowed=allowed)
         if len({rotor.spin * math.copysign(1, rotor.axis[2]) for rotor in rotors}) < 2:
             spins = [rotor.spin for rotor in rotors]
-            reason = "with one direction alone the yaw cannot be held"
+            reason = "yaw cannot be controlled if all rotors turn the same way"
             raise QuadrlError(reason, name="rotor spins", value=spins, allowed="of both signs")
         for axis, moment in zip("xyz", self.mixer[1:], strict=True):
             if not (moment > 0).any() or not (moment < 0).any():
@@ -116,9 +116,9 @@ class Vehicle:
         rows = self.mixer / np.abs(self.mixer).max(axis=1, keepdims=True)
         values = np.linalg.svd(rows, compute_uv=False)
         if values[-1] < SINGULAR * values[0]:
-            reason = "thrust and the three moments cannot be set apart with these (singular mixer)"
+            reason = "they cannot set thrust, roll, pitch and yaw independently (singular mixer)"
             positions = [rotor.position for rotor in rotors]
-            allowed = "an arrangement with four independent combinations"
+            allowed = "a layout with an allocation that can be inverted"
             raise QuadrlError(reason, name="rotor positions", value=positions, allowed=allowed)
         if not (hover_squares(self.mixer, self.mass) > 0).all():
             reason = "hovering without turning would need a negative thrust of one of them"
@@ -140,12 +140,12 @@ class Vehicle:
         if self.control_timestep > MAX_SUBSTEPS * step or not math.isclose(
             self.substeps * step, self.control_timestep, rel_tol=1e-9
         ):
-            allowed = f"a whole number, 1 to {MAX_SUBSTEPS}, of physics steps of {step:g} s"
+            allowed = f"1 to {MAX_SUBSTEPS} times the physics step, {step:g} s"
             raise QuadrlError(name="control_timestep", value=self.control_timestep, allowed=allowed)
         # The Runge-Kutta method is unstable from 2.785 on, and inexact before.
         fastest = max(max(rotor.lag_up, rotor.lag_down) for rotor in self.rotors)
         if fastest * step > 1 + 1e-9:
-            reason = f"a rotor lags at {fastest:g} 1/s, and the product may be 1 at most"
+            reason = f"a rotor's rate is {fastest:g} 1/s, and rate times step may be at most 1"
             allowed = f"at most {1 / fastest:.3g} s"
             raise QuadrlError(reason, name="physics_timestep", value=step, allowed=allowed)
         for resolved, needed, names in (
@@ -155,8 +155,8 @@ class Vehicle:
             if resolved < needed:
                 unit = "rad/s" if needed == SLOWEST_TURN else "m/s"
                 raise QuadrlError(
-                    f"with this {names} no more than {resolved:.3g} {unit} is resolved, and "
-                    f"{needed:.3g} is needed",
+                    f"with this {names} the step resolves up to {resolved:.3g} {unit}, and "
+                    f"{needed:.3g} {unit} are needed",
                     name="physics_timestep",
                     value=step,
                     allowed=f"at most {step * resolved / needed:.2g} s",

@@ -1,5 +1,5 @@
 # shellcheck shell=bash
-# What scripts/quickstart and scripts/test share: the environment in .venv. To be sourced; needs bash 3.2 or later.
+# What the scripts share: the environment in .venv. To be sourced; needs bash 3.2 or later.
 
 REPOSITORY="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 ENVIRONMENT="$REPOSITORY/.venv"

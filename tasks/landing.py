@@ -61,13 +61,13 @@ class Landing(Task):
     altitude: float = 0.0
     """Height of the origin above the ground [m]; that of the aircraft on its feet at least."""
     survival_weight: float = 0.0
-    """Reward for each step: none, or it would hover over the pad rather than come to rest."""
+    """Reward per 0.05 s: none, or it would hover over the pad rather than come to rest."""
     speed_weight: float = 5.0
-    """Reward for each m/s by which the speed falls."""
+    """Reward per m/s by which the speed falls."""
     spin_weight: float = 10.0
-    """Reward for each rad/s by which the body rate falls; with less a rotation is left."""
+    """Reward per rad/s by which the body rate falls; smaller values leave a rotation."""
     haste_weight: float = 60.0
-    """Cost of sinking a m/s faster than a gentle approach, at each step; larger than the progress
+    """Cost per 0.05 s of sinking 1 m/s faster than a gentle approach; larger than the progress
     reward."""
     gentle_speed: float = 0.1
     """Sink rate of a gentle approach at the pad [m/s]."""
@@ -76,7 +76,7 @@ class Landing(Task):
     success_weight: float = 100.0
     """Reward for coming to rest on the pad; with 200 it hurries and touches down faster."""
     failure_weight: float = 300.0
-    """Cost of a crash: more than the progress of a dive to the ground."""
+    """Cost of a failure; larger than the progress of a dive to the ground."""
     start_height: float = 3.0
     """Height of the start over the pad [m]."""
     start_offset: float = 1.5

@@ -17,8 +17,8 @@ class Benchmark:
     seconds: float = 0.2
     """Length of each measurement; short, since the speed of a machine drifts."""
     repeats: int = 30
-    """Measurements of each layer, in turns: the fastest is the rate, the median ratio of a turn the
-    share."""
+    """Measurements of each layer, in turns. The rate is the fastest; the share is the median of the
+    ratios to bare mj_step within a turn."""
     task: str = "hover"
     """The task that is flown."""
     json: bool = False

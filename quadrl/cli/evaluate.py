@@ -12,7 +12,7 @@ from quadrl.rollout import evaluate
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate(Flown):
-    """Fly the mean action of a policy, or a controller, through fresh episodes."""
+    """Evaluate the mean action of a policy, or a controller, in fresh episodes."""
 
     episodes: int = 100
     """Number of episodes."""

@@ -25,15 +25,15 @@ class Flown:
 
     policy: Positional[str] = ""
     """A run folder, a .safetensors file, or the name of a task: then the policy for it that comes
-    with quadrl (a folder with the name of a task is written ./NAME)."""
+    with quadrl (write ./NAME for a folder of that name)."""
     algo: str = ""
     """The algorithm that trained the policy that comes with quadrl; ppo by default."""
     controller: str = ""
     """A controller instead of a policy: geometric or lqr."""
     task: str = ""
-    """The task; by default the one that the policy was trained for."""
+    """The task; by default the one that the policy was trained for, and hover for a controller."""
     vehicle: str = ""
-    """The aircraft; by default the one that the policy was trained with."""
+    """The aircraft; by default the one that the policy was trained with, paper for a controller."""
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
     task_options: tuple[str, ...] = ()
@@ -49,7 +49,7 @@ class Flown:
         if bool(self.policy) == bool(self.controller):
             raise QuadrlError(
                 "give either a policy (a run folder, a .safetensors file, or the name of a task) "
-                f"or --controller {' or '.join(CONTROLLERS)} with --task"
+                f"or --controller {' or '.join(CONTROLLERS)}"
             )
         shipped = self.policy in tasks.TASKS
         if self.algo and not shipped:

@@ -15,13 +15,13 @@ from quadrl.learning.folder import LEARNING_CURVE, METRICS, read_config
 
 @dataclasses.dataclass(frozen=True)
 class Plot:
-    """Draw the learning curve of a run again, or those of several runs over each other."""
+    """Draw the learning curve of one run, or the curves of several runs in one picture."""
 
     run_folders: Positional[tuple[Path, ...]]
     """Run folders. Several are overlaid: a picture for each task, a curve for each algorithm with
     the spread over its runs."""
     out: Path | None = None
-    """The picture, its kind (png, pdf, svg) by its ending; by default learning_curve.png in the
+    """Output file; its ending (png, pdf, svg) sets the format; by default learning_curve.png in the
     run folder, or, of several runs, learning_curves_TASK.png here."""
 
     def run(self) -> None:

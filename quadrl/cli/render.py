@@ -16,13 +16,13 @@ class Render(Flown):
     """Draw a flight of a policy or a controller as a video."""
 
     out: Path = Path("flight.mp4")
-    """The video."""
+    """Output file (.mp4)."""
     camera: str = "follow"
-    """follow, track, chase, onboard or fixed."""
+    """Camera: follow, track, chase, onboard or fixed."""
     width: int = 848
-    """[pixels]"""
+    """Width of the video [pixels]."""
     height: int = 480
-    """[pixels]"""
+    """Height of the video [pixels]."""
     fps: float = 30.0
     """Frames per second."""
 

@@ -49,10 +49,10 @@ Settings: Any = optional(TrainConfig)
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a policy from nothing, evaluate it and draw it, into a run folder.
+    """Train a policy from scratch, evaluate it, and write results and pictures to a run folder.
 
-    The defaults shown are those of a task that has none of its own: quadrl tasks TASK lists those
-    that it has.
+    The defaults shown are for ppo and the aircraft paper. A task, vpg or another aircraft may have
+    others: quadrl tasks TASK lists those of a task.
     """
 
     settings: Annotated[Settings, arg(name="")]  # pyright: ignore[reportInvalidTypeForm]

@@ -1,7 +1,7 @@
 """What flies an aircraft: control modes and their loops, and the controllers that use them.
 
-Controllers see the same observations and give the same actions as policies, whose yardstick they
-are.
+Controllers see the same observations and give actions of the same form as policies, whose
+yardstick they are.
 """
 
 from __future__ import annotations

@@ -103,13 +103,13 @@ def _check(model: mujoco.MjModel) -> None:
     ]
     turned = not (model.body_iquat[-1] == (1, 0, 0, 0)).all() or model.body_ipos[-1].any()
     for wrong, what in (
-        (model.nbody != 2 or not free, "one aircraft on a free joint and no other body"),
-        (not rotors or model.neq or model.ntendon, "rotors alone, without constraints"),
-        (obstacles, f"nothing to touch but level ground (there is {', '.join(obstacles)})"),
-        (turned, "a centre of mass and principal axes that are the body's own"),
+        (model.nbody != 2 or not free, "a single body on a free joint"),
+        (not rotors or model.neq or model.ntendon, "rotors as actuators and no constraints"),
+        (obstacles, f"level ground and no obstacle (here: {', '.join(obstacles)})"),
+        (turned, "a body frame at the centre of mass, along the principal axes"),
     ):
         if wrong:
-            reason = f"free flight is for {what}"
+            reason = f"free flight supports only {what}"
             raise QuadrlError(
                 reason, name="engine", value="free_flight", allowed="'mujoco' for this model"
             )

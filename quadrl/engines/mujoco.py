@@ -160,7 +160,7 @@ def make(
     """The engine of a name for N aircraft in a world, as `BatchEngine` takes them.
 
     Raises:
-        QuadrlError: Unknown name, or a count that cannot be.
+        QuadrlError: Unknown name or impossible count.
     """
     validation.choice("engine", name, ENGINES)
     validation.number("num_envs", num_envs, 1, MAX_ENVS, whole=True)

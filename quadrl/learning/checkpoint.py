@@ -71,5 +71,5 @@ def check_same(
         if isinstance(was, dict) and isinstance(now, dict):
             check_same(path, was, now, f"{prefix}{name}.")
         elif was != now and name not in FREE:
-            reason = f"{path} was trained with that: go back to it, or start a new run"
+            reason = f"{path} was trained with it; restore that setting or start a new run"
             raise QuadrlError(reason, name=f"{prefix}{name}", value=now, allowed=repr(was))

@@ -122,7 +122,7 @@ class TrainConfig:
     task: str = "hover"
     """Name of the task."""
     algo: str = "ppo"
-    """Algorithm: ppo, trpo, or vpg, the plain policy gradient (gae, the paper's word, means it)."""
+    """Algorithm: ppo, trpo, or vpg (the plain policy gradient; the paper's name gae works too)."""
     seed: int = 0
     """Seed of the networks, the exploration and the episodes, between 0 and 2^32 - 1."""
     vehicle: str = "paper"
@@ -130,8 +130,8 @@ class TrainConfig:
     control_mode: str = "rotor"
     """Meaning of the actions: rotor (the paper's), thrust_body_rate, velocity or position."""
     engine: str = "free_flight"
-    """What the training flies in: free_flight (wherever there is nothing to touch) or mujoco.
-    Evaluations fly in mujoco."""
+    """Engine of the training: free_flight (MuJoCo only near the ground) or mujoco. Evaluations
+    always fly in mujoco."""
     task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the task that differ from its defaults, such as time_limit=5."""
     num_envs: int = 256
@@ -141,8 +141,8 @@ class TrainConfig:
     steps: int = 1_310_720
     """Control steps of all aircraft in the training."""
     gamma: float = 0.93
-    """Discount per control step (effective horizon 0.7 s): since the reward is progress, a short
-    one costs a lasting error more than one that is corrected."""
+    """Discount per control step (effective horizon 0.7 s): with a short one a lasting
+    error costs more than one that is corrected."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimation."""
     reward_scale: float = 0.01

@@ -106,7 +106,7 @@ def learning_curves(
     path: Path,
     clocks: Sequence[str] = ("steps", "seconds"),
 ) -> Path:
-    """Draw return and success of several trainings over each other; figures 3 to 5 of the paper.
+    """Draw return and success of several trainings in one picture; figures 3 to 5 of the paper.
 
     Of each algorithm it shows the median over its runs, and the band from the worst to the best.
 

@@ -199,7 +199,7 @@ def library() -> ctypes.CDLL:
 
 @functools.cache
 def _stop_clock() -> None:
-    """Spare every step MuJoCo's readings of the clock, unless somebody has installed one.
+    """Spare every step MuJoCo's readings of the clock, unless a clock is installed already.
 
     Done once per process. Physics does not depend on it, but `mjData.timer` of every model then
     shows no durations. To keep them, set `$QUADRL_KEEP_CLOCK` to 1 before the first model is made,
@@ -216,7 +216,7 @@ def install(replace: bool = False) -> None:
     receives such a model from elsewhere (a spawned worker) calls it once.
 
     Args:
-        replace: Take over callbacks that somebody else installed, with a warning.
+        replace: Replace callbacks that other code installed, with a warning.
 
     Raises:
         NativeError: Somebody else's callback is installed and `replace` is False.
@@ -229,8 +229,8 @@ def install(replace: bool = False) -> None:
     ]
     if foreign and not replace:
         raise NativeError(
-            f"another callback is installed as {_names(foreign)}; quadrl does not take it over "
-            "unasked: remove it, or call quadrl.native.install(replace=True)"
+            f"another callback is installed as {_names(foreign)}; quadrl does not replace it "
+            "unless asked: remove it, or call quadrl.native.install(replace=True)"
         )
     if foreign:
         warnings.warn(f"quadrl replaces the callback {_names(foreign)}", stacklevel=2)
@@ -255,7 +255,7 @@ def check_installed() -> None:
     missing = [name for name in CALLBACKS if _current(name) != getattr(ours, name)]
     if missing:
         raise NativeError(
-            f"the rotor callback {_names(missing)} was removed or replaced by somebody else, and "
+            f"the rotor callback {_names(missing)} was removed or replaced by other code, and "
             "the physics would be wrong; call quadrl.native.install() again"
         )
 

@@ -77,5 +77,6 @@ def require(module: str, package: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise RenderingUnavailable(
-            f"videos need {package}: pip install 'quadrl[video]'; simulation and training do not"
+            f"videos need {package}: install the extra `video` of quadrl; simulation and training "
+            "work without it"
         ) from error

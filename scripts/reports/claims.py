@@ -65,7 +65,7 @@ def wobble(trial: Trial) -> tuple[int, str]:
     return sampled_above_mean(trial, "wobble_rad_s")
 
 
-@claim("Stochastic policies should stand disturbance such as wind well.")
+@claim("Stochastic policies should be robust to disturbances such as wind.")
 def sturdier(trial: Trial) -> tuple[int, str]:
     """In gusts, sampled actions lose less success than the mean action, solved seed by seed."""
     differences, texts = [], {}
@@ -158,7 +158,7 @@ def gae_collapses(trial: Trial) -> tuple[int, str]:
     return agreed(smaller(losses[algo], losses["vpg"]) for algo in OTHERS), listed(texts)
 
 
-@claim("GAE is less suited to flight control.")
+@claim("GAE may be less suited to flight control.")
 def gae_worse(trial: Trial) -> tuple[int, str]:
     """Its return is clearly lower than PPO's, and than TRPO's."""
     returns = {algo: trial.column(algo, "mean.return_mean") for algo in LABELS}

@@ -50,7 +50,8 @@ def figures() -> str:
             share = f"{row['share']:.2f} times bare `mj_step` on {row['of']}"
             rows.append((f"{row['what']}", f"{row['rate']:,.0f} control steps/s; {share}",
                          "`quadrl benchmark`"))  # fmt: skip
-    return f"{table(('what', 'figure', 'command'), rows)}\n\n{report.source(measured)}"
+    sources = f"{report.source(measured)} The row of hover at commit {result['commit']}."
+    return f"{table(('what', 'figure', 'command'), rows)}\n\n{sources}"
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ def main(jobs: int = 2) -> None:
     """Train what is missing, evaluate it, write it down.
 
     Args:
-        jobs: Trainings at the same time, of those whose wall clock is no record.
+        jobs: Trainings at the same time, of those whose wall clock is not compared.
     """
     planned = plan(jobs)
     for jobs, runs in planned.items():
