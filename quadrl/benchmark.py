@@ -150,9 +150,6 @@ def _measure(works: list[Work], seconds: float, repeats: int) -> list[list[float
     return rates
 
 
-# --------------------------------------------------------------------------------------- the layers
-
-
 def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Layer]:
     """Everything that is measured; what has to be closed goes to the stack."""
     gymnasium_id = f"quadrl/{task.name.title().replace('_', '')}-v0"

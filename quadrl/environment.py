@@ -8,6 +8,7 @@ Row i of a batch seeded with s is the single environment seeded with s + i.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -64,7 +65,7 @@ class Environment:
         """
         self.task = tasks.make(task)
         self.vehicle = engine.vehicle if isinstance(engine, Engine) else resolve(vehicle)
-        self.ranges = Ranges(self.vehicle, ranges) if ranges else None
+        self.ranges = None if ranges is None else Ranges(self.vehicle, ranges)
         self._per_row = self.ranges is not None and self.ranges.per_row
         if not isinstance(engine, Engine):
             engine = mujoco.make(
@@ -76,6 +77,10 @@ class Environment:
                 scene=self.task.scene,
                 num_threads=num_threads,
                 per_row=self._per_row,
+            )
+        elif self._per_row and len(engine.parameters) < engine.num_envs:
+            raise QuadrlError(
+                name="engine", value=engine, allowed="made with per_row=True where there are ranges"
             )
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
         self.control_mode = modes.make(control_mode, self.vehicle)
@@ -283,8 +288,12 @@ class Environment:
             self._episodes[:] = 0  # this episode does not count
         own = self.save()
         records.check_alike(saved, own)
+        if not np.isfinite(saved["engine.rows"]).all():
+            raise QuadrlError(name="engine.rows", value=saved["engine.rows"], allowed="finite")
         name = "engine.parameters"
-        if not (self._per_row or np.array_equal(saved[name], own[name])):
+        same = functools.partial(np.array_equal, own[name])
+        holds = self.ranges.holds if self.ranges and self._per_row else same
+        if not holds(saved[name]):
             reason = "the state was saved with another aircraft"
             raise QuadrlError(reason, name=name, value=saved[name], allowed="this aircraft's")
         self.engine.restore({key.removeprefix("engine."): saved[key] for key in saved})

@@ -13,17 +13,18 @@ class QuadrlError(ValueError):
         name: What was wrong: an option, a parameter, an argument; None where a file was.
         value: Its value.
         allowed: What it must be, in words.
+        reason: Why, or what to do; the end of the message.
     """
 
     def __init__(
-        self, message: str = "", *, name: str | None = None, value: Any = None, allowed: str = ""
+        self, reason: str = "", *, name: str | None = None, value: Any = None, allowed: str = ""
     ) -> None:
-        """Compose the message: "name = value: must be ALLOWED; MESSAGE"."""
-        self.name, self.value, self.allowed = name, value, allowed
+        """Compose the message: "name = value: must be ALLOWED; REASON"."""
+        self.name, self.value, self.allowed, self.reason = name, value, allowed, reason
         if name is not None:
             must = f": must be {allowed}" if allowed else ""
-            message = f"{name} = {reprlib.repr(value)}{must}" + (f"; {message}" if message else "")
-        super().__init__(message)
+            reason = f"{name} = {reprlib.repr(value)}{must}" + (f"; {reason}" if reason else "")
+        super().__init__(reason)
 
 
 class NativeError(QuadrlError, RuntimeError):

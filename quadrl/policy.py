@@ -13,7 +13,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -21,6 +21,10 @@ from safetensors.numpy import save
 
 from quadrl.errors import QuadrlError
 from quadrl.validation import choice
+from quadrl.vehicle import VEHICLES
+
+if TYPE_CHECKING:
+    from quadrl.environment import Environment
 
 FORMAT = "quadrl-policy-2"
 FILE = "policy.safetensors"
@@ -104,24 +108,26 @@ class Policy:
 
         return act
 
-    def check_fits(self, size: int, action_size: int, where: str) -> None:
+    def check_fits(self, environment: Environment) -> None:
         """Refuse a task and a vehicle with another layout than the policy was trained for.
 
-        Args:
-            size: Numbers in an observation there.
-            action_size: Numbers in an action there.
-            where: The task and the vehicle, in words.
-
         Raises:
-            QuadrlError: The policy observes or commands another number of values.
+            QuadrlError: The policy observes or commands another number of values, or it commands
+                rotors, and those of the vehicle stand or turn otherwise.
         """
+        vehicle = environment.vehicle
         for what, own, needed in (
-            ("observation", self.size, size),
-            ("action", self.action_size, action_size),
+            ("observation", self.size, environment.size),
+            ("action", self.action_size, environment.action_size),
         ):
             if own != needed:
                 name = f"{what} size of the policy for {self.task}"
+                where = f"{environment.task.name} with the vehicle {vehicle.name}"
                 raise QuadrlError(name=name, value=own, allowed=f"{needed} for {where}")
+        trained = VEHICLES.get(str(self.metadata.get("vehicle")), vehicle)
+        if self.control_mode == "rotor" and not np.array_equal(trained.layout, vehicle.layout):
+            allowed = f"one with the rotor layout of {trained.name}, which the policy has learned"
+            raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
 
     def _outputs(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and log-variance (..., k) of the actions."""

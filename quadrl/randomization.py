@@ -12,13 +12,14 @@ from quadrl import parameters
 from quadrl.errors import QuadrlError
 from quadrl.rng import Rng
 from quadrl.rotors import MAX, Rotor
-from quadrl.validation import keys, numbers
+from quadrl.validation import keys, number, numbers
 from quadrl.vehicle import Vehicle, check_inertia
 
 AIRCRAFT = ("mass", "inertia", "drag_coefficient", "moment_coefficient")
 ROTOR = ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed")
 RANGES = (*AIRCRAFT, *ROTOR, "wind")
 """What can be drawn: parameters of the aircraft, of each rotor on its own, and the wind [m/s]."""
+COEFFICIENTS = ROTOR[:2]
 MAX_WIND = 100.0  # [m/s], in each direction
 
 
@@ -51,15 +52,11 @@ class Ranges:
 
     def _pair(self, name: str, given: Any) -> tuple[np.ndarray, np.ndarray]:
         size = 3 if name in ("inertia", "wind") else 1
-        try:
-            low, high = given
-        except (TypeError, ValueError) as error:
-            raise QuadrlError(
-                name=f"range of {name}", value=given, allowed="a pair (low, high)"
-            ) from error
+        if not isinstance(given, (list, tuple, np.ndarray)) or len(given) != 2:
+            raise QuadrlError(name=f"range of {name}", value=given, allowed="a pair (low, high)")
         limit = MAX_WIND if name == "wind" else MAX
         ends = []
-        for end in (low, high):
+        for end in given:
             whole = [end] * size if np.ndim(end) == 0 else end
             ends.append(np.array(numbers(f"range of {name}", whole, size, -limit, limit)))
         if not (ends[0] <= ends[1]).all():
@@ -69,6 +66,7 @@ class Ranges:
 
     def _check_extremes(self) -> None:
         """Make the lightest and strongest, and the heaviest and weakest aircraft of the ranges."""
+        fastest = np.linalg.norm(np.abs(self._ranges.get("wind", (0.0, 0.0))).max(axis=0))
         for heavy in (0, 1):
             # Its mass, drag and moments at one end, what its rotors give at the other.
             changes = {name: self._end(name, heavy) for name in AIRCRAFT if name in self._ranges}
@@ -79,22 +77,50 @@ class Ranges:
                     if name in self._ranges:
                         changes[name] = self._end(name, drag)
                 try:
-                    dataclasses.replace(self._vehicle, rotors=rotors, **changes)
+                    made = dataclasses.replace(self._vehicle, rotors=rotors, **changes)
+                    number("fastest wind [m/s]", float(fastest), 0.0, made.resolved_speed)
                 except QuadrlError as error:
-                    what = "heaviest" if heavy else "lightest"
-                    raise QuadrlError(
-                        f"in the {what} aircraft of these ranges",
-                        name=error.name,
-                        value=error.value,
-                        allowed=error.allowed,
-                    ) from error
+                    where = f"in the {'heaviest' if heavy else 'lightest'} aircraft of these ranges"
+                    reason = f"{error.reason}; {where}".removeprefix("; ")
+                    raise QuadrlError(**vars(error) | {"reason": reason}) from error
         if "inertia" in self._ranges:
             low, high = (tuple(end.tolist()) for end in self._ranges["inertia"])
             check_inertia("range of inertia", low, high)
+        if any(name in self._ranges for name in COEFFICIENTS):
+            self._check_unlike_rotors()
+
+    def _check_unlike_rotors(self) -> None:
+        """Each rotor is drawn alone: every combination of weak and strong ones must hover."""
+        count = self._vehicle.rotor_count
+        corners = np.indices((4,) * count).reshape(count, -1).T  # (4^R, R)
+        table = parameters.rows(self._vehicle, len(corners))
+        table["mass"] = self._ranges.get("mass", table["mass"][:1])[-1]
+        rotor = table["rotor"][:, :count]
+        ends = (corners % 2, corners // 2, 0 * corners)
+        for name, end in zip((*COEFFICIENTS, "max_speed"), ends, strict=True):
+            if name in self._ranges:
+                rotor[name] = np.concatenate(self._ranges[name])[end]
+        parameters.refresh(table, self._vehicle.physics_timestep)
+        hover = rotor["hover_speed"]
+        unable = ((hover <= 0) | (hover >= rotor["max_speed"])).any(axis=-1)
+        if unable.any():
+            worst = {name: rotor[name][unable][0].tolist() for name in COEFFICIENTS}
+            reason = "each rotor is drawn alone, and with these the aircraft cannot hover"
+            raise QuadrlError(reason, name="ranges", value=worst, allowed="narrower")
 
     def _end(self, name: str, which: int) -> Any:
         end = self._ranges[name][which]
         return tuple(end.tolist()) if len(end) > 1 else float(end[0])
+
+    def holds(self, saved: np.ndarray) -> bool:
+        """Whether rows of parameters can have been drawn from these ranges."""
+        table = saved.copy().view(parameters.AIRCRAFT)[:, 0]
+        own = parameters.rows(self._vehicle, len(table))
+        for name in self._ranges.keys() - {"wind"}:
+            of = np.s_[:] if name in AIRCRAFT else "rotor"
+            own[of][name][:] = table[of][name]
+        parameters.refresh(own, self._vehicle.physics_timestep)
+        return np.array_equal(own.view(np.float64).reshape(saved.shape), saved)
 
     @property
     def per_row(self) -> bool:

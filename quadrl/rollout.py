@@ -67,8 +67,7 @@ def fly(
     )
     task, timestep = environment.task, environment.vehicle.control_timestep
     if isinstance(controller, Policy):
-        where = f"{task.name} with the vehicle {environment.vehicle.name}"
-        controller.check_fits(environment.size, environment.action_size, where)
+        controller.check_fits(environment)
     observation = environment.flatten(environment.reset())
     seeds = range(seed, seed + episodes)
     winds = make_gusts(gusts, environment.time_limit_steps, timestep, seeds) if gusts else None

@@ -52,7 +52,7 @@ class Rotor:
         for name in ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed"):
             object.__setattr__(self, name, number(f"rotor {name}", getattr(self, name), MIN, MAX))
         object.__setattr__(self, "radius", number("rotor radius", self.radius, *LENGTHS))
-        if self.spin not in (1, -1):
+        if abs(number("rotor spin", self.spin)) != 1:
             raise QuadrlError(name="rotor spin", value=self.spin, allowed="1 or -1")
         if abs(math.hypot(*self.axis) - 1) > 1e-9:
             raise QuadrlError(name="rotor axis", value=self.axis, allowed="a unit vector")
@@ -71,6 +71,7 @@ def ring(
         **rotor: The other parameters of `Rotor`, the same for all.
     """
     number("arm_length", arm_length, *LENGTHS)
+    numbers("spins", spins, len(bearings))
     rotors = []
     for bearing, spin in zip(bearings, spins, strict=True):
         # Rounded, so that a rotor straight ahead stands at y = 0 exactly.

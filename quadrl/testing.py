@@ -277,9 +277,6 @@ def varied_actions(steps: int, count: int, size: int = 4) -> np.ndarray:
     return actions.astype(np.float32)
 
 
-# ---------------------------------------------------------------------------------------- helpers
-
-
 def _outputs(task: Task, before: Snapshot, now: Snapshot) -> dict[str, Array]:
     """What each function of a task gives, by name."""
     rows = f"{len(now.time)} rows of {type(now.time).__module__} arrays"

@@ -164,7 +164,7 @@ def _float(value: Any) -> float:
 def _range(low: float, high: float, whole: bool, positive: bool) -> str:
     kind = "a whole number" if whole else "a number"
     if math.isfinite(low) and math.isfinite(high):
-        return f"{kind} between {low:g} and {high:.10g}"
+        return f"{kind} between {low:g} and {high if whole else format(high, '.10g')}"
     if math.isfinite(low):
         return f"{kind} of at least {low:g}"
     if math.isfinite(high):

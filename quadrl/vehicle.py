@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
+from typing import NoReturn
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from quadrl.errors import QuadrlError
 from quadrl.rotation import Array
 from quadrl.rotors import (
     GRAVITY,
+    LENGTHS,
     MAX,
     MIN,
     Rotor,
@@ -41,6 +43,7 @@ MAX_SUBSTEPS = 10_000
 # second and to fall as fast as it can.
 TURN, DAMPING = 0.5, 1.0
 SLOWEST_TURN = 2 * math.pi  # [rad/s]
+LEAN = 0.01  # of the weight; the controllers then hover about 3 cm aside
 SINGULAR = 1e-9
 """Smallest singular value of a mixer over its largest; each row over its largest entry."""
 
@@ -81,7 +84,7 @@ class Vehicle:
     def __post_init__(self) -> None:
         """Validate the numbers, alone and together."""
         if not isinstance(self.name, str) or not self.name:
-            raise QuadrlError(name="name", value=self.name, allowed="a string")
+            raise QuadrlError(name="name", value=self.name, allowed="a string that is not empty")
         object.__setattr__(self, "inertia", numbers("inertia", self.inertia, 3, MIN, MAX))
         for field in ("mass", "action_scale", "physics_timestep", "control_timestep"):
             object.__setattr__(self, field, number(field, getattr(self, field), MIN, MAX))
@@ -101,30 +104,26 @@ class Vehicle:
         if not MIN_ROTORS <= count <= MAX_ROTORS:
             allowed = f"between {MIN_ROTORS} and {MAX_ROTORS}"
             raise QuadrlError(name="number of rotors", value=count, allowed=allowed)
+        number("distance of the farthest rotor [m]", self.size, *LENGTHS)
         if len({rotor.spin * math.copysign(1, rotor.axis[2]) for rotor in rotors}) < 2:
-            spins = [rotor.spin for rotor in rotors]
             reason = "yaw cannot be controlled if all rotors turn the same way"
-            raise QuadrlError(reason, name="rotor spins", value=spins, allowed="of both signs")
+            self._refuse("spin", "of both signs", reason)
         for axis, moment in zip("xyz", self.mixer[1:], strict=True):
             if not (moment > 0).any() or not (moment < 0).any():
-                raise QuadrlError(
-                    f"these rotors turn the aircraft about its {axis} axis in one direction only",
-                    name="rotor positions",
-                    value=[rotor.position for rotor in rotors],
-                    allowed="on different sides of every axis",
-                )
+                reason = f"they turn the aircraft about its {axis} axis in one direction only"
+                self._refuse("position", "on different sides of every axis", reason)
         rows = self.mixer / np.abs(self.mixer).max(axis=1, keepdims=True)
         values = np.linalg.svd(rows, compute_uv=False)
         if values[-1] < SINGULAR * values[0]:
             reason = "they cannot set thrust, roll, pitch and yaw independently (singular mixer)"
-            positions = [rotor.position for rotor in rotors]
-            allowed = "a layout with an allocation that can be inverted"
-            raise QuadrlError(reason, name="rotor positions", value=positions, allowed=allowed)
-        if not (hover_squares(self.mixer, self.mass) > 0).all():
+            self._refuse("position", "a layout with an allocation that can be inverted", reason)
+        squares = hover_squares(self.mixer, self.mass)
+        if not (squares > 0).all():
             reason = "hovering without turning would need a negative thrust of one of them"
-            positions = [rotor.position for rotor in rotors]
-            allowed = "around the centre of mass"
-            raise QuadrlError(reason, name="rotor positions", value=positions, allowed=allowed)
+            self._refuse("position", "around the centre of mass", reason)
+        thrust = squares * [rotor.thrust_coefficient for rotor in rotors]
+        if np.hypot(*(thrust @ [rotor.axis[:2] for rotor in rotors])) > LEAN * self.mass * GRAVITY:
+            self._refuse("axis", "balanced: no sideways force in hover")
         if not (self.hover_speed < self.max_speed).all():
             worst = int(np.argmax(self.hover_speed / self.max_speed))
             raise QuadrlError(
@@ -162,6 +161,11 @@ class Vehicle:
                     allowed=f"at most {step * resolved / needed:.2g} s",
                 )
 
+    def _refuse(self, field: str, allowed: str, reason: str = "") -> NoReturn:
+        values = [getattr(rotor, field) for rotor in self.rotors]
+        name = {"axis": "rotor axes"}.get(field, f"rotor {field}s")
+        raise QuadrlError(reason, name=name, value=values, allowed=allowed)
+
     @property
     def rotor_count(self) -> int:
         """R."""
@@ -182,6 +186,12 @@ class Vehicle:
     def hover_speed(self) -> np.ndarray:
         """(R,) Omega_hover [rad/s]: together they carry the weight and give no moment."""
         return np.sqrt(hover_squares(self.mixer, self.mass))
+
+    @property
+    def layout(self) -> np.ndarray:
+        """(4, R) Which way each rotor lifts and turns the aircraft: 1, -1, or 0 for not at all."""
+        rows = self.mixer / np.abs(self.mixer).max(axis=1, keepdims=True)
+        return np.sign(np.where(np.abs(rows) < SINGULAR, 0.0, rows))
 
     @functools.cached_property
     def max_speed(self) -> np.ndarray:

@@ -16,14 +16,7 @@ from quadrl.validation import choice
 
 TASKS: dict[str, type[Task]] = {
     task.name: task
-    for task in (
-        Hover,
-        StaticWaypoint,
-        RandomWaypoint,
-        StraightAndLevel,
-        Landing,
-        TargetFollowing,
-    )
+    for task in (Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing)
 }
 """Every registered task by name."""
 

@@ -148,11 +148,12 @@ class Landing(Task):
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """Over the pad, and down on it, slower the lower; it presses on when the pad is reached."""
-        height = np.maximum(-reading.to_goal[..., 2], 0.0)
+        xp = namespace(reading.to_goal)
+        height = xp.clip(-reading.to_goal[..., 2], 0.0, None)
         aside = norm(reading.to_goal[..., :2])
-        sink = np.minimum(DESCENT_RATE * height + TOUCHDOWN_SPEED, MAX_DESCENT_SPEED)
-        sink = sink * np.clip(1.5 - aside / (0.2 + 0.2 * height), 0.0, 1.0)  # within a cone
-        zero = np.zeros_like(sink)
+        sink = xp.clip(DESCENT_RATE * height + TOUCHDOWN_SPEED, None, MAX_DESCENT_SPEED)
+        sink = sink * xp.clip(1.5 - aside / (0.2 + 0.2 * height), 0.0, 1.0)  # within a cone
+        zero = xp.zeros_like(sink)
         offset = stack(reading.to_goal[..., 0], reading.to_goal[..., 1], zero)
         return offset, stack(zero, zero, -sink)
 

@@ -112,9 +112,9 @@ class StraightAndLevel(Task):
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """To the nearest point of the line through the goal, and along it at its velocity."""
-        line = reading.target_velocity
-        along = line / np.maximum(norm(line), 1e-9)[..., None]
-        ahead = np.sum(reading.to_goal * along, axis=-1, keepdims=True)
+        xp, line = namespace(reading.to_goal), reading.target_velocity
+        along = line / xp.clip(norm(line), 1e-9, None)[..., None]
+        ahead = xp.sum(reading.to_goal * along, axis=-1, keepdims=True)
         return reading.to_goal - ahead * along, line
 
     def markers(self, now: Snapshot) -> Sequence[Marker]:

@@ -133,7 +133,7 @@ class TargetFollowing(Task):
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """To the nearest point at the distance to keep, and along with the target."""
-        share = self.keep / np.maximum(norm(reading.to_goal), 1e-9)
+        share = self.keep / namespace(reading.to_goal).clip(norm(reading.to_goal), 1e-9, None)
         return reading.to_goal * (1 - share)[..., None], reading.target_velocity
 
     def markers(self, now: Snapshot) -> Sequence[Marker]:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from quadrl import mjcf, tasks, validation
 from quadrl.environment import Environment
+from quadrl.rendering import gl
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
 
 ENVIRONMENT = ("control_mode", "engine", "ranges", "num_threads", "seed")
 """Keywords of `quadrl.environment.Environment` that every API passes on."""
+KEYWORDS = (*ENVIRONMENT, "vehicle", "max_episode_steps", "reward_terms")
+"""What every API takes beside the options of the task."""
 
 
 def make(
@@ -44,7 +49,20 @@ def make(
     if max_episode_steps is not None:
         steps = validation.number("max_episode_steps", max_episode_steps, 1, whole=True)
         settings["time_limit"] = steps * vehicle.control_timestep
-    return Environment(tasks.make(task, **settings), num_envs=num_envs, vehicle=vehicle, **own)
+    return Environment(
+        make_task(task, settings, KEYWORDS), num_envs=num_envs, vehicle=vehicle, **own
+    )
+
+
+def make_task(task: str | Task, options: Mapping[str, Any], keywords: Iterable[str]) -> Task:
+    """A task with some options; the refusal of an unknown one lists the API's keywords as well."""
+    task = tasks.make(task)
+    names = [*keywords, *(field.name for field in dataclasses.fields(task))]
+    validation.keys(f"{task.name} option", options, names)
+    return task.replace(**options)
+
+
+gl.shield_triton()  # whoever imports triton later may have drawn before
 
 
 class Pictures:

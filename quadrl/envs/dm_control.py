@@ -24,13 +24,15 @@ from dm_control.rl import control
 from dm_control.suite import base
 from dm_env import specs
 
-from quadrl import mjcf, native, tasks, validation
+from quadrl import mjcf, native, validation
 from quadrl.engines.mujoco import ENGINES, DataEngine
 from quadrl.environment import Environment, Transition
+from quadrl.envs.common import make_task
 from quadrl.errors import QuadrlError
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
 
+KEYWORDS = "random vehicle control_mode engine ranges".split()
 ENVIRONMENT_KWARGS = "time_limit control_timestep n_sub_steps flat_observation legacy_step".split()
 
 
@@ -161,13 +163,14 @@ def make(
     # The task keeps the clock, not dm_control: there a time limit hides a crash on the last step.
     if (limit := settings.pop("time_limit", time_limit)) is not None:
         options["time_limit"] = limit
-    task, vehicle = tasks.make(task, **options), resolve(vehicle)
+    task, vehicle = make_task(task, options, KEYWORDS), resolve(vehicle)
     timestep = settings.pop("control_timestep", None)
     if (substeps := settings.pop("n_sub_steps", None)) is not None:
         if timestep is not None:
             raise QuadrlError(
                 name="n_sub_steps", value=substeps, allowed="absent where control_timestep is given"
             )
+        substeps = validation.number("n_sub_steps", substeps, 1, whole=True)
         timestep = substeps * vehicle.physics_timestep
     if timestep is not None:
         vehicle = dataclasses.replace(vehicle, control_timestep=timestep)

@@ -10,13 +10,7 @@ from quadrl import mjcf
 from quadrl.errors import RenderingUnavailable
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.figures import learning_curve, trajectory
-from quadrl.learning.folder import (
-    EVALUATION,
-    LEARNING_CURVE,
-    TRAJECTORY,
-    VIDEO,
-    write_json,
-)
+from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO, write_json
 from quadrl.learning.train import Progress, Training
 from quadrl.rollout import MAX_EPISODES, Rollout, evaluate
 from quadrl.validation import number

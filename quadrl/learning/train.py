@@ -96,10 +96,7 @@ class Training:
             self.actor, self.critic, getattr(config, config.algo)
         )
         self.advantages = GAE(
-            gamma=config.gamma,
-            lmbda=config.gae_lambda,
-            value_network=self.critic,
-            average_gae=True,
+            gamma=config.gamma, lmbda=config.gae_lambda, value_network=self.critic, average_gae=True
         )
         self.iteration = 0
         self.seconds = 0.0  # of training, in all processes that worked on it

@@ -77,9 +77,6 @@ def yardstick(task: str, episodes: int) -> Result:
     return {"mean": mean, "gusts": gusts}
 
 
-# ------------------------------------------------------------------------------------- the pictures
-
-
 def draw(runs: list[study.Run], result: Result, folder: Path) -> None:
     """Figures 3 to 7 of the paper, and two of our own."""
     groups: dict[tuple[str, str], list[study.Run]] = {}
@@ -148,9 +145,6 @@ def lines(
     figure.supylabel(axes[1], fontsize=10)
     figure.legend(drawn.values(), drawn, loc="outside lower center", ncols=4, frameon=False)
     save(figure, path)
-
-
-# ------------------------------------------------------------------------------- parts of the pages
 
 
 def made() -> str:

@@ -63,9 +63,6 @@ def fly_batch(env: Any) -> Work:
         yield env.num_envs - int(np.count_nonzero(terminated | truncated))
 
 
-# -------------------------------------------------------------------------------------- simulators
-
-
 def quadrl(sizes: list[int]) -> list[Row]:
     """Its hover in both engines."""
     import gymnasium as gym

@@ -67,9 +67,6 @@ def flown(controller: Controller, task: str, vehicle: str) -> Result:
     return {"task": task, "vehicle": vehicle, "metrics": summarize(rollout)}
 
 
-# ------------------------------------------------------------------------------- parts of the pages
-
-
 def hover() -> str:
     """Hover, in both engines and on every aircraft."""
     result = report.load("training")

@@ -70,9 +70,7 @@ def column(runs: Iterable[Result], path: str) -> list[float]:
     return values
 
 
-# --------------------------------------------------------- tests: 1 yes, -1 the contrary, 0 neither
-
-
+# Tests: 1 yes, -1 the contrary, 0 neither.
 def smaller(a: Sequence[float], b: Sequence[float]) -> int:
     """Whether the seeds of a are clearly smaller than those of b: Mann and Whitney, one-sided."""
     low, high = ([x for x in values if math.isfinite(x)] for values in (a, b))

@@ -1,6 +1,7 @@
 """What every API has to do alike: seeds, resets, copies, divergence, refusals."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -190,6 +191,7 @@ def test_a_divergence_ends_the_episode(api):
     [
         ({"task": "hoover"}, "task"),
         ({"tollerance": 1.0}, "hover option"),
+        ({"vehicel": "racer"}, "hover option"),
         ({"tolerance": "wide"}, "hover tolerance"),
         ({"time_limit": 0.0}, "hover time_limit"),
         ({"control_mode": "rotors"}, "control_mode"),
@@ -204,6 +206,10 @@ def test_an_unknown_name_or_value_is_refused(api, settings, name):
         api(**settings)
     assert caught.value.name == name
     assert caught.value.allowed
+    if name == "hover option":  # what the API takes beside the options of the task is listed too
+        assert {"vehicle", "engine", "ranges", "tolerance"} <= set(
+            re.findall(r"\w+", str(caught.value))
+        )
 
 
 @every_api

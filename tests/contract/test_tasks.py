@@ -9,6 +9,7 @@ import pytest
 
 from quadrl.control.modes import CONTROL_MODES
 from quadrl.envs.gymnasium import QuadrotorEnv
+from quadrl.reading import Reading
 from quadrl.rotation import namespace
 from quadrl.task import Potentials, TaskState
 from quadrl.tasks import TASKS, make
@@ -32,6 +33,23 @@ WAYPOINTS = ((0.0, 0.1, 0.3), (0.1, 0.0, 0.9), (0.0, 0.0, 5.0))
 @pytest.mark.parametrize("name", TASKS)
 def test_task_keeps_the_contract(name):
     check_task(name)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_yardstick_is_guided_in_any_namespace(name):
+    torch = pytest.importorskip("torch")
+    draw = np.random.default_rng(3).normal
+    arrays = {"rotation": draw(size=(5, 3, 3)), "rotor_speed": draw(size=(5, 4))}
+    arrays |= {
+        k: draw(size=(5, 3)) for k in ("velocity", "body_rate", "to_goal", "target_velocity")
+    }
+    expected = make(name).guide(Reading(**arrays))
+    for settings in ({}, {"device": "meta"}):
+        tensors = {key: torch.tensor(array, **settings) for key, array in arrays.items()}
+        for got, wanted in zip(make(name).guide(Reading(**tensors)), expected, strict=True):
+            assert got.shape == wanted.shape and got.device.type == settings.get("device", "cpu")
+            if not settings:
+                np.testing.assert_allclose(got.numpy(), wanted, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -397,6 +397,9 @@ def test_a_policy_for_another_layout(refusal, run):
     assert error.value == 22 and error.allowed.startswith("25 ")
     error, _ = refusal("evaluate", run, "--vehicle", "hexa")
     assert error.value == 22 and error.allowed.startswith("24 ")
+    # As many rotors as the aircraft that it was trained with, but an X.
+    error, _ = refusal("evaluate", run, "--vehicle", "racer")
+    assert (error.name, error.value) == ("vehicle", "racer") and "paper" in error.allowed
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 from helpers import WIND, drawn, flying, ranges_of
 
 from quadrl import mjcf, tasks
+from quadrl.engines import mujoco as engines
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
 from quadrl.errors import QuadrlError
@@ -194,6 +195,15 @@ def test_a_task_sees_the_specified_aircraft_unless_it_asks_for_the_true_one(rest
 
 # --------------------------------------------------------------------------------------- refused
 
+
+def test_a_batch_of_equal_aircraft_takes_no_ranges():
+    alike = engines.make("mujoco", PAPER, 4, altitude=3.0)
+    with pytest.raises(QuadrlError) as caught:
+        Environment("hover", engine=alike, ranges={"mass": (0.6, 0.7)})
+    assert caught.value.name == "engine"
+    Environment("hover", engine=alike, ranges={"wind": (-1.0, 1.0)}).reset()
+
+
 REFUSED = [  # ranges, name, value, a part of what is allowed
     ({"mas": (1, 2)}, "range", "mas", "did you mean mass?"),
     ({"hover_speed": (1, 2)}, "range", "hover_speed", "mass"),
@@ -219,6 +229,15 @@ REFUSED = [  # ranges, name, value, a part of what is allowed
     ),
     ({"lag_down": (5.0, 101.0)}, "physics_timestep", 0.01, "0.0099"),
     ({"moment_coefficient": (1e-4, 0.1)}, "physics_timestep", 0.01, "0.006"),
+    ({"mass": {0.5, 0.6}}, "range of mass", {0.5, 0.6}, "pair"),
+    ({"wind": (-50, 50), "drag_coefficient": (0.1, 0.5)}, "fastest wind [m/s]", ..., "0 and 65"),
+    # Each end alone can hover; one rotor that turns the aircraft far more than the others cannot.
+    (
+        {"thrust_coefficient": (2e-5, 4.2e-5), "torque_coefficient": (2e-7, 2e-6)},
+        "ranges",
+        ...,
+        "narrow",
+    ),
     # J_z of 0.015 is possible with 7.5e-3 twice, but not with 7e-3.
     ({"inertia": ((7e-3, 7e-3, 1e-2), (8e-3, 8e-3, 1.5e-2))}, "range of inertia", ..., "sum"),
 ]

@@ -116,6 +116,20 @@ def test_parameters_of_another_aircraft_are_not_restored():
     np.testing.assert_array_equal(drawn(other), before)
 
 
+def test_rows_that_the_ranges_cannot_hold_are_not_restored():
+    other = flying(ranges={"mass": (0.6, 0.7)})
+    before = drawn(other)
+    heavy = dataclasses.replace(PAPER, inertia=(8e-3, 8e-3, 1.4e-2))
+    wrong = flying(ranges={"mass": (0.6, 0.7)}, vehicle=heavy).save()
+    broken = other.save()
+    broken["engine.rows"][0, 0] = np.nan
+    for saved, name in ((wrong, "engine.parameters"), (broken, "engine.rows")):
+        with pytest.raises(QuadrlError) as caught:
+            other.restore(saved)
+        assert caught.value.name == name
+        np.testing.assert_array_equal(drawn(other), before)
+
+
 @dataclasses.dataclass(frozen=True)
 class Trail(TaskState):
     """Where the aircraft was after the last two steps, and the fastest that it has been."""

@@ -12,6 +12,9 @@ from quadrl.vehicle import PAPER_ROTORS, VEHICLES, Rotor, Vehicle, plus, resolve
 PAPER = Vehicle()
 
 
+LEANING = (math.sin(math.radians(5)), 0.0, math.cos(math.radians(5)))
+
+
 def rotors(**changed):
     """The paper's rotors with some numbers changed in all."""
     return tuple(dataclasses.replace(rotor, **changed) for rotor in PAPER_ROTORS)
@@ -213,6 +216,9 @@ BAD = [  # parameters, name, value (... for any)
     (dict(rotors=ringed((45, 135, 315, 225), (1, 1, -1, -1))), "rotor positions", ...),
     # A plus moved ahead by more than its arm would need a negative thrust to hover.
     (dict(rotors=placed((0.5, 0), (0.3, 0.2), (-0.01, 0), (0.3, -0.2))), "rotor positions", ...),
+    # All lean ahead by 5 degrees: whoever hovers level flies off.
+    (dict(rotors=rotors(axis=LEANING)), "rotor axes", [LEANING] * 4),
+    (dict(rotors=placed((1e-6, 0), (0, 1e-6), (-1e-6, 0), (0, -1e-6))), ..., 1e-6),
     # Hover needs 225.678 rad/s of each.
     (dict(rotors=rotors(max_speed=225.0)), ..., 225.0),
     (dict(mass=1.31), ..., ...),  # more than twice the paper's
