@@ -8,7 +8,6 @@ Row i of a batch seeded with s is the single environment seeded with s + i.
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,7 +21,7 @@ from quadrl.engines.engine import Engine, EngineName
 from quadrl.errors import QuadrlError
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
-from quadrl.randomization import Ranges
+from quadrl.randomization import Ranges, check_saved
 from quadrl.rng import PARAMETERS, Rng, check_seed
 from quadrl.rotation import Array
 from quadrl.task import Snapshot, Task, layout
@@ -79,9 +78,8 @@ class Environment:
                 per_row=self._per_row,
             )
         elif self._per_row and len(engine.parameters) < engine.num_envs:
-            raise QuadrlError(
-                name="engine", value=engine, allowed="made with per_row=True where there are ranges"
-            )
+            allowed = "made with per_row=True, since there are ranges"
+            raise QuadrlError(name="engine", value=engine, allowed=allowed)
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
         self.control_mode = modes.make(control_mode, self.vehicle)
         self.action_size = self.control_mode.size
@@ -288,14 +286,7 @@ class Environment:
             self._episodes[:] = 0  # this episode does not count
         own = self.save()
         records.check_alike(saved, own)
-        if not np.isfinite(saved["engine.rows"]).all():
-            raise QuadrlError(name="engine.rows", value=saved["engine.rows"], allowed="finite")
-        name = "engine.parameters"
-        same = functools.partial(np.array_equal, own[name])
-        holds = self.ranges.holds if self.ranges and self._per_row else same
-        if not holds(saved[name]):
-            reason = "the state was saved with another aircraft"
-            raise QuadrlError(reason, name=name, value=saved[name], allowed="this aircraft's")
+        check_saved(self.ranges, saved, own)
         self.engine.restore({key.removeprefix("engine."): saved[key] for key in saved})
         self._keys[:], self._episodes[:] = saved["keys"], saved["episodes"]
         episode = records.of_arrays("episode", self._episode, saved)

@@ -116,10 +116,11 @@ class Policy:
                 rotors, and those of the vehicle stand or turn otherwise.
         """
         vehicle = environment.vehicle
-        for what, own, needed in (
-            ("observation", self.size, environment.size),
-            ("action", self.action_size, environment.action_size),
-        ):
+        own_sizes, there = (
+            (self.size, self.action_size),
+            (environment.size, environment.action_size),
+        )
+        for what, own, needed in zip(("observation", "action"), own_sizes, there, strict=True):
             if own != needed:
                 name = f"{what} size of the policy for {self.task}"
                 where = f"{environment.task.name} with the vehicle {vehicle.name}"

@@ -148,3 +148,18 @@ class Ranges:
         if self.per_row:
             parameters.refresh(table, self._vehicle.physics_timestep)
         return table, air
+
+
+def check_saved(ranges: Ranges | None, saved: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Refuse a saved state that is not finite, or of an aircraft that this environment never has.
+
+    Raises:
+        QuadrlError: The message names the array.
+    """
+    rows, table = "engine.rows", "engine.parameters"
+    if not np.isfinite(saved[rows]).all():
+        raise QuadrlError(name=rows, value=saved[rows], allowed="finite")
+    drawn = ranges is not None and ranges.per_row and ranges.holds(saved[table])
+    if not (drawn or np.array_equal(saved[table], own[table])):
+        reason = "the state was saved with another aircraft"
+        raise QuadrlError(reason, name=table, value=saved[table], allowed="this aircraft's")

@@ -71,6 +71,5 @@ def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) 
         if kept is None or (kept.shape, kept.dtype) != (array.shape, array.dtype):
             found = None if kept is None else f"{kept.dtype} {kept.shape}"
             reason = "what was saved is of another environment"
-            raise QuadrlError(
-                reason, name=name, value=found, allowed=f"{array.dtype} {array.shape}"
-            )
+            allowed = f"{array.dtype} {array.shape}"
+            raise QuadrlError(reason, name=name, value=found, allowed=allowed)

@@ -200,6 +200,5 @@ def _check_array(task: Task, what: str, value: Any, shape: tuple[int, ...], kind
     found = (tuple(getattr(value, "shape", ())), str(getattr(value, "dtype", type(value).__name__)))
     if found[0] != shape or ("bool" if kind == "b" else "float") not in found[1]:
         allowed = f"an array of {'bool' if kind == 'b' else 'floating-point numbers'} {shape}"
-        raise QuadrlError(
-            f"it is {found[1]} {found[0]}", name=f"{task.name} {what}", value=value, allowed=allowed
-        )
+        reason, name = f"it is {found[1]} {found[0]}", f"{task.name} {what}"
+        raise QuadrlError(reason, name=name, value=value, allowed=allowed)

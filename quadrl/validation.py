@@ -102,9 +102,8 @@ def like(name: str, value: Any, default: Any) -> Any:
         array = np.asarray(None)
     # Whole numbers past 64 bits are objects to NumPy.
     if array.dtype.kind not in "fiu" or not (np.abs(array) <= MAX_OPTION).all():
-        raise QuadrlError(
-            name=name, value=value, allowed=f"finite, between -{MAX_OPTION:g} and {MAX_OPTION:g}"
-        )
+        allowed = f"finite, between -{MAX_OPTION:g} and {MAX_OPTION:g}"
+        raise QuadrlError(name=name, value=value, allowed=allowed)
     return value
 
 

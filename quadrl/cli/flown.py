@@ -61,11 +61,10 @@ class Flown:
             vehicle = resolve(self.vehicle or None)
             task = tasks.make(self.task or "hover", **options)
             return make_controller(self.controller, task, vehicle), task, vehicle
-        policy = (
-            Policy.pretrained(self.policy, self.algo or "ppo")
-            if shipped
-            else Policy.load(self.policy)
-        )
+        if shipped:
+            policy = Policy.pretrained(self.policy, self.algo or "ppo")
+        else:
+            policy = Policy.load(self.policy)
         name = self.task or policy.task
         trained = policy.metadata.get("task_options", {}) if name == policy.task else {}
         task = tasks.make(name, **(trained | options))

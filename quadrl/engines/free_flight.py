@@ -109,7 +109,5 @@ def _check(model: mujoco.MjModel) -> None:
         (turned, "a body frame at the centre of mass, along the principal axes"),
     ):
         if wrong:
-            reason = f"free flight supports only {what}"
-            raise QuadrlError(
-                reason, name="engine", value="free_flight", allowed="'mujoco' for this model"
-            )
+            reason, allowed = f"free flight supports only {what}", "'mujoco' for this model"
+            raise QuadrlError(reason, name="engine", value="free_flight", allowed=allowed)

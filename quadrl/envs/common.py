@@ -15,9 +15,8 @@ from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
 
 ENVIRONMENT = ("control_mode", "engine", "ranges", "num_threads", "seed")
-"""Keywords of `quadrl.environment.Environment` that every API passes on."""
 KEYWORDS = (*ENVIRONMENT, "vehicle", "max_episode_steps", "reward_terms")
-"""What every API takes beside the options of the task."""
+"""Keywords beside the options of the task; those of `quadrl.environment.Environment` come first."""
 
 
 def make(

@@ -167,9 +167,8 @@ def make(
     timestep = settings.pop("control_timestep", None)
     if (substeps := settings.pop("n_sub_steps", None)) is not None:
         if timestep is not None:
-            raise QuadrlError(
-                name="n_sub_steps", value=substeps, allowed="absent where control_timestep is given"
-            )
+            allowed = "absent where control_timestep is given"
+            raise QuadrlError(name="n_sub_steps", value=substeps, allowed=allowed)
         substeps = validation.number("n_sub_steps", substeps, 1, whole=True)
         timestep = substeps * vehicle.physics_timestep
     if timestep is not None:
