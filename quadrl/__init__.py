@@ -25,18 +25,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "VEHICLES",
-    "Policy",
-    "Task",
-    "Vehicle",
-    "envs",
-    "load",
-    "register",
-    "rendering",
-    "suite",
-    "tasks",
-    "testing",
-]
+    "VEHICLES", "Policy", "Task", "Vehicle", "envs", "load", "register", "rendering", "suite",
+    "tasks", "testing",
+]  # fmt: skip
 
 envs.register_ids()
 

@@ -211,6 +211,7 @@ class CompiledStep:
 
     def begin(self, now: Snapshot, episode: Episode) -> None:
         """Take up a snapshot of all rows."""
+        self.observation = {}
         self._new_table()
         own = self._kept.views(self._table[:, : self._engine.num_envs])
         for into, array in zip(own, _arrays(now, episode), strict=True):

@@ -7,7 +7,6 @@ Row i of a batch seeded with s is the single environment seeded with s + i.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -103,6 +102,7 @@ class Environment:
         self._snapshot: Snapshot | None = None
         self.compiled: CompiledStep | None = None
         """The task's step in C from the first reset on; None where it cannot be compiled."""
+        self.not_compiled = ""  # why
         self._action = np.zeros((self.num_envs, self.action_size))
         self._command = np.zeros((self.num_envs, self.vehicle.rotor_count))  # [rad/s]
         self._setpoint: Any = None
@@ -176,8 +176,10 @@ class Environment:
             inputs = self._action, self._command, self._diverged
             loops = self.control_mode.has_loops
             rows = self.engine, self._rows, inputs
-            with contextlib.suppress(Exception):  # whatever the functions of a task raise
+            try:
                 self.compiled = CompiledStep(self.task, self._clock, *rows, now, episode, loops)
+            except Exception as error:  # whatever the functions of a task raise
+                self.not_compiled = str(error)
         self._snapshot, self._episode = now, episode
         if self.compiled:
             self.compiled.begin(now, episode)

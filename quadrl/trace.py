@@ -16,46 +16,37 @@ import numpy as np
 
 from quadrl.rotation import Array
 
+OPERATORS = {
+    "add": "+", "subtract": "-", "multiply": "*", "divide": "/", "less": "<", "less_equal": "<=",
+    "greater": ">", "greater_equal": ">=", "equal": "==", "not_equal": "!=", "bitwise_and": "&",
+    "bitwise_or": "|", "bitwise_xor": "^", "logical_and": "&", "logical_or": "|",
+}  # fmt: skip
+CALLS = {"absolute": "fabs", "arcsin": "asin", "arccos": "acos", "arctan": "atan"}
+CALLS |= {name: name for name in ("sqrt", "sin", "cos", "exp", "log", "tan", "tanh")}
 C: dict[str, str] = {
-    "add": "{} + {}",
-    "subtract": "{} - {}",
-    "multiply": "{} * {}",
-    "divide": "{} / {}",
     "negative": "-{}",
-    "absolute": "fabs({})",
-    "sqrt": "sqrt({})",
-    "sin": "sin({})",
-    "cos": "cos({})",
-    "exp": "exp({})",
-    "log": "log({})",
-    "tan": "tan({})",
-    "tanh": "tanh({})",
-    "arcsin": "asin({})",
-    "arccos": "acos({})",
-    "arctan": "atan({})",
     "arctan2": "atan2({}, {})",
     "maximum": "{0} >= {1} || {0} != {0} ? {0} : {1}",
     "minimum": "{0} <= {1} || {0} != {0} ? {0} : {1}",
     "where": "{} ? {} : {}",
-    "less": "{} < {}",
-    "less_equal": "{} <= {}",
-    "greater": "{} > {}",
-    "greater_equal": "{} >= {}",
-    "equal": "{} == {}",
-    "not_equal": "{} != {}",
-    "bitwise_and": "{} & {}",
-    "bitwise_or": "{} | {}",
-    "bitwise_xor": "{} ^ {}",
-    "logical_and": "{} & {}",
-    "logical_or": "{} | {}",
     "invert": "!{}",
     "logical_not": "!{}",
 }
 """Operations by the names of NumPy's functions."""
-LOGICAL = set(list(C)[list(C).index("bitwise_and") :])
+C |= {name: f"{{}} {sign} {{}}" for name, sign in OPERATORS.items()}
+C |= {name: f"{call}({{}})" for name, call in CALLS.items()}
+LOGICAL = {name for name in C if name.startswith(("bitwise_", "logical_"))} | {"invert"}
 """Those of truth values."""
 FLAGS = LOGICAL | {name for name in C if name.startswith(("less", "greater", "equal", "not_"))}
 """Those that give a truth value."""
+ARRANGING = {
+    np.stack, np.concatenate, np.broadcast_to, np.moveaxis, np.transpose, np.reshape, np.roll,
+    np.expand_dims, np.squeeze, np.take, np.flip, np.tile, np.repeat, np.zeros_like, np.ones_like,
+    np.empty_like, np.full_like, np.copyto, np.result_type, np.clip, np.max, np.min, np.sum,
+    np.prod, np.any, np.all,
+}  # fmt: skip
+"""Functions that move numbers, or call the operations above; others might look at objects."""
+MAX_OPERATIONS = 2000  # more would take the C compiler longer than they save
 
 
 class Symbol:
@@ -65,6 +56,12 @@ class Symbol:
         """Name the result of a C expression of others."""
         self.trace, self.text, self.operands, self.is_flag = trace, text, operands, is_flag
         self.name = f"t{len(trace.known)}"
+
+    def __bool__(self) -> bool:
+        raise TypeError("a branch on data cannot be compiled")
+
+    __eq__ = __ne__ = lambda self, other: bool(self)  # of lists, for instance
+    __hash__ = object.__hash__
 
 
 class Trace:
@@ -95,7 +92,7 @@ class Trace:
             name, values = "multiply", (values[0], values[0])
         flags = [_is_flag(value) for value in values]
         known = flags[0] if name == "where" else all(flags) == (name in LOGICAL)
-        if name not in C or not known:
+        if name not in C or not known or len(self.known) > MAX_OPERATIONS:
             raise TypeError(f"{name} cannot be compiled")
         names = tuple(self.name_of(value) for value in values)
         is_flag = name in FLAGS or (name == "where" and all(flags))
@@ -135,8 +132,11 @@ class Symbols(np.ndarray):
         """Write an operation down for each element."""
         if method == "__call__" and not any(x is not None for x in options.values()):
             return elementwise(ufunc.__name__, *inputs)
-        if method == "reduce" and not options.get("keepdims"):
-            parts = np.moveaxis(np.asarray(inputs[0]), options.get("axis", 0), 0)
+        rest = (options[name] for name in options.keys() - {"axis", "keepdims"})
+        usual = not options.get("keepdims") and all(x is None or x is True for x in rest)
+        parts = np.moveaxis(np.asarray(inputs[0]), options.get("axis", 0), 0)
+        # From 8 numbers on NumPy adds in another order.
+        if method == "reduce" and usual and (ufunc is not np.add or len(parts) < 8):
             return functools.reduce(functools.partial(elementwise, ufunc.__name__), parts)
         raise TypeError(f"{ufunc.__name__}.{method} cannot be compiled")
 
@@ -144,6 +144,8 @@ class Symbols(np.ndarray):
         """Choose between symbols, or arrange them."""
         if function is np.where:
             return elementwise("where", *args)
+        if function not in ARRANGING:
+            raise TypeError(f"{function.__name__} cannot be compiled")
         result = super().__array_function__(function, types, args, options)
         return symbols(result) if isinstance(result, np.ndarray) else result
 

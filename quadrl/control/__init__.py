@@ -16,17 +16,9 @@ from quadrl.validation import choice
 from quadrl.vehicle import Vehicle, resolve
 
 __all__ = [
-    "CONTROLLERS",
-    "CONTROL_MODES",
-    "ActionTerm",
-    "ControlMode",
-    "Controller",
-    "Gains",
-    "GeometricController",
-    "LQRController",
-    "Weights",
-    "make",
-]
+    "CONTROLLERS", "CONTROL_MODES", "ActionTerm", "ControlMode", "Controller", "Gains",
+    "GeometricController", "LQRController", "Weights", "make",
+]  # fmt: skip
 
 CONTROLLERS: dict[str, type[GeometricController] | type[LQRController]] = {
     "geometric": GeometricController,

@@ -20,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import warnings
 from pathlib import Path
 
@@ -191,9 +192,17 @@ def address(array: np.ndarray) -> int:
     return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
 
 
-@functools.cache
+_LOCK = threading.Lock()
+
+
 def library() -> ctypes.CDLL:
     """The library for this process, built when needed."""
+    with _LOCK:  # one for all threads, since MuJoCo has one set of callbacks
+        return _library()
+
+
+@functools.cache
+def _library() -> ctypes.CDLL:
     return load(build())
 
 

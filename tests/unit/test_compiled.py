@@ -2,6 +2,7 @@
 
 import ctypes
 import dataclasses
+import functools
 
 import helpers
 import numpy as np
@@ -107,6 +108,51 @@ def noisy(self, now):
 
 def branching(self, now):
     return now.state.height < (1.0 if now.state.speed.max() > 0 else 0.0)
+
+
+FAR = "now.potentials.to_goal[..., 0] > 0.1, now.potentials.to_goal[..., 1] > 0.1"
+SILENT = [  # what NumPy does with objects that it does not know is not what it does with numbers
+    f"np.any([{FAR}], axis=0)",
+    f"np.logical_or.reduce([{FAR}])",
+    "(now.potentials.distance > 0.1).astype(bool)",
+    "np.count_nonzero(now.potentials.to_goal > 0.1, axis=-1) > 1",
+    "np.array([bool(x) for x in now.potentials.distance > 0.1])",
+    "now.potentials.distance > (0.5 if now.potentials.distance[0] == 0.5 else 0.1)",
+    "np.sum(now.potentials.to_goal, axis=-1, where=now.potentials.to_goal > 0) > 0.1",
+    "np.max(now.potentials.to_goal, axis=-1, initial=0.3) > 0.3",
+    "np.nan_to_num(now.potentials.distance) > 0.1",
+    "np.sum(np.concatenate([now.potentials.to_goal] * 3, axis=-1), axis=-1) > 0.1",
+    "np.isin(now.potentials.distance, [0.5]) | (now.potentials.distance > 0.1)",
+]
+
+
+@pytest.mark.parametrize("expression", SILENT)
+def test_what_numpy_would_do_otherwise_with_symbols_is_not_compiled(expression):
+    terminated = eval(f"lambda self, now: {expression}", {"np": np})
+    environments = [
+        helpers.begun(variant(terminated=terminated, compiled=compiled), 2)
+        for compiled in (True, False)
+    ]
+    for _ in range(4):
+        first, second = (helpers.idle(environment) for environment in environments)
+        np.testing.assert_array_equal(first.terminated, second.terminated)
+    assert environments[0].compiled is None and environments[0].not_compiled
+
+
+def test_a_task_that_takes_the_compiler_long_is_run_as_it_is_written():
+    def rays(self, now):
+        turned = [now.potentials.distance * k for k in range(1500)]
+        return functools.reduce(np.add, turned)
+
+    assert helpers.begun(variant(error=rays), 2).compiled is None
+
+
+def test_a_transition_is_flattened_after_the_next_reset_too():
+    environment = helpers.begun("hover", 3)
+    done = helpers.idle(environment)
+    before = environment.flatten(done.observation)
+    environment.reset()
+    np.testing.assert_array_equal(environment.flatten(done.observation), before)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from quadrl.engines import mujoco as engines
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
 from quadrl.errors import QuadrlError
+from quadrl.rng import PARAMETERS, Rng
 from quadrl.tasks.hover import Hover
 from quadrl.vehicle import VEHICLES, Vehicle
 
@@ -194,6 +195,23 @@ def test_a_task_sees_the_specified_aircraft_unless_it_asks_for_the_true_one(rest
 
 
 # --------------------------------------------------------------------------------------- refused
+
+
+def test_starts_and_parameters_are_drawn_from_streams_of_their_own():
+    rng, other = (Rng(np.array([5]), np.array([0]), *stream) for stream in ((), (PARAMETERS,)))
+    assert not np.intersect1d(rng.uniform(0.0, 1.0, 8), other.uniform(0.0, 1.0, 8)).size
+    environment = flying(ranges={"mass": (0.6, 0.7)}, count=1)
+    share = (environment.engine.parameters["mass"] - 0.6) / (0.7 - 0.6)
+    place = environment._keys, environment._episodes - 1
+    np.testing.assert_allclose(share, Rng(*place, PARAMETERS).uniform(0.0, 1.0, 1)[0])
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_reset_calms_the_air(count):
+    environment = flying(ranges=None, count=count)
+    environment.engine.air[:] = 2.0
+    environment.reset(np.array([0]))
+    assert (environment.engine.air[0] == 0).all() and (environment.engine.air[1:] == 2).all()
 
 
 def test_a_batch_of_equal_aircraft_takes_no_ranges():

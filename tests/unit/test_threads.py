@@ -1,5 +1,7 @@
 """Many threads of Python at once: nobody's numbers depend on who else flies."""
 
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 
@@ -108,3 +110,14 @@ def test_eight_threads_get_bit_for_bit_what_one_gets(work):
     assert len({result.tobytes() for result in alone}) == THREADS  # every thread has other numbers
     for together, expected in zip(at_once(work), alone, strict=True):
         np.testing.assert_array_equal(together, expected)
+
+
+def test_the_first_environments_of_a_process_may_be_made_in_threads():
+    code = (
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "from quadrl.environment import Environment\n"
+        "def make(seed): return Environment('hover', seed=seed).reset()\n"
+        "list(ThreadPoolExecutor(4).map(make, range(4)))\n"
+        "make(4)"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
