@@ -195,7 +195,7 @@ FAULTS = {
         {"begin": begun(lambda start, state: (start, TaskState(np.random.normal(size=(4, 3)))))},
     ),
     "no rotation": (
-        "quaternion of begin.*of length 1",
+        "quaternion of begin.*of norm 1",
         {"begin": begun(lambda a, b: (dataclasses.replace(a, quaternion=2 * a.quaternion), b))},
     ),
     "a start by the mean of the batch": (

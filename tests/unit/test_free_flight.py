@@ -151,7 +151,7 @@ def off_centre(spec):
 
 @pytest.mark.parametrize(
     ("edit", "named"),
-    [(wall, "wall"), (load, "no other body"), (off_centre, "centre of mass")],
+    [(wall, "wall"), (load, "single body"), (off_centre, "centre of mass")],
 )
 def test_refuses_what_the_equations_do_not_describe(edit, named):
     spec = mjcf.spec(PAPER, contact=True)

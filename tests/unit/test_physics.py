@@ -161,14 +161,19 @@ def test_one_rotor_alone():
 
 
 def test_one_tilted_rotor_alone():
-    # Rotor 1 leans back by 30 degrees, 0.1 m above the centre: axis (-0.5, 0, 0.866025).
+    # Rotor 1 leans back by 30 degrees, 0.1 m above the centre: axis (-0.5, 0, 0.866025). Rotor 3,
+    # its mirror image, stands still.
     # 1.252 N along it: (-0.626, 0, 1.084264) N. Moment about the centre of (0.23, 0, 0.1) m:
     # (0, 0.1 * -0.626 - 0.23 * 1.084264, 0) = (0, -0.311981, 0) N m; the reaction, -0.03 N m
     # about the axis: (0.015, 0, -0.025981) N m.
-    leaning = dataclasses.replace(
-        PAPER_ROTORS[0], position=(0.23, 0, 0.1), axis=(-0.5, 0, math.sqrt(0.75))
-    )
-    vehicle = dataclasses.replace(VACUUM, rotors=(leaning, *PAPER_ROTORS[1:]))
+    leaning = [
+        dataclasses.replace(
+            PAPER_ROTORS[k], position=(side * 0.23, 0, 0.1), axis=(side * -0.5, 0, math.sqrt(0.75))
+        )
+        for k, side in ((0, 1), (2, -1))
+    ]
+    rotors = (leaning[0], PAPER_ROTORS[1], leaning[1], PAPER_ROTORS[3])
+    vehicle = dataclasses.replace(VACUUM, rotors=rotors)
     linear, angular = accelerations(vehicle, speed=(200, 0, 0, 0))
     np.testing.assert_allclose(linear, [-0.626 / 0.65, 0, 1.084264 / 0.65 - 9.81], atol=1e-6)
     expected = np.array([0.015, -0.311981, -0.025981]) / INERTIA
