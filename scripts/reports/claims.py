@@ -41,7 +41,7 @@ def claim(sentence: str) -> Callable[[Vote], Vote]:
     return add
 
 
-@claim("Over all, PPO and TRPO perform more consistently than GAE.")
+@claim("Overall, PPO and TRPO perform more consistently than GAE.")
 def more_consistent(trial: Trial) -> tuple[int, str]:
     """Each solves clearly more seeds than GAE, or no fewer and its return spreads clearly less."""
     return agreed(consistent(trial, algo, "vpg") for algo in OTHERS), seeds(trial)
