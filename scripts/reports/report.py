@@ -19,6 +19,7 @@ from quadrl.task import Target
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS, RUNS = REPOSITORY / "docs", REPOSITORY / "runs"
 RESULTS, IMAGES = DOCS / "results", DOCS / "images"
+CODE = ("quadrl", "tasks", "assets", "scripts")  # what a result depends on
 PATHS = [str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(PATHS)}
 """Environment variables with which a process imports this repository's package."""
@@ -44,8 +45,10 @@ def load(name: str) -> Result:
 
 def save(name: str, result: Result) -> None:
     """Keep a result, with the machine and the commit that it was measured on."""
-    command = ("git", "-C", str(REPOSITORY), "describe", "--always", "--dirty")
-    commit = subprocess.run(command, capture_output=True, text=True).stdout.strip() or "unknown"
+    git = ("git", "-C", str(REPOSITORY))
+    known = subprocess.run((*git, "describe", "--always"), capture_output=True, text=True).stdout
+    changed = subprocess.run((*git, "diff", "--quiet", "HEAD", "--", *CODE)).returncode == 1
+    commit = (known.strip() or "unknown") + "-dirty" * changed
     whole = {"machine": benchmark.machine(), "commit": commit, **rounded(result)}
     text = json.dumps(whole, indent=1)
     # A list of numbers takes one line, not one per number.
