@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from quadrl import envs, tasks
 from quadrl.policy import Policy
+from quadrl.shield import shield_triton
 from quadrl.task import Task
 from quadrl.vehicle import VEHICLES, Vehicle
 
@@ -30,6 +31,7 @@ __all__ = [
 ]  # fmt: skip
 
 envs.register_ids()
+shield_triton()  # whoever imports triton later may have drawn before
 
 
 def register(task: type[Task]) -> type[Task]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from quadrl import mjcf, tasks, validation
 from quadrl.environment import Environment
-from quadrl.rendering import gl
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
 
@@ -59,9 +58,6 @@ def make_task(task: str | Task, options: Mapping[str, Any], keywords: Iterable[s
     names = [*keywords, *(field.name for field in dataclasses.fields(task))]
     validation.keys(f"{task.name} option", options, names)
     return task.replace(**options)
-
-
-gl.shield_triton()  # whoever imports triton later may have drawn before
 
 
 class Pictures:

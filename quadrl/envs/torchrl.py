@@ -1,14 +1,8 @@
 """TorchRL: a batched environment. It needs torch, so `import quadrl` leaves it out."""
 
-# ruff: noqa: E402 - triton is shielded before torchrl is imported.
-
 from __future__ import annotations
 
 from typing import Any
-
-from quadrl.rendering import gl
-
-gl.shield_triton()  # torchrl imports triton, perhaps after a picture
 
 import numpy as np
 import torch

@@ -8,15 +8,12 @@ mujoco.Renderer and, after `choose`, for dm_control as well.
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import functools
 import importlib
 import importlib.util
 import os
 import sys
 import warnings
 from collections.abc import Generator
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -24,30 +21,11 @@ import mujoco
 from quadrl.errors import RenderingUnavailable
 
 
-@functools.cache
-def shield_triton() -> None:
-    """Load triton's library, if it is installed, so that it can live beside Mesa's in one process.
-
-    Each brings its own LLVM. Mesa's is visible to every library that is loaded after it, and
-    triton's would call into it and crash. Opened with RTLD_DEEPBIND it keeps to its own symbols,
-    and `import triton` then finds it loaded. It takes 0.05 s. Every order of pictures, this call
-    and the import works in which this call comes before the import.
-    """
-    if "triton" in sys.modules or not hasattr(os, "RTLD_DEEPBIND"):
-        return
-    found = importlib.util.find_spec("triton")
-    for folder in (found and found.submodule_search_locations) or ():
-        for library in Path(folder, "_C").glob("libtriton*.so"):
-            with contextlib.suppress(OSError):
-                ctypes.CDLL(str(library), mode=os.RTLD_LOCAL | os.RTLD_NOW | os.RTLD_DEEPBIND)
-
-
 def choose() -> None:
     """Let dm_control draw without a screen; call it before dm_control is imported, or after.
 
     Where dm_control would use GLFW, its renderer becomes one that opens EGL at the first picture.
     """
-    shield_triton()  # dm_control loads Mesa at its import where MUJOCO_GL is egl
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # GLFW's, about the missing screen
         render: Any = importlib.import_module("dm_control._render")
@@ -61,7 +39,6 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int, max_geom: int)
     Raises:
         RenderingUnavailable: There is no graphics library to draw with.
     """
-    shield_triton()
     with _failure_named():
         if _without_screen():
             # The class that mujoco.Renderer asks for its contexts.

@@ -57,13 +57,16 @@ assert before.std() > 10 and first.std() > 10
 """
 
 
-def run(code, **variables):
-    """Run code in a process without a screen, warnings being errors; its end must be clean."""
+def run(code, before="", **variables):
+    """Run code in a process without a screen, warnings being errors; its end must be clean.
+
+    Some of it may come before `import quadrl`.
+    """
     names = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")
     kept = {name: value for name, value in os.environ.items() if name not in names}
     places = [str(Path(quadrl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     environment = kept | {"PYTHONPATH": os.pathsep.join(filter(None, places))} | variables
-    command = [sys.executable, "-W", "error", "-c", PREAMBLE + code]
+    command = [sys.executable, "-W", "error", "-c", before + PREAMBLE + code]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr, done.stdout) == (0, "", "")
 
@@ -79,6 +82,10 @@ def test_without_a_screen_it_draws_beside_other_renderers(code):
 
 
 @pytest.mark.skipif(not importlib.util.find_spec("triton"), reason="triton is not installed")
-@pytest.mark.parametrize("code", [OURS, DM_CONTROL, MUJOCO + "import quadrl.learning"])
-def test_triton_can_be_imported_after_a_picture(code):
-    run(code + "\nimport triton\n", MUJOCO_GL="egl")
+@pytest.mark.parametrize(
+    ("before", "code"),
+    [("", OURS), ("", DM_CONTROL), ("", MUJOCO), ("import mujoco\n" + MUJOCO, "")],
+    ids=["ours", "dm_control", "mujoco", "mujoco first"],
+)
+def test_triton_can_be_imported_after_a_picture(before, code):
+    run(code + "\nimport triton\n", before, MUJOCO_GL="egl")

@@ -18,6 +18,7 @@ from quadrl.markers import Marker
 from quadrl.rendering import Renderer, gl, render_trajectory, write_video
 from quadrl.rendering.camera import aircraft_scale, follow_cameras, in_view
 from quadrl.rendering.overlay import Panel
+from quadrl.shield import shield_triton
 from quadrl.vehicle import VEHICLES
 
 SIZE = 200  # [pixels], of square pictures
@@ -331,25 +332,20 @@ headless = pytest.mark.skipif(sys.platform != "linux", reason="only Linux draws 
 
 
 @headless
-def test_triton_is_loaded_by_itself_before_the_first_context(model, monkeypatch, tmp_path):
+def test_triton_is_loaded_with_its_own_symbols(monkeypatch, tmp_path):
     library = tmp_path / "triton" / "_C" / "libtriton.so"
     library.parent.mkdir(parents=True)
     library.write_text("not one: that it cannot be loaded does no harm")
     (tmp_path / "triton" / "__init__.py").touch()
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "triton", raising=False)
-    events, load, begin = [], ctypes.CDLL, mujoco.Renderer.__init__
+    loaded, load = [], ctypes.CDLL
 
-    def record_load(name, mode=0):
-        events.append((name, bool(mode & os.RTLD_DEEPBIND)))
+    def record(name, mode=0):
+        loaded.append((name, bool(mode & os.RTLD_DEEPBIND)))
         return load(name, mode=mode)
 
-    def record_begin(*given):
-        events.append("context")
-        begin(*given)
-
-    gl.shield_triton.cache_clear()
-    monkeypatch.setattr("ctypes.CDLL", record_load)
-    monkeypatch.setattr("mujoco.Renderer.__init__", record_begin)
-    with Renderer(model, **SMALL):
-        assert events == [(str(library), True), "context"]
+    shield_triton.cache_clear()
+    monkeypatch.setattr("ctypes.CDLL", record)
+    shield_triton()
+    assert loaded == [(str(library), True)]
