@@ -1,4 +1,4 @@
-"""The graphics library: which one draws, and how it gets along with dm_control and triton.
+"""The graphics library: which one draws, and how it gets along with dm_control.
 
 mujoco and dm_control choose theirs at import, and without a screen take GLFW, which then fails,
 unless `MUJOCO_GL` is set. Here a machine without a screen gets EGL at its first picture, for
