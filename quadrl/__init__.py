@@ -4,6 +4,8 @@
     environment = quadrl.load("hover")                       # dm_control
     environment = gymnasium.make("quadrl/Hover-v0")          # Gymnasium
     environment = quadrl.envs.torchrl.QuadrotorEnv("hover")  # TorchRL
+    run = quadrl.train("hover", seed=0)                      # as the command `quadrl train`
+    quadrl.evaluate(run), quadrl.render(run), quadrl.plot(run)
 
 The import registers the Gymnasium ids; dm_control, torch and rendering are imported on first use.
 """
@@ -14,7 +16,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from quadrl import envs, tasks
+from quadrl.observing import Observing
 from quadrl.policy import Policy
+from quadrl.randomization import RANDOMIZATIONS, Randomization
 from quadrl.shield import shield_triton
 from quadrl.task import Task
 from quadrl.vehicle import VEHICLES, Vehicle
@@ -23,12 +27,25 @@ if TYPE_CHECKING:
     from dm_control.rl.control import Environment as ControlEnvironment
 
     from quadrl import rendering, suite, testing
+    from quadrl.disturbed import robustness
+    from quadrl.evaluation import evaluate
+    from quadrl.learning.run import train
+    from quadrl.show import plot, render
 
 __version__ = "0.1.0"
 __all__ = [
-    "VEHICLES", "Policy", "Task", "Vehicle", "envs", "load", "register", "rendering", "suite",
-    "tasks", "testing",
+    "RANDOMIZATIONS", "VEHICLES", "Observing", "Policy", "Randomization", "Task", "Vehicle", "envs",
+    "evaluate", "load", "plot", "register", "render", "rendering", "robustness", "suite", "tasks",
+    "testing", "train",
 ]  # fmt: skip
+LAZY = {
+    "train": "quadrl.learning.run",
+    "evaluate": "quadrl.evaluation",
+    "render": "quadrl.show",
+    "plot": "quadrl.show",
+    "robustness": "quadrl.disturbed",
+}
+"""Functions that are imported on first use, and their modules."""
 
 envs.register_ids()
 shield_triton()  # whoever imports triton later may have drawn before
@@ -58,7 +75,9 @@ def load(
 
 
 def __getattr__(name: str) -> Any:
-    """Import `suite`, `rendering` and `testing` on first use: they bring more libraries."""
+    """Import on first use what brings more libraries."""
+    if name in LAZY:
+        return getattr(importlib.import_module(LAZY[name]), name)
     if name in ("suite", "rendering", "testing"):
         return importlib.import_module(f"quadrl.{name}")
     raise AttributeError(f"module 'quadrl' has no attribute {name!r}")

@@ -8,17 +8,13 @@ control steps per second.
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import importlib.util
 import itertools
 import operator
-import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -27,10 +23,13 @@ import numpy as np
 from mujoco.batch import Batch
 
 from quadrl import mjcf, suite, tasks
-from quadrl.engines.mujoco import EngineName
+from quadrl.draw import Draw
+from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
+from quadrl.machine import cores, machine
+from quadrl.randomization import FACTORS, RANDOMIZATIONS, Randomization
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
+from quadrl.vehicle import Vehicle, in_real_air
 
 Work = Iterator[int]
 """Flies some control steps each time, and says how many."""
@@ -39,14 +38,20 @@ ALL_CORES, ONE_CORE = "all cores", "one core"
 CHUNK = 200  # control steps of one aircraft between two looks at the clock
 FLIGHT = 16  # control steps from hover under random commands, until bare aircraft are put back
 HEIGHT = 3.0  # [m], where the aircraft of bare mj_step begin; in a FLIGHT they come near nothing
+LOW = 0.5  # [m], where they feel the ground
+FULL = RANDOMIZATIONS["full"]
+DIFFERENT = Randomization(**{name: getattr(FULL, name) for name in (*FACTORS, "rotors")})
+"""Aircraft that differ, and nothing else."""
 FREE_FLIGHT_ENVS = 4096
+FREE_FLIGHT = "free flight"  # Environment of FREE_FLIGHT_ENVS
+KERNEL = "kernel"  # free flight of FREE_FLIGHT_ENVS on one core and nothing else
 
 
 class Layer(NamedTuple):
     """One thing that is measured."""
 
     what: str
-    of: str  # the yardstick: bare mj_step on ALL_CORES, or on ONE_CORE for one aircraft
+    of: str  # the yardstick: bare mj_step on ALL_CORES or ONE_CORE, or another layer
     work: Work
     target: float | None = None  # share of the yardstick that it should reach
     bare: bool = False  # a candidate for the yardstick itself; the fastest one is
@@ -65,14 +70,16 @@ def benchmark(
 
     Returns:
         `rates`: for each layer `what`, `rate` [control steps/s], all `repeats` of it, `share` of
-        bare mj_step on `of` (the median of the ratios within one turn), and its `target` (None:
-        none is set). `machine`, and the settings. The TorchRL layer is left out where TorchRL is
-        not installed.
+        `of` (the median of the ratios within one turn), and its `target` (None: none is set). `of`
+        is bare mj_step on all cores or on one, or another layer. `machine`, and the settings. The
+        TorchRL layer is left out where TorchRL is not installed.
     """
     with contextlib.ExitStack() as stack:
         layers = _layers(tasks.make(task), num_envs, stack)
         rates = _measure([layer.work for layer in layers], seconds, repeats)
     yardsticks = {}
+    for layer, measured in zip(layers, rates, strict=True):
+        yardsticks |= {of: measured for of in (FREE_FLIGHT, KERNEL) if layer.what.endswith(of)}
     for of in (ALL_CORES, ONE_CORE):
         bare = [r for layer, r in zip(layers, rates, strict=True) if layer.bare and layer.of == of]
         yardsticks[of] = max(bare, key=statistics.median)
@@ -96,12 +103,16 @@ def benchmark(
 
 
 def rows(measured: dict[str, Any]) -> list[tuple[str, ...]]:
-    """What `benchmark` returned, to be read: what, fastest and median rate, share, target."""
+    """What `benchmark` returned, to be read: what, fastest and median rate, share, of, target."""
     written = []
     for row in measured["rates"]:
-        speeds = (f"{rate:,.0f}" for rate in (row["rate"], statistics.median(row["repeats"])))
+        what, rate = row["what"], row["rate"]
+        if what.startswith(KERNEL):
+            what += f": {1e9 / (rate * Vehicle().substeps):,.0f} ns a physics step"
+        speeds = (f"{rate:,.0f}" for rate in (rate, statistics.median(row["repeats"])))
         target = "" if row["target"] is None else f"{row['target']:.2f}"
-        written.append((row["what"], *speeds, f"{row['share']:.2f}", target))
+        of = "mj_step" if row["of"] in (ALL_CORES, ONE_CORE) else row["of"]
+        written.append((what, *speeds, f"{row['share']:.2f}", of, target))
     return written
 
 
@@ -111,28 +122,6 @@ def summary(measured: dict[str, Any]) -> str:
     cpu, cores, system = (computer.pop(name) for name in ("cpu", "cores", "system"))
     versions = ", ".join(f"{name} {version}" for name, version in computer.items())
     return f"{cpu}, {cores} core{'s' * (cores > 1)}, {system}, {versions}"
-
-
-def machine() -> dict[str, str | int]:
-    """What the figures were measured on."""
-    versions = {}
-    for name in ("mujoco", "gymnasium", "dm-control", "torch", "torchrl"):
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    cpu = platform.processor() or platform.machine()
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-        cpu = next(named, cpu)
-    known = {"cpu": cpu, "cores": _cores(), "system": f"{platform.system()} {platform.machine()}"}
-    return known | {"python": platform.python_version()} | versions
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _measure(works: list[Work], seconds: float, repeats: int) -> list[list[float]]:
@@ -155,18 +144,19 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
     gymnasium_id = f"quadrl/{task.name.title().replace('_', '')}-v0"
     vehicle, size = Vehicle(), f"{num_envs:,}"
     model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.scene)
-    pool = stack.enter_context(ThreadPoolExecutor(_cores()))
+    pool = stack.enter_context(ThreadPoolExecutor(cores()))
     alone, loaded = gym.make(gymnasium_id), suite.make(task, random=0)
     vectors: Any = gym.make_vec(gymnasium_id, num_envs=num_envs)
     for env in (alone, loaded, vectors):
         stack.callback(env.close)
-    batch, free = _batched_mj_step(vehicle, model, num_envs), FREE_FLIGHT_ENVS
+    batch, free = _batched_mj_step(vehicle, model, num_envs), f"{FREE_FLIGHT_ENVS:,}"
+    air = in_real_air(vehicle)
     many: list[tuple[Any, ...]] = [
-        ("mj_step, a loop on each core", _mj_step(vehicle, model, pool, _cores()), None, True),
+        ("mj_step, a loop on each core", _mj_step(vehicle, model, pool, cores()), None, True),
         (f"mj_step, mujoco.batch of {size}", batch, None, True),
         ("the same with mujoco's own stage clock", _with_clock(batch)),
-        (f"Environment of {size}", _environment(task, num_envs), 0.90),
-        (f"Environment of {free:,}, free flight", _environment(task, free, "free_flight"), 20.0),
+        (f"Environment of {size}", _environment(task, num_envs=num_envs), 0.90),
+        (f"Environment of {free}, {FREE_FLIGHT}", _in_free_flight(task), 20.0),
         (f"Gymnasium make_vec of {size}", _vectors(vectors)),
     ]
     if importlib.util.find_spec("torchrl"):
@@ -176,8 +166,28 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
         ("mj_step, a loop on one core", _mj_step(vehicle, model, pool, 1), None, True),
         ("Gymnasium make, one aircraft", _single(alone, model.nu, lambda x: x[2] or x[3]), 0.35),
         ("dm_control load, one aircraft", _single(loaded, model.nu, lambda x: x.last())),
+        (KERNEL, _free_flight(vehicle, HEIGHT)),
     ]
-    groups = ((ALL_CORES, many), (ONE_CORE, one))
+    disturbed: list[tuple[Any, ...]] = [
+        (
+            "the same in real air and wind",
+            _in_free_flight(task, vehicle=air, weather="light"),
+            1 / 3,
+        ),
+        ("the same, different aircraft", _in_free_flight(task, randomization=DIFFERENT), 0.90),
+        ("the same, all that is drawn", _in_free_flight(task, randomization=FULL)),
+    ]
+    kernels: list[tuple[Any, ...]] = [
+        (f"{KERNEL} in air", _free_flight(air, HEIGHT), 1 / 3),
+        (f"{KERNEL} near the ground", _free_flight(air, LOW), 1 / 3),
+        (f"{KERNEL}, different aircraft", _free_flight(vehicle, HEIGHT, DIFFERENT), 0.90),
+    ]
+    # The order of the table: what is disturbed follows what is not.
+    after = [layer[0] for layer in many].index(f"Environment of {free}, {FREE_FLIGHT}") + 1
+    groups = (
+        *((ALL_CORES, many[:after]), (FREE_FLIGHT, disturbed), (ALL_CORES, many[after:])),
+        *((ONE_CORE, one), (KERNEL, kernels)),
+    )
     return [Layer(what, of, *rest) for of, group in groups for what, *rest in group]
 
 
@@ -236,10 +246,34 @@ def _with_clock(work: Work) -> Work:
         yield steps
 
 
-def _environment(task: Task, num_envs: int, engine: EngineName = "mujoco") -> Work:
-    environment = Environment(task, num_envs=num_envs, seed=0, engine=engine)
+def _free_flight(
+    vehicle: Vehicle, height: float, randomization: Randomization | None = None
+) -> Work:
+    """From hover at a height [m]."""
+    count, draw = FREE_FLIGHT_ENVS, Draw(randomization, vehicle)
+    settings: Any = {"engine": "free_flight", "num_threads": 1, "per_row": draw.given.per_row}
+    engine = BatchEngine(vehicle, count, altitude=height, **settings)
+    if draw.given.per_row:
+        drawn = draw.of(np.random.default_rng(0).random((count, len(draw.names))))
+        engine.write_parameters(np.arange(count), draw.table(drawn))
+    commands = _commands(vehicle, count)
+    while True:
+        engine.qpos[:], engine.qvel[:] = (0, 0, height, 1, 0, 0, 0), 0.0
+        engine.act[:] = vehicle.hover_speed
+        for _ in range(FLIGHT):
+            engine.ctrl[:] = next(commands)
+            engine.advance(vehicle.substeps)
+            yield count
+
+
+def _in_free_flight(task: Task, **settings: Any) -> Work:
+    return _environment(task, num_envs=FREE_FLIGHT_ENVS, engine="free_flight", **settings)
+
+
+def _environment(task: Task, **settings: Any) -> Work:
+    environment = Environment(task, seed=0, **settings)
     environment.flatten(environment.reset())
-    for action in _actions(num_envs, environment.action_size):
+    for action in _actions(num_envs := environment.num_envs, environment.action_size):
         now = environment.step(action)
         observation = environment.flatten(now.observation)
         over = np.asarray(now.terminated | now.truncated)
@@ -272,8 +306,8 @@ def _collector(task: Task, num_envs: int, stack: contextlib.ExitStack) -> Work:
 
     from quadrl.envs.torchrl import QuadrotorEnv
     from quadrl.learning.config import TrainConfig
+    from quadrl.learning.environments import make_collector
     from quadrl.learning.networks import make_actor_critic
-    from quadrl.learning.train import make_collector
 
     config = TrainConfig(task.name)
     env = QuadrotorEnv(task, num_envs, seed=0)

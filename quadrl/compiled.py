@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from quadrl import native, records
-from quadrl.engines.engine import Engine
+from quadrl.engines.engine import Engine, Frame
 from quadrl.parameters import AIRCRAFT, ROW_SIZE, Parameters
 from quadrl.rotation import Array
 from quadrl.snapshot import Snapshot
@@ -39,14 +39,14 @@ MOMENT = ("action", "rotor_command", "time")
 FLAGS = ("terminated", "truncated", "is_success", "diverged")
 POINTERS = (
     *("constants", "parameters", "action", "command", "diverged"),
-    *("state", "last_state", "was", "out"),
+    *("state", "last_state", "estimate", "was", "out"),
 )
 SOURCE = """#include <math.h>
 #include <stdint.h>
 typedef struct {{
   const double *constants, *parameters, *action, *command;
   const uint8_t* diverged;
-  const double *state, *last_state, *was;
+  const double *state, *last_state, *estimate, *was;
   double* out;
   int64_t stride, columns;
 }} Rows;
@@ -54,7 +54,7 @@ __attribute__((visibility("default"))) void step(const Rows* rows, int64_t n) {{
   const double *restrict c = rows->constants, *restrict p = rows->parameters;
   const double *restrict action = rows->action, *restrict command = rows->command;
   const double *restrict state = rows->state, *restrict last_state = rows->last_state;
-  const double* restrict was = rows->was;
+  const double *restrict estimate = rows->estimate, *restrict was = rows->was;
   const uint8_t* restrict diverged = rows->diverged;
   double* restrict out = rows->out;
   const int64_t stride = rows->stride, columns = rows->columns;
@@ -116,6 +116,7 @@ class CompiledStep:
         now: Snapshot,
         episode: Episode,
         loops: bool,
+        estimate: Frame | None = None,
     ) -> None:
         """Trace and compile.
 
@@ -129,11 +130,13 @@ class CompiledStep:
             now: Any snapshot of the task, with those parameters.
             episode: Any of its episodes.
             loops: Whether the control mode reads the state in the middle of a step.
+            estimate: Table of the state that is observed, read live; None for the true one.
 
         Raises:
             Exception: Of any kind: the functions of the task do more than arithmetic.
         """
         self._engine, self._rows, self._inputs = engine, rows, inputs
+        self._estimate = estimate
         self._table = self._last = np.empty(0)
         self._tables: list[tuple[np.ndarray, int]] = []  # with their addresses
         self.observation: dict[str, np.ndarray] = {}
@@ -164,10 +167,11 @@ class CompiledStep:
         rotors = self._inputs[1].shape[1]
         own = Parameters.of(places, clock.control_timestep, rotors)
         states = np.arange(engine.frames[0].table.shape[0])[:, None]
-        state, last_state = (
+        state, last_state, estimate = (
             records.mapped(read(f"{name}[{{}} * columns + i]"), State.of_table(states))
-            for name in ("state", "last_state")
+            for name in ("state", "last_state", "estimate")
         )
+        estimated = (estimate,) if self._estimate else ()
         kept = self._kept.views(np.arange(self._kept.end)[:, None])
         before, begun = self._records([read("was[{} * columns + i]")(places) for places in kept])
         before.state, before.parameters = last_state, own.map(read("p[i * stride + {}]"))
@@ -176,9 +180,11 @@ class CompiledStep:
             for name, buffer in zip(("action", "command"), self._inputs, strict=False)
         )
         diverged = trace.inputs(np.array(["diverged[i]"], object), is_flag=True)
-        after, ended, done = finish(task, clock, begun, before, state, action, command, diverged)
+        inputs = (state, action, command, diverged, *estimated)
+        after, ended, done = finish(task, clock, begun, before, *inputs)
         self._observed, self._rewarded = list(done.observation), list(done.reward_terms)
         given = [*done.observation.values(), *done.reward_terms.values(), done.reward, done.error]
+        given += done.truth.values() if estimated else ()
         self._given = _Columns(self._kept.end, given)
         size = sum(array.shape[-1] for array in done.observation.values())
         self._vectors = slice(self._kept.end, self._kept.end + size)
@@ -204,6 +210,7 @@ class CompiledStep:
             self._constants.ctypes.data,
             rows.ctypes.data,
             *(buffer.ctypes.data for buffer in self._inputs),
+            estimate=self._estimate.address if self._estimate else None,
             stride=rows.strides[0] // 8 if len(rows) > 1 else 0,
             columns=self._engine.frames[0].columns,
         )
@@ -227,15 +234,18 @@ class CompiledStep:
         given = self._given.views(self._table[:, :count])
         flags = self._table[self._flags].view(np.bool_).reshape(-1, columns)
         self.observation = dict(zip(observed, given, strict=False))
+        terms = dict(zip(self._rewarded, given[len(observed) :], strict=False))
+        reward, error, *true = given[len(observed) + len(terms) :]
         return Transition(
             observation=self.observation,
-            reward=given[-2],
-            reward_terms=dict(zip(self._rewarded, given[len(observed) :], strict=False)),
+            reward=reward,
+            reward_terms=terms,
             terminated=flags[0, :count],
             truncated=flags[1, :count],
             is_success=flags[2, :count],
             diverged=flags[3, :count],
-            error=given[-1],
+            error=error,
+            truth=dict(zip(observed, true, strict=True)) if true else self.observation,
         )
 
     def flat(self) -> np.ndarray:

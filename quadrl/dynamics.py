@@ -1,14 +1,16 @@
 """The equations of motion in the array API: the definition that the C of `native/` is held against.
 
-Equations 3 to 10 of the paper for rows of aircraft, in NumPy or torch. `native/aero.h` has the same
-forces; a force term is written there and here, under the same name.
+Equations 3 to 10 of the paper for rows of aircraft, in NumPy or torch, and what the air does to
+rotors beside them (`quadrl.aerodynamics`). `native/aero.h` has the same forces; a force term is
+written there and here, under the same name.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
-from quadrl.parameters import Parameters
+from quadrl.parameters import WIND, Parameters
 from quadrl.rotation import Array, namespace, norm, rotation_matrix, stack, to_body, to_world
 
 
@@ -60,23 +62,141 @@ def aero_wrench(p: Parameters, airspeed: Array, body_rate: Array) -> tuple[Array
     return force, moment
 
 
-def derivative(
-    p: Parameters, motion: Motion, command: Array, wind: Array, gravity: float
-) -> Motion:
+def lift_change(
+    p: Parameters, speed: Array, climb: Array, p_square: Array, noise: Array | float
+) -> Array:
+    """Thrust (N, R) [N] less that of equation 7: inflow and vortex ring state.
+
+    Args:
+        p: Parameters.
+        speed: (N, R) of the rotors [rad/s].
+        climb: (N, R) airspeed of each hub along the rotor's axis [m/s].
+        p_square: (N, R) of its airspeed in the rotor's plane [m^2/s^2].
+        noise: (N, R) of each rotor's thrust, of unit variance.
+    """
+    xp, rotor = namespace(speed), p.rotor
+    inflow, rest = p.inflow[..., None], rotor.thrust_coefficient * speed * speed
+    flow, induced = _disc(p)
+    response = inflow * p.blade_lift[..., None] * flow * rotor.disc_radius * induced
+    w0 = induced * speed
+    k = response / (8 * rotor.thrust_coefficient) * w0
+    v = xp.minimum(xp.maximum(climb, -2 * w0), 3 * w0)  # beyond, the steps would diverge
+    w = 0.5 * (v - k + xp.sqrt((v - k) ** 2 + 4 * w0 * (w0 + k)))  # exact where p_square is 0
+    for _ in range(2):  # Newton's
+        through = xp.sqrt(w * w + p_square)
+        lacking = (w0 + k) * w0 - k * w - (w - v) * through
+        w = w + through * lacking / ((k + through) * through + (w - v) * w + 1e-12)
+    over = 1 / (w0 + 1e-6)
+    off = (climb * over + 1.4) / 1.2
+    steep = xp.maximum(1 - off * off, 0 * off)
+    ring = steep**3 * xp.maximum(1 - p_square * over * over / 0.95**2, 0 * off)
+    change = (
+        flow * k * (w0 - w - p.vortex_ring[..., None] * w0 * ring)
+        + inflow * p.translational_lift[..., None] * p_square
+        + p.vortex_ring_noise[..., None] * rest * noise * ring
+    )
+    return xp.minimum(xp.maximum(change, -rest), 0.6 * rest)  # above, the blades stall
+
+
+def ground_share(p: Parameters, up: Array, height: Array) -> Array:
+    """Share (N, R) of its flow that the ground takes from a rotor's disc in hover.
+
+    Args:
+        p: Parameters.
+        up: (N, 3), the world's vertical in the body frame.
+        height: (N,) of the centre of mass over the ground [m].
+    """
+    xp, position, radius = namespace(height), p.rotor.position, p.rotor.disc_radius
+    over = height[..., None] + (position * up[..., None, :]).sum(-1)
+    z = xp.maximum(over, radius / 2)
+
+    def image(radius: Array, distance_square: Array, z: Array) -> Array:
+        square = distance_square + 4 * z * z
+        return 0.5 * radius * radius * z / (square * xp.sqrt(square))
+
+    aside = position[..., None, :, :2] - position[..., :, None, :2]  # (N, R, R, 2)
+    share = image(radius[..., None, :], (aside**2).sum(-1), z[..., :, None]).sum(-1)
+    centre = 4 * (position[..., :2] ** 2).sum(-1)
+    share = share + 4 * p.body_lift[..., None] * image(radius, centre, z)
+    near = (8 * radius - z) / (2 * radius)
+    near = xp.minimum(xp.maximum(near, 0 * near), 0 * near + 1)
+    level = (p.rotor.axis * up[..., None, :]).sum(-1)
+    cosine = xp.maximum(level, 0 * level)
+    return p.ground_effect[..., None] * share * cosine**2 * near**2 * (3 - 2 * near)
+
+
+def rotor_wrench(
+    p: Parameters,
+    speed: Array,
+    command: Array,
+    airspeed: Array,
+    body_rate: Array,
+    up: Array,
+    height: Array,
+    noise: Array | float = 0.0,
+) -> tuple[Array, Array]:
+    """What the air does to the rotors beside equation 7, and their inertia.
+
+    Args:
+        p: Parameters.
+        speed: (N, R) of the rotors [rad/s].
+        command: (N, R) [rad/s].
+        airspeed: (N, 3) [m/s], body frame.
+        body_rate: (N, 3) [rad/s].
+        up: (N, 3), the world's vertical in the body frame.
+        height: (N,) of the centre of mass over the ground [m].
+        noise: (N, R) of each rotor's thrust, of unit variance.
+
+    Returns:
+        Force (N, 3) [N] and moment (N, 3) [N m], body frame.
+    """
+    xp, rotor = namespace(speed), p.rotor
+    turn = body_rate[..., None, :] + 0 * rotor.position  # (N, R, 3)
+    hub = airspeed[..., None, :] + cross(turn, rotor.position)
+    climb = (hub * rotor.axis).sum(-1)
+    across = hub - climb[..., None] * rotor.axis
+    p_square = (across * across).sum(-1)
+    change = lift_change(p, speed, climb, p_square, noise)
+    rest = rotor.thrust_coefficient * speed * speed
+    hover = (_disc(p)[1] * speed) ** 2
+    taken = ground_share(p, up, height) * hover / (hover + p_square + 1e-12)
+    most = xp.minimum(taken, 0 * taken + 0.36)
+    change = change + (rest + change) * (most / (1 - most))  # lift / (1 - most)
+    drag = (p.rotor_drag[..., None] * speed)[..., None] * across
+    push = change[..., None] * rotor.axis - drag
+    flap = (p.flapping_moment[..., None] * speed)[..., None] * cross(across, rotor.axis)
+    inertia = rotor.spin * p.rotor_inertia[..., None]
+    momentum = (inertia * speed)[..., None] * rotor.axis
+    faster = (inertia * rotor_acceleration(p, speed, command))[..., None] * rotor.axis
+    moment = cross(rotor.position, push) + flap - cross(turn, momentum) - faster
+    return push.sum(-2), moment.sum(-2)
+
+
+def _disc(p: Parameters) -> tuple[Array, Array]:
+    """2 rho A (N, R) [kg/m], and nu [m/rad]: induced velocity in hover over rotor speed."""
+    flow = 2 * math.pi * p.air_density[..., None] * p.rotor.disc_radius**2
+    return flow, namespace(flow).sqrt(p.rotor.thrust_coefficient / flow)
+
+
+def derivative(p: Parameters, motion: Motion, command: Array, air: Array, gravity: float) -> Motion:
     """The rate of change of a motion, equations 3 to 6.
 
     Args:
         p: Parameters of the rows.
         motion: What is.
         command: (N, R) of the rotors [rad/s].
-        wind: (N, 3) [m/s], world frame.
+        air: (N, AIR) as `parameters.AIR` has it, or the wind alone (N, 3) [m/s, world frame].
         gravity: Along z [m/s^2], negative.
     """
     rate, speed, q = motion.body_rate, motion.rotor_speed, motion.quaternion
     rotation = rotation_matrix(q / norm(q)[..., None])
     force, moment = thrust_wrench(p, speed)
-    drag, damping = aero_wrench(p, to_body(rotation, motion.velocity - wind), rate)
-    push = to_world(rotation, force + drag) / p.mass[..., None]
+    airspeed = to_body(rotation, motion.velocity - air[..., :WIND])
+    drag, damping = aero_wrench(p, airspeed, rate)
+    noise = air[..., WIND : WIND + speed.shape[-1]] if air.shape[-1] > WIND else 0.0
+    up, height = rotation[..., 2, :], motion.position[..., 2]
+    more, twist = rotor_wrench(p, speed, command, airspeed, rate, up, height, noise)
+    push = to_world(rotation, force + drag + more) / p.mass[..., None]
     spin = p.inertia * rate
     w, x, y, z = (q[..., k] for k in range(4))
     a, b, c = (rate[..., k] for k in range(3))
@@ -86,7 +206,7 @@ def derivative(
         position=motion.velocity,
         quaternion=turn / 2,
         velocity=stack(push[..., 0], push[..., 1], push[..., 2] + gravity),
-        body_rate=(moment + damping - cross(rate, spin)) / p.inertia,
+        body_rate=(moment + damping + twist - cross(rate, spin)) / p.inertia,
         rotor_speed=rotor_acceleration(p, speed, command),
     )
 

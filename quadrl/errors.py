@@ -1,4 +1,4 @@
-"""The exceptions of quadrl: what the user can fix, the C part, and the renderer."""
+"""The exceptions of quadrl: what the user can fix, keywords, the C part, and the renderer."""
 
 from __future__ import annotations
 
@@ -25,6 +25,10 @@ class QuadrlError(ValueError):
             must = f": must be {allowed}" if allowed else ""
             reason = f"{name} = {reprlib.repr(value)}{must}" + (f"; {reason}" if reason else "")
         super().__init__(reason)
+
+
+class UnknownKeyword(QuadrlError, TypeError):
+    """A keyword that nothing takes, in Python's words too: libraries try keywords and read them."""
 
 
 class NativeError(QuadrlError, RuntimeError):

@@ -35,7 +35,7 @@ class Marker:
     points: Sequence[Sequence[float]] | np.ndarray = ()
     """(n, 3) corners of a path [m]."""
     label: str = ""
-    """Written beside a goal or a sphere."""
+    """Written at its position, or where a path begins."""
 
     def __post_init__(self) -> None:
         """Validate the kind and the end."""

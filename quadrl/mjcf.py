@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from quadrl import native, parameters
+from quadrl import landmarks, native, parameters
 from quadrl.vehicle import DRAWN_SIZE, GRAVITY, Vehicle
 
 ASSETS = Path(__file__).parent / "assets"
@@ -139,7 +139,7 @@ def rotor_colour(position: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _draw(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
-    """Scale the airframe and attach the rotors; adds no body."""
+    """Scale the airframe, attach the rotors and paint the ground; adds no body."""
     body, scale = whole.body("aircraft"), vehicle.scale
     whole.visual.map.shadowclip *= scale  # a shadow map as sharp as the aircraft is small
     for element in (*body.geoms, *body.cameras):
@@ -148,6 +148,12 @@ def _draw(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
         geom.size, geom.fromto = np.asarray(geom.size) * scale, np.asarray(geom.fromto) * scale
     for mesh in whole.meshes:
         mesh.scale = np.asarray(mesh.scale) * scale
+    # After the scaling: a metre on the ground is a metre for every aircraft.
+    for name, (vertices, faces) in landmarks.meshes().items():
+        shell, kind = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL, mujoco.mjtGeom.mjGEOM_MESH
+        whole.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel(), inertia=shell)
+        seen = dict(type=kind, meshname=name, material=name, contype=0, conaffinity=0)
+        whole.worldbody.add_geom(name=name, **seen)
     for k, rotor in enumerate(vehicle.rotors):
         part = mujoco.MjSpec.from_file(str(ASSETS / "rotor.xml"))
         x, y, z = rotor.position

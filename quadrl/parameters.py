@@ -1,9 +1,9 @@
 """Rows of parameters: what the engines know of each aircraft, one C struct per row.
 
-The struct follows from the numeric fields of `Rotor` and `Vehicle`: a new parameter is a field
-there, and `native/aero.h` and `quadrl/dynamics.py` find it by its name. A row stands in the
-`user` data of the aircraft's body (`body_user`), where the callbacks read it; free flight reads
-the same bytes.
+The struct follows from the numeric fields of `Rotor`, `Vehicle` and `Aerodynamics`: a new
+parameter is a field there, and `native/aero.h` and `quadrl/dynamics.py` find it by its name. A row
+stands in the `user` data of the aircraft's body (`body_user`), where the callbacks read it; free
+flight reads the same bytes.
 """
 
 from __future__ import annotations
@@ -14,22 +14,27 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aerodynamics import Aerodynamics
 from quadrl.rotation import Array
 from quadrl.rotors import Rotor, hover_squares, mixer
 from quadrl.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
 
-AIR = 3
-"""Numbers of a row of air, in the simulation's `userdata`: the wind [m/s], world frame."""
+WIND = 3
+AIR = WIND + MAX_ROTORS
+"""Numbers of a row of air, in the simulation's `userdata`: the wind [m/s], world frame, and for
+each rotor the noise of its thrust in the vortex ring state, of unit variance."""
 MARK = 1903518052.0
 """Tells the actuators and bodies of quadrl from everybody else's: "quad" in ASCII."""
-SETTINGS = ("name", "rotors", "action_scale", "physics_timestep", "control_timestep")
+SETTINGS = (
+    *("name", "rotors", "action_scale", "physics_timestep", "control_timestep", "aerodynamics"),
+)
 """Fields of `Vehicle` that are not a parameter of an aircraft's row."""
 DERIVED = ("foot", "hull", "ground_clearance", "rotor_height", "resolved_speed", "resolved_turn")
 """Properties of `Vehicle` that stand in a row."""
 
 
 def _fields(kind: type, settings: tuple[str, ...] = ()) -> list[Any]:
-    sizes = {"float": (), "Vector": (3,)}
+    sizes = {"float": (), "bool": (), "Vector": (3,)}
     fields = [field for field in dataclasses.fields(kind) if field.name not in settings]
     return [(field.name, np.float64, sizes[str(field.type)]) for field in fields]
 
@@ -42,6 +47,8 @@ AIRCRAFT = np.dtype(
         ("rotor_count", np.float64),
         *_fields(Vehicle, SETTINGS),
         *((name, np.float64, (3,) if name in ("foot", "hull") else ()) for name in DERIVED),
+        *_fields(Aerodynamics),
+        ("effects", np.float64),  # Aerodynamics.effects
         ("rotor", ROTOR, (MAX_ROTORS,)),
     ]
 )
@@ -55,12 +62,24 @@ def rows(vehicle: Vehicle, count: int = 1) -> np.ndarray:
     table["mark"], table["size"] = MARK, ROW_SIZE
     for name in AIRCRAFT.names or ():
         if name not in ("mark", "size", "rotor"):
-            table[name] = getattr(vehicle, name)
+            owner = vehicle if hasattr(vehicle, name) else vehicle.aerodynamics
+            table[name] = getattr(owner, name)
     for name, *_ in _fields(Rotor):
         for k, rotor in enumerate(vehicle.rotors):
-            table["rotor"][name][:, k] = getattr(rotor, name)
+            value = rotor.disc if name == "disc_radius" else getattr(rotor, name)
+            table["rotor"][name][:, k] = value
     table["rotor"]["hover_speed"][:, : vehicle.rotor_count] = vehicle.hover_speed
     return table
+
+
+def numbers(table: np.ndarray) -> np.ndarray:
+    """Rows (n,) as the doubles that they are, (n, ROW_SIZE)."""
+    return np.ascontiguousarray(table).view(np.float64).reshape(len(table), -1)
+
+
+def limits(table: np.ndarray) -> np.ndarray:
+    """Largest speed [m/s] and spin [rad/s] of rows (n,), (n, 2): as native/state.c has them."""
+    return np.stack([table["resolved_speed"], table["resolved_turn"]], axis=1)
 
 
 def refresh(table: np.ndarray, timestep: float) -> None:
@@ -129,10 +148,11 @@ def c_structs() -> str:
             lines.append(f"  double {name}{sizes}[LANES];")
         return "\n".join(lines)
 
+    sizes = f"MAX_ROTORS = {MAX_ROTORS}, WIND = {WIND}, AIR = {AIR}, ROW_SIZE = {ROW_SIZE}"
     return (
-        "// Written by quadrl/parameters.py from the fields of Rotor and Vehicle.\n"
+        "// Written by quadrl/parameters.py from the fields of Rotor, Vehicle and Aerodynamics.\n"
         f"#define QUADRL_MARK {MARK!r}\n"
-        f"enum {{ MAX_ROTORS = {MAX_ROTORS}, AIR = {AIR}, ROW_SIZE = {ROW_SIZE} }};\n"
+        f"enum {{ {sizes} }};\n"
         f"typedef struct {{\n{fields(ROTOR)}\n}} Rotor;\n"
         f"typedef struct {{\n{fields(AIRCRAFT)}\n}} Aircraft;\n"
     )

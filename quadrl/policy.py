@@ -2,49 +2,47 @@
 
 The file is safetensors: arrays and a table of strings, nothing that could run. The network is the
 paper's: hidden layers of tanh, then the mean and the log-variance of a normal distribution over the
-actions. Observations are normalised with the mean and the deviation of the training.
+actions. Observations are normalised with the mean and the deviation of the training. A policy with
+a memory has a gated recurrent unit beside that: its state joins the observation.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from quadrl.errors import QuadrlError
-from quadrl.validation import choice
+from quadrl.files import HEADER, read_safetensors, write_whole
+from quadrl.memory import GRU, NAMES, PREFIX, Flyer
+from quadrl.observing import resolve
+from quadrl.validation import choice, number
 from quadrl.vehicle import VEHICLES
 
 if TYPE_CHECKING:
     from quadrl.environment import Environment
 
+CONDITIONS = ("weather", "randomization", "observe")
 FORMAT = "quadrl-policy-2"
+RECURRENT_FORMAT = "quadrl-policy-gru-1"
 FILE = "policy.safetensors"
 CLIP = 10.0
 """Normalised observations are clipped to +-CLIP."""
 LOG_VARIANCE = (-12.0, 2.0)
 """Bounds of the log-variance of the actions."""
 SHIPPED = Path(__file__).parent / "assets" / "policies"
-"""The policies that come with the package: TASK_ALGO.safetensors, with a .json beside each."""
+"""The policies that come with the package: TASK_ALGO.safetensors, or TASK_VARIANT.safetensors for a
+variant of the training, with a .json beside each."""
 SHIPPED_AS = {"vpg": "gae"}
 """Algorithms that the file names call otherwise: the paper's word for the policy gradient."""
 
-UNREADABLE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError,
-              RecursionError)  # fmt: skip
-"""What reading a damaged safetensors file and its header can raise."""
-HEADER = "quadrl"
-"""The one entry of the file's table, JSON: safetensors writes several in random order."""
 
-
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Policy:
     """The mean action of a trained network."""
 
@@ -59,12 +57,26 @@ class Policy:
     task: str
     """The task that it was trained for."""
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """How it was made: algo, seed, steps, vehicle, rotors, control_mode, task_options."""
+    """How it was made: algo, seed, variant, steps, vehicle, rotors, control_mode, task_options; and
+    the other conditions of `TrainConfig.conditions`, where they differ from the usual."""
+    memory: GRU | None = None
+    """What it remembers with: its state after an observation joins the normalised observation."""
+
+    def __repr__(self) -> str:
+        layers = "-".join(str(x) for x in (self.size, *(len(bias) for bias in self.biases)))
+        known = ", ".join(f"{k} {self.metadata[k]}" for k in REPR if k in self.metadata)
+        memory = f"; memory of {self.state_size}" if self.memory else ""
+        return f"Policy for {self.task} ({known or 'made by hand'}; layers {layers}{memory})"
 
     @property
     def control_mode(self) -> str:
         """What its actions mean."""
         return str(self.metadata.get("control_mode", "rotor"))
+
+    @property
+    def conditions(self) -> dict[str, Any]:
+        """What its training flew in and saw, for `Environment`, where it is not the usual."""
+        return {name: self.metadata[name] for name in CONDITIONS if name in self.metadata}
 
     @property
     def size(self) -> int:
@@ -76,8 +88,13 @@ class Policy:
         """Numbers in an action, k."""
         return len(self.biases[-1]) // 2
 
+    @property
+    def state_size(self) -> int:
+        """Numbers that it remembers of an aircraft; 0 without a memory."""
+        return self.memory.width if self.memory else 0
+
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """The mean action.
+        """The mean action of a policy without a memory; `flying` is for every policy.
 
         Args:
             observation: Flat vectors (..., size), in the order of the task's terms.
@@ -86,36 +103,70 @@ class Policy:
             Actions (..., k), within [-1, 1].
 
         Raises:
-            QuadrlError: The observation has another size.
+            QuadrlError: The observation has another size, or the policy has a memory, which it
+                would lose with every call.
         """
-        return np.clip(self._outputs(observation)[0], -1.0, 1.0)
+        return self._act(observation, self._without_memory(), None)[0]
 
     def sampled(self, seed: int) -> Callable[[np.ndarray], np.ndarray]:
-        """The stochastic policy, as in training: a normal distribution, clipped to [-1, 1].
+        """As the policy itself, with actions drawn as in training; `flying` takes a seed too."""
+        state, generator = self._without_memory(), np.random.default_rng(seed)
+        return lambda observation: self._act(observation, state, generator)[0]
+
+    def initial_state(self, n: int | None = None) -> np.ndarray:
+        """What it remembers as an episode begins: (n, state_size); (state_size,) without n."""
+        rows = () if n is None else (int(number("n", n, 1, whole=True)),)
+        return np.zeros((*rows, self.state_size), dtype=np.float32)
+
+    def step(
+        self,
+        observation: np.ndarray,
+        state: np.ndarray,
+        generator: np.random.Generator | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions, and what to remember until the next observation.
 
         Args:
-            seed: Of the draws.
+            observation: (n, size), or (size,) of one aircraft.
+            state: What the last step gave, (n, state_size) or (state_size,); `initial_state` in the
+                rows whose episode begins.
+            generator: Of the draws of the stochastic policy; None for the mean action.
 
         Returns:
-            A function of observations, as the policy itself.
+            Actions (n, k) or (k,), within [-1, 1]; the next state, of the shape of the present one.
+
+        Raises:
+            QuadrlError: The observation or the state has another shape.
         """
-        generator = np.random.default_rng(seed)
+        state = np.asarray(state, dtype=np.float32)
+        if state.shape != (needed := (*np.shape(observation)[:-1], self.state_size)):
+            raise QuadrlError(name="state shape", value=state.shape, allowed=f"{needed}")
+        return self._act(observation, state, generator)
 
-        def act(observation: np.ndarray) -> np.ndarray:
-            mean, log_variance = self._outputs(observation)
-            deviation = np.exp(0.5 * np.clip(log_variance, *LOG_VARIANCE))
-            return np.clip(mean + deviation * generator.standard_normal(mean.shape), -1.0, 1.0)
+    def flying(self, n: int | None = None, seed: int | None = None) -> Flyer:
+        """Any policy as a function of observations that remembers; its `reset` makes it forget.
 
-        return act
+        Args:
+            n: Aircraft that it flies: observations are (n, size). None for one, (size,).
+            seed: Of the draws of the stochastic policy; None for the mean action.
+        """
+        return Flyer(self, n, seed)
 
     def check_fits(self, environment: Environment) -> None:
         """Refuse a task and a vehicle with another layout than the policy was trained for.
 
         Raises:
-            QuadrlError: The policy observes or commands another number of values, or it commands
-                rotors, and those of the vehicle stand or turn otherwise.
+            QuadrlError: The policy observes or commands another number of values or with other
+                options, or it commands rotors, and those of the vehicle stand or turn otherwise.
         """
         vehicle = environment.vehicle
+        needed, seen = (
+            resolve(self.conditions.get("observe")).for_policy(),
+            environment.observing.for_policy(),
+        )
+        if needed != seen:
+            allowed = f"{needed}, as in the training of the policy for {self.task}"
+            raise QuadrlError(name="observe", value=seen, allowed=allowed)
         own_sizes, there = (
             (self.size, self.action_size),
             (environment.size, environment.action_size),
@@ -130,25 +181,49 @@ class Policy:
             allowed = f"one with the rotor layout of {trained.name}, which the policy has learned"
             raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
 
-    def _outputs(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and log-variance (..., k) of the actions."""
+    def _without_memory(self) -> np.ndarray:
+        """The state of a policy that has none.
+
+        Raises:
+            QuadrlError: It has one.
+        """
+        if self.memory:
+            raise QuadrlError(
+                f"the policy for {self.task} has a memory, which a single call would lose: fly "
+                "with policy.flying(n), or keep the state with policy.step(observation, state)"
+            )
+        return self.initial_state()
+
+    def _act(
+        self, observation: np.ndarray, state: np.ndarray, generator: np.random.Generator | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions (..., k) and the next state."""
         observation = np.asarray(observation, dtype=np.float32)
         if observation.shape[-1:] != self.mean.shape:
             allowed = f"(..., {self.size}) for the policy for {self.task}"
             raise QuadrlError(name="observation shape", value=observation.shape, allowed=allowed)
         hidden = np.clip((observation - self.mean) / self.deviation, -CLIP, CLIP)
+        if self.memory:
+            state = self.memory.step(hidden, state)
+            hidden = np.concatenate([hidden, state], axis=-1)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = np.tanh(hidden @ weight.T + bias)
         output = hidden @ self.weights[-1].T + self.biases[-1]
-        return output[..., : self.action_size], output[..., self.action_size :]
+        action, log_variance = output[..., : self.action_size], output[..., self.action_size :]
+        if generator is not None:
+            deviation = np.exp(0.5 * np.clip(log_variance, *LOG_VARIANCE))
+            action = action + deviation * generator.standard_normal(action.shape)
+        return np.clip(action, -1.0, 1.0), state
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
         arrays = {"mean": self.mean, "deviation": self.deviation}
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
+        arrays |= self.memory.arrays() if self.memory else {}
         arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
-        header = {"format": FORMAT, "task": self.task, "metadata": self.metadata}
+        written = RECURRENT_FORMAT if self.memory else FORMAT
+        header = {"format": written, "task": self.task, "metadata": self.metadata}
         write_whole(Path(path), save(arrays, metadata={HEADER: json.dumps(header)}))
 
     @classmethod
@@ -164,42 +239,53 @@ class Policy:
         path = Path(path)
         file = path / FILE if path.is_dir() else path
         if not file.is_file():
+            if (path / "config.json").is_file():
+                raise QuadrlError(
+                    f"the run in {path} has no policy yet, since it was stopped before its first "
+                    f"checkpoint; continue it: quadrl train --resume {path}"
+                )
             raise QuadrlError(
                 f"there is no policy at {file}; give a run folder (quadrl train ... --out FOLDER "
                 "makes one) or a .safetensors file"
             )
-        arrays, header = read_safetensors(file, FORMAT, "numpy")
+        arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), "numpy")
         task, metadata = header.get("task"), header.get("metadata")
         options = metadata.get("task_options", {}) if isinstance(metadata, dict) else None
         if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
             raise QuadrlError(f"{file} does not say what its policy was trained for")
-        layers = max(1, len(arrays) // 2 - 1)
-        names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS))
+        own = NAMES if header["format"] == RECURRENT_FORMAT else ()
+        layers = max(1, (len(arrays) - len(own)) // 2 - 1)
+        names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS), *own)
         if set(arrays) != set(names):
             raise QuadrlError(f"{file} is damaged: its arrays are {', '.join(sorted(arrays))}")
         weights, biases = (tuple(arrays[f"{p}_{k}"] for k in range(layers)) for p in PARTS)
-        policy = cls(weights, biases, arrays["mean"], arrays["deviation"], task, metadata)
+        memory = GRU(**{k.removeprefix(PREFIX): arrays[k] for k in own}) if own else None
+        mean, deviation = arrays["mean"], arrays["deviation"]
+        policy = cls(weights, biases, mean, deviation, task, metadata, memory)
         if not _is_network(policy):
             raise QuadrlError(f"{file} is damaged: its arrays do not make a policy network")
         return policy
 
     @classmethod
-    def pretrained(cls, task: str, algo: str = "ppo") -> Policy:
+    def pretrained(cls, task: str, algo: str = "ppo", variant: str = "ideal") -> Policy:
         """A policy that comes with the package; the .json beside it says how it was made.
 
         Args:
-            task: The task that it was trained for.
+            task: The task that it was trained for, or the name of its file, such as hover_robust.
             algo: The algorithm that it was trained with: ppo, trpo or vpg (or gae, its alias).
+            variant: The variant of the training: ideal, or robust, for an uncertain aircraft.
 
         Raises:
             QuadrlError: There is no such policy; the message lists those that there are.
         """
-        known = [file.stem for file in shipped()]
-        name = choice("pretrained policy", f"{task}_{SHIPPED_AS.get(algo, algo)}", known)
-        return cls.load(SHIPPED / f"{name}.safetensors")
+        name, known = task, [file.stem for file in shipped()]
+        if task not in known:
+            name = f"{task}_{SHIPPED_AS.get(algo, algo) if variant == 'ideal' else variant}"
+        return cls.load(SHIPPED / f"{choice('pretrained policy', name, known)}.safetensors")
 
 
 PARTS = ("weight", "bias")
+REPR = ("algo", "seed", "vehicle")  # what a policy says of itself
 
 
 def _is_network(policy: Policy) -> bool:
@@ -208,11 +294,15 @@ def _is_network(policy: Policy) -> bool:
     width = policy.mean.size
     sound = policy.mean.shape == policy.deviation.shape == (width,)
     sound = sound and all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays)
-    largest = CLIP
+    largest: Any = CLIP
+    if sound and policy.memory:
+        sound = policy.memory.is_sound(width, CLIP)
+        largest = np.repeat([CLIP, 1.0], [width, policy.state_size])
+        width += policy.state_size
     for weight, bias in zip(policy.weights, policy.biases, strict=True):
         if not sound or weight.shape != (bias.size, width) or bias.shape != (bias.size,):
             return False
-        sums = largest * np.abs(weight, dtype=np.float64).sum(axis=1) + np.abs(bias)
+        sums = (largest * np.abs(weight, dtype=np.float64)).sum(axis=1) + np.abs(bias)
         sound = bool((sums < np.finfo(np.float32).max / 2).all())
         width, largest = bias.size, 1.0  # the largest output of tanh
     return sound and width > 0 and width % 2 == 0 and bool((policy.deviation > 0).all())
@@ -221,44 +311,3 @@ def _is_network(policy: Policy) -> bool:
 def shipped() -> list[Path]:
     """The files of the policies that come with the package, by name."""
     return sorted(SHIPPED.glob("*.safetensors"))
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: the old one stays until the new one is on the disk."""
-    scratch = path.with_name(path.name + ".part")
-    try:
-        with open(scratch, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(scratch, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            scratch.unlink()
-        raise
-
-
-def read_safetensors(
-    path: Path, wanted: str, framework: str
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arrays of a safetensors file, and the header that quadrl wrote into its table.
-
-    Args:
-        path: The file.
-        wanted: The header's format.
-        framework: "numpy" or "pt".
-
-    Raises:
-        QuadrlError: The file cannot be read, or is of another format.
-    """
-    try:
-        with safe_open(path, framework=framework) as opened:
-            header = json.loads((opened.metadata() or {}).get(HEADER, "{}"))
-            written = header.get("format")
-            names = opened.keys() if written == wanted else ()
-            arrays = {name: opened.get_tensor(name) for name in names}
-    except UNREADABLE as error:
-        raise QuadrlError(f"{path} is damaged or not a safetensors file: {error}") from error
-    if written != wanted:
-        raise QuadrlError(name=f"format of {path}", value=written, allowed=wanted)
-    return arrays, header

@@ -1,4 +1,8 @@
-"""Ranges from which the parameters and the air of each row are drawn, once per episode."""
+"""The aircraft that is not quite the one: what is drawn for each row at the start of an episode.
+
+Aircraft are drawn around the one that is specified, by factors, so that a preset fits all of them.
+`quadrl.draw` makes the aircraft, `quadrl.disturbances` flies them.
+"""
 
 from __future__ import annotations
 
@@ -8,158 +12,210 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import parameters
 from quadrl.errors import QuadrlError
-from quadrl.rng import Rng
-from quadrl.rotors import MAX, Rotor
-from quadrl.validation import keys, number, numbers
-from quadrl.vehicle import Vehicle, check_inertia
+from quadrl.rotors import MAX
+from quadrl.validation import choice, keys, number, numbers
 
-AIRCRAFT = ("mass", "inertia", "drag_coefficient", "moment_coefficient")
-ROTOR = ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed")
-RANGES = (*AIRCRAFT, *ROTOR, "wind")
-"""What can be drawn: parameters of the aircraft, of each rotor on its own, and the wind [m/s]."""
-COEFFICIENTS = ROTOR[:2]
-MAX_WIND = 100.0  # [m/s], in each direction
+Range = tuple[float, float]
+LEAST, MOST = 0.01, 100.0  # of a factor
+LONGEST_DELAY = 10.0  # [s]
+LONGEST_SHIFT = 1.0  # [m]
+FACTORS = ("mass", "inertia", "thrust", "torque", "lag", "drag", "inflow", "max_speed")
+DELAYS = ("command_delay", "observation_delay")
 
 
-class Ranges:
-    """Uniform ranges of parameters, validated for a vehicle."""
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """Sizes of errors of the state estimate, the same along or about each of three axes."""
 
-    def __init__(self, vehicle: Vehicle, ranges: Mapping[str, Any]) -> None:
-        """Validate.
+    position: float = 0.0
+    """[m], world frame."""
+    attitude: float = 0.0
+    """[rad], about the axes of the body."""
+    velocity: float = 0.0
+    """[m/s], world frame."""
+    body_rate: float = 0.0
+    """[rad/s], body frame."""
 
-        Args:
-            vehicle: The aircraft as it is specified; what has no range stays as it is there.
-            ranges: By name of RANGES a pair (low, high), each a number or one per component
-                (inertia and wind have three), in the unit of the parameter. Parameters of `Rotor`
-                are drawn for each rotor alone.
+    def __post_init__(self) -> None:
+        """Validate the sizes."""
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, number(name, value, 0, MAX))
 
-        Raises:
-            QuadrlError: Unknown name, a range the wrong way round, or one that holds an aircraft
-                that cannot exist or cannot hover.
-        """
-        if not isinstance(ranges, Mapping):
-            allowed = "a mapping from names to pairs (low, high)"
-            raise QuadrlError(name="ranges", value=ranges, allowed=allowed)
-        keys("range", ranges, RANGES)
-        self._vehicle = vehicle
-        self._ranges: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        for name in RANGES:  # drawn in this order, however they were given
-            if name in ranges:
-                self._ranges[name] = self._pair(name, ranges[name])
-        self._check_extremes()
+    @property
+    def sizes(self) -> np.ndarray:
+        """Of all twelve errors, (12,), in the order of the fields."""
+        return np.repeat([*vars(self).values()], 3)
 
-    def _pair(self, name: str, given: Any) -> tuple[np.ndarray, np.ndarray]:
-        size = 3 if name in ("inertia", "wind") else 1
-        if not isinstance(given, (list, tuple, np.ndarray)) or len(given) != 2:
-            raise QuadrlError(name=f"range of {name}", value=given, allowed="a pair (low, high)")
-        limit = MAX_WIND if name == "wind" else MAX
-        ends = []
-        for end in given:
-            whole = [end] * size if np.ndim(end) == 0 else end
-            ends.append(np.array(numbers(f"range of {name}", whole, size, -limit, limit)))
-        if not (ends[0] <= ends[1]).all():
-            allowed = "(low, high) with low at most high"
-            raise QuadrlError(name=f"range of {name}", value=given, allowed=allowed)
-        return ends[0], ends[1]
 
-    def _check_extremes(self) -> None:
-        """Make the lightest and strongest, and the heaviest and weakest aircraft of the ranges."""
-        fastest = np.linalg.norm(np.abs(self._ranges.get("wind", (0.0, 0.0))).max(axis=0))
-        for heavy in (0, 1):
-            # Its mass, drag and moments at one end, what its rotors give at the other.
-            changes = {name: self._end(name, heavy) for name in AIRCRAFT if name in self._ranges}
-            rotor = {name: self._end(name, 1 - heavy) for name in ROTOR if name in self._ranges}
-            rotors = tuple(dataclasses.replace(r, **rotor) for r in self._vehicle.rotors)
-            for drag in (0, 1):
-                for name in ("drag_coefficient", "moment_coefficient"):
-                    if name in self._ranges:
-                        changes[name] = self._end(name, drag)
-                try:
-                    made = dataclasses.replace(self._vehicle, rotors=rotors, **changes)
-                    number("fastest wind [m/s]", float(fastest), 0.0, made.resolved_speed)
-                except QuadrlError as error:
-                    where = f"in the {'heaviest' if heavy else 'lightest'} aircraft of these ranges"
-                    reason = f"{error.reason}; {where}".removeprefix("; ")
-                    raise QuadrlError(**vars(error) | {"reason": reason}) from error
-        if "inertia" in self._ranges:
-            low, high = (tuple(end.tolist()) for end in self._ranges["inertia"])
-            check_inertia("range of inertia", low, high)
-        if any(name in self._ranges for name in COEFFICIENTS):
-            self._check_unlike_rotors()
+@dataclasses.dataclass(frozen=True)
+class Pushes:
+    """Impulses that hit an aircraft now and then, between two control steps."""
 
-    def _check_unlike_rotors(self) -> None:
-        """Each rotor is drawn alone: every combination of weak and strong ones must hover."""
-        count = self._vehicle.rotor_count
-        corners = np.indices((4,) * count).reshape(count, -1).T  # (4^R, R)
-        table = parameters.rows(self._vehicle, len(corners))
-        table["mass"] = self._ranges.get("mass", table["mass"][:1])[-1]
-        rotor = table["rotor"][:, :count]
-        ends = (corners % 2, corners // 2, 0 * corners)
-        for name, end in zip((*COEFFICIENTS, "max_speed"), ends, strict=True):
-            if name in self._ranges:
-                rotor[name] = np.concatenate(self._ranges[name])[end]
-        parameters.refresh(table, self._vehicle.physics_timestep)
-        hover = rotor["hover_speed"]
-        unable = ((hover <= 0) | (hover >= rotor["max_speed"])).any(axis=-1)
-        if unable.any():
-            worst = {name: rotor[name][unable][0].tolist() for name in COEFFICIENTS}
-            reason = "each rotor is drawn alone, and with these the aircraft cannot hover"
-            raise QuadrlError(reason, name="ranges", value=worst, allowed="narrower")
+    rate: float = 0.0
+    """Pushes in a second, on average."""
+    velocity: float = 0.0
+    """Change of the velocity by each push [m/s], in any direction."""
+    body_rate: float = 0.0
+    """Change of the body rate by each push [rad/s], about any axis."""
 
-    def _end(self, name: str, which: int) -> Any:
-        end = self._ranges[name][which]
-        return tuple(end.tolist()) if len(end) > 1 else float(end[0])
+    def __post_init__(self) -> None:
+        """Validate the numbers."""
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, number(f"pushes {name}", value, 0, MAX))
 
-    def holds(self, saved: np.ndarray) -> bool:
-        """Whether rows of parameters can have been drawn from these ranges."""
-        table = saved.copy().view(parameters.AIRCRAFT)[:, 0]
-        own = parameters.rows(self._vehicle, len(table))
-        for name in self._ranges.keys() - {"wind"}:
-            of = np.s_[:] if name in AIRCRAFT else "rotor"
-            own[of][name][:] = table[of][name]
-        parameters.refresh(own, self._vehicle.physics_timestep)
-        return np.array_equal(own.view(np.float64).reshape(saved.shape), saved)
+
+def _record(name: str, given: Any, kind: type) -> Any:
+    """A record of a kind, from one or from some of its fields."""
+    if isinstance(given, kind):
+        return given
+    if not isinstance(given, Mapping):
+        names = (
+            f", or a name of {', '.join(RANDOMIZATIONS)}"
+            if kind is not Errors and kind is not Pushes
+            else ""
+        )
+        allowed = f"a {kind.__name__}, or a mapping of its fields{names}"
+        raise QuadrlError(name=name, value=given, allowed=allowed)
+    fields = [field.name for field in dataclasses.fields(kind)]
+    keys(f"field of {name}", given, fields)
+    return kind(**given)
+
+
+def _pair(name: str, given: Any, low: float, high: float) -> Range:
+    """A range, from two numbers or from one for both ends."""
+    whole = isinstance(given, (list, tuple, np.ndarray))
+    first, last = numbers(name, given if whole else (given, given), 2, low, high)
+    if first > last:
+        raise QuadrlError(name=name, value=given, allowed="(low, high) with low at most high")
+    return first, last
+
+
+@dataclasses.dataclass(frozen=True)
+class Randomization:
+    """What is drawn anew for each aircraft at each reset, evenly between two ends (low, high).
+
+    One number in place of a pair stands for both ends. Factors are of what is specified.
+    """
+
+    mass: Range = (1.0, 1.0)
+    """Factor of the mass."""
+    inertia: Range = (1.0, 1.0)
+    """Factor of the moments of inertia, the same about every axis."""
+    thrust: Range = (1.0, 1.0)
+    """Factor of the thrust of all rotors at a rotor speed."""
+    torque: Range = (1.0, 1.0)
+    """Factor of their torque."""
+    lag: Range = (1.0, 1.0)
+    """Factor of their time constants, rising and falling."""
+    drag: Range = (1.0, 1.0)
+    """Factor of the aircraft's drag and aerodynamic moment, and of the drag of its rotors."""
+    inflow: Range = (1.0, 1.0)
+    """Factor of the lift of the blades, with which thrust answers climb and descent."""
+    max_speed: Range = (1.0, 1.0)
+    """Factor of the largest rotor speed, at most 1: a battery that runs low."""
+    rotors: Range = (1.0, 1.0)
+    """Further factor of the thrust, the torque and the time constant of each rotor on its own."""
+    one_rotor: Range = (1.0, 1.0)
+    """Further factor of the thrust and the torque of one rotor, any of them: a damaged one."""
+    wind: Range = (1.0, 1.0)
+    """Factor of the weather's mean wind, with which its turbulence grows."""
+    centre_of_mass: float = 0.0
+    """Largest distance of the centre of mass from where it should be, along each axis [m]."""
+    command_delay: Range = (0.0, 0.0)
+    """Time from a command to the rotors that get it [s], in whole physics steps."""
+    observation_delay: Range = (0.0, 0.0)
+    """Age of the observation [s], in whole control steps."""
+    noise: Errors = Errors()
+    """Standard deviations of the errors of the state estimate, drawn anew at each control step."""
+    bias: Errors = Errors()
+    """Largest errors of it that last for the episode."""
+    pushes: Pushes = Pushes()
+    """Impulses."""
+
+    def __post_init__(self) -> None:
+        """Validate what can be judged without an aircraft."""
+        for field in dataclasses.fields(self):
+            name, given = field.name, getattr(self, field.name)
+            if field.name == "centre_of_mass":
+                value: Any = number(name, given, 0, LONGEST_SHIFT)
+            elif field.name in ("noise", "bias", "pushes"):
+                value = _record(name, given, Pushes if name == "pushes" else Errors)
+            elif field.name in DELAYS:
+                value = _pair(name, given, 0, LONGEST_DELAY)
+            else:
+                least = 0.0 if name in ("drag", "wind") else LEAST
+                value = _pair(name, given, least, 1.0 if name == "max_speed" else MOST)
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"Randomization({', '.join(f'{k}={v!r}' for k, v in self.given().items())})"
+
+    def given(self) -> dict[str, Any]:
+        """The fields that differ from none, as JSON has them."""
+        off, own = dataclasses.asdict(NONE), dataclasses.asdict(self)
+        return {name: value for name, value in own.items() if value != off[name]}
 
     @property
     def per_row(self) -> bool:
-        """Whether parameters are drawn, beside the air."""
-        return any(name != "wind" for name in self._ranges)
-
-    def draw(self, rng: Rng, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of parameters (count,) and of air (count, AIR) for episodes that begin.
-
-        Args:
-            rng: Of those rows, at the beginning of the stream of parameters.
-            count: Number of rows.
-        """
-        table, air = parameters.rows(self._vehicle, count), np.zeros((count, parameters.AIR))
-        rotors = self._vehicle.rotor_count
-        for name, (low, high) in self._ranges.items():
-            size = rotors if name in Rotor.__dataclass_fields__ else len(low)
-            drawn = low + (high - low) * rng.uniform(0.0, 1.0, size)
-            if name == "wind":
-                air[:] = drawn
-            elif name in AIRCRAFT:
-                table[name] = drawn if size > 1 else drawn[:, 0]
-            else:
-                table["rotor"][name][:, :rotors] = drawn
-        if self.per_row:
-            parameters.refresh(table, self._vehicle.physics_timestep)
-        return table, air
+        """Whether parameters of the aircraft are drawn."""
+        return self.centre_of_mass > 0 or any(
+            getattr(self, name) != (1.0, 1.0) for name in (*FACTORS, "rotors", "one_rotor")
+        )
 
 
-def check_saved(ranges: Ranges | None, saved: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-    """Refuse a saved state that is not finite, or of an aircraft that this environment never has.
+NONE = Randomization()
+RANDOMIZATIONS = {
+    "none": NONE,
+    # An aircraft that has been identified: half of what "full" has, and noise as in learning-to-fly
+    # (Eschmann et al. 2024).
+    "light": Randomization(
+        mass=(0.95, 1.05),  # chosen
+        inertia=(0.92, 1.08),  # chosen
+        torque=(0.85, 1.15),  # chosen
+        lag=(0.8, 1.25),  # chosen
+        drag=(0.5, 1.5),  # chosen
+        inflow=(0.85, 1.15),  # chosen
+        rotors=(0.975, 1.025),  # chosen
+        centre_of_mass=0.001,  # chosen
+        command_delay=(0.0, 0.01),  # 5 to 10 ms on Crazyflies (fitted to flights by IMRCLab)
+        noise=Errors(position=1e-3, attitude=1e-3, velocity=2e-3, body_rate=2e-3),
+    ),
+    # An aircraft that is known from its data sheet.
+    "full": Randomization(
+        mass=(0.8, 1.2),  # chosen: a battery or a camera more or less
+        inertia=(0.85, 1.15),  # chosen
+        thrust=(0.95, 1.05),  # chosen: with the mass, within what an action of 1 can carry
+        torque=(0.7, 1.3),  # chosen
+        lag=(0.5, 2.0),  # chosen: measured on one kind of aircraft were 39 to 87 ms (IMRCLab)
+        drag=(0.0, 2.0),  # chosen
+        inflow=(0.7, 1.3),  # chosen
+        max_speed=(0.97, 1.0),  # chosen: 0.94 to 1 of the thrust
+        wind=(0.0, 1.0),  # chosen
+        rotors=(0.96, 1.04),  # chosen; others take 0.9 to 1.1 (Molchanov et al. 2019)
+        centre_of_mass=0.002,  # chosen
+        command_delay=(0.0, 0.05),  # chosen: about 10 ms from sensor to policy (RAPTOR), and radio
+        noise=Errors(position=5e-3, attitude=5e-3, velocity=2e-2, body_rate=2e-2),
+        # position: Molchanov et al. 2019; the others chosen
+        bias=Errors(position=1e-2, attitude=1e-2, velocity=2e-2, body_rate=5e-3),  # chosen
+        pushes=Pushes(rate=0.2, velocity=0.3, body_rate=0.5),  # chosen
+    ),
+}
+"""What is known by name."""
+
+
+Randomized = Randomization | Mapping[str, Any] | str | None
+"""What `resolve` takes."""
+
+
+def resolve(given: Randomized) -> Randomization:
+    """A randomization, the one of a name or of some fields, or none for None.
 
     Raises:
-        QuadrlError: The message names the array.
+        QuadrlError: It is something else, a name or field is unknown, or a value out of range.
     """
-    rows, table = "engine.rows", "engine.parameters"
-    if not np.isfinite(saved[rows]).all():
-        raise QuadrlError(name=rows, value=saved[rows], allowed="finite")
-    drawn = ranges is not None and ranges.per_row and ranges.holds(saved[table])
-    if not (drawn or np.array_equal(saved[table], own[table])):
-        reason = "the state was saved with another aircraft"
-        raise QuadrlError(reason, name=table, value=saved[table], allowed="this aircraft's")
+    if given is None or isinstance(given, Randomization):
+        return given or NONE
+    if isinstance(given, str):
+        return RANDOMIZATIONS[choice("randomization", given, RANDOMIZATIONS)]
+    return _record("randomization", given, Randomization)

@@ -51,7 +51,8 @@ def put(record: Any, rows: np.ndarray, fresh: Any) -> None:
 def arrays(prefix: str, record: Any) -> dict[str, np.ndarray]:
     """Copies of a record's arrays by name, "PREFIX.FIELD"."""
     fields = dataclasses.fields(record)
-    return {f"{prefix}.{field.name}": np.array(getattr(record, field.name)) for field in fields}
+    # In C's order, as every file format wants them.
+    return {f"{prefix}.{f.name}": np.array(getattr(record, f.name), order="C") for f in fields}
 
 
 def of_arrays(prefix: str, like: Any, saved: Mapping[str, np.ndarray]) -> Any:

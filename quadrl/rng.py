@@ -10,10 +10,12 @@ is its definition for every array namespace.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quadrl.errors import QuadrlError
 from quadrl.rotation import Array, namespace, quaternion_from_heading_and_tilt, stack
 from quadrl.state import Start
 from quadrl.validation import number
@@ -25,9 +27,14 @@ MAX_SEED = (1 << 62) - 1
 FULL_TURN = 2 * math.pi
 # Streams of an episode. A new purpose takes a new number, so that the others stay as they are.
 START, PARAMETERS = 0, 1
+WEATHER, TURBULENCE = 8, 9  # numbers of an episode; blocks of its control steps
+NOISE, PUSHES = 16, 17  # blocks of its control steps
 ADVANCE = 16
 """Numbers that are drawn at once, about as many as a start takes."""
-_MASK = 0xFFFFFFFF
+MASK = 0xFFFFFFFF
+"""Of a 32-bit word."""
+Seed = int | Sequence[int | None] | None
+"""Of all rows, or one for each; None for one from the system, or for none."""
 
 
 def check_seed(seed: Any) -> int:
@@ -37,6 +44,26 @@ def check_seed(seed: Any) -> int:
         QuadrlError: It is no whole number from 0 to `MAX_SEED`.
     """
     return number("seed", seed, 0, MAX_SEED, whole=True)
+
+
+def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
+    """Those of some rows (n,) that get a seed, and their seeds.
+
+    Args:
+        seed: Row i gets seed + i, or seed[i] unless that is None.
+        rows: Numbers of rows.
+        count: Number of all rows.
+
+    Raises:
+        QuadrlError: A seed is no whole number from 0 to `MAX_SEED`, or there are not `count` seeds.
+    """
+    if not isinstance(seed, (list, tuple, np.ndarray)):
+        return rows, check_seed(seed) + rows
+    if len(seed) != count:
+        allowed = f"a whole number, or a sequence of {count}"
+        raise QuadrlError(name="seed", value=seed, allowed=allowed)
+    own = [row for row in rows.tolist() if seed[row] is not None]
+    return np.array(own, dtype=np.int64), [check_seed(seed[row]) for row in own]
 
 
 def philox(counter: tuple[Array, ...], key: tuple[Array, Array]) -> tuple[Array, ...]:
@@ -54,9 +81,9 @@ def philox(counter: tuple[Array, ...], key: tuple[Array, Array]) -> tuple[Array,
     for _ in range(10):
         # The products wrap around as those of unsigned numbers do.
         p0, p1 = c0 * 0xD2511F53, c2 * 0xCD9E8D57
-        c0, c1 = ((p1 >> 32) & _MASK) ^ c1 ^ low, p1 & _MASK
-        c2, c3 = ((p0 >> 32) & _MASK) ^ c3 ^ high, p0 & _MASK
-        low, high = (low + 0x9E3779B9) & _MASK, (high + 0xBB67AE85) & _MASK
+        c0, c1 = ((p1 >> 32) & MASK) ^ c1 ^ low, p1 & MASK
+        c2, c3 = ((p0 >> 32) & MASK) ^ c3 ^ high, p0 & MASK
+        low, high = (low + 0x9E3779B9) & MASK, (high + 0xBB67AE85) & MASK
     return c0, c1, c2, c3
 
 
@@ -95,8 +122,8 @@ def uniform_array_api(keys: Array, episodes: Array, stream: int, first: int, cou
     words: list[Array] = []
     for block in blocks:
         zero = xp.zeros_like(keys)
-        counter = (zero + block, zero + stream, episodes & _MASK, (episodes >> 32) & _MASK)
-        words += philox(counter, (keys & _MASK, (keys >> 32) & _MASK))
+        counter = (zero + block, zero + stream, episodes & MASK, (episodes >> 32) & MASK)
+        words += philox(counter, (keys & MASK, (keys >> 32) & MASK))
     start = first - 4 * blocks[0]
     chosen = xp.stack(words[start : start + count], axis=-1)
     return xp.astype(chosen, xp.float64) * 2.0**-32

@@ -1,31 +1,34 @@
-"""Fly a controller through fresh episodes, in calm air or in gusts, and summarize them."""
+"""Fly a controller through fresh episodes, in calm air or in wind, and summarize them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from quadrl.engines.engine import EngineName
 from quadrl.environment import Environment
 from quadrl.errors import QuadrlError
+from quadrl.memory import Flyer
+from quadrl.observing import Observed
 from quadrl.policy import Policy
+from quadrl.randomization import Randomized
 from quadrl.snapshot import Rollout
 from quadrl.task import Task
-from quadrl.validation import number
 from quadrl.vehicle import Vehicle
+from quadrl.weather import Weathered
 
 Controller = Callable[[np.ndarray], np.ndarray]
 """Flat observations (N, size) float32 to actions (N, k); its attribute `control_mode`, if it has
-one, says what they mean."""
+one, says what they mean, and `conditions` what it has to see and what it was trained in."""
 
 EVALUATION_SEED = 1 << 53
 """Beyond the seeds of every training (2^32 * 2^20), so that evaluation episodes are fresh ones."""
 MAX_SEED, MAX_EPISODES = (1 << 32) - 1, 100_000
 FINAL_STRETCH = 2.0  # [s], over which position_error_m is the mean
-GUST_TIME = 1.0  # [s], correlation time of the gusts
 HISTORY = ("position", "quaternion", "velocity", "body_rate", "rotor_speed", "goal", "action",
-           "error", "reward")  # fmt: skip
+           "error", "reward", "wind")  # fmt: skip
 
 
 def fly(
@@ -36,7 +39,10 @@ def fly(
     seed: int = EVALUATION_SEED,
     vehicle: Vehicle | str | None = None,
     control_mode: str | None = None,
-    gusts: float = 0.0,
+    weather: Weathered = None,
+    randomization: Randomized = None,
+    observe: Observed = None,
+    engine: EngineName = "mujoco",
 ) -> Rollout:
     """Fly one episode of each of N aircraft.
 
@@ -47,30 +53,23 @@ def fly(
         seed: Aircraft i has the seed `seed + i`.
         vehicle: The aircraft; None for the paper's.
         control_mode: What actions mean; None for what the controller says, or "rotor".
-        gusts: Standard deviation of the wind in each direction [m/s]; see `make_gusts`. The
-            aircraft does not observe it, and each flies in a wind of its own, from its seed.
+        weather: A `Weather` or its name; None for that of the controller's training, or calm air.
+            Each aircraft flies in a wind of its own, from its seed, and does not observe it.
+        randomization: What is drawn for each aircraft and disturbs it; None for what the controller
+            was trained with, or nothing.
+        observe: Options of the observation; None for those that the controller needs.
+        engine: "mujoco", or "free_flight" wherever there is nothing to touch.
 
     Raises:
         QuadrlError: The controller's actions have another meaning or another size, or an argument
             is out of range.
     """
-    own = getattr(controller, "control_mode", None)
-    if None not in (control_mode, own) and control_mode != own:
-        raise QuadrlError(name="control_mode", value=control_mode, allowed=f"{own!r}, as trained")
-    gusts = number("gusts", gusts, 0)
-    environment = Environment(
-        task,
-        num_envs=episodes,
-        seed=seed,
-        vehicle=vehicle,
-        control_mode=control_mode or own or "rotor",
+    environment, controller = prepared(
+        *(controller, task, episodes, seed, vehicle, control_mode, engine),
+        {"weather": weather, "randomization": randomization, "observe": observe},
     )
     task, timestep = environment.task, environment.vehicle.control_timestep
-    if isinstance(controller, Policy):
-        controller.check_fits(environment)
     observation = environment.flatten(environment.reset())
-    seeds = range(seed, seed + episodes)
-    winds = make_gusts(gusts, environment.time_limit_steps, timestep, seeds) if gusts else None
     history: dict[str, list[np.ndarray]] = {name: [] for name in HISTORY}
     alive = np.ones(episodes, dtype=bool)
     length = np.zeros(episodes, dtype=int)
@@ -78,13 +77,12 @@ def fly(
     markers = []
     while alive.any():
         taken = np.clip(controller(observation), -1.0, 1.0)
-        if winds is not None:
-            environment.engine.air[:] = winds[len(markers)]
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         markers.append(environment.markers())
         state, goal = environment.snapshot.state, task.goal(environment.snapshot)
         moment = {"goal": goal, "action": taken, "error": now.error, "reward": now.reward}
+        moment["wind"] = environment.engine.wind
         for name, values in history.items():
             value = np.array(moment[name] if name in moment else getattr(state, name), dtype=float)
             value[~alive] = np.nan
@@ -104,25 +102,76 @@ def fly(
     )
 
 
-def make_gusts(deviation: float, steps: int, timestep: float, seeds: range) -> np.ndarray:
-    """Wind (steps, N, 3) [m/s], world frame: three Ornstein-Uhlenbeck processes per aircraft.
-
-    The spectrum is that of the longitudinal gusts of Dryden's model (MIL-F-8785C, 3.7.2.2) with
-    `GUST_TIME` for length over airspeed, in every direction.
+def prepared(
+    controller: Controller,
+    task: str | Task,
+    episodes: int,
+    seed: int,
+    vehicle: Vehicle | str | None,
+    control_mode: str | None,
+    engine: EngineName,
+    conditions: Mapping[str, Any],
+) -> tuple[Environment, Controller]:
+    """An environment for a controller, and the controller with nothing remembered.
 
     Args:
-        deviation: Of each component at any time [m/s].
-        steps: Control steps.
-        timestep: Of the control [s].
-        seeds: Of the N aircraft.
+        controller: As `fly` takes it, as well as the arguments before `conditions`.
+        task: What is flown.
+        episodes: N.
+        seed: Of the first aircraft.
+        vehicle: The aircraft.
+        control_mode: What actions mean.
+        engine: Its name.
+        conditions: Weather, randomization and options of the observation; None for the
+            controller's own.
+
+    Raises:
+        QuadrlError: As `fly`.
     """
-    keep = np.exp(-timestep / GUST_TIME)
-    # Their second word keeps these streams apart from all that have the seed alone.
-    rows = [np.random.default_rng([seed, 1]).normal(size=(steps, 3)) for seed in seeds]
-    wind = deviation * np.stack(rows, axis=1)
-    for k in range(1, steps):  # the first is drawn from the distribution itself
-        wind[k] = keep * wind[k - 1] + np.sqrt(1 - keep**2) * wind[k]
-    return wind
+    own = getattr(controller, "control_mode", None)
+    if None not in (control_mode, own) and control_mode != own:
+        raise QuadrlError(name="control_mode", value=control_mode, allowed=f"{own!r}, as trained")
+    given = {name: value for name, value in conditions.items() if value is not None}
+    environment = Environment(
+        task,
+        num_envs=episodes,
+        seed=seed,
+        vehicle=vehicle,
+        control_mode=control_mode or own or "rotor",
+        engine=engine,
+        **getattr(controller, "conditions", {}) | given,
+    )
+    if isinstance(controller, Policy):
+        controller = controller.flying(episodes)
+    if isinstance(controller, Flyer):
+        controller.policy.check_fits(environment)
+        controller.reset()
+    return environment, controller
+
+
+def flights(rollout: Rollout) -> dict[str, np.ndarray]:
+    """What each flight of a rollout reached, arrays (N,).
+
+    Returns:
+        success, survived and diverged (bool); position_error_m: mean error over the last 2 s [m];
+        where the heading matters heading_error_deg: mean of |yaw| over the same time; return;
+        length_s.
+    """
+    steps = max(1, round(FINAL_STRETCH / rollout.control_timestep))
+    index = np.arange(len(rollout.error))[:, None]
+    last = (index >= rollout.length - steps) & (index < rollout.length)
+    w, x, y, z = np.moveaxis(rollout.quaternion, -1, 0)
+    yaw = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
+    heading = {"heading_error_deg": _means(np.abs(yaw), last)}
+    return {
+        "success": rollout.is_success,
+        "survived": ~(rollout.terminated & ~rollout.is_success),
+        "diverged": rollout.diverged,
+        "position_error_m": _means(rollout.error, last),
+        **(heading if rollout.task.heading_matters else {}),
+        "return": np.nansum(rollout.reward, 0),
+        "length_s": rollout.length * rollout.control_timestep,
+    }
 
 
 def summarize(rollout: Rollout) -> dict[str, Any]:
@@ -130,56 +179,24 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
 
     Returns:
         episodes; success_rate and survival_rate (shares); position_error_m and
-        position_error_std_m: mean, and deviation over the episodes, of the error over the last 2 s
-        [m]; where the heading matters heading_error_deg: mean of |yaw| over the same time;
-        return_mean and return_std; length_mean_s; diverged (count); and the task's own metrics.
+        position_error_std_m: mean and deviation over the flights [m]; where the heading matters
+        heading_error_deg; return_mean and return_std; length_mean_s; diverged (count); and the
+        task's own metrics. `flights` says what each of them is of one flight.
     """
-    steps = max(1, round(FINAL_STRETCH / rollout.control_timestep))
-    index = np.arange(len(rollout.error))[:, None]
-    last = (index >= rollout.length - steps) & (index < rollout.length)
-    final = _means(rollout.error, last)
-    returns = np.nansum(rollout.reward, 0)
-    w, x, y, z = np.moveaxis(rollout.quaternion, -1, 0)
-    yaw = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
-    heading = {"heading_error_deg": float(_means(np.abs(yaw), last).mean())}
+    flown = flights(rollout)
+    heading = {k: float(v.mean()) for k, v in flown.items() if k == "heading_error_deg"}
     return {
-        "episodes": len(returns),
-        "success_rate": float(rollout.is_success.mean()),
-        "survival_rate": float(1 - (rollout.terminated & ~rollout.is_success).mean()),
-        "position_error_m": float(final.mean()),
-        "position_error_std_m": float(final.std()),
-        **(heading if rollout.task.heading_matters else {}),
-        "return_mean": float(returns.mean()),
-        "return_std": float(returns.std()),
-        "length_mean_s": float(rollout.length.mean() * rollout.control_timestep),
-        "diverged": int(rollout.diverged.sum()),
+        "episodes": len(flown["return"]),
+        "success_rate": float(flown["success"].mean()),
+        "survival_rate": float(flown["survived"].mean()),
+        "position_error_m": float(flown["position_error_m"].mean()),
+        "position_error_std_m": float(flown["position_error_m"].std()),
+        **heading,
+        "return_mean": float(flown["return"].mean()),
+        "return_std": float(flown["return"].std()),
+        "length_mean_s": float(flown["length_s"].mean()),
+        "diverged": int(flown["diverged"].sum()),
     } | rollout.task.metrics(rollout)
-
-
-def evaluate(
-    controller: Controller,
-    task: Task,
-    *,
-    episodes: int,
-    seed: int = 0,
-    vehicle: Vehicle | str | None = None,
-) -> tuple[dict[str, Any], Rollout]:
-    """Fly a controller through episodes that no training has seen.
-
-    Args:
-        controller: A `Policy`, or any function of observations.
-        task: The task.
-        episodes: Their number.
-        seed: Of the episodes; the same ones for every controller.
-        vehicle: The aircraft; None for the paper's.
-
-    Returns:
-        The task's name, the seed and the metrics of `summarize`; and the rollout.
-    """
-    seed = number("seed", seed, 0, MAX_SEED, whole=True)
-    number("episodes", episodes, 1, MAX_EPISODES, whole=True)
-    rollout = fly(controller, task, episodes=episodes, seed=EVALUATION_SEED + seed, vehicle=vehicle)
-    return {"task": task.name, "seed": seed} | summarize(rollout), rollout
 
 
 def _means(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:

@@ -44,6 +44,8 @@ class Rotor:
     """Unit vector along the thrust."""
     radius: float = 0.06
     """Radius of the disc [m], drawn and used for contact with the ground."""
+    disc_radius: float = 0.0
+    """Radius of the disc that moves the air [m]; 0 where it is `radius`."""
 
     def __post_init__(self) -> None:
         """Validate the numbers."""
@@ -52,11 +54,24 @@ class Rotor:
         for name in ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed"):
             object.__setattr__(self, name, number(f"rotor {name}", getattr(self, name), MIN, MAX))
         object.__setattr__(self, "radius", number("rotor radius", self.radius, *LENGTHS))
+        if number("rotor disc_radius", self.disc_radius) != 0:
+            number("rotor disc_radius", self.disc_radius, *LENGTHS)
+        object.__setattr__(self, "disc_radius", float(self.disc_radius))
         if abs(number("rotor spin", self.spin)) != 1:
             raise QuadrlError(name="rotor spin", value=self.spin, allowed="1 or -1")
         if abs(math.hypot(*self.axis) - 1) > 1e-9:
             raise QuadrlError(name="rotor axis", value=self.axis, allowed="a unit vector")
         object.__setattr__(self, "spin", float(self.spin))
+
+    @property
+    def disc(self) -> float:
+        """Radius of the disc that moves the air [m]."""
+        return self.disc_radius or self.radius
+
+    def figure_of_merit(self, air_density: float) -> float:
+        """Least power that can give the thrust at rest, by momentum theory, over the shaft's."""
+        flow = 2 * air_density * math.pi * self.disc**2  # [kg/m]
+        return self.thrust_coefficient**1.5 / (math.sqrt(flow) * self.torque_coefficient)
 
 
 def ring(

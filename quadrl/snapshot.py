@@ -75,7 +75,7 @@ class EpisodeEnd:
         return self.terminated & ~self.succeeded
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Rollout:
     """One episode of each of N aircraft, step by step; T steps are the longest of them.
 
@@ -91,6 +91,7 @@ class Rollout:
     action: np.ndarray  # (T, N, k), within [-1, 1]
     error: np.ndarray  # (T, N) [m]
     reward: np.ndarray  # (T, N)
+    wind: np.ndarray  # (T, N, 3) [m/s], world frame; that of the step which led to each state
     length: np.ndarray  # (N,) steps of each episode
     terminated: np.ndarray  # (N,) bool
     is_success: np.ndarray  # (N,) bool
@@ -100,12 +101,17 @@ class Rollout:
     control_timestep: float  # [s]
     task: Any  # the Task that was flown
 
+    def __repr__(self) -> str:
+        steps, flights = self.error.shape
+        return f"Rollout of {self.task.name}: {flights} flights, {steps} control steps at most"
+
     def trajectory(self, vehicle: Vehicle, episode: int = 0) -> Trajectory:
         """The flight of one aircraft, to be drawn; the markers are those of the first."""
         from quadrl.rendering import Trajectory
+        from quadrl.rendering.overlay import outcome
 
         steps = slice(0, int(self.length[episode]))
-        position = self.position[steps, episode] + self.origin
+        position, wind = self.position[steps, episode] + self.origin, self.wind[steps, episode]
         return Trajectory(
             time=np.arange(1, len(position) + 1) * self.control_timestep,
             qpos=np.concatenate([position, self.quaternion[steps, episode]], axis=1),
@@ -117,4 +123,6 @@ class Rollout:
             max_rotor_speed=vehicle.max_speed,
             task=self.task.name,
             markers=self.markers[steps],
+            outcome=outcome(self.terminated[episode], True, self.is_success[episode]),
+            wind=wind if wind.any() else None,
         )

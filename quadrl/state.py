@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
+from quadrl.errors import QuadrlError
 from quadrl.rotation import Array, norm, rotation_matrix, sin_cos_attitude, to_body
+from quadrl.validation import keys
 
 SIZES = {
     "position": 3,
@@ -124,6 +128,31 @@ class Start:
     velocity: Array  # (n, 3) [m/s], world frame
     body_rate: Array  # (n, 3) [rad/s], body frame
     rotor_speed: Array  # (n, R) [rad/s]
+
+    def replaced(self, given: Mapping[str, Any], rows: np.ndarray, count: int) -> Start:
+        """A start with some arrays given, (count, k) or (k,), of which some rows (n,) count.
+
+        Raises:
+            QuadrlError: Unknown name, wrong shape, or a quaternion of length 0.
+        """
+        if not given:
+            return self
+        keys("start", given, [field.name for field in dataclasses.fields(self)])
+        arrays: dict[str, np.ndarray] = {}
+        for name, value in given.items():
+            size = getattr(self, name).shape[-1]
+            try:
+                arrays[name] = np.broadcast_to(np.asarray(value, float), (count, size))[rows]
+            except (TypeError, ValueError):
+                allowed = f"numbers of shape ({size},) or ({count}, {size})"
+                raise QuadrlError(name=name, value=value, allowed=allowed) from None
+        if "quaternion" in arrays:
+            length = norm(arrays["quaternion"])[:, None]
+            if not (length > 0).all():
+                allowed = "of a length above 0"
+                raise QuadrlError(name="quaternion", value=given["quaternion"], allowed=allowed)
+            arrays["quaternion"] = arrays["quaternion"] / length
+        return dataclasses.replace(self, **arrays)
 
 
 def c_rows() -> str:

@@ -40,7 +40,8 @@ def load(
         domain_name: "quadrotor".
         task_name: A name of the catalogue.
         task_kwargs: `random` (seed), `time_limit` [s], `vehicle`, `control_mode`, `engine`,
-            `ranges` (see `quadrl.envs.dm_control.make`), and any option of the task.
+            `aerodynamics`, `weather`, `randomization`, `observe` (see
+            `quadrl.envs.dm_control.make`), and any option of the task.
         environment_kwargs: Those of `dm_control.rl.control.Environment`: `time_limit` and
             `control_timestep` [s], `n_sub_steps`, `flat_observation`, `legacy_step`.
         visualize_reward: Colour the aircraft by its reward, clipped to [0, 1].

@@ -123,11 +123,16 @@ class Task(abc.ABC):
     at anything but their arguments."""
     true_parameters: ClassVar[bool] = False
     """Whether snapshots show the parameters that were drawn, instead of the specified ones."""
+    variants: ClassVar[dict[str, dict[str, Any]]] = {}
+    """Settings of other trainings than the usual one that differ from it, by variant."""
+    signed: ClassVar[tuple[str, ...]] = ()
+    """Options that may be negative although their default is positive."""
 
     time_limit: float = 10.0
     """Time limit of an episode [s]."""
     settle_time: float = 2.0
-    """Length of the stretch before the time limit over which the final error is taken [s]."""
+    """Length of the stretch before the time limit over which the final error is taken [s]; the
+    default is cut to a shorter time limit."""
     altitude: float = 3.0
     """Height of the origin of the task's frame above the ground [m]; at least that of the
     aircraft's centre when it stands on its feet."""
@@ -143,16 +148,27 @@ class Task(abc.ABC):
     """Reward per rad/s by which the body rate falls (gym-aero: 0.1)."""
     control_weight: float = 1.0
     """Cost of sum((Omega_c - Omega_hover)^2) / Omega_max^2, for each 0.05 s."""
+    smoothness_weight: float = 0.0
+    """Cost of sum((Omega_c - Omega_c before)^2) / Omega_max^2, the change of the commands from one
+    control step to the next, for each 0.05 s."""
     survival_weight: float = 10.0
     """Reward for each 0.05 s in the air."""
 
     def __post_init__(self) -> None:
         """Validate options."""
-        for field in dataclasses.fields(self):
-            if field.default is not dataclasses.MISSING:
-                like(f"{self.name} {field.name}", getattr(self, field.name), field.default)
         number(f"{self.name} time_limit", self.time_limit, positive=True)
+        for field in dataclasses.fields(self):
+            default, name = field.default, f"{self.name} {field.name}"
+            if default is dataclasses.MISSING:
+                continue
+            value = like(name, getattr(self, field.name), default)
+            counts = isinstance(default, (int, float)) and not isinstance(default, bool)
+            if counts and default > 0 and field.name not in self.signed:
+                number(name, value, 0)
         number(f"{self.name} altitude", self.altitude, 0)
+        number(f"{self.name} smoothness_weight", self.smoothness_weight, 0)
+        if self.settle_time != Task.settle_time:
+            number(f"{self.name} settle_time", self.settle_time, 0, self.time_limit)
 
     @abc.abstractmethod
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
@@ -209,7 +225,7 @@ class Task(abc.ABC):
         was, is_, rotor = before.potentials, now.potentials, now.parameters.rotor
         share = reward_share(now.parameters)
         effort = square_norm((now.rotor_command - rotor.hover_speed) / rotor.max_speed)
-        return {
+        terms = {
             "progress": self.progress_weight * (was.distance - is_.distance),
             "attitude": self.attitude_weight * (was.attitude - is_.attitude),
             "speed": self.speed_weight * (was.speed - is_.speed),
@@ -217,6 +233,10 @@ class Task(abc.ABC):
             "control": (-self.control_weight * share) * effort,
             "survival": 0.0 * effort + self.survival_weight * share,
         }
+        if self.smoothness_weight > 0:
+            change = (now.rotor_command - before.rotor_command) / rotor.max_speed
+            terms["smoothness"] = (-self.smoothness_weight * share) * square_norm(change)
+        return terms
 
     @abc.abstractmethod
     def terminated(self, now: Snapshot) -> Array:

@@ -21,9 +21,10 @@ from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
 
 from quadrl import parameters, records, tasks
-from quadrl.description import docstrings
+from quadrl.description import docstrings, source
 from quadrl.environment import Environment
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng
@@ -50,10 +51,9 @@ def check_task(task: str | Task | type[Task]) -> None:
         AssertionError: The first fault that is found.
     """
     task = task() if isinstance(task, type) else tasks.make(task)
-    check_declaration(task)
-    check_begin(task)
-    check_functions(task)
+    check_rules(task, _optional("torch"))
     check_episodes(task)
+    check_saving(task)
     short = task.replace(time_limit=min(task.time_limit, EPISODE))
     environment = Environment(short)
     steps = environment.time_limit_steps + 1  # past the end
@@ -63,6 +63,22 @@ def check_task(task: str | Task | type[Task]) -> None:
     check_gymnasium(short)
     if _optional("torchrl"):
         check_torchrl(short)
+
+
+def check_rules(task: Task | type[Task], torch: Any = None) -> None:
+    """Check in about a second what can be checked without flying: declarations and functions.
+
+    Args:
+        task: A task or its class.
+        torch: The module, to check the functions with tensors as well.
+
+    Raises:
+        AssertionError: The first fault that is found.
+    """
+    task = task() if isinstance(task, type) else task
+    check_declaration(task)
+    check_begin(task, torch)
+    check_functions(task, torch)
 
 
 def check_declaration(task: Task) -> None:
@@ -81,12 +97,12 @@ def check_declaration(task: Task) -> None:
         with _blame(task, f"an environment of the vehicle {vehicle!r}"):
             Environment(task, vehicle=vehicle)
     documented = docstrings(kind)
-    for field in dataclasses.fields(task):
+    for field in dataclasses.fields(task) if source(kind) else ():
         text = documented.get(field.name)
         _require(text, f"{task.name}: the option {field.name} needs a docstring")
 
 
-def check_begin(task: Task) -> None:
+def check_begin(task: Task, torch: Any = None) -> None:
     """A start follows from the random numbers alone, differs by row, and is the same in torch."""
     own = Parameters.of(parameters.rows(PAPER), PAPER.control_timestep)
 
@@ -104,14 +120,14 @@ def check_begin(task: Task) -> None:
         _require_equal(begin(keys[i : i + 1], own), row, message)
     varied = any(np.ptp(value, axis=0).any() for value in batch.values())
     _require(varied, f"{task.name}: every episode begins alike")
-    if torch := _optional("torch"):
+    if torch:
         tensors = own.map(torch.tensor)
         _require_close(begin(torch.tensor(keys), tensors), batch, f"{task.name}: begin", 1e-9)
         meta = own.map(lambda array: torch.tensor(array, device="meta"))
         begin(torch.tensor(keys, device="meta"), meta)
 
 
-def check_functions(task: Task) -> None:
+def check_functions(task: Task, torch: Any = None) -> None:
     """Shapes are those declared; a row, a batch and torch get the same; no argument is changed."""
     with _blame(task, "a reset"):
         environment = Environment(task, num_envs=ROWS, seed=1)
@@ -129,7 +145,7 @@ def check_functions(task: Task) -> None:
         alone = _outputs(task, _mapped(row, before), _mapped(row, now))
         message = f"{task.name}: one aircraft and a batch get different numbers"
         _require_equal(alone, {k: value[i : i + 1] for k, value in batch.items()}, message)
-    if torch := _optional("torch"):
+    if torch:
         check_tensors(task, before, now, batch, torch)
 
 
@@ -196,6 +212,22 @@ def check_episodes(task: Task) -> None:
         _require(np.isfinite(term).all(), f"{task.name}: {name!r} is not always finite")
         constant = np.flatnonzero(np.ptp(term, axis=0) == 0).tolist()
         _require(not constant, f"{task.name}: entries {constant} of {name!r} never change")
+
+
+def check_saving(task: Task) -> None:
+    """What is saved in the middle of an episode can be stored, and another continues from it."""
+    actions = varied_actions(6, ROWS, Environment(task).action_size)
+    one, other = (Environment(task, num_envs=ROWS, seed=seed) for seed in (1, 2))
+    one.reset()
+    for action in actions[:3]:
+        one.step(action)
+    with _blame(task, "saving and restoring"):
+        stored = safetensors.numpy.load(safetensors.numpy.save(one.save()))
+        other.restore(stored)
+    for action in actions[3:]:
+        got, expected = (environment.step(action) for environment in (other, one))
+        seen = [{"reward": now.reward} | now.observation for now in (got, expected)]
+        _require_equal(seen[0], seen[1], f"{task.name}: a restored episode goes on otherwise")
 
 
 def check_flight(task: Task, actions: np.ndarray) -> None:

@@ -41,9 +41,9 @@ FLAGS = LOGICAL | {name for name in C if name.startswith(("less", "greater", "eq
 """Those that give a truth value."""
 ARRANGING = {
     np.stack, np.concatenate, np.broadcast_to, np.moveaxis, np.transpose, np.reshape, np.roll,
-    np.expand_dims, np.squeeze, np.take, np.flip, np.tile, np.repeat, np.zeros_like, np.ones_like,
-    np.empty_like, np.full_like, np.copyto, np.result_type, np.clip, np.max, np.min, np.sum,
-    np.prod, np.any, np.all,
+    np.expand_dims, np.squeeze, np.swapaxes, np.take, np.flip, np.tile, np.repeat, np.split,
+    np.array_split, np.zeros_like, np.ones_like, np.empty_like, np.full_like, np.copyto,
+    np.result_type, np.clip, np.max, np.min, np.sum, np.prod, np.any, np.all,
 }  # fmt: skip
 """Functions that move numbers, or call the operations above; others might look at objects."""
 MAX_OPERATIONS = 2000  # more would take the C compiler longer than they save
@@ -133,11 +133,15 @@ class Symbols(np.ndarray):
         if method == "__call__" and not any(x is not None for x in options.values()):
             return elementwise(ufunc.__name__, *inputs)
         rest = (options[name] for name in options.keys() - {"axis", "keepdims"})
-        usual = not options.get("keepdims") and all(x is None or x is True for x in rest)
-        parts = np.moveaxis(np.asarray(inputs[0]), options.get("axis", 0), 0)
-        # From 8 numbers on NumPy adds in another order.
-        if method == "reduce" and usual and (ufunc is not np.add or len(parts) < 8):
-            return functools.reduce(functools.partial(elementwise, ufunc.__name__), parts)
+        usual, axes = all(x is None or x is True for x in rest), options.get("axis", 0)
+        axes = axes if isinstance(axes, tuple) else (axes,)
+        whole = np.moveaxis(np.asarray(inputs[0]), axes, range(len(axes)))
+        parts = whole.reshape(-1, *whole.shape[len(axes) :])
+        # Over several axes, and from 8 numbers on, NumPy adds in another order.
+        in_order = ufunc is not np.add or (len(axes) == 1 and len(parts) < 8)
+        if method == "reduce" and usual and in_order:
+            result = functools.reduce(functools.partial(elementwise, ufunc.__name__), parts)
+            return np.expand_dims(result, axes) if options.get("keepdims") else result
         raise TypeError(f"{ufunc.__name__}.{method} cannot be compiled")
 
     def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:

@@ -15,6 +15,8 @@ from quadrl.state import Start, State
 from quadrl.task import EpisodeEnd, Snapshot, Task, total
 
 Observation = dict[str, Array]
+SAMPLE = 64  # episodes that are begun to check a task
+STARTS = "such that episodes begin within the bounds that end them"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -24,6 +26,13 @@ class Clock:
     control_timestep: float  # [s]
     time_limit_steps: int
     settle_steps: int  # before the time limit, over which the final error is taken
+
+    @classmethod
+    def of(cls, task: Task, control_timestep: float) -> Clock:
+        """The clock of a task, in whole control steps [s]."""
+        limit = max(1, round(task.time_limit / control_timestep))
+        settle = min(max(1, round(task.settle_time / control_timestep)), limit)
+        return cls(control_timestep, limit, settle)
 
 
 @dataclasses.dataclass(slots=True)
@@ -59,6 +68,9 @@ class Transition:
     good one, and terminated is set."""
     error: Array
     """The task's error [m]."""
+    truth: Observation
+    """The task's entries of the true state: the observation itself, unless that has errors, is late
+    or has other entries."""
 
 
 def begin(
@@ -91,6 +103,7 @@ def finish(
     action: Array,
     rotor_command: Array,
     diverged: Array,
+    estimate: State | None = None,
 ) -> tuple[Snapshot, Episode, Transition]:
     """The transition to a new state.
 
@@ -103,6 +116,7 @@ def finish(
         action: (N, k) that was taken.
         rotor_command: (N, R) [rad/s], mean over the control step.
         diverged: (N,) bool, where the simulation broke down.
+        estimate: The state that is observed; None for the true one, which all else looks at.
 
     Returns:
         The snapshot after it, how far the episodes are, and the transition.
@@ -125,8 +139,9 @@ def finish(
     if task_state is not now.task:  # a goal may have moved on
         now = Snapshot(state, task_state, before.parameters, action, rotor_command, time)
         now.potentials = task.measure(now)
+    truth = task.observe(now)
     transition = Transition(
-        observation=task.observe(now),
+        observation=truth if estimate is None else observe(task, now, estimate),
         reward=total(terms),
         reward_terms=terms,
         terminated=terminated,
@@ -134,8 +149,31 @@ def finish(
         is_success=end.succeeded,
         diverged=diverged,
         error=error + 0.0,  # its own, since a reset writes into the potentials
+        truth=truth,
     )
     return now, Episode(steps, error_sum, final_sum), transition
+
+
+def observe(task: Task, now: Snapshot, estimate: State) -> Observation:
+    """The task's observation of a moment, of another state than the true one."""
+    moment = (now.task, now.parameters, now.action, now.rotor_command, now.time)
+    seen = Snapshot(estimate, *moment)
+    seen.potentials = task.measure(seen)
+    return task.observe(seen)
+
+
+def check_reward(task: Task, done: Transition) -> None:
+    """Refuse a reward that is not finite.
+
+    Raises:
+        QuadrlError: The message names the aircraft and has the terms of its reward.
+    """
+    sound = np.isfinite(done.reward)
+    if np.count_nonzero(sound) < len(sound):
+        row = int(np.argmin(sound))
+        values = {name: float(term[row]) for name, term in done.reward_terms.items()}
+        name = f"{task.name} reward of aircraft {row}"
+        raise QuadrlError(name=name, value=values, allowed="finite in every term")
 
 
 def check_task(
@@ -155,7 +193,7 @@ def check_task(
     Raises:
         QuadrlError: The message names the function.
     """
-    rows, rotors = 4, parameters.rotor.hover_speed.shape[-1]
+    rows, rotors = SAMPLE, parameters.rotor.hover_speed.shape[-1]
     keys = np.arange(rows)
     begun = task.begin(Rng(keys, 0 * keys), parameters)
     if not isinstance(begun, tuple) or not isinstance(begun[0], Start):
@@ -177,6 +215,12 @@ def check_task(
     now, _ = begin(task, state, task_state, parameters, actions)
     terminated = task.terminated(now)
     _check_array(task, "terminated", terminated, (rows,), "b")
+    if terminated.any():
+        changed = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
+        changed = {k: v for k, v in changed.items() if str(v) != str(getattr(type(task), k, ""))}
+        reason = f"{terminated.sum()} of {rows} episodes would end where they begin"
+        name = f"{task.name} {'options' if changed else 'begin'}"
+        raise QuadrlError(reason, name=name, value=changed or task, allowed=STARTS)
     error = task.error(now)
     _check_array(task, "error", error, (rows,), "f")
     end = EpisodeEnd(terminated, ~terminated, error + 1, error, error, 1, terminated)

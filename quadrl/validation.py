@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.errors import QuadrlError
+from quadrl.errors import QuadrlError, UnknownKeyword
 
 MAX_OPTION = 1e9
 """Larger options of a task would take the digits from what is added to them."""
@@ -78,11 +78,15 @@ def keys(what: str, given: Iterable[str], choices: Iterable[str]) -> None:
     """Refuse the first name that is not among the choices.
 
     Raises:
-        QuadrlError: The message lists the choices.
+        UnknownKeyword: The message lists the choices.
     """
     allowed = list(choices)
     for name in given:
-        choice(what, name, allowed)
+        try:
+            choice(what, name, allowed)
+        except QuadrlError as error:
+            reason = f"got an unexpected keyword argument {name!r}"
+            raise UnknownKeyword(reason, name=what, value=name, allowed=error.allowed) from None
 
 
 def like(name: str, value: Any, default: Any) -> Any:

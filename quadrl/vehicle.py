@@ -10,11 +10,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
-from typing import NoReturn
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
 
 import numpy as np
 
+from quadrl.aerodynamics import Aerodynamics, check_air
+from quadrl.aerodynamics import in_real_air as in_real_air  # beside the aircraft
 from quadrl.errors import QuadrlError
 from quadrl.rotation import Array
 from quadrl.rotors import (
@@ -29,7 +31,7 @@ from quadrl.rotors import (
     plus,
     ring,
 )
-from quadrl.validation import choice, number, numbers
+from quadrl.validation import choice, keys, number, numbers
 
 MIN_ROTORS, MAX_ROTORS = 4, 8
 DRAWN_SIZE = 0.23  # [m], distance of a rotor from the centre in the drawings of assets/
@@ -48,13 +50,14 @@ SINGULAR = 1e-9
 """Smallest singular value of a mixer over its largest; each row over its largest entry."""
 
 PAPER_ROTORS = plus(
-    0.23,  # l [m] (gym-aero)
+    0.23,  # gym-aero
     thrust_coefficient=3.13e-5,  # gym-aero
     torque_coefficient=7.5e-7,  # gym-aero
     lag_up=1 / 0.18,  # gym-aero
-    lag_down=1 / 0.18,
+    lag_down=1 / 0.18,  # gym-aero, which has one constant for both
     max_speed=math.sqrt(2.0) * math.sqrt(0.65 * GRAVITY / (4 * 3.13e-5)),  # twice the weight
-    radius=0.06,
+    radius=0.06,  # chosen
+    disc_radius=0.15,  # the OS4: the physics page says why
 )
 
 
@@ -80,6 +83,11 @@ class Vehicle:
     """Step of the RK4 integrator [s] (gym-aero)."""
     control_timestep: float = 0.05
     """Time between two actions [s] (gym-aero); a whole number of physics steps."""
+    aerodynamics: Aerodynamics = Aerodynamics()
+    """What the air does to the rotors beside equation 7; nothing by default."""
+
+    def __repr__(self) -> str:
+        return f"Vehicle({self.name!r}, {self.mass:g} kg, {len(self.rotors)} rotors)"
 
     def __post_init__(self) -> None:
         """Validate the numbers, alone and together."""
@@ -93,6 +101,7 @@ class Vehicle:
         check_inertia("inertia", self.inertia, self.inertia)
         self._check_rotors()
         self._check_timesteps()
+        check_air(self)
 
     def _check_rotors(self) -> None:
         """Refuse rotors that cannot hold the aircraft in hover and turn it about every axis."""
@@ -297,24 +306,30 @@ def check_inertia(name: str, low: Vector, high: Vector) -> None:
             raise QuadrlError(name=name, value=value, allowed=allowed)
 
 
-def resolve(vehicle: Vehicle | str | None) -> Vehicle:
+def resolve(vehicle: Vehicle | str | None, options: Mapping[str, Any] | None = None) -> Vehicle:
     """A vehicle, the one of a name, or the paper's for None.
 
+    Args:
+        vehicle: The vehicle.
+        options: Numbers that differ from it, by their fields' names.
+
     Raises:
-        QuadrlError: It is something else, or the name is unknown.
+        QuadrlError: It is something else, a name is unknown, or a number impossible.
     """
-    if vehicle is None or isinstance(vehicle, Vehicle):
-        return vehicle or VEHICLES["paper"]
-    if not isinstance(vehicle, str):
+    if isinstance(vehicle, str):
+        vehicle = VEHICLES[choice("vehicle", vehicle, VEHICLES)]
+    vehicle = VEHICLES["paper"] if vehicle is None else vehicle
+    if not isinstance(vehicle, Vehicle):
         allowed = f"a Vehicle or a name ({', '.join(VEHICLES)})"
         raise QuadrlError(name="vehicle", value=vehicle, allowed=allowed)
-    return VEHICLES[choice("vehicle", vehicle, VEHICLES)]
+    keys("vehicle option", options or {}, OPTIONS)
+    return dataclasses.replace(vehicle, **options) if options else vehicle
 
 
 CRAZYFLIE = Vehicle(
-    name="crazyflie",  # 2.1, brushed; its motors 1 to 4, clockwise from ahead on the right
+    name="crazyflie",  # Crazyflie 2.1, brushed; motors 1 to 4, clockwise from ahead on the right
     mass=0.0293,  # Foerster 2015, "System Identification of the Crazyflie 2.0 Nano Quadrocopter"
-    inertia=(16.6e-6, 16.6e-6, 29.3e-6),  # ibid., principal part
+    inertia=(16.6e-6, 16.6e-6, 29.3e-6),  # Foerster 2015, principal part
     rotors=ring(
         (315, 225, 135, 45),
         (1, -1, 1, -1),
@@ -322,15 +337,15 @@ CRAZYFLIE = Vehicle(
         thrust_coefficient=2.02e-8,  # thrust stand, stock propellers (IMRCLab, crazyflie-system-id)
         torque_coefficient=2.02e-8 * 5.965e-3,  # ratio of torque to thrust: Foerster 2015
         lag_up=1 / 0.049,  # brushed, from measured rotor speeds (IMRCLab flights)
-        lag_down=1 / 0.087,  # ibid.
+        lag_down=1 / 0.087,  # the same flights
         max_speed=2426.0,  # the stand's largest, at a battery of 2.97 V
-        radius=0.0225,
+        radius=0.0225,  # propellers of 45 mm
     ),
     drag_coefficient=5e-3,  # chosen: 7.6 m/s of terminal speed
     moment_coefficient=1e-7,  # chosen: the paper's, over the fifth power of the arm length
-    action_scale=200.0,
-    physics_timestep=0.005,
-    control_timestep=0.02,
+    action_scale=200.0,  # chosen
+    physics_timestep=0.005,  # chosen
+    control_timestep=0.02,  # chosen
 )
 RACER = Vehicle(
     name="racer",  # Foehn et al. 2022, "Agilicious", Science Robotics 7: the Kingfisher
@@ -356,9 +371,9 @@ RACER = Vehicle(
     ),
     drag_coefficient=2e-2,  # chosen: 19 m/s of terminal speed
     moment_coefficient=1e-4,  # chosen
-    action_scale=150.0,
-    physics_timestep=0.005,
-    control_timestep=0.02,
+    action_scale=150.0,  # chosen
+    physics_timestep=0.005,  # chosen
+    control_timestep=0.02,  # chosen
 )
 HEXA = Vehicle(
     name="hexa",  # AscTec Firefly, in the numbers of RotorS (Furrer et al. 2016), rotors included
@@ -379,8 +394,10 @@ HEXA = Vehicle(
     drag_coefficient=3e-2,  # chosen: 22 m/s of terminal speed
     moment_coefficient=2e-3,  # chosen
     action_scale=110.0,  # chosen: a fifth of the hover speed, since its yaw is weak
-    physics_timestep=0.005,
-    control_timestep=0.02,
+    physics_timestep=0.005,  # chosen
+    control_timestep=0.02,  # chosen
 )
+OPTIONS = ("mass", "inertia", "drag_coefficient", "moment_coefficient", "action_scale")
+"""Fields that may differ from an aircraft's without making another one of it."""
 VEHICLES = {vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, RACER, HEXA)}
 """The aircraft that are known by name."""

@@ -6,6 +6,8 @@ ENVIRONMENT="$REPOSITORY/.venv"
 ENVIRONMENT_PYTHON="$ENVIRONMENT/bin/python"
 # First line: the fingerprint of what was installed. Second line: the extras.
 STAMP="$ENVIRONMENT/quadrl-environment"
+# Python: ends with 0 in a version that pyproject.toml allows.
+SUPPORTED='import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))'
 
 say() { printf 'quadrl: %s\n' "$*" >&2; }
 
@@ -26,13 +28,12 @@ install_packages() {
 find_python() {
     local candidate
     if [ -n "${PYTHON:-}" ]; then
-        "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null ||
-            die "PYTHON=$PYTHON is not a Python of version 3.11 or later"
+        "$PYTHON" -c "$SUPPORTED" 2>/dev/null || die "PYTHON=$PYTHON is not a Python 3.11 or 3.12"
         echo "$PYTHON"
         return
     fi
     for candidate in python3 python3.12 python3.11 python; do
-        if "$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))' 2>/dev/null; then
+        if "$candidate" -c "$SUPPORTED" 2>/dev/null; then
             echo "$candidate"
             return
         fi
@@ -85,6 +86,19 @@ ensure_renderer() {
         "or mesa-libEGL mesa-libGL mesa-dri-drivers (Fedora)."
 }
 
+# ensure_web: emcc, which compiles C to WebAssembly; and node and Chromium, which the tests of the page run.
+ensure_web() {
+    local command missing=()
+    for command in emcc:emscripten node:nodejs chromium:chromium; do
+        command -v "${command%%:*}" >/dev/null || missing+=("${command##*:}")
+    done
+    [ "${#missing[@]}" -eq 0 ] && return
+    install_packages "${missing[@]}" && return
+    command -v emcc >/dev/null ||
+        die "needs emcc to compile C to WebAssembly: install 'emscripten' (Debian, Ubuntu, Fedora, Homebrew)"
+    say "not here: ${missing[*]}; the page is built, and its tests are skipped"
+}
+
 # fingerprint: changes with anything that the environment is made from.
 fingerprint() {
     (cd "$REPOSITORY" && { pwd && cat pyproject.toml constraints.txt; } | cksum)
@@ -108,8 +122,8 @@ ensure_environment() {
     local extra installed wanted
     ensure_compiler
     [ -f "$ENVIRONMENT/pyvenv.cfg" ] || make_venv
-    "$ENVIRONMENT_PYTHON" -c 'import pip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null ||
-        die "$ENVIRONMENT has no Python 3.11 or later that works: remove it and run again"
+    "$ENVIRONMENT_PYTHON" -c "import pip; $SUPPORTED" 2>/dev/null ||
+        die "$ENVIRONMENT has no Python 3.11 or 3.12 that works: remove it and run again"
     installed="$(sed -n 2p "$STAMP" 2>/dev/null || true)"
     for extra in "$@"; do
         case " $installed " in

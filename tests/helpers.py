@@ -7,14 +7,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from quadrl import parameters, tasks
+from quadrl.aerodynamics import Aerodynamics, in_real_air
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
+from quadrl.randomization import Randomization
 from quadrl.state import Start
-from quadrl.vehicle import VEHICLES, Vehicle, resolve, ring
+from quadrl.vehicle import VEHICLES, Vehicle, ring
 
 # ------------------------------------------------------------------- motions, flown by an engine
 
 PARAMETERS = ("mass", "inertia", "drag_coefficient", "moment_coefficient")
+AIR_PARAMETERS = (
+    *("rotor_drag", "flapping_moment", "vortex_ring", "vortex_ring_noise", "rotor_inertia"),
+    *("blade_lift", "translational_lift", "body_lift", "air_density"),
+)
 ROTOR_PARAMETERS = ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed")
 UP = np.array([0.0, 0.0, 100.0])  # [m]; where nothing is near
 _ROTOR = dict(thrust_coefficient=1.1e-5, torque_coefficient=2e-7, lag_up=20.0, lag_down=12.0)
@@ -41,6 +47,23 @@ LAYOUTS = VEHICLES | {
     ),
 }
 """Every preset, and layouts that no preset has."""
+_AIR = dataclasses.replace(Aerodynamics.full(), flapping_moment=2e-6, rotor_inertia=2e-5)
+IN_AIR = {
+    f"{name} in air": in_real_air(
+        vehicle
+        if name in VEHICLES
+        else dataclasses.replace(
+            vehicle,
+            aerodynamics=_AIR,
+            rotors=tuple(
+                dataclasses.replace(rotor, disc_radius=0.08 + 0.005 * k * (name == "leaning"))
+                for k, rotor in enumerate(vehicle.rotors)
+            ),
+        )
+    )
+    for name, vehicle in LAYOUTS.items()
+}
+"""The same with every effect of the air."""
 
 
 @dataclasses.dataclass
@@ -104,7 +127,7 @@ def put(engine, motion, origin=UP):
     """Write a motion into an engine."""
     engine.qpos[:] = np.concatenate([motion.position + origin, motion.quaternion], axis=-1)
     engine.qvel[:] = np.concatenate([motion.velocity, motion.body_rate], axis=-1)
-    engine.act[:], engine.air[:] = motion.rotor_speed, motion.wind
+    engine.act[:], engine.wind[:] = motion.rotor_speed, motion.wind
 
 
 def taken(engine, origin=UP):
@@ -115,7 +138,7 @@ def taken(engine, origin=UP):
         velocity=engine.qvel[:, :3].copy(),
         body_rate=engine.qvel[:, 3:].copy(),
         rotor_speed=engine.act.copy(),
-        wind=engine.air.copy(),
+        wind=engine.wind.copy(),
     )
 
 
@@ -142,6 +165,10 @@ def parameter_rows(vehicle, count, seed=2, spread=0.2):
         table[name] *= rng.uniform(1 - spread, 1 + spread, table[name].shape)
     for name in ROTOR_PARAMETERS:
         table["rotor"][name] *= rng.uniform(1 - spread, 1 + spread, table["rotor"][name].shape)
+    for name in AIR_PARAMETERS:
+        table[name] *= rng.uniform(1 - spread, 1 + spread, table[name].shape)
+    disc = table["rotor"]["disc_radius"]
+    disc *= rng.uniform(1 - spread, 1 + spread, disc.shape)
     parameters.refresh(table, vehicle.physics_timestep)
     return table
 
@@ -182,41 +209,44 @@ FLAGS = ("terminated", "truncated", "is_success", "diverged")
 def vehicle_of_row(vehicle, row):
     """The aircraft that a row of parameters describes."""
     rotors = tuple(
-        dataclasses.replace(r, **{n: float(row["rotor"][n][k]) for n in ROTOR_PARAMETERS})
+        dataclasses.replace(
+            r,
+            position=tuple(row["rotor"]["position"][k].tolist()),
+            **{n: float(row["rotor"][n][k]) for n in ROTOR_PARAMETERS},
+        )
         for k, r in enumerate(vehicle.rotors)
     )
     own = {name: row[name].tolist() for name in PARAMETERS}
+    air = {name: float(row[name]) for name in ("rotor_drag", "flapping_moment", "blade_lift")}
+    own["aerodynamics"] = dataclasses.replace(vehicle.aerodynamics, **air)
     return dataclasses.replace(vehicle, rotors=rotors, **own | {"inertia": tuple(own["inertia"])})
 
 
-WIND = ((-2.0, -1.0, 0.0), (2.0, 1.0, 0.5))
-
-
-def ranges_of(vehicle, spread=0.1):
-    """Every parameter within a share of what is specified, in wind."""
-
-    def around(value):
-        return (1 - spread) * np.array(value), (1 + spread) * np.array(value)
-
-    given = {n: around(getattr(vehicle, n)) for n in PARAMETERS}
-    # J_z is next to J_x + J_y, and must not be larger.
-    given["inertia"] = tuple(np.array(vehicle.inertia) * [[1.0, 1.0, 1 - spread], [1 + spread] * 3])
-    given["inertia"][1][2] = vehicle.inertia[2]
-    rotor = vehicle.rotors[0]
-    given |= {n: around(getattr(rotor, n)) for n in ROTOR_PARAMETERS}
-    return given | {"wind": WIND}
+EVERYTHING = Randomization(
+    mass=(0.9, 1.1),
+    inertia=(0.9, 1.1),
+    thrust=(0.95, 1.05),
+    torque=(0.9, 1.1),
+    lag=(0.8, 1.25),
+    drag=(0.5, 1.5),
+    inflow=(0.9, 1.1),
+    max_speed=(0.95, 1.0),
+    rotors=(0.96, 1.04),
+    centre_of_mass=0.002,
+)
+"""Every number of an aircraft is drawn."""
 
 
 def drawn(environment):
     """Parameters and air of every row, (N, k), a copy."""
-    table, air = environment.engine.parameters, environment.engine.air
-    rows = np.ascontiguousarray(table).view(np.float64).reshape(len(table), -1)
+    table, air = environment.engine.parameters, environment.engine.wind
+    rows = parameters.numbers(table)
     return np.concatenate([np.broadcast_to(rows, (len(air), rows.shape[1])), air], axis=1)
 
 
 def flying(task="hover", *, count=4, seed=3, reset=True, **settings):
-    """An environment whose rows draw every parameter, and wind, unless `ranges` says others."""
-    settings = {"ranges": ranges_of(resolve(settings.get("vehicle")))} | settings
+    """An environment whose rows draw every parameter, unless `randomization` says others."""
+    settings = {"randomization": EVERYTHING} | settings
     environment = Environment(task, num_envs=count, seed=seed, **settings)
     if reset:
         environment.reset()

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from quadrl.errors import QuadrlError
+from quadrl.evaluation import evaluate
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training
-from quadrl.policy import Policy
-from quadrl.rollout import evaluate
 
 # 6 batches of 32 transitions; episodes of 10 steps, so that many end in between.
 TINY = TrainConfig(
@@ -67,7 +66,7 @@ def assert_same_run(a: Path, b: Path) -> None:
     assert (a / "policy.safetensors").read_bytes() == (b / "policy.safetensors").read_bytes()
     assert metrics(a) == metrics(b)
     task = TrainConfig.of_folder(a).make_task()
-    one, other = (evaluate(Policy.load(folder), task, episodes=4)[0] for folder in (a, b))
+    one, other = (evaluate(folder, task, episodes=4).metrics for folder in (a, b))
     assert one == other
 
 

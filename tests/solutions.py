@@ -26,6 +26,6 @@ def deviations(vehicle, engine, name, seconds):
     flights = exact(name)
     batch = BatchEngine(vehicle, len(flights["start"]), altitude=3.0, engine=engine)
     batch.qpos[:], batch.qvel[:], batch.act[:] = reference.to_mujoco(flights["start"])
-    batch.ctrl[:], batch.air[:] = flights["command"], flights["wind"]
+    batch.ctrl[:], batch.wind[:] = flights["command"], flights["wind"]
     batch.advance(round(seconds / vehicle.physics_timestep))
     return reference.deviation(batch.qpos, batch.qvel, batch.act, flights["end"])

@@ -11,17 +11,15 @@ steps make the 2,048 transitions of a batch; VecNormalize, as its model zoo has 
 import json
 import time
 from dataclasses import dataclass
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 import tyro
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-import quadrl  # noqa: F401 - registers the ids
+from quadrl.envs.sb3 import QuadrotorVecEnv
 from quadrl.rollout import fly, summarize
 
 
@@ -40,59 +38,6 @@ class Args:
     learning_rate: float = 3e-4  # of Adam
     anneal: bool = False  # let the learning rate fall linearly to zero
     gamma: float = 0.99  # discount of a control step
-
-
-class QuadrotorVecEnv(VecEnv):
-    """The native vector as Stable-Baselines3 wants it: reset in the same step, an info a row."""
-
-    def __init__(self, id: str, num_envs: int, **settings: Any) -> None:  # noqa: ANN401
-        """Make the aircraft."""
-        self.envs: Any = gym.make_vec(
-            id, num_envs, autoreset_mode="SameStep", reward_terms=False, **settings
-        )
-        super().__init__(
-            num_envs, self.envs.single_observation_space, self.envs.single_action_space
-        )
-
-    def reset(self) -> np.ndarray:
-        """Begin an episode in every row; `seed` was called before, or chance decides."""
-        return self.envs.reset(seed=self._seeds[0])[0]
-
-    def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for `step_wait`."""
-        self._actions = actions
-
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Fly one control step."""
-        observation, reward, terminated, truncated, info = self.envs.step(self._actions)
-        done, infos = terminated | truncated, [{} for _ in range(self.num_envs)]
-        for i in np.flatnonzero(done):
-            infos[i] = {
-                "terminal_observation": info["final_obs"][i],
-                "TimeLimit.truncated": bool(truncated[i]),
-                "is_success": bool(info["final_info"]["is_success"][i]),
-            }
-        return observation, reward.astype(np.float32), done, infos
-
-    def close(self) -> None:
-        """Free the renderer."""
-        self.envs.close()
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:  # noqa: ANN401
-        """An attribute of the batch, once a row."""
-        return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:  # noqa: ANN401
-        """Not for one row alone."""
-        raise NotImplementedError("the aircraft of a batch share their settings")
-
-    def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> list[Any]:  # noqa: ANN401
-        """Not for one row alone."""
-        raise NotImplementedError("the aircraft of a batch have no methods of their own")
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:  # noqa: ANN401
-        """No row is."""
-        return [False for _ in self._get_indices(indices)]
 
 
 class Stopwatch(BaseCallback):
@@ -119,9 +64,7 @@ class Stopwatch(BaseCallback):
 def main(args: Args) -> None:
     """Train, evaluate the mean action, print one JSON object."""
     torch.set_num_threads(1)  # networks this small are slower with a second thread
-    camel = "".join(word.capitalize() for word in args.task.split("_"))
-    envs = QuadrotorVecEnv(f"quadrl/{camel}-v0", args.num_envs)
-    envs = VecNormalize(VecMonitor(envs), gamma=args.gamma)
+    envs = VecNormalize(VecMonitor(QuadrotorVecEnv(args.task, args.num_envs)), gamma=args.gamma)
     watch = Stopwatch(args)
     model = PPO(
         "MlpPolicy",

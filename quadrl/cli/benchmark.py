@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
+from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
 from quadrl.validation import number
 
 
 @dataclasses.dataclass(frozen=True)
 class Benchmark:
-    """Measure the speed of every layer in one run, as rates and as shares of bare mj_step."""
+    """Measure the speed of every layer in one run, as rates and as shares of others."""
 
     num_envs: int = 1024
     """Aircraft in the batch."""
@@ -18,8 +19,8 @@ class Benchmark:
     """Length of each measurement; short, since the speed of a machine drifts."""
     repeats: int = 30
     """Measurements of each layer, in turns. The rate is the fastest; the share is the median of the
-    ratios to bare mj_step within a turn."""
-    task: str = "hover"
+    ratios to what it is a share of, within a turn."""
+    task: choices.TaskName = choices.TaskName("hover")
     """The task that is flown."""
     json: bool = False
     """Print one JSON object and nothing else."""
@@ -36,6 +37,6 @@ class Benchmark:
         if self.json:
             console.print_json(data=measured, indent=None)
             return
-        head = ("what", "control steps/s", "median", "of bare mj_step", "target")
-        console.print(make_table(head, rows(measured), numbers=4))
+        head = ("what", "control steps/s", "median", "share", "of", "target")
+        console.print(make_table(head, rows(measured), numbers=3))
         say(f"\n{summary(measured)}")

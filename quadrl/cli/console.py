@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from quadrl.tasks import TASKS
+from quadrl.evaluation import comes_with_quadrl
 
 console = Console()
 own_files: list[Path] = []
@@ -36,8 +36,8 @@ def make_table(head: Sequence[str], rows: Iterable[Sequence[str]] = (), numbers:
 def again(command: str, *folder: Path) -> str:
     """A command as it has to be typed, with the files that register what the run needs."""
     own = [word for path in own_files for word in ("--import", str(path))]
-    # The bare name of a task would mean the policy that comes with quadrl.
-    where = [f"./{path}" if str(path) in TASKS else str(path) for path in folder]
+    # A bare name may be that of a policy that comes with quadrl.
+    where = [f"./{path}" if comes_with_quadrl(str(path)) else str(path) for path in folder]
     return shlex.join(["quadrl", *own, *command.split(), *where])
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
-from quadrl.cli.console import console, make_table
+from quadrl.cli import choices
+from quadrl.cli.console import console, make_table, say
 from quadrl.cli.flown import Flown
-from quadrl.control import make as make_controller
-from quadrl.rollout import evaluate
+from quadrl.evaluation import evaluate, shown
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,26 +18,44 @@ class Evaluate(Flown):
 
     episodes: int = 100
     """Number of episodes."""
+    weather: choices.WeatherName = choices.WeatherName("")
+    """The weather: calm, light, moderate or severe, or JSON such as '{"wind_speed": 5}'; by default
+    that of the policy's training, and calm for a controller."""
+    sampled: bool = False
+    """Draw the actions of a policy as in training, instead of taking their mean."""
+    csv: Path | None = None
+    """Also write a table with one row per flight to this file."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
         """Print the metrics, beside those of the geometric controller."""
-        controller, task, vehicle = self.setting()
-        flown = {self.controller or "policy": controller}
+        _, controller, task, vehicle = self.setting()
+        name = self.controller or "policy"
+        flown: dict[str, Any] = {name: controller}
         if self.controller != "geometric" and not self.json:
-            flown["geometric controller"] = make_controller("geometric", task, vehicle)
-        columns = {
-            name: evaluate(one, task, episodes=self.episodes, seed=self.seed, vehicle=vehicle)[0]
+            flown["geometric controller"] = "geometric"
+        evaluations = {
+            name: evaluate(
+                one,
+                task,
+                episodes=self.episodes,
+                seed=self.seed,
+                vehicle=vehicle,
+                randomization=self.of_all("randomization", [controller]),
+                weather=self.of_all("weather", [controller]),
+                sampled=self.sampled and one is controller,
+            )
             for name, one in flown.items()
         }
-        first = next(iter(columns.values()))
+        first = evaluations[name].metrics
+        if self.csv is not None:
+            evaluations[name].save_csv(self.csv)
         if self.json:
             console.print_json(data=first, indent=None)
             return
-        rows = [(name, *(_text(metrics[name]) for metrics in columns.values())) for name in first]
-        console.print(make_table(("", *columns), rows, numbers=len(columns)))
-
-
-def _text(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+        columns = [evaluation.metrics for evaluation in evaluations.values()]
+        rows = [(metric, *(shown(column[metric]) for column in columns)) for metric in first]
+        console.print(make_table(("", *evaluations), rows, numbers=len(columns)))
+        if self.csv is not None:
+            say(f"wrote {self.csv}")

@@ -4,71 +4,96 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from quadrl import tasks
+from quadrl.cli import choices
 from quadrl.control import CONTROLLERS
-from quadrl.control import make as make_controller
 from quadrl.errors import QuadrlError
+from quadrl.evaluation import comes_with_quadrl, setting
 from quadrl.learning.config import tuples
-from quadrl.policy import Policy
 from quadrl.rollout import Controller
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
+from quadrl.validation import choice
+from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)
 class Flown:
     """What flies, and what it flies."""
 
-    policy: Positional[str] = ""
-    """A run folder, a .safetensors file, or the name of a task: then the policy for it that comes
-    with quadrl (write ./NAME for a folder of that name)."""
-    algo: str = ""
+    policy: Annotated[Positional[str], arg(metavar="[POLICY]")] = ""
+    """A run folder, a .safetensors file, the name of a task, for the policy for it that comes with
+    quadrl, or of such a policy, as hover_robust (write ./NAME for a folder of that name)."""
+    algo: choices.Algorithm = choices.Algorithm("")
     """The algorithm that trained the policy that comes with quadrl; ppo by default."""
-    controller: str = ""
+    controller: choices.ControllerName = choices.ControllerName("")
     """A controller instead of a policy: geometric or lqr."""
-    task: str = ""
+    task: choices.TaskName = choices.TaskName("")
     """The task; by default the one that the policy was trained for, and hover for a controller."""
-    vehicle: str = ""
+    vehicle: choices.VehicleName = choices.VehicleName("")
     """The aircraft; by default the one that the policy was trained with, paper for a controller."""
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
     task_options: tuple[str, ...] = ()
     """Options of the task that differ from the training's, such as time_limit=5."""
 
-    def setting(self) -> tuple[Controller, Task, Vehicle]:
-        """Controller, task and aircraft.
+    randomization: choices.RandomizationName = choices.RandomizationName("")
+    """What is drawn for each aircraft and disturbs it: none, light or full, or JSON such as
+    '{"mass": [0.8, 1.2]}'; by default that of the policy's training, and none for a controller."""
+
+    aerodynamics: str = ""
+    """Effects of the air on the rotors: none, full, or names of single ones with commas between
+    them; by default those of the policy's training."""
+
+    def setting(self) -> tuple[str, Controller, Task, Vehicle]:
+        """A name for what flies, what flies, task and aircraft.
 
         Raises:
             QuadrlError: One is unknown, or the choice is ambiguous.
         """
-        options = parse_options(self.task_options)
         if bool(self.policy) == bool(self.controller):
             raise QuadrlError(
                 "give either a policy (a run folder, a .safetensors file, or the name of a task) "
                 f"or --controller {' or '.join(CONTROLLERS)}"
             )
-        shipped = self.policy in tasks.TASKS
-        if self.algo and not shipped:
+        if self.algo and self.policy not in tasks.TASKS:
             raise QuadrlError(
                 "--algo chooses among the policies that come with quadrl: give the name of a task, "
                 "or leave it out"
             )
-        if not self.policy:
-            vehicle = resolve(self.vehicle or None)
-            task = tasks.make(self.task or "hover", **options)
-            return make_controller(self.controller, task, vehicle), task, vehicle
-        if shipped:
-            policy = Policy.pretrained(self.policy, self.algo or "ppo")
-        else:
-            policy = Policy.load(self.policy)
-        name = self.task or policy.task
-        trained = policy.metadata.get("task_options", {}) if name == policy.task else {}
-        task = tasks.make(name, **(trained | options))
-        return policy, task, resolve(self.vehicle or policy.metadata.get("vehicle"))
+        choice("controller", self.controller or "geometric", CONTROLLERS)
+        # The name of a controller is no policy here: a folder may be called so.
+        flown = self.controller or (
+            self.policy if comes_with_quadrl(self.policy) else Path(self.policy)
+        )
+        options = parse_options(self.task_options)
+        chosen = self.task or None, self.vehicle or None, options, self.algo or "ppo"
+        return setting(flown, *chosen, self.aerodynamics or None)
+
+    def of_all(self, name: str, flown: Iterable[Controller]) -> Any:
+        """The weather, or the randomization, in which all fly beside each other."""
+        own = (getattr(controller, "conditions", {}).get(name) for controller in flown)
+        return parse_named(name, getattr(self, name)) or next(filter(None, own), None)
+
+
+def parse_named(name: str, text: str) -> Any:
+    """A name as it is, or what JSON such as {"mass": [0.8, 1.2]} stands for.
+
+    Raises:
+        QuadrlError: It begins like JSON and is none.
+    """
+    if not text.startswith("{"):
+        return text
+    try:
+        return tuples(json.loads(text))
+    except (ValueError, RecursionError) as error:
+        allowed = 'a name, or JSON such as {"mass": [0.8, 1.2]}'
+        raise QuadrlError(f"{error}", name=name, value=text, allowed=allowed) from None
 
 
 def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:

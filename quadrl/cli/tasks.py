@@ -10,6 +10,7 @@ from rich.markup import escape
 from tyro.conf import Positional
 
 from quadrl import tasks
+from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
 from quadrl.description import describe
 
@@ -18,7 +19,7 @@ from quadrl.description import describe
 class Tasks:
     """List the tasks, or describe one of them in full."""
 
-    task: Positional[str] = ""
+    task: Positional[choices.TaskName] = choices.TaskName("")
     """Name of a task, to describe it with its options; all tasks by default."""
     json: bool = False
     """Print one JSON object and nothing else."""

@@ -6,17 +6,28 @@ import dataclasses
 import time
 import typing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from quadrl.cli.console import again, console, reason, say
-from quadrl.cli.flown import parse_options
-from quadrl.cli.progress import ProgressBar
+from quadrl.cli import choices
+from quadrl.cli.console import again, console, make_table, reason, say
+from quadrl.cli.flown import parse_named, parse_options
 from quadrl.description import docstrings
-from quadrl.errors import QuadrlError
+from quadrl.errors import QuadrlError, RenderingUnavailable
 from quadrl.learning import folder as names
-from quadrl.learning.config import TrainConfig
+from quadrl.learning.config import TrainConfig, prepare
+from quadrl.learning.defaults import PAIRS
+from quadrl.progress import ProgressBar
+from quadrl.rollout import MAX_EPISODES, MAX_SEED
+from quadrl.validation import number
+
+if TYPE_CHECKING:
+    from quadrl.learning.run import Run
+
+
+MAX_SEEDS = 1000  # in one command
+FEW = 16  # aircraft: with less, most of the time goes into calls from Python
 
 
 def optional(config: type) -> type:
@@ -26,7 +37,7 @@ def optional(config: type) -> type:
     """
     hints, texts, fields = typing.get_type_hints(config), docstrings(config), []
     for field in dataclasses.fields(config):
-        kind, help_text = hints[field.name], texts[field.name]
+        kind, help_text = choices.SETTINGS.get(field.name, hints[field.name]), texts[field.name]
         if dataclasses.is_dataclass(kind):
             inner: Any = optional(typing.cast(type, kind))
             factory = dataclasses.field(default_factory=inner)
@@ -34,11 +45,12 @@ def optional(config: type) -> type:
             continue
         default: Any = field.default
         shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
-        if field.name == "task_options":
+        if field.name in PAIRS:
             kind, shown = tuple[str, ...], "none"
         hint = arg(help=help_text, help_behavior_hint=f"(default: {shown})")
-        if field.name == "task":
-            fields.append((field.name, Annotated[Positional[str], hint], field.default))
+        if field.name in choices.SETTINGS:
+            word = Positional[kind] if field.name == "task" else kind
+            fields.append((field.name, Annotated[word, hint], kind("")))
         else:
             fields.append((field.name, Annotated[kind | None, hint], None))
     return dataclasses.make_dataclass(f"{config.__name__}Settings", fields, frozen=True)
@@ -57,37 +69,64 @@ class Train:
 
     settings: Annotated[Settings, arg(name="")]  # pyright: ignore[reportInvalidTypeForm]
     out: Path | None = None
-    """Folder of the run; by default runs/TASK-ALGO-SEED. It must not hold a run."""
+    """Folder of the run; by default runs/TASK-ALGO-SEED, numbered if that holds a run already. With
+    --seeds the folder of the runs."""
     resume: Path | None = None
-    """Continue the run in this folder, with its own settings; other settings are ignored."""
+    """Continue the run in this folder, with its own settings; --steps may ask for more than it was
+    begun with."""
+    seeds: Annotated[str, arg(help_behavior_hint="(default: none)")] = ""
+    """Train several seeds one after another and draw their curves in one picture: 0:5 for 0 to 4,
+    or 3,5,8."""
     episodes: int = 100
     """Episodes of the evaluation at the end."""
     video: bool = True
-    """Draw a flight at the end."""
+    """Draw a flight at the end; with --seeds none is drawn."""
 
     def run(self) -> None:
-        """Train, evaluate, draw, sum up."""
-        config, folder = None, self.resume
-        if folder is None:
-            settings = dataclasses.asdict(self.settings)
-            options = parse_options(settings.pop("task_options") or ())
-            config = TrainConfig(**settings, task_options=options or None)
-            named = Path("runs") / f"{config.task}-{config.algo}-{config.seed}"
-            folder = self.out or named
+        """Train, sum up, draw."""
+        settings = given(dataclasses.asdict(self.settings))
+        for name in PAIRS:
+            if options := parse_options(settings.pop(name, ())):
+                settings[name] = options
+        for name in ("weather", "randomization"):
+            if name in settings:
+                settings[name] = parse_named(name, settings[name])
+        task = settings.pop("task", None)
+        if not self.seeds:
+            run = self._train(*prepare(task, self.out, self.resume, settings))
+            _draw(run, video=self.video)
+            _list_files(run)
+            return
+        configs = [TrainConfig(task or "hover", seed=k, **settings) for k in self._seeds(settings)]
+        where = self.out or Path("runs")
+        runs = []
+        for config in configs:
+            folder = names.free_folder(where / f"{config.task}-{config.algo}-{config.seed}")
+            runs.append(self._train(config, folder))
+            _draw(runs[-1], video=False)
+        _compare(runs, where)
+
+    def _train(self, config: TrainConfig, folder: Path) -> Run:
+        """Train and evaluate, and print the result."""
+        number("episodes", self.episodes, 1, MAX_EPISODES, whole=True)
         began = time.perf_counter()
         with console.status("importing torch and TorchRL"):
-            from quadrl.learning.run import train
+            from quadrl.learning.run import train_in
         imports = time.perf_counter() - began
+        if self.resume:
+            say(f"continuing {folder}")
+        batch = config.num_envs * config.rollout
+        if config.steps % batch:
+            say(f"{config.iterations * batch:,} steps: whole batches of {batch:,}")
         go_on = f"continue it: {again('train --resume', folder)}"
         try:
-            with ProgressBar() as bar:
-                config, metrics = train(
-                    config,
+            with ProgressBar(console) as bar:
+                run = train_in(
                     folder,
+                    config,
+                    resume=self.resume is not None,
                     episodes=self.episodes,
-                    video=self.video,
-                    on_progress=bar.show,
-                    report=say,
+                    show=bar.show,
                 )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"stopped; the run is kept, {go_on}") from None
@@ -95,20 +134,74 @@ class Train:
             kept = (folder / names.CONFIG).exists()
             advice = f"the run is kept, {go_on}" if kept else "choose another --out"
             raise QuadrlError(f"{reason(error)}; {advice}") from error
-        _sum_up(folder, config, metrics, imports)
+        _sum_up(run, imports)
+        if config.num_envs < FEW:
+            say("Many aircraft train faster than few, with shorter rollouts: see --num-envs.\n")
+        return run
+
+    def _seeds(self, settings: dict[str, Any]) -> list[int]:
+        """The numbers in --seeds.
+
+        Raises:
+            QuadrlError: They are no such numbers, or another option speaks against them.
+        """
+        for name, other in (("--seed", settings.get("seed")), ("--resume", self.resume)):
+            if other is not None:
+                raise QuadrlError(name=name, value=str(other), allowed="left out beside --seeds")
+        first, colon, last = self.seeds.partition(":")
+        words = self.seeds.split(",")
+        try:
+            count = int(last) - int(first) if colon else len(words)
+            wanted = range(int(first), int(last)) if colon else map(int, words)
+            seeds = list(wanted) if 0 < count <= MAX_SEEDS else []
+        except ValueError:
+            seeds = []
+        within = seeds and 0 <= min(seeds) and max(seeds) <= MAX_SEED
+        if not within or len(set(seeds)) < len(seeds):
+            allowed = f"FIRST:END such as 0:5, or numbers such as 3,5,8; at most {MAX_SEEDS}"
+            raise QuadrlError(name="seeds", value=self.seeds, allowed=allowed)
+        return seeds
 
 
-def _sum_up(folder: Path, config: TrainConfig, metrics: dict[str, Any], imports: float) -> None:
-    """Print the result, the files and what to try next."""
+def given(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings that are given, at any depth."""
+    kept = {k: given(v) if isinstance(v, dict) else v for k, v in settings.items()}
+    return {name: value for name, value in kept.items() if value not in (None, "", {})}
+
+
+def _sum_up(run: Run, imports: float) -> None:
+    """Print what the policy reached."""
+    config, metrics = run.config, run.evaluation.metrics
     console.print(
         f"\n[bold]{config.task}[/bold] trained with {config.algo.upper()} in "
-        f"{metrics['training_s']:.1f} s of wall clock from the first step to the saved policy "
+        f"{run.seconds:.1f} s of wall clock from the first step to the saved policy "
         f"(imports: {imports:.1f} s; engine: {config.engine})\n"
         f"{metrics['episodes']} episodes in MuJoCo with the mean action: "
         f"{100 * metrics['survival_rate']:.0f} % to the end, "
         f"{100 * metrics['success_rate']:.0f} % successful, error over the last 2 s "
         f"{100 * metrics['position_error_m']:.1f} cm\n"
     )
+
+
+def _draw(run: Run, *, video: bool) -> None:
+    """Draw the pictures of a run; Ctrl-C skips the rest of them."""
+    with ProgressBar(console) as bar:
+
+        def on_frame(done: int, total: int) -> None:
+            bar.update(done, total, f"drawing {names.VIDEO} (Ctrl-C skips it)")
+
+        try:
+            for _ in run.draw(video=video, on_frame=on_frame):
+                pass
+        except KeyboardInterrupt:
+            say(f"skipped; to draw it later: {again('render', run.folder)}")
+        except RenderingUnavailable as error:
+            say(f"no video: {error}")
+
+
+def _list_files(run: Run) -> None:
+    """Print what is in the folder of a run, and what to try next."""
+    folder = run.folder
     meanings = {
         "policy.safetensors": "the policy",
         names.LEARNING_CURVE: "return, success and error over the training",
@@ -117,7 +210,7 @@ def _sum_up(folder: Path, config: TrainConfig, metrics: dict[str, Any], imports:
         names.EVALUATION: "the metrics",
         names.METRICS: f"the training, row by row; also: tensorboard --logdir {folder}",
         names.CONFIG: "the resolved configuration",
-        "checkpoint.safetensors": f"to continue: {again('train --resume', folder)}",
+        "checkpoint.safetensors": f"to continue: {again('train --resume', folder)} --steps N",
     }
     say(f"in {folder}")
     for name, meaning in meanings.items():
@@ -128,3 +221,27 @@ def _sum_up(folder: Path, config: TrainConfig, metrics: dict[str, Any], imports:
         f"      {again('evaluate', folder)} --episodes 1000\n"
         f"      {again('tasks')}"
     )
+
+
+def _compare(runs: list[Run], folder: Path) -> None:
+    """Print the results of several seeds in a table, and draw their curves in one picture."""
+    from quadrl.learning.figures import learning_curves, read_metrics
+
+    head = ("run", "successful", "error over the last 2 s", "return", "training")
+    rows = []
+    for run in runs:
+        found = run.evaluation.metrics
+        rows.append(
+            (
+                str(run.folder),
+                f"{100 * found['success_rate']:.0f} %",
+                f"{100 * found['position_error_m']:.1f} cm",
+                f"{found['return_mean']:.0f}",
+                f"{run.seconds:.1f} s",
+            )
+        )
+    console.print("", make_table(head, rows, numbers=4))
+    config = runs[0].config
+    curves = {config.algo: [read_metrics(run.folder / names.METRICS) for run in runs]}
+    path = folder / f"{config.task}-{config.algo}-seeds.png"
+    say(f"\nwrote {learning_curves(curves, config.task, path)}")

@@ -56,8 +56,7 @@ class Allocation:
 
         A common thrust t with low <= x / s + t <= high exists if s is at least that.
         """
-        share = tilt[:, None, :] - tilt[:, :, None]
-        share /= self._room
+        share = (tilt[:, None, :] - tilt[:, :, None]) / self._room
         return share.max(axis=(1, 2))
 
 

@@ -140,7 +140,7 @@ class Loops:
         """
         rate, brake = self._position_gain, self.max_acceleration[1:] / 2  # (2,), level and up
         half = brake / rate**2 / 2
-        distance = np.array([norm(offset[:, :2]), np.abs(offset[:, 2])]).T  # (N, 2)
+        distance = columns(norm(offset[:, :2])[:, None], np.abs(offset[:, 2:]))  # (N, 2)
         stoppable = np.sqrt(2 * brake * np.maximum(distance - half, half))
         speed = np.minimum(np.minimum(rate * distance, stoppable), max_speed)
         return offset * (speed / np.maximum(distance, 1e-9)).T.take((0, 0, 1), axis=0).T

@@ -25,12 +25,14 @@ ENGINES: tuple[EngineName, ...] = ("mujoco", "free_flight")
 class Engine(abc.ABC):
     """What is common: the table of the state, filled from rows of generalised coordinates."""
 
+    name: EngineName
     model: mujoco.MjModel
     qpos: np.ndarray  # (N, 7), live
     qvel: np.ndarray  # (N, 6)
     act: np.ndarray  # (N, R) rotor speeds [rad/s]
     ctrl: np.ndarray  # (N, R) rotor commands [rad/s]
-    air: np.ndarray  # (N, 3) wind [m/s], world frame; saved and restored with the rest
+    air: np.ndarray  # (N, AIR) rows of air; saved and restored with the rest
+    wind: np.ndarray  # (N, 3) [m/s], world frame: the first numbers of `air`
     parameters: np.ndarray  # (N,) rows, or (1,) where all are the same
 
     def __init__(
@@ -38,7 +40,7 @@ class Engine(abc.ABC):
         vehicle: Vehicle,
         fields: dict[str, np.ndarray],
         altitude: float,
-        name: str,
+        name: EngineName,
         threads: int,
     ) -> None:
         """Set up the tables.
@@ -50,12 +52,13 @@ class Engine(abc.ABC):
             name: One of ENGINES.
             threads: Threads to fly on.
         """
-        self.vehicle, self.num_envs = vehicle, len(fields["qpos"])
+        self.vehicle, self.name, self.num_envs = vehicle, name, len(fields["qpos"])
         self.origin = np.array([0.0, 0.0, altitude])  # (3,) [m], world
         self.qpos, self.qvel, self.act, self.ctrl = (
             fields[k] for k in ("qpos", "qvel", "act", "ctrl")
         )
         self.air = fields["userdata"][:, : parameters.AIR]
+        self.wind = self.air[:, :3]
         self._free_flight = FreeFlight(self.model, fields, threads) if name != "mujoco" else None
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
@@ -77,12 +80,13 @@ class Engine(abc.ABC):
         self.parameters = rows.view(parameters.AIRCRAFT)[:, 0]
         if self._free_flight is not None:
             self._free_flight.use(self.parameters)
-        arrays = (self.qpos, self.qvel, self.act, self.origin, self.parameters)
-        stride = self.parameters.strides[0] // 8 if len(self.parameters) > 1 else 0
+        self._limits = parameters.limits(self.parameters)
+        arrays = (self.qpos, self.qvel, self.act, self.origin, self._limits)
+        stride = self._limits.shape[1] if len(self._limits) > 1 else 0
         # As `Rows` in native/state.c.
         self._rows = np.array(
             [*(array.ctypes.data for array in arrays), self.qpos.strides[0] // 8, stride,
-             self.frames[0].columns]
+             self.frames[0].columns, self.vehicle.rotor_count]
         )  # fmt: skip
         self._address = self._rows.ctypes.data
 
@@ -94,7 +98,7 @@ class Engine(abc.ABC):
         weights = np.concatenate([1 / mass, (1 / inertia).mean(1, keepdims=True)], axis=1)
         ratio = rotor["torque_coefficient"] / rotor["thrust_coefficient"]
         for name, place, value in (
-            ("body_user", np.s_[:, 1], table.view(np.float64).reshape(len(table), -1)),
+            ("body_user", np.s_[:, 1], parameters.numbers(table)),
             ("body_mass", np.s_[:, 1], mass[:, 0]),
             ("body_subtreemass", np.s_[:, :2], mass),
             ("body_inertia", np.s_[:, 1], inertia),
@@ -106,6 +110,12 @@ class Engine(abc.ABC):
         ):
             field = self._model_field(name)
             field[place][rows] = value
+        self._model_field("site_pos")[np.ix_(rows, self.model.actuator_trnid[:, 0])] = rotor[
+            "position"
+        ]
+        self._limits[rows] = parameters.limits(table)
+        if self._free_flight is not None:
+            self._free_flight.write(rows, table)
 
     @abc.abstractmethod
     def advance(self, steps: int) -> None:
@@ -128,8 +138,8 @@ class Engine(abc.ABC):
             return None
         table, last = (frame.table for frame in self.frames)
         sound = (np.abs(table) < mujoco.mjMAXVAL).all(axis=0)
-        sound &= table[FIRST["speed"]] <= self.parameters["resolved_speed"]
-        broken = ~(sound & (table[FIRST["angular_speed"]] <= self.parameters["resolved_turn"]))
+        sound &= table[FIRST["speed"]] <= self._limits[:, 0]
+        broken = ~(sound & (table[FIRST["angular_speed"]] <= self._limits[:, 1]))
         rows = np.flatnonzero(broken)
         table[:, rows] = last[:, rows]
         air = self.air[rows]
@@ -161,9 +171,9 @@ class Engine(abc.ABC):
 
     def _refuse(self, rows: np.ndarray, start: Start) -> None:
         """Say what is wrong with a start."""
-        own = self.parameters if len(self.parameters) == 1 else self.parameters[rows]
-        fastest = {"velocity": own["resolved_speed"].min(), "body_rate": own["resolved_turn"].min()}
+        own = self._limits if len(self._limits) == 1 else self._limits[rows]
         names = ("velocity", "body_rate", "quaternion", "rotor_speed")
+        fastest = dict(zip(names, own.min(axis=0), strict=False))
         for name in names:
             part, limit = getattr(start, name), fastest.get(name, mujoco.mjMAXVAL)
             if not ((np.abs(part) < mujoco.mjMAXVAL).all() and (norm(part) <= limit).all()):
@@ -190,8 +200,7 @@ class Engine(abc.ABC):
         self._fill(None)
 
     def _saved_parameters(self) -> np.ndarray:
-        rows = np.ascontiguousarray(self.parameters)
-        return rows.view(np.float64).reshape(len(rows), -1).copy()
+        return parameters.numbers(self.parameters).copy()
 
     def _write(self, rows: np.ndarray, start: Start | State) -> None:
         self.qpos[rows] = np.concatenate([start.position + self.origin, start.quaternion], axis=-1)

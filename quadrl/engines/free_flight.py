@@ -16,11 +16,14 @@ import numpy as np
 
 from quadrl import native
 from quadrl.errors import QuadrlError
+from quadrl.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
 """Those of mjData that free flight reads or writes."""
 ROWS_PER_THREAD = 256
 """Aircraft that are worth a thread."""
+LANES = 8
+"""Aircraft that the kernel flies side by side."""
 MARGIN = 0.05
 """Clearance at which MuJoCo takes over [m]; more than what a contact's own margin is."""
 
@@ -45,24 +48,34 @@ class FreeFlight:
         self._fields = fields  # kept alive: the kernel knows their addresses
         self._addresses = [fields[name].ctypes.data for name in FIELDS]
         self._stride = stride
-        self._world = np.array([model.opt.timestep, model.opt.gravity[2], _floor(model)])
+        self._world = world(model)
         self._near = np.zeros(count, dtype=np.int8)
         parts = max(1, min(threads, count // ROWS_PER_THREAD))
         # Whole groups of lanes to each, so that no group is flown twice.
-        ends = [8 * (count * k // parts // 8) for k in range(parts)] + [count]
+        ends = [LANES * (count * k // parts // LANES) for k in range(parts)] + [count]
         self._parts = list(zip(ends, ends[1:], strict=False))
         self._pool = ThreadPoolExecutor(parts - 1) if parts > 1 else None
 
-    def use(self, parameters: np.ndarray) -> None:
-        """Take rows of parameters (N,), or one (1,) for all; live."""
-        stride = parameters.strides[0] // 8 if len(parameters) == len(self._near) > 1 else 0
-        self._parameters = parameters  # kept alive
-        last = (parameters, self._world, self._near)
+    def use(self, table: np.ndarray) -> None:
+        """Take rows of parameters (N,), or one (1,) for all; that one is live."""
+        self._parameters, block = table, 0
+        if len(table) > 1:
+            rotors = MAX_ROTORS - int(table["rotor_count"][0])
+            block = LANES * (ROW_SIZE - rotors * ROTOR.itemsize // 8)
+            self._parameters = np.empty((-(-len(table) // LANES), block // LANES, LANES))
+            self._parameters[:] = numbers(table[:1])[0, : block // LANES, None]
+            self.write(np.arange(len(table)), table)
+        last = (self._parameters, self._world, self._near)
         # As `Rows` in native/free_flight.c.
         self._rows = np.array(
-            [*self._addresses, *(array.ctypes.data for array in last), self._stride, stride]
+            [*self._addresses, *(array.ctypes.data for array in last), self._stride, block]
         )
         self._address = self._rows.ctypes.data
+
+    def write(self, rows: np.ndarray, table: np.ndarray) -> None:
+        """Take parameters (n,) of some aircraft (n,)."""
+        if (blocks := self._parameters).ndim > 1:
+            blocks[rows // LANES, :, rows % LANES] = numbers(table)[:, : blocks.shape[1]]
 
     def advance(self, steps: int) -> np.ndarray | None:
         """Fly some physics steps.
@@ -78,6 +91,11 @@ class FreeFlight:
         marked = self._kernel(self._address, *self._parts[0], steps)
         marked += sum(part.result() for part in waiting)
         return np.flatnonzero(self._near) if marked else None
+
+
+def world(model: mujoco.MjModel) -> np.ndarray:
+    """Physics step [s], gravity along z [m/s^2] and floor [m]: `World` of the kernel."""
+    return np.array([model.opt.timestep, model.opt.gravity[2], _floor(model)])
 
 
 def _floor(model: mujoco.MjModel) -> float:

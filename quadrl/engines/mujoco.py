@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -13,6 +15,9 @@ from quadrl.engines.engine import ENGINES, Engine, EngineName
 from quadrl.engines.free_flight import FIELDS
 from quadrl.errors import QuadrlError
 from quadrl.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadrl.task import Task
 
 __all__ = ["ENGINES", "BatchEngine", "DataEngine", "Engine", "EngineName", "make"]
 
@@ -108,6 +113,11 @@ class DataEngine(Engine):
         fields = {name: getattr(data, name)[None] for name in FIELDS}
         super().__init__(vehicle, fields, altitude, engine, 1)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickle and deepcopy: over the copy of its data that its owner has then."""
+        copied = functools.partial(DataEngine, altitude=self.origin[2], engine=self.name)
+        return _over, (copied, self.vehicle, self.data)
+
     def _model_field(self, name: str) -> np.ndarray:
         return getattr(self.model, name)[None]
 
@@ -144,6 +154,13 @@ class DataEngine(Engine):
         spec = mujoco.mjtState.mjSTATE_INTEGRATION
         mujoco.mj_setState(self.model, self.data, saved["rows"][0], spec)
         self._restore_state(saved)
+        # What is drawn and measured belongs to the new state; the warm start is what was saved.
+        mujoco.mj_forward(self.model, self.data)
+        mujoco.mj_setState(self.model, self.data, saved["rows"][0], spec)
+
+
+def _over(copied: Callable[..., DataEngine], vehicle: Vehicle, data: mujoco.MjData) -> DataEngine:
+    return copied(vehicle, data.model, data)
 
 
 def make(
@@ -174,6 +191,31 @@ def make(
     return DataEngine(vehicle, model, mujoco.MjData(model), **world)
 
 
+def of_task(
+    engine: str | Engine, task: Task, vehicle: Vehicle, num_envs: int, **settings: Any
+) -> Engine:
+    """The engine of a name in the world of a task, or one that is made already.
+
+    Args:
+        engine: The name, or the engine.
+        task: The task.
+        vehicle: The aircraft.
+        num_envs: N.
+        **settings: Those of `make`; `per_row` is asked of either.
+
+    Raises:
+        QuadrlError: As `make`; or the engine's aircraft cannot have parameters of their own.
+    """
+    if isinstance(engine, Engine):
+        if settings["per_row"] and len(engine.parameters) < engine.num_envs:
+            allowed = "made with per_row=True, since parameters are drawn"
+            raise QuadrlError(name="engine", value=engine, allowed=allowed)
+        return engine
+    altitude = max(task.altitude, vehicle.ground_clearance)
+    world: Any = {"altitude": altitude, "contact": task.contact, "scene": task.scene}
+    return make(engine, vehicle, num_envs, **world, **settings)
+
+
 def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:
     """Refuse a model whose coordinates are not the aircraft's alone, or that would fly wrongly."""
     count = vehicle.rotor_count
@@ -187,7 +229,7 @@ def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:
         (marked and rotors, "the parameters of an aircraft: begin with quadrl.mjcf.spec"),
         (
             model.nuserdata >= parameters.AIR,
-            f"nuserdata of at least {parameters.AIR}, for the wind",
+            f"nuserdata of at least {parameters.AIR}, for the air",
         ),
         (step == vehicle.physics_timestep, f"the vehicle's step, {vehicle.physics_timestep} s"),
     ):

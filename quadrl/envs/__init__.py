@@ -1,4 +1,4 @@
-"""The APIs: dm_control, Gymnasium and TorchRL, thin layers over `quadrl.environment`."""
+"""The APIs, thin layers over `quadrl.environment`: dm_control, Gymnasium, SB3 and TorchRL."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import gymnasium as gym
 from quadrl import tasks
 
 if TYPE_CHECKING:
-    from quadrl.envs import dm_control, gymnasium, torchrl
+    from quadrl.envs import dm_control, gymnasium, sb3, torchrl
 
-__all__ = ["dm_control", "gymnasium", "register_ids", "torchrl"]
+__all__ = ["dm_control", "gymnasium", "register_ids", "sb3", "torchrl"]
 
 
 def register_ids() -> None:
@@ -22,7 +22,7 @@ def register_ids() -> None:
         if (id := f"quadrl/{camel}-v0") not in gym.registry:
             gym.register(
                 id=id,
-                entry_point="quadrl.envs.gymnasium:QuadrotorEnv",
+                entry_point="quadrl.envs.gymnasium:make_one",
                 vector_entry_point="quadrl.envs.gymnasium:QuadrotorVectorEnv",
                 kwargs={"task": name},
                 # The environment itself refuses a step before a reset and a bad action, and the

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -9,13 +10,21 @@ from typing import Any
 import numpy as np
 
 from quadrl import mjcf, tasks, validation
+from quadrl.aerodynamics import Aerodynamics, with_effects
 from quadrl.environment import Environment
+from quadrl.errors import RenderingUnavailable
+from quadrl.rotation import norm
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
 
-ENVIRONMENT = ("control_mode", "engine", "ranges", "num_threads", "seed")
-KEYWORDS = (*ENVIRONMENT, "vehicle", "max_episode_steps", "reward_terms")
-"""Keywords beside the options of the task; those of `quadrl.environment.Environment` come first."""
+ENVIRONMENT = (
+    *("control_mode", "engine", "weather", "randomization", "observe", "num_threads", "seed"),
+)
+"""Keywords of `quadrl.environment.Environment` that every API passes on."""
+OWN = ("vehicle", "aerodynamics", "control_timestep", "max_episode_steps", "reward_terms")
+KEYWORDS = (*ENVIRONMENT, *OWN)
+PICTURE = ("width", "height", "camera")
+"""Keywords of the pictures that an API draws."""
 
 
 def make(
@@ -23,7 +32,10 @@ def make(
     num_envs: int,
     *,
     vehicle: Vehicle | str | None = None,
+    aerodynamics: Aerodynamics | str | None = None,
+    control_timestep: float | None = None,
     max_episode_steps: int | None = None,
+    also: Iterable[str] = (),
     **settings: Any,
 ) -> Environment:
     """Make an environment.
@@ -32,24 +44,37 @@ def make(
         task: A name of the catalogue or a task.
         num_envs: N.
         vehicle: A name of `quadrl.VEHICLES` or a Vehicle; None for the paper's.
+        aerodynamics: Effects of the air on its rotors: "none", "full", names of single ones with
+            commas between them, or an Aerodynamics; None for those of the vehicle.
+        control_timestep: Time between two actions [s]; None for the vehicle's.
         max_episode_steps: The time limit in control steps, in place of `time_limit` [s].
+        also: Keywords that the API takes itself.
         **settings: `control_mode` (what actions mean, a name of `quadrl.control.CONTROL_MODES`),
             `engine` ("mujoco", or "free_flight": no contact is computed where there is nothing to
-            touch), `ranges` (of parameters that are drawn at each reset), `num_threads` (of the
-            simulation; 0 for every core), `seed` (row i is seeded with seed + i; None for one from
-            the system), and any option of the task.
+            touch), `weather` (a name of `quadrl.weather.WEATHERS` or a Weather), `randomization`
+            (what is drawn at each reset and disturbs the flight: a name of `quadrl.RANDOMIZATIONS`
+            or a `quadrl.Randomization`), `observe` (options of the observation, as
+            `quadrl.Observing` has them), `num_threads` (of the simulation; 0 for every core),
+            `seed` (row i is seeded with seed + i; None for one from the system), and any option of
+            the task.
 
     Raises:
         QuadrlError: Unknown name or impossible value.
     """
-    vehicle = resolve(vehicle)
+    vehicle = with_timestep(with_effects(resolve(vehicle), aerodynamics), control_timestep)
     own = {name: settings.pop(name) for name in ENVIRONMENT if name in settings}
     if max_episode_steps is not None:
         steps = validation.number("max_episode_steps", max_episode_steps, 1, whole=True)
         settings["time_limit"] = steps * vehicle.control_timestep
-    return Environment(
-        make_task(task, settings, KEYWORDS), num_envs=num_envs, vehicle=vehicle, **own
-    )
+    task = make_task(task, settings, [*KEYWORDS, *also])
+    return Environment(task, num_envs=num_envs, vehicle=vehicle, **own)
+
+
+def with_timestep(vehicle: Vehicle, control_timestep: float | None) -> Vehicle:
+    """A vehicle with another time between two actions [s], unless that is None."""
+    if control_timestep is None:
+        return vehicle
+    return dataclasses.replace(vehicle, control_timestep=control_timestep)
 
 
 def make_task(task: str | Task, options: Mapping[str, Any], keywords: Iterable[str]) -> Task:
@@ -60,36 +85,145 @@ def make_task(task: str | Task, options: Mapping[str, Any], keywords: Iterable[s
     return task.replace(**options)
 
 
-class Pictures:
-    """Draws the aircraft of an environment; opens the renderer at the first picture."""
+def told(environment: Environment) -> dict[str, np.ndarray]:
+    """What is told beside the observation, arrays (N, k); nothing in the usual case.
 
-    def __init__(self, environment: Environment, camera: str, width: int, height: int) -> None:
-        """Note what to draw, on pictures of width x height pixels."""
+    Returns:
+        drawn: what was drawn for each aircraft, with names; privileged: for the critic alone.
+    """
+    values: dict[str, np.ndarray] = {}
+    if environment.disturbances.active and (shown := environment.disturbances.shown()):
+        values["drawn"] = Named(shown)
+    if environment.observer and (privileged := environment.privileged) is not None:
+        values["privileged"] = privileged.astype(np.float32)
+    return values
+
+
+class Pictures:
+    """Draws the aircraft of an environment; opens the renderer at the first picture.
+
+    The camera is eased from one picture of an episode to the next. A panel with time, error, speed,
+    reward, wind, horizon, rotor speeds and, at its end, the outcome of the episode is laid over
+    pictures that are large enough (from about 370 x 280 pixels on), where Pillow is installed.
+    """
+
+    def __init__(
+        self,
+        environment: Environment,
+        camera: str,
+        width: int,
+        height: int,
+        *,
+        overlay: bool = True,
+    ) -> None:
+        """Note what to draw, on pictures of width x height pixels, with or without the panel."""
         self._environment, self._camera = environment, camera
-        self._size = {"width": width, "height": height}
+        self._width, self._height = width, height
+        self._overlay = overlay
         self._renderer: Any = None
+        self._panel: Any = None
+        self._flights: dict[int, Any] = {}  # by row
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle and deepcopy: a copy opens a renderer of its own."""
+        return self.__dict__ | {"_renderer": None, "_panel": None}
 
     def frame(self, row: int = 0) -> np.ndarray:
         """The picture (height, width, 3) uint8 of one aircraft.
 
         Raises:
             RenderingUnavailable: This machine has no graphics library.
+            QuadrlError: There is no such camera.
         """
-        environment, task = self._environment, self._environment.task
+        environment = self._environment
         if self._renderer is None:
-            from quadrl.rendering import Renderer
+            self._open()
+        from quadrl.rendering.live import LiveFlight
 
-            model = mjcf.compile_model(environment.vehicle, contact=task.contact, scene=task.scene)
-            self._renderer = Renderer(model, **self._size)
-        return self._renderer.frame(
-            environment.engine.qpos[row],
-            camera=self._camera,
-            goal=environment.goals()[row],
-            markers=environment.markers(row),
-        )
+        flight = self._flights.setdefault(row, LiveFlight(self._camera))
+        now, qpos = environment.snapshot, environment.engine.qpos[row]
+        time, speeds = float(now.time[row]), now.state.rotor_speed[row]
+        goal, markers = environment.goals()[row], environment.markers(row)
+        wind = None if environment.weather.calm else environment.engine.wind[row]
+        picture = flight.picture(self._renderer, time, qpos, speeds, goal, markers, wind)
+        if self._panel is not None:
+            self._panel.draw(picture, *self._values(row, time))
+        return picture
+
+    def _open(self) -> None:
+        from quadrl.rendering import Renderer
+        from quadrl.rendering.overlay import Panel, task_title
+
+        vehicle, task = self._environment.vehicle, self._environment.task
+        model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene)
+        self._renderer = Renderer(model, self._width, self._height)
+        if self._overlay:
+            with contextlib.suppress(RenderingUnavailable):  # without Pillow
+                colours = [mjcf.rotor_colour(rotor.position) for rotor in vehicle.rotors]
+                windy = not self._environment.weather.calm
+                panel = Panel(self._height, task_title(task.name), colours, windy)
+                self._panel = panel if panel.fits(self._width, self._height) else None
+
+    def _values(self, row: int, time: float) -> tuple[Any, ...]:
+        """What the panel shows of a row: values, rotor speeds, attitude, outcome."""
+        from quadrl.rendering.overlay import flight_lines, outcome
+
+        environment = self._environment
+        now, done, reward, end = environment.snapshot, environment.transition, 0.0, ""
+        error = environment.task.error(now)[row]
+        if done is not None and time > 0:  # it is of this episode
+            error, reward = done.error[row], done.reward[row]
+            end = outcome(done.terminated[row], done.truncated[row], done.is_success[row])
+        calm = environment.weather.calm
+        wind = None if calm else float(norm(environment.engine.wind[row]))
+        moment = time, float(error), float(now.state.speed[row]), float(reward)
+        values = flight_lines(*moment, wind)
+        shares = now.state.rotor_speed[row] / environment.vehicle.max_speed
+        return [*values.values()], shares, environment.engine.qpos[row][3:7], end
 
     def close(self) -> None:
         """Free the renderer."""
         if self._renderer is not None:
             self._renderer.close()
-            self._renderer = None
+            self._renderer = self._panel = None
+
+
+class Named(np.ndarray):
+    """Numbers (k,) or (N, k): an array whose last axis has names, as the terms of the reward.
+
+    `terms["progress"]` and `terms.items()` work as in a dict; clients that read numbers alone, as
+    TorchRL's, see the array.
+    """
+
+    names: tuple[str, ...]
+
+    def __new__(cls, terms: Mapping[str, np.ndarray]) -> Named:
+        """Stack numbers, each () or (N,)."""
+        stacked = np.stack(list(terms.values()), axis=-1).view(cls)
+        stacked.names = tuple(terms)
+        return stacked
+
+    def __array_finalize__(self, other: Any) -> None:
+        self.names = getattr(other, "names", ())
+
+    def __reduce__(self) -> Any:
+        return Named, (dict(self.items()),)
+
+    def __getitem__(self, key: Any) -> Any:
+        if isinstance(key, str):
+            if key not in self.names:
+                raise KeyError(f"{key}; the names are {', '.join(self.names)}")
+            return self.view(np.ndarray)[..., self.names.index(key)]
+        return super().__getitem__(key)
+
+    def keys(self) -> tuple[str, ...]:
+        """The names."""
+        return self.names
+
+    def values(self) -> list[np.ndarray]:
+        """The numbers."""
+        return [self[name] for name in self.names]
+
+    def items(self) -> list[tuple[str, np.ndarray]]:
+        """Names and numbers."""
+        return list(zip(self.names, self.values(), strict=True))

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import dataclasses
 from collections.abc import Callable, Generator
 from typing import Any
 
 from quadrl.rendering import gl
+from quadrl.rendering.camera import FOLLOW, aircraft_scale, follow_cameras, in_view
 
 gl.choose()
 
@@ -25,14 +25,18 @@ from dm_control.suite import base
 from dm_env import specs
 
 from quadrl import mjcf, native, validation
+from quadrl.aerodynamics import Aerodynamics, with_effects
 from quadrl.engines.mujoco import ENGINES, DataEngine
 from quadrl.environment import Environment, Transition
-from quadrl.envs.common import make_task
+from quadrl.envs.common import make_task, with_timestep
 from quadrl.errors import QuadrlError
+from quadrl.observing import Observed
+from quadrl.randomization import Randomized
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
+from quadrl.weather import Weathered
 
-KEYWORDS = "random vehicle control_mode engine ranges".split()
+KEYWORDS = "random vehicle aerodynamics control_mode engine weather randomization observe".split()
 ENVIRONMENT_KWARGS = "time_limit control_timestep n_sub_steps flat_observation legacy_step".split()
 
 
@@ -42,8 +46,34 @@ class Physics(mujoco.Physics):
     engine: DataEngine | None = None
     """Flies it where free flight is the engine; a copy has none."""
     inner_loop: Callable[[], None] | None = None
-    """Commands the rotors before each physics step, during the control steps of a control mode
-    with loops."""
+    """Commands the rotors before each physics step, during control steps in which they get more
+    than one command."""
+    in_view: Callable[[], np.ndarray] | None = None
+    """What the camera "follow" keeps in view, (n, 3) [m]; None before the first episode."""
+
+    def __getstate__(self) -> Any:
+        """For pickle and deepcopy."""
+        return super().__getstate__(), self.engine, self.legacy_step, self.in_view
+
+    def __setstate__(self, state: Any) -> None:
+        """Take up what was copied."""
+        data, self.engine, self.legacy_step, self.in_view = state
+        super().__setstate__(data)
+
+    def render(
+        self, height: int = 240, width: int = 320, camera_id: Any = -1, **options: Any
+    ) -> np.ndarray:
+        """As in dm_control; "follow" moves with the aircraft and keeps the goal in view."""
+        if camera_id != FOLLOW or self.in_view is None:
+            return super().render(height, width, camera_id, **options)  # type: ignore[arg-type]
+        scale = aircraft_scale(self.model.ptr)
+        view = follow_cameras(self.data.qpos[None, :3], [self.in_view()], scale=scale)[0]
+        callback = options.pop("scene_callback", None)
+        camera = mujoco.MovableCamera(self, height, width, scene_callback=callback)
+        camera.set_pose(view.lookat, view.distance, view.azimuth, view.elevation)
+        picture = camera.render(**options)
+        camera._scene.free()
+        return picture
 
     def step(self, nstep: int = 1) -> None:
         """Advance by physics steps; a NativeError if the rotor callbacks were removed."""
@@ -99,12 +129,13 @@ class QuadrotorTask(base.Task):
     def initialize_episode(self, physics: Physics) -> None:
         """Begin an episode."""
         self._observation, self.transition = self.environment.reset(), None
+        physics.in_view = self.in_view
         super().after_step(physics)  # colours the reward
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Hand the action to the rotors, or to the loops."""
         self.environment.begin(np.asarray(action)[None])
-        if self.environment.control_mode.has_loops:
+        if self.environment.stepwise:
             physics.inner_loop = self.environment.control
 
     def after_step(self, physics: Physics) -> None:
@@ -113,6 +144,10 @@ class QuadrotorTask(base.Task):
         now = self.transition = self.environment.finish()
         self._observation = now.observation
         super().after_step(physics)
+
+    def in_view(self) -> np.ndarray:
+        """What a camera should keep in view, (n, 3) [m], world frame."""
+        return in_view(self.environment.goals()[0], self.environment.markers())
 
     def get_observation(self, physics: Physics) -> dict[str, np.ndarray]:
         """Named terms, float64."""
@@ -139,7 +174,10 @@ def make(
     vehicle: Vehicle | str | None = None,
     control_mode: str = "rotor",
     engine: str = "mujoco",
-    ranges: Any = None,
+    aerodynamics: Aerodynamics | str | None = None,
+    weather: Weathered = None,
+    randomization: Randomized = None,
+    observe: Observed = None,
     **options: Any,
 ) -> control.Environment:
     """Build the dm_control environment of a task.
@@ -152,7 +190,13 @@ def make(
         vehicle: A name of `quadrl.VEHICLES` or a Vehicle; None for the paper's.
         control_mode: What actions mean, a name of `quadrl.control.CONTROL_MODES`.
         engine: "mujoco" or "free_flight".
-        ranges: Of the parameters, drawn at each reset.
+        aerodynamics: Effects of the air, as `quadrl.aerodynamics.with_effects` takes them.
+        weather: What the wind is like, as `quadrl.weather.Weather.of` takes it.
+        randomization: What is drawn at each reset and disturbs the flight, as
+            `quadrl.randomization.resolve` takes it; `task.environment.disturbances.shown()` has
+            what was drawn.
+        observe: Options of the observation, as `quadrl.observing.resolve` takes them;
+            `task.environment.privileged` is the observation for the critic alone.
         **options: Those of the task.
 
     Raises:
@@ -164,6 +208,7 @@ def make(
     if (limit := settings.pop("time_limit", time_limit)) is not None:
         options["time_limit"] = limit
     task, vehicle = make_task(task, options, KEYWORDS), resolve(vehicle)
+    vehicle = with_effects(vehicle, aerodynamics)
     timestep = settings.pop("control_timestep", None)
     if (substeps := settings.pop("n_sub_steps", None)) is not None:
         if timestep is not None:
@@ -171,8 +216,7 @@ def make(
             raise QuadrlError(name="n_sub_steps", value=substeps, allowed=allowed)
         substeps = validation.number("n_sub_steps", substeps, 1, whole=True)
         timestep = substeps * vehicle.physics_timestep
-    if timestep is not None:
-        vehicle = dataclasses.replace(vehicle, control_timestep=timestep)
+    vehicle = with_timestep(vehicle, timestep)
     model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene)
     # A simulation that diverges must not pass for a fresh one.
     model.opt.disableflags |= int(_mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -185,7 +229,13 @@ def make(
         engine=validation.choice("engine", engine, ENGINES),
     )
     environment = Environment(
-        task, vehicle=vehicle, engine=physics.engine, control_mode=control_mode, ranges=ranges
+        task,
+        vehicle=vehicle,
+        engine=physics.engine,
+        control_mode=control_mode,
+        weather=weather,
+        randomization=randomization,
+        observe=observe,
     )
     return control.Environment(
         physics, QuadrotorTask(environment, random), n_sub_steps=vehicle.substeps, **settings

@@ -2,8 +2,12 @@
 
 The observation is the flat float32 vector of the task's terms (`environment.layout` has the slice
 of each name); the action is Box(-1, 1, (k,)), and `control_mode` says what it means. The `info` of
-a step holds `reward_terms`, `is_success`, `error` [m] and `diverged`. A new -vN is for new numbers.
+a step holds `reward_terms`, `is_success`, `error` [m] and `diverged`; with a randomization it and
+that of a reset hold `drawn`, and `privileged` on request. A new -vN is for new numbers.
 """
+
+# pyright: reportIncompatibleVariableOverride=false
+# `spec` is a property here: Gymnasium sets it after the environment is made.
 
 from __future__ import annotations
 
@@ -11,13 +15,16 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import HumanRendering
 
 from quadrl import validation
-from quadrl.environment import Transition
-from quadrl.envs.common import Pictures, make
+from quadrl.environment import Environment, Transition
+from quadrl.envs.common import PICTURE, Named, Pictures, make, told
 from quadrl.errors import QuadrlError
+from quadrl.rng import Seed
 from quadrl.task import Task
 
 Array = np.ndarray
@@ -28,6 +35,21 @@ class _Shared:
     """What the single environment and the vector share."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    environment: Environment
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How `gym.make` made it, with the steps after which the task itself ends an episode."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            # A spec that was registered with them would bring a TimeLimit wrapper, which calls a
+            # crash on the last step a time-out as well.
+            spec.max_episode_steps = self.environment.time_limit_steps
+        self._spec = spec
 
     def _make(
         self,
@@ -38,13 +60,14 @@ class _Shared:
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
-        camera: str = "track",
+        camera: str = "follow",
         **settings: Any,
     ) -> tuple[gym.spaces.Box, gym.spaces.Box]:
         """Make the environment; returns the spaces of one aircraft."""
         if render_mode is not None:
             validation.choice("render_mode", render_mode, self.metadata["render_modes"])
-        environment = self.environment = make(task, num_envs, **settings)
+        also = ("render_mode", *PICTURE)
+        environment = self.environment = make(task, num_envs, also=also, **settings)
         self._pictures = Pictures(environment, camera, width, height)
         self.render_mode, self._terms_wanted = render_mode, reward_terms
         fps = round(1 / environment.vehicle.control_timestep)
@@ -57,14 +80,17 @@ class _Shared:
     def _values(self, now: Transition) -> Info:
         """What the info of a step tells, arrays (N,)."""
         values: Info = {"is_success": now.is_success, "error": now.error, "diverged": now.diverged}
-        return values | {"reward_terms": now.reward_terms} if self._terms_wanted else values
+        if self._terms_wanted:
+            values["reward_terms"] = Named(now.reward_terms)
+        return values
 
 
 class QuadrotorEnv(_Shared, gym.Env):
     """One aircraft: `gym.make("quadrl/Hover-v0")`.
 
     `gym.make` keeps its argument `max_episode_steps` for a TimeLimit wrapper that knows nothing of
-    success: give the task's option `time_limit` [s] instead.
+    success: give the task's option `time_limit` [s] instead. `spec.max_episode_steps` is that limit
+    in steps.
     """
 
     def __init__(self, task: str | Task = "hover", **settings: Any) -> None:
@@ -73,25 +99,31 @@ class QuadrotorEnv(_Shared, gym.Env):
         Args:
             task: A name of the catalogue or a task.
             **settings: Those of `quadrl.envs.common.make`; `reward_terms` (whether `info` holds
-                them); `render_mode` (None or "rgb_array"), `width`, `height` [pixels] and `camera`
-                (a name of `quadrl.rendering`) of a picture.
+                them); `render_mode` (None or "rgb_array"; `gym.make` takes "human" too), `width`,
+                `height` [pixels] and `camera` (a name of `quadrl.rendering`) of a picture.
         """
         settings = {"num_threads": 1} | settings
         self.observation_space, self.action_space = self._make(task, 1, **settings)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:
-        """Begin an episode; a seed starts the sequence of episodes anew."""
+        """Begin an episode; a seed starts the sequence of episodes anew.
+
+        Options are arrays of the start, by names of `quadrl.state.Start`: {"position": (0, 0, 1)}.
+        """
         if seed is not None:
             self.environment.seed(seed)
         super().reset(seed=seed)
-        return self.environment.flatten(self.environment.reset())[0], {}
+        observation = self.environment.flatten(self.environment.reset(start=options))[0]
+        return observation, {name: value[0] for name, value in told(self.environment).items()}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, Info]:
         """Fly one control step; an action (k,) that is not finite raises a QuadrlError."""
         # An array needs no copy for its leading axis; anything else is the environment's to judge.
         now = self.environment.step(action[None] if isinstance(action, np.ndarray) else (action,))
         observation = self.environment.flatten(now.observation)[0]
-        info = _of_one(self._values(now))
+        # Scalars of NumPy, which TorchRL reads; flags as arrays, which Gymnasium's vectors stack.
+        values = (self._values(now) | told(self.environment)).items()
+        info = {k: np.array(v[0]) if v.dtype == bool else v[0] for k, v in values}
         return observation, now.reward.item(), now.terminated.item(), now.truncated.item(), info
 
     def render(self) -> Array | None:
@@ -110,8 +142,7 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
     the row's action, resets the row and gives it reward 0. SAME_STEP: `info["final_obs"]` and
     `info["final_info"]` hold the end's own observation and info. DISABLED: reset with
     `options={"reset_mask": mask}`. `info["_name"]` masks the rows that `info["name"]` holds for.
-    TorchRL's GymWrapper takes DISABLED, and SAME_STEP with `reward_terms=False`: it cannot read an
-    info within an info.
+    TorchRL's GymWrapper takes DISABLED and SAME_STEP.
     """
 
     def __init__(
@@ -134,19 +165,21 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         self._observation = np.zeros((num_envs, self.environment.size), np.float32)
         self._resting = np.zeros(num_envs, dtype=bool)  # NEXT_STEP: reset at the next step
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:
+    def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Array, Info]:
         """Begin episodes in the rows of `options["reset_mask"]` (N,) bool, by default in all.
 
-        Row i is seeded with seed + i.
+        Row i is seeded with seed + i, or with seed[i] unless that is None. Other options are arrays
+        (N, k) or (k,) of the start, as above.
         """
-        rows = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        start = dict(options or {})
+        rows = np.asarray(start.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if rows.dtype != bool or rows.shape != (self.num_envs,) or not rows.any():
             allowed = f"an array of {self.num_envs} bool, at least one of them True"
             raise QuadrlError(name="reset_mask", value=rows, allowed=allowed)
         if seed is not None:
             self.environment.seed(seed, rows)
-        self._begin(rows)
-        return self._observation.copy(), {}
+        self._begin(rows, start)
+        return self._observation.copy(), _masked(told(self.environment), rows)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Info]:
         """Fly one control step in every row; actions (N, k)."""
@@ -156,23 +189,26 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         reward = np.where(flown, now.reward, 0.0)
         terminated, truncated = now.terminated & flown, now.truncated & flown
         ended, values = terminated | truncated, self._values(now)
+        last = told(self.environment)
         if mode == AutoresetMode.SAME_STEP and ended.any():
             final = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(ended):
                 final[i] = self._observation[i].copy()
             info = _masked(values, ~ended) | {"final_obs": final, "_final_obs": ended}
-            info |= {"final_info": _masked(values, ended), "_final_info": ended.copy()}
+            info |= {"final_info": _masked(values | last, ended), "_final_info": ended.copy()}
             self._begin(ended)
         else:
             info = _masked(values, flown)
             if resting.any():
                 self._begin(resting)
             self._resting = ended & (mode == AutoresetMode.NEXT_STEP)
+        if last:
+            info |= _masked(told(self.environment), np.ones(self.num_envs, dtype=bool))
         return self._observation.copy(), reward, terminated, truncated, info
 
-    def _begin(self, rows: Array) -> None:
+    def _begin(self, rows: Array, start: Info | None = None) -> None:
         """Begin an episode in some rows (N,) bool."""
-        self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
+        self._observation[rows] = self.environment.flatten(self.environment.reset(rows, start))
         self._resting = self._resting & ~rows
 
     def render(self) -> tuple[Array, ...] | None:
@@ -180,20 +216,55 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         rows = range(self.num_envs)
         return None if self.render_mode is None else tuple(map(self._pictures.frame, rows))
 
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """As SyncVectorEnv: an attribute of each row's environment, called if it can be.
+
+        The rows share their environment, so that all but `render` gives the same N times.
+
+        Raises:
+            QuadrlError: It is `reset`, `step` or `close`, which no row has of its own.
+        """
+        if name in ("reset", "step", "close"):
+            raise QuadrlError(f"call {name} of the vector itself", name="name", value=name)
+        spaces = ("observation_space", "action_space")
+        value: Any = getattr(self, f"single_{name}" if name in spaces else name)
+        value = value(*args, **kwargs) if callable(value) else value
+        return value if name == "render" and value else (value,) * self.num_envs
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """As SyncVectorEnv: an attribute of each row's environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """As SyncVectorEnv, but the rows share it: one value, or the same N times."""
+        each = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(each) != self.num_envs or any(not np.array_equal(v, each[0]) for v in each):
+            allowed = f"one value, or the same {self.num_envs} times"
+            raise QuadrlError(name=name, value=values, allowed=allowed)
+        setattr(self, name, each[0])
+
     def close_extras(self, **_: Any) -> None:
         """Free the renderer."""
         self._pictures.close()
 
 
-def _of_one(values: Info) -> Info:
-    """The values of the only row, as Python's own numbers."""
-    return {k: _of_one(v) if isinstance(v, dict) else v.item() for k, v in values.items()}
+def make_one(
+    task: str | Task = "hover", render_mode: str | None = None, **settings: Any
+) -> gym.Env[Array, Array]:
+    """What `gym.make` calls: a QuadrotorEnv, in a window where the render mode is "human"."""
+    if render_mode == "human":
+        return HumanRendering(QuadrotorEnv(task, render_mode="rgb_array", **settings))
+    return QuadrotorEnv(task, render_mode=render_mode, **settings)
+
+
+# Gymnasium reads from it which wrapper a render mode needs.
+make_one.metadata = QuadrotorEnv.metadata | {"render_modes": ["human", "rgb_array"]}  # type: ignore[attr-defined]
 
 
 def _masked(values: Info, rows: Array) -> Info:
     """Arrays (N,), 0 outside of `rows` (N,) bool, and a mask per name."""
     info: Info = {f"_{name}": rows.copy() for name in values}
     for name, value in values.items():
-        nested = isinstance(value, dict)
-        info[name] = _masked(value, rows) if nested else np.where(rows, value, np.zeros_like(value))
+        info[name] = value.copy()
+        info[name][~rows] = 0
     return info

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from quadrl.envs.common import make
+from quadrl.envs.common import PICTURE, Pictures, make
 from quadrl.task import Task
 
 DONE = ("done", "terminated", "truncated")
@@ -20,7 +20,8 @@ class QuadrotorEnv(EnvBase):
     """N aircraft, batch size [N]; observation (N, size) float32, action (N, k) in [-1, 1].
 
     Simulated on the CPU, whatever the device of the tensors. `is_success`, `error` [m] and, on
-    request, the named `reward_terms` stand beside the observation.
+    request, the named `reward_terms` and `pixels` stand beside the observation. TorchRL's
+    PixelRenderTransform and VideoRecorder draw with `render`.
     """
 
     def __init__(
@@ -31,6 +32,10 @@ class QuadrotorEnv(EnvBase):
         device: str | torch.device = "cpu",
         *,
         reward_terms: bool = False,
+        from_pixels: bool = False,
+        width: int = 640,
+        height: int = 480,
+        camera: str = "follow",
         **settings: Any,
     ) -> None:
         """Make the environments.
@@ -41,12 +46,17 @@ class QuadrotorEnv(EnvBase):
             seed: Row i is seeded with seed + i; None for one from the system.
             device: Of the tensors.
             reward_terms: Whether to give the named terms of the reward (they cost time).
+            from_pixels: Whether to give pictures, `pixels` (N, height, width, 3) uint8.
+            width: Of a picture [pixels].
+            height: Of a picture [pixels].
+            camera: A name of `quadrl.rendering`.
             **settings: Those of `quadrl.envs.common.make`.
 
         Raises:
             QuadrlError: Unknown name or impossible value.
         """
-        self.environment = make(task, num_envs, seed=seed, **settings)
+        also = ("from_pixels", *PICTURE)
+        self.environment = make(task, num_envs, seed=seed, also=also, **settings)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._terms = self.environment.term_names if reward_terms else ()
         shape, column = torch.Size([num_envs]), torch.Size([num_envs, 1])
@@ -57,9 +67,17 @@ class QuadrotorEnv(EnvBase):
             "is_success": Binary(shape=column, dtype=torch.bool),
             "error": Unbounded(column, dtype=torch.float32),
         }
+        if (privileged := self.environment.privileged) is not None:
+            wide = torch.Size([num_envs, privileged.shape[1]])
+            entries["privileged"] = Unbounded(wide, dtype=torch.float32)
         if self._terms:
             terms = {name: Unbounded(column) for name in self._terms}
             entries["reward_terms"] = Composite(terms, shape=shape)
+        self._pictures = Pictures(self.environment, camera, width, height)
+        self._from_pixels = from_pixels
+        if from_pixels:
+            picture = torch.Size([num_envs, height, width, 3])
+            entries["pixels"] = Bounded(0, 255, picture, dtype=torch.uint8)
         done = {flag: Binary(shape=column, dtype=torch.bool) for flag in DONE}
         self.observation_spec = Composite(entries, shape=shape).to(self.device)
         self.action_spec = Bounded(-1.0, 1.0, actions, dtype=torch.float32).to(self.device)
@@ -124,10 +142,23 @@ class QuadrotorEnv(EnvBase):
     ) -> TensorDictBase:
         content: dict[str, Any] = {"observation": torch.from_numpy(self._observation.copy())}
         content |= columns
+        if (privileged := self.environment.privileged) is not None:
+            content["privileged"] = torch.from_numpy(privileged.astype(np.float32))
+        if self._from_pixels:
+            content["pixels"] = torch.from_numpy(self.render())
         if terms:
             content["reward_terms"] = TensorDict(terms, batch_size=self.batch_size)
         packed = TensorDict(content, batch_size=self.batch_size)
         return packed if self.device.type == "cpu" else packed.to(self.device)
+
+    def render(self) -> np.ndarray:
+        """A picture of each aircraft, (N, height, width, 3) uint8."""
+        return np.stack([self._pictures.frame(row) for row in range(self.num_envs)])
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free the renderer."""
+        self._pictures.close()
+        super().close(raise_if_closed=raise_if_closed)
 
     def _set_seed(self, seed: int | None) -> None:
         self.environment.seed(seed)

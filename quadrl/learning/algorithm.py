@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import Parameter
+from torchrl.modules import set_recurrent_mode
 
 
 class Algorithm(abc.ABC):
@@ -34,8 +35,9 @@ class Algorithm(abc.ABC):
         """Learn from a batch.
 
         Args:
-            batch: (transitions,), with observation, action, loc, scale, action_log_prob, advantage
-                (normalised) and value_target.
+            batch: (transitions,), or (aircraft, time) for a policy with a memory, with what actor
+                and critic read, action, loc, scale, action_log_prob, advantage (normalised) and
+                value_target.
             remaining: Share of the training that is left, 1 to 0.
 
         Returns:
@@ -44,7 +46,8 @@ class Algorithm(abc.ABC):
         for adam, _, rate in self._optimisers.values():
             for group in adam.param_groups:
                 group["lr"] = rate * remaining
-        return self.learn(batch)
+        with set_recurrent_mode():
+            return self.learn(batch)
 
     @abc.abstractmethod
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
@@ -59,13 +62,17 @@ class Algorithm(abc.ABC):
             torch.nn.utils.clip_grad_norm_(parameters, self.config.max_gradient)
         adam.step()
 
+    def rows(self, batch: TensorDictBase) -> int:
+        """Of a minibatch: transitions, or the aircraft that have as many."""
+        return max(1, self.config.minibatch * len(batch) // batch.numel())
+
     def fit_critic(
         self, loss: Callable[[TensorDictBase], Tensor], batch: TensorDictBase
     ) -> dict[str, float]:
         """Passes of the optimiser "critic" over a batch; returns the last loss for the log."""
         value = torch.zeros(())
         for _ in range(self.config.critic_epochs):
-            for rows in torch.randperm(len(batch)).split(self.config.minibatch):
+            for rows in torch.randperm(len(batch)).split(self.rows(batch)):
                 value = loss(batch[rows])
                 self.step("critic", value)
         return {"critic_loss": value.item()}

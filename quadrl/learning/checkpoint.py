@@ -14,10 +14,10 @@ from safetensors.torch import save as to_bytes
 from tensordict import TensorDict
 
 from quadrl.errors import QuadrlError
-from quadrl.learning.folder import FREE
-from quadrl.policy import HEADER, read_safetensors, write_whole
+from quadrl.files import HEADER, read_safetensors, write_whole
+from quadrl.learning.folder import CHANGEABLE
 
-FORMAT = "quadrl-checkpoint-3"
+FORMAT = "quadrl-checkpoint-4"
 CHECKPOINT = "checkpoint.safetensors"
 
 
@@ -42,7 +42,7 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     if not path.is_file():
         raise QuadrlError(f"there is no checkpoint at {path}")
-    flat, header = read_safetensors(path, FORMAT, "pt")
+    flat, header = read_safetensors(path, (FORMAT,), "pt")
     try:
         tensors = TensorDict(flat).unflatten_keys("/").to_dict()
     except (KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -70,6 +70,6 @@ def check_same(
         was, now = saved.get(name), present.get(name)
         if isinstance(was, dict) and isinstance(now, dict):
             check_same(path, was, now, f"{prefix}{name}.")
-        elif was != now and name not in FREE:
+        elif was != now and name not in CHANGEABLE:
             reason = f"{path} was trained with it; restore that setting or start a new run"
             raise QuadrlError(reason, name=f"{prefix}{name}", value=now, allowed=repr(was))

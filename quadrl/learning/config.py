@@ -7,109 +7,39 @@ import json
 import math
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from quadrl import __version__, tasks
+from quadrl.aerodynamics import with_effects
 from quadrl.control.modes import CONTROL_MODES
+from quadrl.draw import Draw
 from quadrl.engines.mujoco import ENGINES, MAX_ENVS, MAX_THREADS
 from quadrl.errors import QuadrlError
-from quadrl.learning.folder import CONFIG, read_config
+from quadrl.learning.algorithm_config import (
+    ALGORITHM_CONFIGS,
+    PPOConfig,
+    TRPOConfig,
+    VPGConfig,
+)
+from quadrl.learning.defaults import PAIRS, training_defaults
+from quadrl.learning.folder import CHANGEABLE, CONFIG, free_folder, read_config
+from quadrl.observing import Observing
+from quadrl.observing import resolve as resolve_observing
+from quadrl.randomization import Randomization, resolve
 from quadrl.rollout import MAX_SEED
 from quadrl.task import Task
 from quadrl.validation import choice, keys, number
-from quadrl.vehicle import VEHICLES
+from quadrl.vehicle import Vehicle
+from quadrl.vehicle import resolve as resolve_vehicle
+from quadrl.weather import Weather
 
 ALGORITHMS = ("ppo", "trpo", "vpg")
 ALIASES = {"gae": "vpg"}
 """The paper names the plain policy gradient after its advantages."""
-CHOSEN = ("task", "algo", "seed", "vehicle")
-"""Settings that the defaults follow from, or that have no better default than another."""
 MAX_BATCH = 1 << 24
 """Most transitions in a batch: some GB."""
 MAX_WIDTH = 1 << 16
-
-
-@dataclasses.dataclass(frozen=True)
-class AlgorithmConfig:
-    """Numbers of an algorithm: whole ones are counts, the others are positive unless listed."""
-
-    training: ClassVar[dict[str, Any]] = {}
-    """Settings of `TrainConfig` that have other defaults with this algorithm."""
-    may_be_zero: ClassVar[tuple[str, ...]] = ("entropy", "critic", "damping")
-
-    def __post_init__(self) -> None:
-        """Validate the numbers."""
-        prefix = type(self).__name__.removesuffix("Config").lower()
-        for field in dataclasses.fields(self):
-            value, name = getattr(self, field.name), f"{prefix}.{field.name}"
-            if isinstance(field.default, int):
-                checked = number(name, value, 1, whole=True)
-            else:
-                checked = number(name, value, 0, positive=field.name not in self.may_be_zero)
-            object.__setattr__(self, field.name, checked)
-
-
-@dataclasses.dataclass(frozen=True)
-class PPOConfig(AlgorithmConfig):
-    """Settings of PPO."""
-
-    learning_rate: float = 4e-3
-    """Initial rate of Adam; it falls linearly to zero over the training."""
-    epochs: int = 5
-    """Passes over each batch."""
-    minibatch: int = 1024
-    """Transitions in a gradient step: few large ones, since each step costs milliseconds."""
-    clip: float = 0.2
-    """Bound on the change of the probability ratio."""
-    entropy: float = 0.0
-    """Weight of the entropy bonus."""
-    critic: float = 1.0
-    """Weight of the critic's squared error."""
-    max_gradient: float = 1.0
-    """Norm to which gradients are clipped."""
-
-
-@dataclasses.dataclass(frozen=True)
-class TRPOConfig(AlgorithmConfig):
-    """Settings of TRPO."""
-
-    max_kl: float = 0.02
-    """Bound on the mean KL divergence of a step."""
-    damping: float = 0.01
-    """Added to the diagonal of the Fisher matrix."""
-    iterations: int = 10
-    """Iterations of the conjugate gradient method."""
-    backtracks: int = 10
-    """Steps tried in the line search."""
-    shrink: float = 0.7
-    """Factor from one tried step to the next."""
-    critic_rate: float = 3e-3
-    """Initial learning rate of the critic; it falls linearly to zero."""
-    critic_epochs: int = 8
-    """Passes of the critic over each batch."""
-    minibatch: int = 1024
-    """Transitions in a gradient step of the critic."""
-
-
-@dataclasses.dataclass(frozen=True)
-class VPGConfig(AlgorithmConfig):
-    """Settings of the plain policy gradient."""
-
-    training = {"num_envs": 128, "rollout": 8}  # one step per batch: more batches, and smaller
-
-    learning_rate: float = 3e-3
-    """Initial rate of the policy's one step on each batch; it falls linearly to zero."""
-    critic_rate: float = 6e-3
-    """Initial learning rate of the critic; it falls linearly to zero."""
-    critic_epochs: int = 8
-    """Passes of the critic over each batch."""
-    minibatch: int = 1024
-    """Transitions in a gradient step of the critic."""
-    max_gradient: float = 1.0
-    """Norm to which gradients are clipped."""
-
-
-ALGORITHM_CONFIGS = {"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig}
+MEMORIES = ("none", "gru")
 
 
 @dataclasses.dataclass(frozen=True, init=False)
@@ -125,8 +55,13 @@ class TrainConfig:
     """Algorithm: ppo, trpo, or vpg (the plain policy gradient; the paper's name gae works too)."""
     seed: int = 0
     """Seed of the networks, the exploration and the episodes, between 0 and 2^32 - 1."""
+    variant: str = "ideal"
+    """Settings that go together: ideal (the paper's episodes), or robust (an uncertain aircraft in
+    light wind, and a policy that sees what it needs for that)."""
     vehicle: str = "paper"
     """Name of the aircraft."""
+    vehicle_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Numbers of the aircraft that differ from it, such as mass=0.7 action_scale=90."""
     control_mode: str = "rotor"
     """Meaning of the actions: rotor (the paper's), thrust_body_rate, velocity or position."""
     engine: str = "free_flight"
@@ -134,6 +69,17 @@ class TrainConfig:
     always fly in mujoco."""
     task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the task that differ from its defaults, such as time_limit=5."""
+    aerodynamics: str = ""
+    """Effects of the air on the rotors: none, full, or names of single ones with commas between
+    them; by default those of the aircraft."""
+    weather: Any = "calm"
+    """Weather of the training: calm, light, moderate or severe; or JSON such as
+    {"wind_speed": 5}, in Python a Weather."""
+    randomization: Any = "none"
+    """What is drawn for each aircraft at each reset and disturbs it: none, light or full; or JSON
+    such as {"mass": [0.8, 1.2]}, in Python a Randomization."""
+    observe: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Options of the observation, such as action_history=2 rotor_speed=estimated."""
     num_envs: int = 256
     """Aircraft flown together."""
     rollout: int = 16
@@ -151,6 +97,13 @@ class TrainConfig:
     """Widths of the policy's hidden layers; the paper has one of 128."""
     critic_hidden: tuple[int, ...] = (64, 64)
     """Widths of the critic's hidden layers."""
+    memory: str = "none"
+    """Memory of the policy: none (the paper's), or gru, a gated recurrent unit."""
+    memory_width: int = 64
+    """Numbers that a policy with a memory remembers."""
+    holds_goal: bool = False
+    """Whether the mean action at the goal is to hover, whatever the weights: the network's output
+    less its output there. It sees neither position nor, where the heading is free, yaw."""
     initial_deviation: float = 1.0
     """Standard deviation of the actions at the start."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
@@ -159,6 +112,8 @@ class TrainConfig:
     """Settings of TRPO."""
     vpg: VPGConfig = dataclasses.field(default_factory=VPGConfig)
     """Settings of the plain policy gradient."""
+    device: str = "cpu"
+    """Device of the networks, such as cuda; the simulation stays on the CPU."""
     num_threads: int = 0
     """Threads of the simulation; 0 for one per core. The results do not depend on it."""
     checkpoint_seconds: float = 5.0
@@ -178,8 +133,9 @@ class TrainConfig:
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
         settings = _given(settings)
         algo = settings.get("algo", TrainConfig.algo)
-        algo = choice("algo", ALIASES.get(algo, algo), ALGORITHMS)
-        values = training_defaults(task, algo, settings.get("vehicle", TrainConfig.vehicle))
+        algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
+        named = (settings.get(name, getattr(TrainConfig, name)) for name in ("vehicle", "variant"))
+        values = training_defaults(_base(), task, algo, *named)
         for name, kind in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
             if isinstance(given, dict):
@@ -188,9 +144,24 @@ class TrainConfig:
             elif not isinstance(given, kind):
                 raise QuadrlError(name=name, value=given, allowed=f"a {kind.__name__} or a dict")
             settings[name] = given
+        if isinstance(given := settings.get("randomization"), Randomization):
+            settings["randomization"] = given.given() or "none"
+        if isinstance(given := settings.get("weather"), Weather):
+            settings["weather"] = dataclasses.asdict(given)
+        if isinstance(given := settings.get("observe"), Observing):
+            settings["observe"] = given.given()
+        for name in PAIRS:
+            if isinstance(settings.get(name), dict):
+                settings[name] = values[name] | settings[name]
         for name, value in (values | settings | {"algo": algo}).items():
             object.__setattr__(self, name, tuples(value))
         self._check()
+
+    def __repr__(self) -> str:
+        usual = training_defaults(_base(), self.task, self.algo, self.vehicle, self.variant)
+        own = {k: v for k, v in vars(self).items() if v != usual.get(k) or k in ("algo", "seed")}
+        given = ", ".join(f"{name}={value!r}" for name, value in own.items() if name != "task")
+        return f"TrainConfig({self.task!r}, {given})"
 
     def _check(self) -> None:
         for name, low, high, rest in (
@@ -199,6 +170,7 @@ class TrainConfig:
             ("rollout", 1, MAX_BATCH, {"whole": True}),
             ("steps", 1, math.inf, {"whole": True}),
             ("num_threads", 0, MAX_THREADS, {"whole": True}),
+            ("memory_width", 1, MAX_WIDTH, {"whole": True}),
             ("gamma", 0, 1, {}),
             ("gae_lambda", 0, 1, {}),
             ("initial_deviation", 0.01, math.e, {}),
@@ -206,16 +178,49 @@ class TrainConfig:
             ("reward_scale", 0, math.inf, {"positive": True}),
         ):
             object.__setattr__(self, name, number(name, getattr(self, name), low, high, **rest))
-        for name, kind in (("hidden", tuple), ("critic_hidden", tuple), ("task_options", dict)):
+        for name, kind in (
+            ("hidden", tuple),
+            ("critic_hidden", tuple),
+            *((n, dict) for n in PAIRS),
+        ):
             if not isinstance(value := getattr(self, name), kind):
                 raise QuadrlError(name=name, value=value, allowed=f"a {kind.__name__}")
+            if kind is dict and not all(isinstance(key, str) for key in value):
+                raise QuadrlError(name=name, value=value, allowed="names and their values")
         for width in (*self.hidden, *self.critic_hidden):
             number("width of a hidden layer", width, 1, MAX_WIDTH, whole=True)
         batch = self.num_envs * self.rollout  # the advantage of a single one has no deviation
         number("num_envs * rollout", batch, 2, MAX_BATCH, whole=True)
         choice("control_mode", self.control_mode, CONTROL_MODES)
         choice("engine", self.engine, ENGINES)
+        choice("memory", self.memory, MEMORIES)
+        if not isinstance(self.holds_goal, bool) or (self.holds_goal and self.memory != "none"):
+            allowed = "True or False; False for a policy with a memory"
+            raise QuadrlError(name="holds_goal", value=self.holds_goal, allowed=allowed)
+        if not isinstance(self.device, str) or not self.device:
+            raise QuadrlError(name="device", value=self.device, allowed="a device of torch")
         self.make_task()
+        Draw(self.randomization, self.make_vehicle())
+        Weather.of(self.weather)
+        resolve_observing(self.observe)
+
+    def conditions(self) -> dict[str, Any]:
+        """What its aircraft meet that others do not, for whoever flies the policy."""
+        drawn, seen = resolve(self.randomization), resolve_observing(self.observe)
+        wind, calm = vars(Weather.of(self.weather)), vars(Weather())
+        met = {
+            "vehicle_options": self.vehicle_options,
+            "aerodynamics": self.aerodynamics,
+            "weather": {name: value for name, value in wind.items() if value != calm[name]},
+            "randomization": drawn.given(),
+            "observe": seen.for_policy(),
+        }
+        return {name: given for name, given in met.items() if given}
+
+    def make_vehicle(self) -> Vehicle:
+        """The aircraft in its air."""
+        vehicle = resolve_vehicle(self.vehicle, self.vehicle_options)
+        return with_effects(vehicle, self.aerodynamics or None)
 
     def make_task(self) -> Task:
         """The task with its options."""
@@ -231,7 +236,9 @@ class TrainConfig:
         packages = ("mujoco", "torch", "torchrl", "numpy")
         whole = dataclasses.asdict(self) | {
             "resolved_task": dataclasses.asdict(self.make_task()),
-            "resolved_vehicle": dataclasses.asdict(VEHICLES[self.vehicle]),
+            "resolved_vehicle": dataclasses.asdict(self.make_vehicle()),
+            "resolved_weather": dataclasses.asdict(Weather.of(self.weather)),
+            "resolved_randomization": dataclasses.asdict(resolve(self.randomization)),
             "versions": {"quadrl": __version__} | {name: version(name) for name in packages},
         }
         return json.loads(json.dumps(whole))
@@ -249,7 +256,7 @@ class TrainConfig:
             raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks {sorted(missing)[0]}")
         config = cls(**{name: saved[name] for name in names})
         now = config.resolved()
-        for part in ("task", "vehicle"):
+        for part in ("task", "vehicle", "weather", "randomization"):
             if saved.get(f"resolved_{part}") != now[f"resolved_{part}"]:
                 raise QuadrlError(
                     f"{folder} was trained with other parameters of the {part} "
@@ -258,30 +265,39 @@ class TrainConfig:
         return config
 
 
-def training_defaults(task: str, algo: str, vehicle: str) -> dict[str, Any]:
-    """The fields of `TrainConfig` that a task is trained with unless something else is said.
-
-    An aircraft that is controlled more often than the paper's looks as far ahead in seconds,
-    collects as many seconds in a batch, and trains for as many.
+def prepare(
+    task: str | TrainConfig | None,
+    out: str | Path | None,
+    resume: str | Path | None,
+    settings: dict[str, Any],
+) -> tuple[TrainConfig, Path]:
+    """Settings and folder of a training, as `quadrl.train` takes them.
 
     Raises:
-        QuadrlError: The task, the vehicle or a setting in `Task.training` is unknown.
+        QuadrlError: A setting is unknown or out of range; or it may not change in a run that is to
+            be continued.
     """
-    own = tasks.TASKS[choice("task", task, tasks.TASKS)].training
+    if resume is not None:
+        config = TrainConfig.of_folder(Path(resume))
+        given = _given({"task": task, "out": out} | settings)
+        for name in given:
+            if name not in CHANGEABLE:
+                reason = f"a run keeps its settings; only {', '.join(CHANGEABLE)} may change"
+                raise QuadrlError(reason, name=name, value=given[name], allowed="left out")
+        number("steps", given.get("steps", config.steps), config.steps, whole=True)
+        return dataclasses.replace(config, **given), Path(resume)
+    if isinstance(task, TrainConfig):
+        config = dataclasses.replace(task, **settings)
+    else:
+        config = TrainConfig(task or "hover", **settings)
+    named = Path("runs") / f"{config.task}-{config.algo}-{config.seed}"
+    return config, free_folder(named) if out is None else Path(out)
+
+
+def _base() -> dict[str, Any]:
+    """The fields' defaults; those of an algorithm follow from the task."""
     names = [field.name for field in dataclasses.fields(TrainConfig)]
-    keys(f"training default of {task}", own, [name for name in names if name not in CHOSEN])
-    values = {name: getattr(TrainConfig, name) for name in names if hasattr(TrainConfig, name)}
-    values |= {"task_options": {}} | ALGORITHM_CONFIGS[algo].training | own
-    values |= {"task": task, "algo": algo}
-    for name, kind in ALGORITHM_CONFIGS.items():
-        values[name] = kind(**own.get(name, {}))
-    aircraft = VEHICLES[choice("vehicle", vehicle, VEHICLES)]
-    often = round(VEHICLES["paper"].control_timestep / aircraft.control_timestep, 9)
-    if often != 1:
-        values["gamma"] = round(values["gamma"] ** (1 / often), 4)
-        values["rollout"] = max(1, round(values["rollout"] * often))
-        values["steps"] = round(values["steps"] * often)
-    return values
+    return {name: getattr(TrainConfig, name, {}) for name in names}
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:

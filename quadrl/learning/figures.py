@@ -7,7 +7,7 @@ import io
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import matplotlib
 import numpy as np
@@ -15,8 +15,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from quadrl.errors import QuadrlError
+from quadrl.files import write_whole
 from quadrl.learning.folder import METRICS, read_config
-from quadrl.policy import write_whole
 from quadrl.rollout import Rollout
 from quadrl.validation import choice
 
@@ -45,6 +45,11 @@ CLOCKS = {
 }
 """What learning curves are drawn over: column of metrics.csv, label and factor."""
 CURVE_POINTS = 200
+FLIGHTS = "#2a6fbb #e8743b #3a9a5b #7c5cbf #c23b6b #1aa3a3 #9a7b1f #6b7280".split()
+"""Colours of the flights in one picture."""
+PLACE = "x east [m]", "y north [m]", "z up [m]"
+MOTION = "roll [deg]", "pitch [deg]", "yaw [deg]"
+LEAST_ERROR = 1e-4  # [m], that is drawn
 
 
 def read_metrics(path: Path) -> Metrics:
@@ -170,38 +175,96 @@ def spread(runs: Sequence[Metrics], name: str, clock: str) -> tuple[np.ndarray, 
 
 
 def trajectory(rollout: Rollout, title: str, path: Path, episodes: int = 8) -> Path:
-    """Draw flights in space and by axis, with their goal; figure 6 of the paper."""
-    figure = Figure(figsize=(11.0, 6.4), layout="constrained")
-    grid = figure.add_gridspec(4, 2, width_ratios=(1.25, 1))
-    space: Any = figure.add_subplot(grid[:, 0], projection="3d")
-    rows = [figure.add_subplot(grid[k, 1]) for k in range(4)]
+    """Draw flights in space and over time; figure 6 of the paper, and what led to it.
+
+    Each flight has a colour. Goals are dashed: black where all flights have the same one that
+    stays, else each in the colour of its flight. Flights in wind show it, and the airspeed. At most
+    `episodes` flights are drawn.
+    """
     shown = min(episodes, rollout.position.shape[1])
-    colours = [STYLE[name] for name in ("blue", "orange", "green", "violet")]
+    colours = [FLIGHTS[i % len(FLIGHTS)] for i in range(shown)]
     time = np.arange(1, len(rollout.error) + 1) * rollout.control_timestep
-    for i in range(shown):
-        colour = colours[i % len(colours)]
-        x, y, z = rollout.position[:, i].T
-        space.plot(x, y, z, color=colour, lw=1.4, alpha=0.9)
-        space.scatter(x[:1], y[:1], z[:1], color=colour, s=18, marker="o")
-        for k, axis in enumerate(rows[:3]):
-            axis.plot(time, rollout.position[:, i, k], color=colour, lw=1.2, alpha=0.85)
-        rows[3].semilogy(time, np.maximum(rollout.error[:, i], 1e-4), color=colour, lw=1.2)
-    goal = rollout.goal[:, 0]
-    space.plot(*goal.T, color="black", lw=1, ls="--")
-    space.scatter(*goal[:1].T, color="black", marker="*", s=120, label="goal")
-    for k, (axis, name) in enumerate(zip(rows, ("x", "y", "z", "error"), strict=True)):
-        axis.set_ylabel(f"{name} [m]")
-        _tidy(axis)
-        if k < 3:
-            axis.plot(time, goal[:, k], color="black", lw=1, ls="--")
-            axis.tick_params(labelbottom=False)
-    rows[3].set_xlabel("time [s]")
-    space.set(xlabel="x east [m]", ylabel="y north [m]", zlabel="z up [m]")
-    space.set_box_aspect((1, 1, 1))
+    goals = rollout.goal[:, :shown]
+    shared = bool(np.all(np.isnan(goals) | (np.abs(goals - goals[:1, :1]) < 1e-9)))
+    figure = Figure(figsize=(14.0, 9.6), layout="constrained")
+    upper, lower = cast(Any, figure.subfigures(2, 1, height_ratios=(1.75, 1)))
+    wind, velocity = rollout.wind[:, :shown], rollout.velocity[:, :shown]
+    windy = bool(np.nan_to_num(wind).any())
+    grid = upper.add_gridspec(4 + windy, 3, width_ratios=(1.35, 1, 1))
+    space: Any = upper.add_subplot(grid[:, 0], projection="3d")
+    rows = [[upper.add_subplot(grid[k, n]) for k in range(4 + windy)] for n in (1, 2)]
+    attitude = _attitude(rollout.quaternion[:, :shown])
+    values = {name: rollout.position[:, :shown, k] for k, name in enumerate(PLACE)}
+    values |= {"wind [m/s]": np.linalg.norm(wind, axis=-1)} if windy else {}
+    values |= {"error [m]": np.maximum(rollout.error[:, :shown], LEAST_ERROR)}
+    values |= {name: attitude[..., k] for k, name in enumerate(MOTION)}
+    values |= {"airspeed [m/s]": np.linalg.norm(velocity - wind, axis=-1)} if windy else {}
+    values |= {"speed [m/s]": np.linalg.norm(velocity, axis=-1)}
+    for axis, (name, value) in zip(itertools.chain(*rows), values.items(), strict=True):
+        _flights(axis, time, value, colours)
+        axis.set_ylabel(name)
+        axis.tick_params(labelbottom=axis in (rows[0][-1], rows[1][-1]))
+    rows[0][-1].set_yscale("log")
+    for column in rows:
+        column[-1].set_xlabel("time [s]")
+        upper.align_ylabels(column)
+    for k, axis in enumerate(rows[0][:3]):
+        target = goals[:, :1, k] if shared else goals[..., k]
+        _flights(axis, time, target, ["black"] if shared else colours, lw=1.0, ls="--")
+    for i, colour in enumerate(colours):
+        flown = rollout.position[: rollout.length[i], i]
+        ended = "successful" if rollout.is_success[i] else "not successful"
+        space.plot(*flown.T, color=colour, lw=1.4, alpha=0.9, label=f"flight {i + 1}, {ended}")
+        space.scatter(*flown[:1].T, color=colour, s=18, marker="o")
+        goal = goals[: rollout.length[i], i]
+        if not shared:
+            space.plot(*goal.T, color=colour, lw=1.0, ls="--", alpha=0.8)
+        if not shared or i == 0:
+            mark = "black" if shared else colour
+            space.scatter(*goal[-1:].T, color=mark, marker="*", s=110, label=None)
+    dashes, words = ("black", "goal") if shared else (STYLE["grey"], "goal of each flight")
+    space.plot([], [], [], color=dashes, lw=1.0, ls="--", marker="*", ms=9, label=words)
+    space.set(xlabel=PLACE[0], ylabel=PLACE[1], box_aspect=(1, 1, 1))
+    space.set_zlabel(PLACE[2], labelpad=-30)  # inside, clear of the next axes
     space.set_aspect("equal", adjustable="datalim")
-    space.legend(frameon=False, loc="upper left")
+    space.legend(frameon=False, loc="upper left", fontsize=8, ncols=2, bbox_to_anchor=(0, 1.07))
+    rotors, actions = rollout.rotor_speed.shape[-1], rollout.action.shape[-1]
+    many = max(rotors, actions)
+    commands: Any = lower.subplots(2, many, sharex=True, sharey="row", squeeze=False)
+    parts = (rollout.rotor_speed, "rotor", rotors), (rollout.action, "action", actions)
+    for axes, (value, name, count) in zip(commands, parts, strict=True):
+        for k, axis in enumerate(axes):
+            axis.set_visible(k < count)
+            if k < count:
+                _flights(axis, time, value[:, :shown, k], colours, lw=0.9)
+                axis.set_title(f"{name} {k + 1}", loc="left", fontsize=9)
+    commands[0][0].set_ylabel("speed [rad/s]")
+    commands[1][0].set(ylabel="action", ylim=(-1.05, 1.05))
+    for axis in commands[1]:
+        axis.set_xlabel("time [s]")
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
     return save(figure, path)
+
+
+def _flights(
+    axis: Any, time: np.ndarray, values: np.ndarray, colours: Sequence[str], **style: Any
+) -> None:
+    """Draw values (T, n) over time, a colour each."""
+    for value, colour in zip(values.T, colours, strict=True):
+        axis.plot(time, value, **({"color": colour, "lw": 1.2, "alpha": 0.85} | style))
+    _tidy(axis)
+
+
+def _attitude(quaternion: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw (..., 3) [deg] of (T, ..., 4); right wing down and nose up are positive.
+
+    Yaw is counted from east to north, and does not jump.
+    """
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x**2 + y**2))
+    pitch = np.arcsin(np.clip(2 * (x * z - w * y), -1, 1))
+    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)), axis=0)
+    return np.degrees(np.stack([roll, pitch, yaw], axis=-1))
 
 
 def save(figure: Figure, path: Path) -> Path:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl.errors import QuadrlError
-from quadrl.policy import write_whole
+from quadrl.files import write_whole
 
 CONFIG = "config.json"
 METRICS = "metrics.csv"
@@ -23,6 +23,17 @@ TRAJECTORY = "trajectory.png"
 VIDEO = "flight.mp4"
 FREE = ("num_threads", "checkpoint_seconds")
 """Settings that change no result."""
+CHANGEABLE = (*FREE, "steps", "device")
+"""Settings that a run may be continued with other values of."""
+
+
+def free_folder(wanted: Path) -> Path:
+    """The folder for a new run: the one that is wanted, numbered if it holds a run already."""
+    number, path = 1, wanted
+    while (path / CONFIG).exists():
+        number += 1
+        path = wanted.with_name(f"{wanted.name}-{number}")
+    return path
 
 
 def new_folder(path: Path) -> None:
@@ -33,8 +44,8 @@ def new_folder(path: Path) -> None:
     """
     if (path / CONFIG).exists():
         raise QuadrlError(
-            f"{path} already holds a run; choose another --out, or continue it: "
-            f"quadrl train --resume {path}"
+            f"{path} already holds a run: choose another folder, or continue the run "
+            f"(quadrl train --resume {path})"
         )
     path.mkdir(parents=True, exist_ok=True)
 
@@ -51,8 +62,7 @@ def lock_folder(path: Path) -> int:
     except BlockingIOError as error:
         os.close(descriptor)
         raise QuadrlError(
-            f"another training works in {path}: wait for its end or stop it, or start a new run "
-            "with another --out"
+            f"another training works in {path}: wait for its end, stop it, or choose another folder"
         ) from error
     return descriptor
 

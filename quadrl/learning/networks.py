@@ -1,4 +1,4 @@
-"""The paper's policy and a critic as TorchRL modules."""
+"""The paper's policy, with a memory or without, and a critic as TorchRL modules."""
 
 from __future__ import annotations
 
@@ -9,10 +9,18 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.modules import GRUCell, IndependentNormal, ProbabilisticActor, recurrent_mode
 
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.goal import goal_state
+from quadrl.memory import GRU
 from quadrl.policy import CLIP, LOG_VARIANCE, Policy
+
+STATE, BEGINS = "recurrent_state", "is_init"
+"""What a policy with a memory reads beside the observation, by TorchRL's names: its state before
+the observation, and whether an episode begins with it."""
+PRIVILEGED = "privileged"
+"""What the critic alone reads, where the environment gives it."""
 
 
 class Normaliser(nn.Module):
@@ -60,81 +68,184 @@ class MeanAndDeviation(nn.Module):
         return mean, (0.5 * log_variance.clamp(*LOG_VARIANCE)).exp()
 
 
-class OfObservation(TensorDictModule):
-    """A network from the observation to named entries: its output, or its tuple of outputs.
+class HoldsGoal(nn.Module):
+    """A network less its output at the goal: there its mean action is 0, which is hover."""
+
+    at_goal: torch.Tensor  # (size,), an observation
+    looks: torch.Tensor  # (size,), 1 for what the network sees, 0 for what it does not
+
+    def __init__(
+        self, normaliser: Normaliser, network: nn.Sequential, at_goal: np.ndarray, looks: np.ndarray
+    ) -> None:
+        """Keep what `quadrl.learning.goal.goal_state` gives."""
+        super().__init__()
+        self.normaliser, self.network = normaliser, network
+        self.last = MeanAndDeviation()
+        self.register_buffer("at_goal", torch.from_numpy(at_goal).float())
+        self.register_buffer("looks", torch.from_numpy(looks).float())
+
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and standard deviation of the actions (..., k) for observations (..., size)."""
+        mean, deviation = self.last(self.network(self.looks * self.normaliser(observation)))
+        return mean - self.mean_at_goal(), deviation
+
+    def mean_at_goal(self) -> torch.Tensor:
+        """What is taken away, (k,)."""
+        return self.last(self.network(self.looks * self.normaliser(self.at_goal)))[0]
+
+
+class Memory(nn.Module):
+    """A gated recurrent unit beside a network: its state joins the normalised observation.
+
+    It follows TorchRL's recurrent mode. TorchRL's GRUModule, which cuts and packs the sequences in
+    which an episode begins, takes twice the time of this loop.
+    """
+
+    def __init__(self, normaliser: Normaliser, width: int, network: nn.Module) -> None:
+        """Keep a network of (normalised observation, state), and make the unit."""
+        super().__init__()
+        self.normaliser, self.network = normaliser, network
+        self.cell = GRUCell(len(normaliser.mean), width)
+
+    def forward(
+        self, observation: torch.Tensor, state: torch.Tensor, begins: torch.Tensor | None
+    ) -> tuple[torch.Tensor, ...]:
+        """What the network gives, and the next state of the unit.
+
+        In TorchRL's recurrent mode it takes a sequence, of whose states it reads the first, and
+        gives no next state.
+
+        Args:
+            observation: (N, size), or (N, T, size).
+            state: Before the observation, (N, width), or (N, T, width); zero as an episode begins.
+            begins: Of a sequence, whether an episode begins with the observation, (N, T, 1).
+        """
+        seen = self.normaliser(observation)
+        if not recurrent_mode():
+            state = self.cell(seen, state)
+            return *self.network(torch.cat([seen, state], -1)), state
+        assert begins is not None
+        state, states = state[:, 0], []
+        for now, begin in zip(seen.unbind(1), begins.unbind(1), strict=True):
+            state = self.cell(now, state.masked_fill(begin, 0.0))
+            states.append(state)
+        return self.network(torch.cat([seen, torch.stack(states, 1)], -1))
+
+
+class Informed(nn.Module):
+    """A network of the observation and the privileged one side by side, both normalised."""
+
+    def __init__(self, normalisers: list[Normaliser], network: nn.Module) -> None:
+        """Keep the normaliser of each, and the network of both."""
+        super().__init__()
+        self.normalisers, self.network = nn.ModuleList(normalisers), network
+
+    def forward(self, *observations: torch.Tensor) -> torch.Tensor:
+        """The network's output for observations (..., size of each)."""
+        pairs = zip(self.normalisers, observations, strict=True)
+        return self.network(torch.cat([module(seen) for module, seen in pairs], -1))
+
+
+class Entries(TensorDictModule):
+    """A network from named entries to named entries: its output, or its tuple of outputs.
 
     At each write, tensordict 0.14 looks for other packages in a TensorDictModule's forward, which
     costs a tenth of a gradient step; this forward only writes.
     """
 
-    def __init__(self, module: nn.Module, *names: str) -> None:
-        """Wrap the network."""
-        super().__init__(module, in_keys=["observation"], out_keys=[*names])
-
     def forward(  # pyright: ignore[reportIncompatibleVariableOverride] - the base wraps it
         self, tensordict: TensorDictBase, **_: Any
     ) -> TensorDictBase:
         """Add the entries."""
-        outputs = self.module(tensordict.get("observation"))
+        outputs = self.module(*(tensordict.get(name) for name in self.in_keys))
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
-        for name, output in zip(self.out_keys, outputs, strict=True):
+        for name, output in zip(self.out_keys, outputs, strict=False):  # a sequence gives fewer
             tensordict.set(name, output)
         return tensordict
 
 
-def make_network(
-    normaliser: Normaliser, hidden: tuple[int, ...], outputs: int, gain: float
-) -> nn.Sequential:
-    """The normaliser and linear layers with tanh between them.
+def make_network(inputs: int, hidden: tuple[int, ...], outputs: int, gain: float) -> nn.Sequential:
+    """Linear layers with tanh between them.
 
     Weights are orthogonal and biases zero; `gain` scales the last layer's weights.
     """
-    widths = (len(normaliser.mean), *hidden, outputs)
+    widths = (inputs, *hidden, outputs)
     layers = [nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)]
     for layer in layers:
         nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else 2**0.5)
         nn.init.zeros_(layer.bias)
     between = [module for layer in layers[:-1] for module in (layer, nn.Tanh())]
-    return nn.Sequential(normaliser, *between, layers[-1])
+    return nn.Sequential(*between, layers[-1])
 
 
 def make_actor_critic(
-    size: int, actions: int, config: TrainConfig
-) -> tuple[ProbabilisticActor, OfObservation, Normaliser]:
-    """Actor, critic and the normaliser that they share.
+    size: int, actions: int, config: TrainConfig, privileged: int = 0
+) -> tuple[ProbabilisticActor, Entries, dict[str, Normaliser]]:
+    """Actor, critic, and the normalisers by the entry that they are of.
+
+    The critic reads the observation and, where there is one, the privileged observation. It has no
+    memory: with the actor's state as an input, which changes its meaning as the actor learns, hover
+    was learned to 6 to 12 cm instead of 2 to 3.
 
     Args:
         size: Numbers in an observation.
         actions: Numbers in an action, k.
-        config: Has the widths of the hidden layers and the deviation of the first actions.
+        config: Has the widths of the layers and the deviation of the first actions.
+        privileged: Numbers in the privileged observation; 0 for none.
     """
-    normaliser = Normaliser(size)
-    network = make_network(normaliser, config.hidden, 2 * actions, gain=0.01)
+    remembered = config.memory_width if config.memory == "gru" else 0
+    normalisers = {"observation": Normaliser(size)}
+    network = make_network(size + remembered, config.hidden, 2 * actions, gain=0.01)
     bias: Any = network[-1].bias
     with torch.no_grad():
         bias[actions:] = 2 * torch.tensor(config.initial_deviation).log()
+    reads: list[Any] = ["observation"]
+    gives: list[Any] = ["loc", "scale"]
+    policy: nn.Module
+    if config.holds_goal:
+        policy = HoldsGoal(normalisers["observation"], network, *goal_state(config))
+    elif remembered:
+        network.append(MeanAndDeviation())
+        policy = Memory(normalisers["observation"], remembered, network)
+        reads, gives = [*reads, STATE, BEGINS], [*gives, ("next", STATE)]
+    else:
+        policy = nn.Sequential(normalisers["observation"], *network, MeanAndDeviation())
     actor = ProbabilisticActor(
-        OfObservation(network.append(MeanAndDeviation()), "loc", "scale"),
+        Entries(policy, reads, gives),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         distribution_kwargs={"validate_args": False},
         return_log_prob=True,
     )
-    network = make_network(normaliser, config.critic_hidden, 1, gain=1.0)
-    return actor, OfObservation(network, "state_value"), normaliser
+    if privileged:
+        normalisers[PRIVILEGED] = Normaliser(privileged)
+    network = make_network(size + privileged, config.critic_hidden, 1, gain=1.0)
+    first = [*normalisers.values()]
+    value = Informed(first, network) if privileged else nn.Sequential(*first, *network)
+    return actor, Entries(value, [*normalisers], ["state_value"]), normalisers
 
 
 def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Policy:
     """The NumPy policy of an actor."""
     layers = [module for module in actor.modules() if isinstance(module, nn.Linear)]
     (normaliser,) = (module for module in actor.modules() if isinstance(module, Normaliser))
+    cells = [module for module in actor.modules() if isinstance(module, GRUCell)]
+    memory = [GRU(*map(_array, (c.weight_ih, c.weight_hh, c.bias_ih, c.bias_hh))) for c in cells]
+    weights = [_array(layer.weight) for layer in layers]
+    biases = [_array(layer.bias) for layer in layers]
+    for module in actor.modules():
+        if isinstance(module, HoldsGoal):  # the same function, as a plain network
+            weights[0] *= _array(module.looks)
+            at_goal = _array(module.mean_at_goal())
+            biases[-1][: len(at_goal)] -= at_goal
     return Policy(
-        weights=tuple(_array(layer.weight) for layer in layers),
-        biases=tuple(_array(layer.bias) for layer in layers),
+        weights=tuple(weights),
+        biases=tuple(biases),
         mean=_array(normaliser.shift),
         deviation=_array(normaliser.deviation),
         task=task,
         metadata=metadata,
+        memory=memory[0] if memory else None,
     )
 
 

@@ -11,7 +11,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
 from quadrl.learning.algorithm import Algorithm
-from quadrl.learning.config import PPOConfig
+from quadrl.learning.algorithm_config import PPOConfig
 
 
 class PPO(Algorithm):
@@ -40,7 +40,7 @@ class PPO(Algorithm):
         batch = batch.exclude("loc", "scale")
         losses: Any = None
         for _ in range(self.config.epochs):
-            for part in batch[torch.randperm(len(batch))].split(self.config.minibatch):
+            for part in batch[torch.randperm(len(batch))].split(self.rows(batch)):
                 losses = self.loss(part)
                 objective = losses["loss_objective"] + losses["loss_critic"]
                 if self.config.entropy > 0:

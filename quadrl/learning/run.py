@@ -1,73 +1,123 @@
-"""A whole run: train, evaluate, draw."""
+"""A whole run: train a policy, evaluate it, draw it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from quadrl import mjcf
-from quadrl.errors import RenderingUnavailable
-from quadrl.learning.config import TrainConfig
-from quadrl.learning.figures import learning_curve, trajectory
+from quadrl.evaluation import Evaluation, evaluate, html_table
+from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO, write_json
 from quadrl.learning.train import Progress, Training
-from quadrl.rollout import MAX_EPISODES, Rollout, evaluate
+from quadrl.policy import Policy
+from quadrl.progress import ProgressBar
+from quadrl.rollout import MAX_EPISODES
 from quadrl.validation import number
-from quadrl.vehicle import VEHICLES, Vehicle
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Run:
+    """A training that has ended: what it was, where it is, and what its policy reached."""
+
+    folder: Path
+    """Holds the policy, the checkpoint, the settings, the metrics and the pictures."""
+    config: TrainConfig
+    """The settings."""
+    policy: Policy
+    """The trained policy: flat observations to the mean action."""
+    evaluation: Evaluation
+    """In MuJoCo, in episodes that the training has not seen."""
+    seconds: float
+    """Wall clock of the training [s], without imports and evaluation."""
+
+    def __repr__(self) -> str:
+        trained = f"trained with {self.config.algo.upper()} in {self.seconds:.1f} s"
+        return f"{self.evaluation}; {trained}; in {self.folder}"
+
+    def _repr_html_(self) -> str:
+        config = self.config
+        head = f"{config.task}, {config.algo.upper()}, seed {config.seed}, {config.vehicle}"
+        rows = [("trained", head), ("folder", str(self.folder)), ("seconds", f"{self.seconds:.1f}")]
+        return html_table(rows) + self.evaluation._repr_html_()
+
+    def draw(
+        self, *, video: bool = True, on_frame: Callable[[int, int], None] = lambda done, total: None
+    ) -> Iterator[Path]:
+        """Draw the pictures of the run into its folder, one at each step of the iterator.
+
+        Args:
+            video: Whether to draw a flight as the last of them.
+            on_frame: Is told how many frames of it are drawn, and of how many.
+
+        Raises:
+            RenderingUnavailable: There is no graphics library to draw the video with.
+        """
+        from quadrl.learning import figures  # it takes a second, and the result comes first
+
+        flown = self.evaluation
+        yield figures.learning_curve(self.folder, self.folder / LEARNING_CURVE)
+        title = f"{flown.task.name}: mean action of the policy"
+        yield figures.trajectory(flown.rollout, title, self.folder / TRAJECTORY)
+        if video:
+            from quadrl.rendering import write_video
+
+            model = mjcf.compile_model(
+                flown.vehicle, contact=flown.task.contact, scene=flown.task.scene
+            )
+            flight = flown.rollout.trajectory(flown.vehicle)
+            yield write_video(flight, model, self.folder / VIDEO, on_frame=on_frame)
 
 
 def train(
-    config: TrainConfig | None,
-    folder: Path,
+    task: str | TrainConfig | None = None,
     *,
+    out: str | Path | None = None,
+    resume: str | Path | None = None,
     episodes: int = 100,
-    video: bool = True,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
-    report: Callable[[str], None] = lambda line: None,
-) -> tuple[TrainConfig, dict[str, Any]]:
-    """Train a policy, evaluate it in MuJoCo and draw it, into a run folder.
+    on_progress: Callable[[Progress], None] | None = None,
+    **settings: Any,
+) -> Run:
+    """Train a policy and evaluate it in MuJoCo; `quadrl train` in Python.
 
     Args:
-        config: The settings; None to continue the run in the folder.
-        folder: Of the run.
-        episodes: Of the evaluation.
-        video: Whether to draw a flight.
-        on_progress: Is called after each iteration.
-        report: Is told, in a line, what the user should know.
+        task: Name of the task, hover by default; or all settings.
+        out: Folder of the run; by default runs/TASK-ALGO-SEED, with a number behind it if that
+            holds a run already.
+        resume: Continue the run in this folder, with its own settings. Of the settings only
+            `steps`, `device`, `num_threads` and `checkpoint_seconds` may be given.
+        episodes: Of the evaluation at the end.
+        on_progress: Is called after each iteration; by default a progress bar is shown.
+        **settings: Fields of `TrainConfig`: `seed`, `algo`, `vehicle`, `steps`, ...
 
     Returns:
-        The settings, and the metrics of the evaluation with the wall clock training_s.
+        The run. An interrupted training (Ctrl-C) leaves its last checkpoint and policy in the
+        folder, which can be continued, evaluated and rendered.
 
     Raises:
         QuadrlError: A setting or the folder cannot be used, or the training diverged.
     """
+    config, folder = prepare(task, out, resume, settings)
+    with ProgressBar() as bar:
+        show = on_progress or bar.show
+        return train_in(folder, config, resume=resume is not None, episodes=episodes, show=show)
+
+
+def train_in(
+    folder: Path,
+    config: TrainConfig,
+    *,
+    resume: bool,
+    episodes: int,
+    show: Callable[[Progress], None],
+) -> Run:
+    """What `train` does once settings and folder are known."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
-    resume, config = config is None, config or TrainConfig.of_folder(folder)
     training = Training(config, folder, resume=resume)
-    if resume:
-        report(f"continuing {folder} at iteration {training.iteration}")
-    policy, vehicle = training.run(on_progress), VEHICLES[config.vehicle]
-    metrics, rollout = evaluate(policy, config.make_task(), episodes=episodes, vehicle=vehicle)
-    metrics["training_s"] = round(training.seconds, 2)
-    write_json(folder / EVALUATION, metrics)
-    draw(folder, rollout, vehicle, video=video, report=report)
-    return config, metrics
-
-
-def draw(
-    folder: Path, rollout: Rollout, vehicle: Vehicle, *, video: bool, report: Callable[[str], None]
-) -> None:
-    """Draw the pictures of a run; without a graphics library the video is left out, with a line."""
-    learning_curve(folder, folder / LEARNING_CURVE)
-    title = f"{rollout.task.name}: mean action of the policy"
-    trajectory(rollout, title, folder / TRAJECTORY)
-    if not video:
-        return
-    from quadrl.rendering import write_video
-
-    try:
-        model = mjcf.compile_model(vehicle, contact=rollout.task.contact, scene=rollout.task.scene)
-        write_video(rollout.trajectory(vehicle), model, folder / VIDEO)
-    except RenderingUnavailable as error:
-        report(f"no video: {error}")
+    policy = training.run(show)
+    found = evaluate(policy, config.make_task(), episodes=episodes, vehicle=config.make_vehicle())
+    seconds = round(training.seconds, 2)
+    write_json(folder / EVALUATION, found.metrics | {"training_s": seconds})
+    return Run(folder, config, policy, found, seconds)

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.errors import QuadrlError
 from quadrl.learning import checkpoint
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import CONFIG, Log, lock_folder, new_folder, write_json
-from quadrl.learning.networks import export, make_actor_critic
+from quadrl.learning.environments import make_collector, make_env
+from quadrl.learning.folder import CONFIG, EVALUATION, Log, lock_folder, new_folder, write_json
+from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE, export, make_actor_critic
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
@@ -36,26 +36,28 @@ from quadrl.vehicle import VEHICLES
 with warnings.catch_warnings():
     # TorchRL 0.14 warns about its own classes at this import.
     warnings.filterwarnings("ignore", message=".*WeightUpdater.*", category=DeprecationWarning)
-    from torchrl.collectors import Collector
+    from torchrl.modules import set_recurrent_mode
     from torchrl.objectives.value import GAE
 
-SEED_STRIDE = 1 << 20
-"""Distance between the aircraft's seeds of two trainings: the most aircraft that there can be."""
+LEARNED_FROM = ("action", "action_log_prob", "loc", "scale", "advantage", "value_target")
+"""Of a batch, beside what actor and critic read."""
 ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "vpg": VPG}
 
 
-def make_collector(env: QuadrotorEnv, actor: torch.nn.Module, frames: int) -> Collector:
-    """TorchRL's collector of batches of `frames` steps, without what a training does not use."""
-    return Collector(
-        env,
-        actor,
-        frames_per_batch=frames,
-        total_frames=-1,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-        use_buffers=False,
-        trust_policy=True,
-    )
+def make_device(name: str) -> torch.device:
+    """The device of a name.
+
+    Raises:
+        QuadrlError: This torch, or this machine, does not have it.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        allowed = "a device that this torch can use, such as cpu"
+        raise QuadrlError(reason, name="device", value=name, allowed=allowed) from error
+    return device
 
 
 @dataclasses.dataclass
@@ -75,23 +77,22 @@ class Training:
     def __init__(self, config: TrainConfig, folder: Path, *, resume: bool = False) -> None:
         """Make everything that learns; then make the folder, or load its checkpoint.
 
+        A run may be continued with more steps than it was begun with.
+
         Raises:
-            QuadrlError: The folder cannot be used.
+            QuadrlError: The folder or the device cannot be used.
         """
         self.config, self.folder = config, folder
+        device = make_device(config.device)
         torch.manual_seed(config.seed)
-        self.env = QuadrotorEnv(
-            config.make_task(),
-            config.num_envs,
-            seed=config.seed * SEED_STRIDE,
-            vehicle=VEHICLES[config.vehicle],
-            control_mode=config.control_mode,
-            num_threads=config.num_threads,
-            engine=config.engine,
+        self.env = make_env(config, device)
+        size, actions = self.env.environment.size, self.env.environment.action_size
+        given = self.env.observation_spec.get(PRIVILEGED, None)
+        self.actor, self.critic, self.normalisers = make_actor_critic(
+            size, actions, config, 0 if given is None else given.shape[-1]
         )
-        self.actor, self.critic, self.normaliser = make_actor_critic(
-            self.env.environment.size, self.env.environment.action_size, config
-        )
+        for network in (self.actor, self.critic):
+            network.to(device)
         self.algorithm = ALGORITHMS[config.algo](
             self.actor, self.critic, getattr(config, config.algo)
         )
@@ -101,7 +102,8 @@ class Training:
         self.iteration = 0
         self.seconds = 0.0  # of training, in all processes that worked on it
         self._running = {name: np.zeros(config.num_envs) for name in ("return", "length")}
-        self._generator_state: torch.Tensor | None = None
+        self._generators: dict[str, torch.Tensor] = {}
+        self._remembered: dict[str, np.ndarray] = {}  # the states of a recurrent policy
         if not resume:
             new_folder(folder)
         self._unlock = weakref.finalize(self, os.close, lock_folder(folder))
@@ -114,6 +116,9 @@ class Training:
             except QuadrlError:
                 self._unlock()
                 raise
+            write_json(folder / CONFIG, config.resolved())
+        if self.iteration < config.iterations:
+            (folder / EVALUATION).unlink(missing_ok=True)
 
     @property
     def steps(self) -> int:
@@ -132,12 +137,13 @@ class Training:
         config = self.config
         with contextlib.ExitStack() as stack:
             stack.callback(self._unlock)
-            if self.iteration >= config.iterations and (self.folder / POLICY_FILE).exists():
-                return Policy.load(self.folder)
+            if self.iteration >= config.iterations:
+                policy = self.policy()  # a kill may have come between the checkpoint and its policy
+                policy.save(self.folder / POLICY_FILE)
+                return policy
             collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
             stack.callback(collector.shutdown, close_env=False)
-            if self._generator_state is not None:
-                torch.set_rng_state(self._generator_state)
+            self._set_generators()
             # Networks this small gain nothing from a second thread and lose a lot when a core is
             # busy, and with one the results are the same on any number of cores.
             stack.callback(torch.set_num_threads, torch.get_num_threads())
@@ -162,10 +168,8 @@ class Training:
                 if self.iteration == config.iterations or now - saved > config.checkpoint_seconds:
                     self.save()
                     saved = time.perf_counter()
-            policy = self.policy()
-            policy.save(self.folder / POLICY_FILE)
             self.seconds = before + time.perf_counter() - started
-        return policy
+        return self.policy()
 
     def policy(self) -> Policy:
         """The policy at this moment."""
@@ -173,11 +177,13 @@ class Training:
         metadata = {
             "algo": config.algo,
             "seed": config.seed,
+            "variant": config.variant,
             "steps": self.steps,
             "vehicle": config.vehicle,
             "rotors": VEHICLES[config.vehicle].rotor_count,
             "control_mode": config.control_mode,
             "task_options": config.task_options,
+            **config.conditions(),
         }
         return export(self.actor, config.task, metadata)
 
@@ -185,23 +191,35 @@ class Training:
         """One iteration on a batch (aircraft, time)."""
         metrics = self._episodes(batch)
         with torch.no_grad():
+            if self.config.memory != "none":
+                done, state = (batch["next", name] for name in ("done", STATE))
+                batch[BEGINS] = torch.roll(done, 1, dims=1)
+                batch[BEGINS][:, 0] = False  # the state before it says so
+                self._remembered = {STATE: state[:, -1].masked_fill(done[:, -1], 0.0).cpu().numpy()}
             if self.iteration == 0:  # the first batch was collected without a normaliser
-                self.normaliser.update(batch["observation"])
-                batch["action_log_prob"] = self.actor.get_dist(batch).log_prob(batch["action"])
+                self._normalise(batch)
+                with set_recurrent_mode():
+                    present = self.actor.get_dist(batch)
+                batch["action_log_prob"] = present.log_prob(batch["action"])
             batch["next", "reward"] *= self.config.reward_scale
             self.advantages(batch)
-        flat = batch.select(
-            "observation", "action", "action_log_prob", "loc", "scale", "advantage", "value_target"
-        ).reshape(-1)
+        flat = batch.select(*self.actor.in_keys, *self.critic.in_keys, *LEARNED_FROM)
+        if self.config.memory == "none":
+            flat = flat.reshape(-1)
         metrics |= self.algorithm.update(flat, 1 - self.iteration / self.config.iterations)
         if self.iteration > 0:
-            self.normaliser.update(batch["observation"])
+            self._normalise(batch)
         return metrics | {"deviation": float(batch["scale"].mean())}
+
+    def _normalise(self, batch: Any) -> None:
+        """Include a batch in the normalisers."""
+        for name, normaliser in self.normalisers.items():
+            normaliser.update(batch[name])
 
     def _episodes(self, batch: Any) -> dict[str, float]:
         """Return, length, success and survival of the episodes that ended in the batch."""
         names = ("reward", "done", "terminated", "is_success", "error")
-        columns = (batch["next", name][..., 0].numpy().T for name in names)
+        columns = (batch["next", name][..., 0].cpu().numpy().T for name in names)
         reward, done, terminated, success, error = columns  # (time, aircraft)
         ended: dict[str, list[np.ndarray]] = {name: [] for name in self._running}
         for gained, over in zip(reward, done, strict=True):
@@ -223,14 +241,14 @@ class Training:
         return metrics
 
     def save(self) -> None:
-        """Write the checkpoint."""
+        """Write the checkpoint, and the policy of this moment."""
         tensors = {
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
             "optimisers": self.algorithm.save(),
-            "environment": self.env.environment.save(),
+            "environment": self.env.environment.save() | self._remembered,
             "running": self._running,
-            "generator": torch.get_rng_state(),
+            "generators": self._get_generators(),
         }
         numbers = {
             "iteration": self.iteration,
@@ -238,6 +256,20 @@ class Training:
             "config": self.config.resolved(),
         }
         checkpoint.save(self.folder / checkpoint.CHECKPOINT, tensors, numbers)
+        self.policy().save(self.folder / POLICY_FILE)
+
+    def _get_generators(self) -> dict[str, torch.Tensor]:
+        """The state of every random number generator that the training draws from."""
+        states = {"cpu": torch.get_rng_state()}
+        if self.env.device.type == "cuda":
+            states["cuda"] = torch.cuda.get_rng_state(self.env.device)
+        return states
+
+    def _set_generators(self) -> None:
+        if "cpu" in self._generators:
+            torch.set_rng_state(self._generators["cpu"])
+        if "cuda" in self._generators and self.env.device.type == "cuda":
+            torch.cuda.set_rng_state(self._generators["cuda"], self.env.device)
 
     def _restore(self) -> None:
         path = self.folder / checkpoint.CHECKPOINT
@@ -249,7 +281,7 @@ class Training:
             self.algorithm.restore(tensors.get("optimisers", {}))
             self.env.restore({k: v.numpy() for k, v in tensors["environment"].items()})
             self._running = {k: v.numpy().copy() for k, v in tensors["running"].items()}
-            self._generator_state = tensors["generator"]
+            self._generators = tensors["generators"]
             self.iteration, self.seconds = int(numbers["iteration"]), float(numbers["seconds"])
         except QuadrlError:
             raise

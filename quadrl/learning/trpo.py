@@ -15,16 +15,16 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.common import LossModule
 
 from quadrl.learning.algorithm import Algorithm
-from quadrl.learning.config import TRPOConfig
+from quadrl.learning.algorithm_config import TRPOConfig
 
 
 class TRPOLoss(LossModule):
     """The surrogate of TRPO, the KL divergence from the policy that acted, and the critic's loss.
 
-    The forward reads `observation`, `action`, `action_log_prob`, `advantage`, `value_target` and
-    the parameters of the acting policy (`loc`, `scale`), each (n, ...), and gives
-    `loss_objective` (the negative surrogate, equation 14 of the paper), `kl` (mean KL divergence
-    of the acting policy from the present one, in closed form) and `loss_critic`.
+    The forward reads what actor and critic read, `action`, `action_log_prob`, `advantage`,
+    `value_target` and the parameters of the acting policy (`loc`, `scale`), each (n, ...), and
+    gives `loss_objective` (the negative surrogate, equation 14 of the paper), `kl` (mean KL
+    divergence of the acting policy from the present one, in closed form) and `loss_critic`.
     """
 
     def __init__(self, actor_network: ProbabilisticActor, critic_network: TensorDictModule) -> None:
@@ -41,12 +41,12 @@ class TRPOLoss(LossModule):
 
     def critic_loss(self, batch: TensorDictBase) -> Tensor:
         """Mean squared error of the critic, a scalar."""
-        value = self.critic_network(batch.select("observation")).get("state_value")
+        value = self.critic_network(batch.select(*self.critic_network.in_keys)).get("state_value")
         return (value - batch.get("value_target")).square().mean()
 
     def surrogate_and_kl(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Mean of ratio times advantage, and mean KL divergence; scalars."""
-        present: Any = self.actor_network.get_dist(batch.select("observation"))
+        present: Any = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
         acting = type(present)(batch.get("loc"), batch.get("scale"))
         ratio = (present.log_prob(batch.get("action")) - batch.get("action_log_prob")).exp()
         surrogate = (ratio * batch.get("advantage").squeeze(-1)).mean()

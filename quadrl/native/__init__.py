@@ -1,11 +1,12 @@
-"""The compiled part: MuJoCo callbacks of the rotors, free flight, the state, random numbers.
+"""The compiled part: MuJoCo callbacks of the rotors, free flight, state, weather, random numbers.
 
 The C sources beside this file are compiled at first use with the machine's own compiler against
 the headers of the installed mujoco, because they read the structs of exactly that version. The
 library is kept in a cache folder (`$QUADRL_CACHE`, else the user's cache folder), one for each
 version of mujoco, of the sources and of the flags; `$QUADRL_CFLAGS` adds flags at the end of
 these (`scripts/sanitize` does). `layout.h`, which declares a row of parameters and the rows of the
-state, is written from `quadrl.parameters` and `quadrl.state` into the build.
+state and of the weather, is written from `quadrl.parameters`, `quadrl.state` and `quadrl.air` into
+the build.
 """
 
 from __future__ import annotations
@@ -27,12 +28,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from quadrl.air import c_weather
 from quadrl.errors import NativeError
 from quadrl.parameters import c_structs
 from quadrl.state import c_rows
 
-SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c")
-HEADERS = ("aero.h",)
+SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
+           "disturbances.c")  # fmt: skip
+HEADERS = ("aero.h", "philox.h", "runge_kutta.h")
 MARK_SLOT = 9
 """Entry of an actuator's `dynprm` that holds MARK."""
 # No contraction: a fused multiply-add would round otherwise than NumPy does.
@@ -102,7 +105,7 @@ def build(include: Path | None = None) -> Path:
     """
     include = include or Path(mujoco.__file__).parent / "include"
     digest = hashlib.sha256(" ".join((*flags(), platform.machine(), str(include))).encode())
-    layout = c_structs() + c_rows()
+    layout = c_structs() + c_rows() + c_weather()
     digest.update(layout.encode())
     for name in HEADERS + SOURCES:
         digest.update((_FOLDER / name).read_bytes())
@@ -177,7 +180,14 @@ def load(path: Path) -> ctypes.CDLL:
     opened.quadrl_state.restype = opened.quadrl_free_flight.restype = integer
     opened.quadrl_state.argtypes = [_POINTER, integer, _POINTER, _POINTER]
     opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
-    opened.quadrl_uniform.restype = None
+    opened.quadrl_uniform.restype = opened.quadrl_weather.restype = None
+    opened.quadrl_weather.argtypes = [_POINTER, integer, _POINTER, integer]
+    real, stride = ctypes.c_double, integer
+    opened.quadrl_estimate.restype = opened.quadrl_push.restype = None
+    opened.quadrl_estimate.argtypes = [_POINTER, integer, _POINTER]
+    opened.quadrl_push.argtypes = [
+        *(integer, _POINTER, _POINTER, _POINTER, integer, real, real, real, _POINTER, stride),
+    ]
     opened.quadrl_uniform.argtypes = [
         *(integer, _POINTER, _POINTER, integer, integer, integer, _POINTER),
     ]

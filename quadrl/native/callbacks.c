@@ -7,7 +7,7 @@
 //   body_user         its row, an Aircraft
 //   actuator_dynprm   [0] number of the rotor, [MARK_SLOT] mark
 //   actuator_gear     along and about the rotor's axis: 1, aero_reaction
-//   userdata (mjData) its air: the wind [m/s], world frame
+//   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/parameters.py says
 #include <mujoco/mujoco.h>
 
 #define LANES 1
@@ -46,6 +46,37 @@ QUADRL_EXPORT mjtNum quadrl_act_gain(const mjModel* m, const mjData* d, int actu
   return rotor ? aero_rotor_gain(rotor, d->act[m->actuator_actadr[actuator]], 0) : 1;
 }
 
+// What the air does to the rotors of a body beside equation 7, and their inertia.
+static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft* a, int body,
+                              const mjtNum airspeed[3], mjtNum force[3], mjtNum moment[3]) {
+  const mjtNum *turn = d->xmat + 9 * body, *rate = d->qvel + m->body_dofadr[body] + 3;
+  Lanes speed[MAX_ROTORS] = {{0}}, command[MAX_ROTORS] = {{0}}, noise[MAX_ROTORS] = {{0}};
+  Lanes air[3], body_rate[3], up[3], push[3] = {{0}}, twist[3] = {{0}}, height;
+  Disc disc[MAX_ROTORS];
+  for (int k = 0; k < m->nu; ++k) {
+    if (!rotor_of(m, k) || m->site_bodyid[m->actuator_trnid[2 * k]] != body) continue;
+    const int rotor = (int)m->actuator_dynprm[mjNDYN * k];
+    speed[rotor][0] = d->act[m->actuator_actadr[k]];
+    command[rotor][0] = d->ctrl[m->actuator_ctrladr[k]];
+    if (m->nuserdata >= AIR) noise[rotor][0] = d->userdata[WIND + rotor];
+  }
+  for (int k = 0; k < 3; ++k) {
+    air[k][0] = airspeed[k];
+    body_rate[k][0] = rate[k];
+    up[k][0] = turn[6 + k];
+  }
+  height[0] = d->xpos[3 * body + 2];
+  const int rotors = (int)a->rotor_count[0];
+  for (int k = 0; k < rotors; ++k) aero_disc(a, a->rotor + k, disc + k);
+  const int effects = a->effects[0] == GROUND_EFFECT ? GROUND_EFFECT : ROTOR_EFFECTS;
+  aero_rotors(a, disc, effects, rotors, speed, command, noise, air, body_rate, up, height, push,
+              twist);
+  for (int k = 0; k < 3; ++k) {
+    force[k] += push[k][0];
+    moment[k] += twist[k][0];
+  }
+}
+
 QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
   for (int body = 1; body < m->nbody; ++body) {
     const Aircraft* a = aircraft_of(m, body);
@@ -65,6 +96,7 @@ QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
       airspeed[k] = turn[k] * air[0] + turn[3 + k] * air[1] + turn[6 + k] * air[2];
     }
     aero_wrench(a, airspeed, d->qvel + dof + 3, force, moment, 0);
+    if (a->effects[0] != STILL_AIR) add_rotor_effects(m, d, a, body, airspeed, force, moment);
     for (int k = 0; k < 3; ++k) {
       d->qfrc_passive[dof + k] +=
           turn[3 * k] * force[0] + turn[3 * k + 1] * force[1] + turn[3 * k + 2] * force[2];

@@ -1,21 +1,9 @@
-// Keyed random numbers: Philox4x32-10 (Salmon et al. 2011, "Parallel Random Numbers: As Easy as
-// 1, 2, 3"). The definition in the array API stands in quadrl/rng.py.
+// Keyed random numbers. The definition in the array API stands in quadrl/rng.py.
 #include <stdint.h>
 
-#define QUADRL_EXPORT __attribute__((visibility("default")))
+#include "philox.h"
 
-static void philox(uint32_t c[4], uint32_t low, uint32_t high) {
-  for (int round = 0; round < 10; ++round) {
-    const uint64_t p0 = (uint64_t)0xD2511F53u * c[0], p1 = (uint64_t)0xCD9E8D57u * c[2];
-    const uint32_t c1 = c[1], c3 = c[3];
-    c[0] = (uint32_t)(p1 >> 32) ^ c1 ^ low;
-    c[1] = (uint32_t)p1;
-    c[2] = (uint32_t)(p0 >> 32) ^ c3 ^ high;
-    c[3] = (uint32_t)p0;
-    low += 0x9E3779B9u;
-    high += 0xBB67AE85u;
-  }
-}
+#define QUADRL_EXPORT __attribute__((visibility("default")))
 
 // Numbers first..first+count-1 of n streams, uniform in [0, 1): out is (n, count). Number j of
 // stream (key, episode, stream) is word j % 4 of the block at counter (j / 4, stream, episode).

@@ -14,11 +14,12 @@
 
 static int is_sound(double x) { return fabs(x) < 1e10; }  // mjMAXVAL; false for NaN
 
-// Where the rows of a simulation are. qpos (7), qvel (6) and act of aircraft i stand at i * stride
-// doubles, its parameters at i * parameter_stride (0: all the same). Filled by quadrl/engines.
+// Where the rows of a simulation are. qpos (7), qvel (6) and act (one per rotor) of aircraft i stand
+// at i * stride doubles, its largest speed [m/s] and spin [rad/s] at i * limit_stride (0: all the
+// same). Filled by quadrl/engines.
 typedef struct {
-  const double *qpos, *qvel, *act, *origin, *parameters;
-  int64_t stride, parameter_stride, columns;
+  const double *qpos, *qvel, *act, *origin, *limits;
+  int64_t stride, limit_stride, columns, rotors;
 } Rows;
 
 // ids lists the n aircraft to compute, or is NULL for the first n. out has a row per quantity and
@@ -30,7 +31,7 @@ QUADRL_EXPORT int64_t quadrl_state(const Rows* rows, int64_t n, const int64_t* i
   int64_t broken = 0;
   for (int64_t i = 0; i < n; ++i) {
     const int64_t row = ids ? ids[i] : i;
-    const Aircraft* a = (const Aircraft*)(rows->parameters + row * rows->parameter_stride);
+    const double* limit = rows->limits + row * rows->limit_stride;
     const double* p = rows->qpos + row * stride;
     const double* v = rows->qvel + row * stride;
     const double* speed = rows->act + row * stride;
@@ -60,7 +61,7 @@ QUADRL_EXPORT int64_t quadrl_state(const Rows* rows, int64_t n, const int64_t* i
       sound &= is_sound(p[3 + k]);
     }
     for (int k = 0; k < 9; ++k) OUT(ROW_ROTATION + k) = r[k];
-    for (int k = 0; k < (int)a->rotor_count[0]; ++k) {
+    for (int k = 0; k < rows->rotors; ++k) {
       OUT(ROW_ROTOR_SPEED + k) = speed[k];
       sound &= is_sound(speed[k]);
     }
@@ -72,8 +73,8 @@ QUADRL_EXPORT int64_t quadrl_state(const Rows* rows, int64_t n, const int64_t* i
     OUT(ROW_EAST_ERROR) = aero_length(sine) + aero_length(off);
     OUT(ROW_SPEED) = aero_length(v);
     OUT(ROW_ANGULAR_SPEED) = aero_length(v + 3);
-    sound &= (OUT(ROW_SPEED) <= a->resolved_speed[0]);
-    sound &= (OUT(ROW_ANGULAR_SPEED) <= a->resolved_turn[0]);
+    sound &= (OUT(ROW_SPEED) <= limit[0]);
+    sound &= (OUT(ROW_ANGULAR_SPEED) <= limit[1]);
 #undef OUT
     broken += !sound;
   }

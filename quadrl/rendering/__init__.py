@@ -6,7 +6,17 @@ never its dynamics: it needs no rotor callbacks and leaves the simulation's own 
 
 from quadrl.errors import RenderingUnavailable
 from quadrl.rendering.scene import Renderer
+from quadrl.rendering.sheet import write_contact_sheet
 from quadrl.rendering.trajectory import Trajectory
-from quadrl.rendering.video import render_trajectory, write_video
+from quadrl.rendering.video import help_notebooks, render_trajectory, write_video
 
-__all__ = ["Renderer", "RenderingUnavailable", "Trajectory", "render_trajectory", "write_video"]
+__all__ = [
+    "Renderer",
+    "RenderingUnavailable",
+    "Trajectory",
+    "render_trajectory",
+    "write_contact_sheet",
+    "write_video",
+]
+
+help_notebooks()

@@ -8,6 +8,7 @@ mujoco.Renderer and, after `choose`, for dm_control as well.
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import importlib.util
 import os
@@ -19,6 +20,9 @@ from typing import Any
 import mujoco
 
 from quadrl.errors import RenderingUnavailable
+
+GL_RENDERER = 0x1F01
+SOFTWARE = (b"llvmpipe", b"softpipe", b"swrast", b"swiftshader", b"software")
 
 
 def choose() -> None:
@@ -33,25 +37,64 @@ def choose() -> None:
         render.Renderer, render.BACKEND = _dm_control_context, "egl"
 
 
-def open_renderer(model: mujoco.MjModel, width: int, height: int, max_geom: int) -> mujoco.Renderer:
-    """MuJoCo's renderer for pictures of a model, width x height pixels, of at most max_geom shapes.
+def open_renderer(
+    model: mujoco.MjModel, width: int, height: int, max_geom: int, fine: bool = True
+) -> mujoco.Renderer:
+    """MuJoCo's renderer for pictures of a model.
+
+    Args:
+        model: What is drawn.
+        width: Of the pictures [pixels].
+        height: Of the pictures [pixels].
+        max_geom: Most shapes in a picture.
+        fine: With the smooth edges and the shadows that the model asks for, or without.
+
+    Raises:
+        RenderingUnavailable: There is no graphics library to draw with.
+    """
+    quality = model.vis.quality
+    asked = quality.offsamples, quality.shadowsize
+    with _failure_named():
+        _set_up()
+        try:
+            if not fine:
+                quality.offsamples = quality.shadowsize = 0
+            with current_context_kept():
+                return mujoco.Renderer(model, height, width, max_geom)
+        finally:
+            quality.offsamples, quality.shadowsize = asked
+
+
+@functools.cache
+def drawn_by_processor() -> bool:
+    """Whether a processor does the work of a graphics card here, as Mesa's llvmpipe does.
 
     Raises:
         RenderingUnavailable: There is no graphics library to draw with.
     """
     with _failure_named():
-        if _without_screen():
-            # The class that mujoco.Renderer asks for its contexts.
-            chosen: Any = importlib.import_module("mujoco.egl")
-            sys.modules[mujoco.Renderer.__module__].gl_context.GLContext = chosen.GLContext
-        egl: Any = sys.modules.get("mujoco.egl")
-        if egl and egl.EGL_DISPLAY is None:
-            # Opened in mujoco's place, which would close it at exit: dm_control shares the display,
-            # and could no longer free its own contexts.
-            display = egl.create_initialized_egl_device_display()
-            egl.EGL_DISPLAY = display if display != egl.EGL.EGL_NO_DISPLAY else None
+        _set_up()
         with current_context_kept():
-            return mujoco.Renderer(model, height, width, max_geom)
+            context = sys.modules[mujoco.Renderer.__module__].gl_context.GLContext(1, 1)
+            try:
+                context.make_current()
+                name = importlib.import_module("OpenGL.GL").glGetString(GL_RENDERER) or b""
+            finally:
+                context.free()
+    return any(software in name.lower() for software in SOFTWARE)
+
+
+def _set_up() -> None:
+    """Choose what mujoco.Renderer asks for its contexts."""
+    if _without_screen():
+        chosen: Any = importlib.import_module("mujoco.egl")
+        sys.modules[mujoco.Renderer.__module__].gl_context.GLContext = chosen.GLContext
+    egl: Any = sys.modules.get("mujoco.egl")
+    if egl and egl.EGL_DISPLAY is None:
+        # Opened in mujoco's place, which would close it at exit: dm_control shares the display, and
+        # could no longer free its own contexts.
+        display = egl.create_initialized_egl_device_display()
+        egl.EGL_DISPLAY = display if display != egl.EGL.EGL_NO_DISPLAY else None
 
 
 def close(renderer: mujoco.Renderer) -> None:

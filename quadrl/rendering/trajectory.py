@@ -28,6 +28,8 @@ class Trajectory:
     task: str  # its name
     # World frame; one tuple per state, or one for all.
     markers: Sequence[tuple[Marker, ...]] = ((),)
+    outcome: str = ""  # how the episode ended, shown with the last state
+    wind: Array | None = None  # (T, 3) [m/s], world frame; None for calm air
 
     def resampled(self, fps: float) -> Trajectory:
         """The same flight at `fps` states a second; a goal that jumps is not interpolated."""
@@ -61,6 +63,7 @@ class Trajectory:
             reward=self.reward[before],
             goal=np.where(jump, self.goal[before], linear(self.goal)),
             markers=markers,
+            wind=None if self.wind is None else linear(self.wind),
         )
 
 

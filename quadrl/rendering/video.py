@@ -3,29 +3,46 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import itertools
 import math
 import os
 import shutil
-from collections.abc import Generator, Sequence
+import sys
+from collections.abc import Callable, Generator, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quadrl.errors import QuadrlError, RenderingUnavailable
-from quadrl.rendering.camera import FOLLOW, SMOOTHING, aircraft_scale, follow_cameras, in_view
-from quadrl.rendering.overlay import Panel, require
-from quadrl.rendering.scene import Renderer
+from quadrl.rendering.camera import (
+    CHASE,
+    FOLLOW,
+    MOVING,
+    SMOOTHING,
+    follow_cameras,
+    headings,
+    in_view,
+)
+from quadrl.rendering.overlay import Panel, flight_lines, grid, require, task_title
+from quadrl.rendering.scene import TRAIL_SECONDS, Renderer
+from quadrl.rendering.streaks import streaks
 from quadrl.rendering.trajectory import Trajectory
 from quadrl.validation import number
 
-TRAIL_SECONDS = 4.0
+T = TypeVar("T")
+OneOrMore = T | Sequence[T]
+OnFrame = Callable[[int, int], object]
+"""Is told how many pictures are drawn, and how many there will be."""
 MAX_FPS = 240
 FFMPEG = "-preset veryfast -movflags +faststart"
 LEAST_RATE = 20.0  # [1/s], at which a flight is followed
+HOLD = 1.0  # [s], for which a video stays at its end, for the outcome to be read
+VIDEOS = ("mp4", "gif")
+"""What the names of videos end in."""
 
 
 def render_trajectory(
@@ -34,9 +51,12 @@ def render_trajectory(
     *,
     width: int = 848,
     height: int = 480,
-    fps: float = 25.0,
+    fps: float = 20.0,
     camera: str = FOLLOW,
     overlay: bool = True,
+    label: str = "",
+    times: ArrayLike | None = None,
+    fine: bool | None = None,
 ) -> Generator[NDArray[np.uint8]]:
     """Draw a flight.
 
@@ -46,8 +66,12 @@ def render_trajectory(
         width: Of the pictures [pixels].
         height: Of the pictures [pixels].
         fps: Pictures a second; the recorded states are interpolated.
-        camera: "follow", or a camera of the model.
-        overlay: Show time, error, speed, reward and rotor speeds.
+        camera: "follow", "chase", or a camera of the model.
+        overlay: Show time, error, speed, reward, wind, horizon, rotor speeds and the outcome.
+        label: Title of the panel in place of the task's name.
+        times: Increasing moments to draw [s]; None for the whole flight, `fps` a second. Beyond its
+            ends a flight stands still.
+        fine: As for `Renderer`.
 
     Yields:
         Pictures (height, width, 3).
@@ -63,62 +87,83 @@ def render_trajectory(
     every = math.ceil(LEAST_RATE / fps)
     rate = every * fps
     flight = trajectory.resampled(rate)
-    position = flight.qpos[:, :3]
-    spins = -np.sign(model.actuator_gear[:, 5])  # the aircraft feels the opposite torque
-    angles = spins * cumulative_trapezoid(flight.rotor_speed, flight.time, axis=0, initial=0)
+    position, last = flight.qpos[:, :3], len(flight.time) - 1
+    drawn = np.arange(0, last + 1, every)
+    if times is not None:
+        drawn = np.searchsorted(flight.time, np.asarray(times) - 0.5 / rate).clip(max=last)
     speed = np.zeros(len(position))
     if len(position) > 1:
         speed = np.linalg.norm(np.gradient(position, flight.time, axis=0), axis=1)
+    wind = drift = np.zeros_like(position)
+    if windy := flight.wind is not None:
+        wind, drift = flight.wind, cumulative_trapezoid(flight.wind, flight.time, axis=0, initial=0)
+    strength = np.linalg.norm(wind, axis=1)
     markers = flight.markers
     if len(markers) == 1:
         markers = [markers[0]] * len(position)
-    cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
-    if camera == FOLLOW:
-        shown = [in_view(*seen) for seen in zip(flight.goal, markers, strict=True)]
-        cameras = follow_cameras(position, shown, SMOOTHING * rate, aircraft_scale(model))
-    panel = None
-    if overlay:
-        colours = [model.mat(f"rotor_{k + 1}_paint").rgba[:3] for k in range(model.nu)]
-        panel = Panel(height, flight.task, colours)
-    with Renderer(model, width, height) as renderer:
-        for k in range(0, len(position), every):
-            picture = renderer.frame(
-                flight.qpos[k],
-                camera=cameras[k],
-                rotor_angles=angles[k],
-                goal=flight.goal[k],
-                trail=position[max(0, k - round(TRAIL_SECONDS * rate)) : k + 1],
-                markers=markers[k],
-            )
-            if panel is not None:
-                lines = (
-                    ("time", f"{flight.time[k]:.2f} s"),
-                    ("error", f"{flight.error[k]:.2f} m"),
-                    ("speed", f"{speed[k]:.2f} m/s"),
-                    ("reward", f"{flight.reward[k]:+.2f}"),
+    with Renderer(model, width, height, fine=fine) as renderer:
+        turned = cumulative_trapezoid(flight.rotor_speed, flight.time, axis=0, initial=0)
+        angles = renderer.spins * turned
+        cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
+        if camera in MOVING:
+            heading = headings(flight.qpos) if camera == CHASE else None
+            also = [()] * len(position) if camera == CHASE else markers
+            shown = [in_view(*seen) for seen in zip(flight.goal, also, strict=True)]
+            smoothing = SMOOTHING * rate
+            how = renderer.scale, heading, renderer.aspect
+            cameras = follow_cameras(position, shown, smoothing, *how)
+        panel = None
+        if overlay:
+            colours = [model.mat(f"rotor_{k + 1}_paint").rgba[:3] for k in range(model.nu)]
+            panel = Panel(height, label or task_title(flight.task), colours, windy)
+        before, picture = -1, np.empty(0, np.uint8)
+        for k in map(int, drawn):
+            if k != before:
+                picture = renderer.frame(
+                    flight.qpos[k],
+                    camera=cameras[k],
+                    rotor_angles=angles[k],
+                    goal=flight.goal[k],
+                    trail=position[max(0, k - round(TRAIL_SECONDS * rate)) : k + 1],
+                    markers=(
+                        *markers[k],
+                        *streaks(position[k], wind[k], drift[k], renderer.scale),
+                    ),
                 )
-                panel.draw(picture, lines, flight.rotor_speed[k] / flight.max_rotor_speed)
+                if panel is not None:
+                    moment = flight.time[k], flight.error[k], speed[k], flight.reward[k]
+                    values = flight_lines(*moment, strength[k] if windy else None)
+                    shares = flight.rotor_speed[k] / flight.max_rotor_speed
+                    end = flight.outcome if k == last else ""
+                    panel.draw(picture, [*values.values()], shares, flight.qpos[k, 3:], end)
+                before = k
             yield picture
 
 
 def write_video(
-    trajectory: Trajectory,
-    model: mujoco.MjModel,
+    trajectory: OneOrMore[Trajectory],
+    model: OneOrMore[mujoco.MjModel],
     path: str | os.PathLike[str],
     *,
-    fps: float = 25.0,
+    fps: float = 20.0,
+    label: OneOrMore[str] = "",
+    on_frame: OnFrame = lambda done, total: None,
     **options: Any,
 ) -> Path:
-    """Write a flight as an MP4 (H.264, yuv420p). An unfinished file never has its final name.
+    """Write a flight as an MP4 (H.264, yuv420p) or a GIF. An unfinished file has another name.
 
-    Ten seconds of flight at the defaults cost about 35 s of CPU time, on all cores, without a GPU.
+    Several flights are shown side by side; one that is over waits for the others. Ten seconds of
+    flight at the defaults cost about 10 s of CPU time without a graphics card.
 
     Args:
-        trajectory: What was flown.
-        model: The drawn model of the aircraft that flew it.
-        path: The file, ending in .mp4.
+        trajectory: What was flown, or several.
+        model: The drawn model of the aircraft that flew it; one for all, or one for each.
+        path: The file, ending in .mp4 or .gif.
         fps: Frames a second.
-        **options: The others of `render_trajectory`; width and height must be even.
+        label: Titles in place of the task's name; one for each flight.
+        on_frame: Is called after each frame with the number of those drawn and of all.
+        **options: The others of `render_trajectory`; width and height are those of one flight, and
+            must be even for an MP4.
 
     Returns:
         The path of the file.
@@ -127,23 +172,31 @@ def write_video(
         RenderingUnavailable: There is no graphics library, no Pillow or no ffmpeg.
         QuadrlError: The path, the size, the frame rate or the camera does not suit a video.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".mp4" or path.is_dir():
-        raise QuadrlError(name="path", value=str(path), allowed="the name of a file ending in .mp4")
+    path, kind = checked(path, VIDEOS)
     for name in ("width", "height"):
-        if options.get(name, 0) % 2:
+        if kind == "mp4" and options.get(name, 0) % 2:
             raise QuadrlError(name=name, value=options[name], allowed="even for a video")
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
-    with contextlib.closing(render_trajectory(trajectory, model, fps=fps, **options)) as frames:
-        first = next(frames)  # what cannot be drawn fails here, before ffmpeg begins
+    flights = listed(trajectory)
+    start, end = _span(flights)
+    number("fps", fps, 1, MAX_FPS)
+    times = np.arange(start, end + 1e-9, 1 / fps)
+    if any(flight.outcome for flight in flights):
+        times = np.append(times, end + np.arange(1, 1 + round(HOLD * fps)) / fps)
+    encoding: dict[str, Any] = {"codec": "gif"}
+    if kind == "mp4":
         encoding = dict(crf=20, encoded_format="yuv420p", ffmpeg_args=FFMPEG)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.{kind}")
+    drawing = _together(flights, model, label, fps=fps, times=times, **options)
+    with contextlib.closing(drawing) as frames:
+        first = next(frames)  # what cannot be drawn fails here, before ffmpeg begins
         writer = _mediapy().VideoWriter(temporary, first.shape[:2], fps=fps, **encoding)
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             writer.__enter__()
             with contextlib.suppress(BrokenPipeError):  # ffmpeg says itself why it stopped
-                for frame in itertools.chain([first], frames):
+                for k, frame in enumerate(itertools.chain([first], frames)):
                     writer.add_image(frame)
+                    on_frame(k + 1, len(times))
             writer.close()
             os.replace(temporary, path)
         except RuntimeError as error:
@@ -153,6 +206,51 @@ def write_video(
                 writer.close()
             temporary.unlink(missing_ok=True)
     return path
+
+
+def help_notebooks() -> None:
+    """Let `mediapy.show_video` find an ffmpeg, where mediapy is imported or a notebook runs."""
+    notebook = "IPython" in sys.modules and importlib.util.find_spec("mediapy")
+    if "mediapy" in sys.modules or notebook:
+        with contextlib.suppress(RenderingUnavailable):  # there is none to find
+            _mediapy()
+
+
+def _together(
+    flights: Sequence[Trajectory], model: Any, label: Any, **options: Any
+) -> Generator[NDArray[np.uint8]]:
+    """Pictures of one flight, or of several side by side."""
+    labels, models = listed(label, len(flights)), listed(model, len(flights))
+    drawings = [
+        render_trajectory(flight, of, label=text, **options)
+        for flight, of, text in zip(flights, models, labels, strict=True)
+    ]
+    with contextlib.ExitStack() as stack:
+        for drawing in drawings:
+            stack.enter_context(contextlib.closing(drawing))
+        for pictures in zip(*drawings, strict=True):
+            yield pictures[0] if len(pictures) == 1 else grid(pictures)
+
+
+def listed(one_or_more: Any, count: int = 1) -> list[Any]:
+    """Several as they are, and one as often as it is needed."""
+    several = isinstance(one_or_more, Iterable) and not isinstance(one_or_more, str)
+    return list(one_or_more) if several else [one_or_more] * count
+
+
+def _span(flights: Sequence[Trajectory]) -> tuple[float, float]:
+    """From the first state to the last of all flights [s]."""
+    return min(f.time[0] for f in flights), max(f.time[-1] for f in flights)
+
+
+def checked(path: str | os.PathLike[str], kinds: Sequence[str]) -> tuple[Path, str]:
+    """A path that ends in one of some kinds, and the kind."""
+    path = Path(path)
+    kind = path.suffix.removeprefix(".").lower()
+    if kind not in kinds or path.is_dir():
+        allowed = f"the name of a file ending in .{' or .'.join(kinds)}"
+        raise QuadrlError(name="path", value=str(path), allowed=allowed)
+    return path, kind
 
 
 def _mediapy() -> Any:

@@ -67,14 +67,14 @@ def wobble(trial: Trial) -> tuple[int, str]:
 
 @claim("Stochastic policies should be robust to disturbances such as wind.")
 def sturdier(trial: Trial) -> tuple[int, str]:
-    """In gusts, sampled actions lose less success than the mean action, solved seed by seed."""
+    """In wind, sampled actions lose less success than the mean action, solved seed by seed."""
     differences, texts = [], {}
     for algo, runs in trial.runs.items():
         solved = [run for run in runs if run["mean"]["success_rate"] >= SOLVED]
         mean, sampled = (
             [
                 run[way]["success_rate"]
-                - statistics.mean(level[way]["success_rate"] for level in run["gusts"])
+                - statistics.mean(level[way]["success_rate"] for level in run["windy"])
                 for run in solved
             ]
             for way in WAYS

@@ -10,18 +10,23 @@ from typing import Any
 from quadrl import VEHICLES, cli, tasks
 from quadrl.cli.tasks import observation_rows, reward_rows, settings
 from quadrl.control import CONTROL_MODES
-from quadrl.description import describe, describe_action, docstrings
-from quadrl.vehicle import GRAVITY, Rotor, Vehicle
+from quadrl.description import describe, describe_action
+from quadrl.vehicle import GRAVITY, Vehicle
 from scripts.reports.report import Parts, asked, table
 
 
 def task_table(**columns: str) -> str:
     """Attributes of each task by the heads of the columns."""
     rows = (
-        (f"[`{name}`](../tasks/{name}.py)", *(getattr(task, x) for x in columns.values()))
+        (f"[`{name}`](tasks/{name}.md)", *(shown(getattr(task, x)) for x in columns.values()))
         for name, task in tasks.TASKS.items()
     )
     return table(("task", *columns), rows)
+
+
+def shown(value: str | float) -> str:
+    """A text, or a number without zeros at its end."""
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def training_table() -> str:
@@ -71,25 +76,6 @@ def coded(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
     return [(f"`{name}`", *rest) for name, *rest in rows]
 
 
-def vehicle() -> str:
-    """The parameters of the default aircraft and of its first rotor."""
-    paper, rows = Vehicle(), []
-    for kind, values in ((Vehicle, paper), (Rotor, paper.rotors[0])):
-        for name, text in docstrings(kind).items():
-            if name not in ("name", "rotors"):
-                label = f"`{name}`" if kind is Vehicle else f"rotor 1: `{name}`"
-                rows.append((label, number(getattr(values, name)), text))
-    rows.append(("rotor 1: `hover_speed`", number(float(paper.hover_speed[0])), "follows [rad/s]"))
-    return table(("parameter", "value", "meaning, unit, source"), rows)
-
-
-def number(value: Any) -> str:
-    """A parameter in few digits."""
-    if isinstance(value, tuple):
-        return ", ".join(map(number, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
 def vehicles() -> str:
     """The aircraft that come with quadrl."""
     rows = []
@@ -121,7 +107,6 @@ PARTS: Parts = {
     "control-modes": control_modes,
     "observation": observation,
     "reward": reward,
-    "vehicle": vehicle,
     "vehicles": vehicles,
     "commands": commands,
 }

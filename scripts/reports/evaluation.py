@@ -34,30 +34,29 @@ def trained(run: Run) -> Result:
     return known | {"steps": steps, "training_s": took}
 
 
-def measure(run: Run, *, episodes: int, gusts: Iterable[float]) -> Result:
+def measure(run: Run, *, episodes: int, weathers: Iterable[str]) -> Result:
     """All figures of a finished run.
 
     Args:
         run: The run.
         episodes: Episodes of each evaluation; the same ones for every run.
-        gusts: Standard deviations of the wind [m/s] to fly in.
+        weathers: Names of the weathers to fly in as well.
 
     Returns:
         What `trained` says, and: `curve`: first, best and final return of the training; `mean` and
         `sampled`: summary and smoothness with the mean action and with actions drawn from the
-        policy; `gusts`: a summary of both for each deviation; `return_noisy_weights`: the return
-        of the mean action with noise on the weights.
+        policy; `windy`: a summary of both for each weather; `return_noisy_weights`: the return of
+        the mean action with noise on the weights.
     """
     policy, task = Policy.load(run.folder), run.config.task
-    ways = {"mean": policy, "sampled": policy.sampled(NOISE_SEED)}
+    ways = {"mean": policy, "sampled": policy.flying(episodes, NOISE_SEED)}
     measured: Result = trained(run) | {"curve": curve_figures(read_metrics(run.folder / METRICS))}
     for way, controller in ways.items():
         rollout = fly(controller, task, episodes=episodes)
         measured[way] = summarize(rollout) | {"smoothness": smoothness(rollout)}
-    measured["gusts"] = [
-        {"deviation_m_s": gust}
-        | {way: blown(controller, task, episodes, gust) for way, controller in ways.items()}
-        for gust in gusts
+    measured["windy"] = [
+        {way: blown(controller, task, episodes, weather) for way, controller in ways.items()}
+        for weather in weathers
     ]
     returns = []
     for draw in range(WEIGHT_DRAWS):
@@ -68,9 +67,9 @@ def measure(run: Run, *, episodes: int, gusts: Iterable[float]) -> Result:
     return measured | {"return_noisy_weights": float(np.mean(returns))}
 
 
-def blown(controller: Any, task: str, episodes: int, deviation: float) -> Result:
-    """The main figures of flights in gusts of a standard deviation [m/s]."""
-    summary = summarize(fly(controller, task, episodes=episodes, gusts=deviation))
+def blown(controller: Any, task: str, episodes: int, weather: str) -> Result:
+    """The main figures of flights in a weather."""
+    summary = summarize(fly(controller, task, episodes=episodes, weather=weather))
     names = ("success_rate", "survival_rate", "position_error_m", "return_mean")
     return {name: summary[name] for name in names}
 

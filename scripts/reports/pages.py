@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
+import statistics
 import sys
 
 import tyro
 
-from scripts.reports import describe, examples, paper, peers, report, speed, step_size, training
+from quadrl.benchmark import ALL_CORES, ONE_CORE
+from scripts.reports import (
+    describe,
+    examples,
+    ground,
+    noise,
+    paper,
+    peers,
+    reference,
+    report,
+    robust,
+    robustness,
+    speed,
+    step_size,
+    task_pages,
+    training,
+)
 from scripts.reports.report import table
 
-MODULES = (describe, examples, paper, peers, speed, step_size, training)
+MODULES = (
+    describe, examples, ground, noise, paper, peers, reference, robust, robustness, speed,
+    step_size, task_pages, training,
+)  # fmt: skip
 
 
 def main(check: bool = False) -> None:
@@ -18,7 +38,7 @@ def main(check: bool = False) -> None:
     Args:
         check: Write nothing; exit with 1 and a message if a page would change.
     """
-    parts: dict = {"figures": figures}
+    parts: dict = {"figures": figures, "claim": claim}
     for module in MODULES:
         parts |= module.PARTS
     stale = [page for page in report.pages() if report.written(page, parts) != page.read_text()]
@@ -32,26 +52,49 @@ def main(check: bool = False) -> None:
 def figures() -> str:
     """The five figures of the README."""
     result, measured = report.load("training"), report.load("speed")
-    hover = [
-        run
-        for run in result["runs"]
-        if [run[x] for x in ("task", "vehicle", "engine")] == ["hover", "paper", "free_flight"]
-    ]
-    took = [run["training_s"] for run in hover]
-    solved = sum(run["metrics"]["success_rate"] == 1 for run in hover)
+    took, solved, _ = hover()
     rows = [(
         "hover, from nothing to a trained policy",
-        f"{min(took):.1f} to {max(took):.1f} s; {solved} of {len(hover)} seeds succeed in all of "
+        f"{min(took):.1f} to {max(took):.1f} s; {solved} of {len(took)} seeds succeed in all of "
         f"{result['episodes']} episodes",
         "`scripts/report training`"
     )]  # fmt: skip
     for row in measured["rates"]:
-        if row["target"]:
+        if row["target"] and row["of"] in (ALL_CORES, ONE_CORE):
             share = f"{row['share']:.2f} times bare `mj_step` on {row['of']}"
             rows.append((f"{row['what']}", f"{row['rate']:,.0f} control steps/s; {share}",
                          "`quadrl benchmark`"))  # fmt: skip
     sources = f"{report.source(measured)} The row of hover at commit {result['commit']}."
     return f"{table(('what', 'figure', 'command'), rows)}\n\n{sources}"
+
+
+def claim() -> str:
+    """What hover takes and reaches, beside the command that shows it."""
+    result = report.load("training")
+    took, solved, error = hover()
+    cells = (
+        "`quadrl train hover`",
+        f"{statistics.median(took):.0f} s ({min(took):.1f} to {max(took):.1f} s)",
+        f"100 % of {result['episodes']} fresh episodes with {solved} of {len(took)} seeds",
+        f"{min(error):.1f} to {max(error):.1f} cm",
+    )
+    head = ("command", "from nothing to the policy", "success", "error over the last 2 s")
+    note = f" Measured {result['note']}." if "note" in result else ""
+    where = f"{result['machine']['cores']} CPU cores without a GPU, in free flight"
+    words = f"*Median and range of the seeds, on {where}. [All trainings](results.md).{note}*"
+    return f"{table(head, [cells])}\n\n{words}"
+
+
+def hover() -> tuple[list[float], int, list[float]]:
+    """Of the trainings of hover: times [s], how many never fail, errors [cm]."""
+    runs = [
+        run
+        for run in report.load("training")["runs"]
+        if [run[x] for x in ("task", "vehicle", "engine")] == ["hover", "paper", "free_flight"]
+    ]
+    took = [run["training_s"] for run in runs]
+    solved = sum(run["metrics"]["success_rate"] == 1 for run in runs)
+    return took, solved, [100 * run["metrics"]["position_error_m"] for run in runs]
 
 
 if __name__ == "__main__":

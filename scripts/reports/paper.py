@@ -19,13 +19,14 @@ from quadrl.learning.figures import COLOURS, STYLE, learning_curves, read_metric
 from quadrl.learning.folder import METRICS
 from quadrl.policy import Policy
 from quadrl.rollout import fly, summarize
+from quadrl.weather import WEATHERS
 from scripts.reports import evaluation, report, study
 from scripts.reports.claims import judged
 from scripts.reports.report import Result, factor, say, spread, table
 from scripts.reports.trial import LABELS, LEVEL, SOLVED, WAYS, Trial, column, trials
 
 TASKS = ("hover", "static_waypoint", "landing")
-GUSTS = (2.0, 3.0, 4.0)  # [m/s]
+WINDY = tuple(name for name, weather in WEATHERS.items() if not weather.calm)
 Line = tuple[Sequence[float], np.ndarray]
 """Where (n,), and values (seeds, n)."""
 
@@ -59,22 +60,23 @@ def main(
     ]
     study.train(runs, jobs, episodes)
     result: Result = {"command": f"scripts/report paper --jobs {jobs}", "episodes": episodes}
+    result["weathers"] = WINDY
     result["geometric"] = {task: yardstick(task, episodes) for task in TASKS}
     result["runs"] = []
     for run in runs:
-        result["runs"].append(evaluation.measure(run, episodes=episodes, gusts=GUSTS))
+        result["runs"].append(evaluation.measure(run, episodes=episodes, weathers=WINDY))
         say(f"{run.folder.name}: measured")
     draw(runs, report.rounded(result), report.IMAGES / name)
     report.save(name, result | {"wall_clock_s": time.perf_counter() - began})
 
 
 def yardstick(task: str, episodes: int) -> Result:
-    """The geometric controller, calm and in gusts."""
+    """The geometric controller, in calm air and in wind."""
     controller = make_controller("geometric", task)
     rollout = fly(controller, task, episodes=episodes)
-    gusts = [{"mean": evaluation.blown(controller, task, episodes, gust)} for gust in GUSTS]
+    windy = [{"mean": evaluation.blown(controller, task, episodes, name)} for name in WINDY]
     mean = summarize(rollout) | {"smoothness": evaluation.smoothness(rollout)}
-    return {"mean": mean, "gusts": gusts}
+    return {"mean": mean, "windy": windy}
 
 
 def draw(runs: list[study.Run], result: Result, folder: Path) -> None:
@@ -92,8 +94,8 @@ def draw(runs: list[study.Run], result: Result, folder: Path) -> None:
     both = trials(result)
     axes = ("frequency [Hz]", "power of the body rate [rad²/s²/Hz]")
     lines({t.task: spectra(t) for t in both}, axes, folder / "smoothness.png", logarithmic=True)
-    axes = ("gusts [m/s]", "successful [share]")
-    lines({t.task: gust_lines(t) for t in both}, axes, folder / "gusts.png")
+    axes, levels = ("wind", "successful [share]"), ("calm", *result["weathers"])
+    lines({t.task: wind_lines(t) for t in both}, axes, folder / "wind.png", ticks=levels)
 
 
 def spectra(trial: Trial) -> dict[str, Line]:
@@ -106,16 +108,20 @@ def spectra(trial: Trial) -> dict[str, Line]:
     return panel
 
 
-def gust_lines(trial: Trial) -> dict[str, Line]:
-    """Success over the strength of the gusts."""
-    levels = [0.0, *GUSTS]
-    return {name: (levels, np.array(blown(runs, way)).T) for name, way, runs in by_way(trial)}
+def wind_lines(trial: Trial) -> dict[str, Line]:
+    """Success in calm air and in one weather after the other."""
+    panel = {}
+    for name, way, runs in by_way(trial):
+        shares = np.array(blown(runs, way)).T
+        panel[name] = range(shares.shape[1]), shares
+    return panel
 
 
 def blown(runs: Sequence[Result], way: str, figure: str = "success_rate") -> list[list[float]]:
-    """A figure of the runs in calm air and at each strength of the gusts."""
+    """A figure of the runs in calm air and in each weather."""
     calm = [run[way][figure] for run in runs]
-    return [calm, *([run["gusts"][k][way][figure] for run in runs] for k in range(len(GUSTS)))]
+    windy = zip(*([air[way][figure] for air in run["windy"]] for run in runs), strict=True)
+    return [calm, *map(list, windy)]
 
 
 def by_way(trial: Trial) -> list[tuple[str, str, list[Result]]]:
@@ -125,7 +131,11 @@ def by_way(trial: Trial) -> list[tuple[str, str, list[Result]]]:
 
 
 def lines(
-    panels: dict[str, dict[str, Line]], axes: tuple[str, str], path: Path, logarithmic: bool = False
+    panels: dict[str, dict[str, Line]],
+    axes: tuple[str, str],
+    path: Path,
+    logarithmic: bool = False,
+    ticks: Sequence[str] = (),
 ) -> None:
     """Figures over something, a panel each, with the range of the seeds; dashed if sampled."""
     figure = Figure(figsize=(3.6 * len(panels), 3.3), layout="constrained")
@@ -141,6 +151,8 @@ def lines(
                 dashes = "--" if label.endswith("sampled") else "-"
                 drawn[label] = axis.plot(x, median, dashes, color=colour, lw=1.6)[0]
         axis.set(title=task, xlabel=axes[0], yscale="log" if logarithmic else "linear")
+        if ticks:
+            axis.set_xticks(range(len(ticks)), ticks)
         axis.grid(alpha=0.25)
     figure.supylabel(axes[1], fontsize=10)
     figure.legend(drawn.values(), drawn, loc="outside lower center", ncols=4, frameon=False)
@@ -199,15 +211,15 @@ def smooth() -> str:
 
 
 def sturdy() -> str:
-    """How well each flies in gusts."""
-    rows = []
-    for trial in trials(report.load("paper")):
+    """How well each flies in wind."""
+    rows, result = [], report.load("paper")
+    for trial in trials(result):
         for name, way, runs in by_way(trial):
             shares = (spread(x, "%", 100) for x in blown(runs, way))
             errors = (spread(x, "cm", 100, 2) for x in blown(runs, way, "position_error_m")[1:3])
             rows.append((trial.task, name, *shares, *errors))
-    levels = (f"gusts of {g:g} m/s" for g in GUSTS)
-    errors = (f"error, {g:g} m/s" for g in GUSTS[:2])
+    levels = result["weathers"]
+    errors = (f"error, {level}" for level in levels[:2])
     return table(("task", "policy", "calm", *levels, *errors), rows)
 
 

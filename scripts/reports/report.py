@@ -114,17 +114,20 @@ def asked(target: Target) -> str:
 
 def pages() -> list[Path]:
     """All pages that may have generated parts."""
-    return [REPOSITORY / "README.md", *sorted(DOCS.glob("*.md"))]
+    return [REPOSITORY / "README.md", *sorted(DOCS.rglob("*.md"))]
 
 
 def written(page: Path, parts: Parts) -> str:
     """The text of a page, each part from `<!-- begin NAME -->` to `<!-- end NAME -->` made anew.
 
-    Links in parts are relative to docs/; they are adapted to a page at the top level.
+    Links in parts are relative to docs/; they are adapted to a page elsewhere.
 
     Raises:
         KeyError: The page has a part that nothing makes.
     """
+
+    def adapted(link: re.Match[str]) -> str:
+        return f"]({os.path.relpath(DOCS / link[1], page.parent)}"
 
     def make(found: re.Match[str]) -> str:
         try:
@@ -133,7 +136,7 @@ def written(page: Path, parts: Parts) -> str:
             report = Path(str(error.filename)).stem
             part = f"Not measured yet: run `scripts/report {report}`."
         if page.parent != DOCS:
-            part = re.sub(r"\]\((?!#|\w+:)", "](docs/", part).replace("](docs/../", "](")
+            part = re.sub(r"\]\((?!#|\w+:)([^)#]+)", adapted, part)
         return f"<!-- begin {found[1]} -->\n\n{part}\n\n<!-- end {found[1]} -->"
 
     pattern = r"<!-- begin ([\w-]+) -->.*?<!-- end \1 -->"

@@ -22,7 +22,7 @@ def main(repeats: int = 100, seconds: float = 0.2) -> None:
 def speed() -> str:
     """Every layer."""
     result = report.load("speed")
-    head = ("what", "control steps/s", "median", "share of bare `mj_step`", "target")
+    head = ("what", "control steps/s", "median", "share", "of", "target")
     return f"{table(head, benchmark.rows(result))}\n\n{report.source(result)}"
 
 

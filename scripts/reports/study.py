@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import signal
 import subprocess
 import sys
@@ -16,8 +17,10 @@ from quadrl.learning.folder import CONFIG, EVALUATION, FREE
 from scripts.reports.report import ENVIRONMENT, say
 
 POLL_SECONDS = 0.2
-NAMED = ("algo", "seed", "steps", "vehicle", "engine", "num_threads")
-"""Settings that the command of a run names: all others are those of its task."""
+NAMED = ("algo", "seed", "variant", "steps", "vehicle", "engine", "memory", "num_threads")
+PAIRED = ("observe", "vehicle_options")
+"""Settings that the command of a run names, beside what disturbs and is observed: all others are
+those of its task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +50,15 @@ class Run:
         known = {name.replace("_", "-"): getattr(self.config, name) for name in NAMED}
         named = [f"--{name}={value}" for name, value in known.items()]
         begin = [self.config.task, *named, f"--out={self.folder}"]
+        for name in ("weather", "randomization", "aerodynamics"):
+            if not (value := getattr(self.config, name)):
+                continue
+            text = value if isinstance(value, str) else json.dumps(value)
+            begin.append(f"--{name}={text}")
+        for name in PAIRED:
+            if given := getattr(self.config, name):
+                option = name.replace("_", "-")
+                begin += [f"--{option}", *(f"{k}={json.dumps(v)}" for k, v in given.items())]
         again = ["--resume", str(self.folder)]
         setting = again if (self.folder / CONFIG).exists() else begin
         ending = ["--no-video", "--episodes", str(episodes)]

@@ -92,22 +92,36 @@ def suite() -> str:
     """Every task beside what counts as solved and the geometric controller."""
     result = report.load("training")
     rows: list[tuple[str, ...]] = []
-    for name, task in tasks.TASKS.items():
-        runs, known = (
-            [row for row in result[part] if (row["task"], row["vehicle"]) == (name, "paper")]
-            for part in ("runs", "yardstick")
-        )
-        runs = [run for run in runs if run["engine"] == "free_flight"][: len(SEEDS)]
-        for k, target in enumerate(task.targets):
-            reached = (each["metrics"][target.metric] for each in (*runs, *known))
-            cells = (number(value and factor(target) * value) for value in reached)
-            rows.append((f"`{name}`" if k == 0 else "", target.words, asked(target), *cells))
-        seeds = ", ".join(str(run["seed"]) for run in runs)
-        words = f"training, {runs[0]['steps']:,} steps, seeds {seeds}"
-        took = (f"{run['training_s']:.0f} s" for run in runs)
-        rows.append(("", words, f"at most {LONGEST:.0f} s", *took, ""))
+    for name in tasks.TASKS:
+        own, _ = reached(result, name)
+        rows += [(f"`{name}`" if k == 0 else "", *row) for k, row in enumerate(own)]
     seeds = ("first seed", "second seed", "third seed")
     return table(("task", "figure", "asked", *seeds, "geometric controller"), rows)
+
+
+def reached(result: Result, name: str) -> tuple[list[tuple[str, ...]], list[int]]:
+    """What a task asks beside what each seed reached, and the seeds.
+
+    Raises:
+        FileNotFoundError: The task was not trained.
+    """
+    task, rows = tasks.TASKS[name], []
+    runs, known = (
+        [row for row in result[part] if (row["task"], row["vehicle"]) == (name, "paper")]
+        for part in ("runs", "yardstick")
+    )
+    runs = [run for run in runs if run["engine"] == "free_flight"][: len(SEEDS)]
+    if not runs:
+        raise FileNotFoundError(name)
+    for target in task.targets:
+        metrics = (each["metrics"][target.metric] for each in (*runs, *known))
+        cells = (number(value and factor(target) * value) for value in metrics)
+        rows.append((target.words, asked(target), *cells))
+    seeds = [run["seed"] for run in runs]
+    words = f"training, {runs[0]['steps']:,} steps, seeds {', '.join(map(str, seeds))}"
+    took = (f"{run['training_s']:.0f} s" for run in runs)
+    rows.append((words, f"at most {LONGEST:.0f} s", *took, ""))
+    return rows, seeds
 
 
 PARTS: report.Parts = {"training-hover": hover, "training-suite": suite}

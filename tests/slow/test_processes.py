@@ -2,15 +2,21 @@
 
 import multiprocessing
 import os
+import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
+from apis import APIS
 
 import quadrl
+from quadrl import native
 from quadrl.environment import Environment
+from quadrl.testing import varied_actions
 
 REPOSITORY = Path(quadrl.__file__).parents[1]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(REPOSITORY)}
@@ -29,6 +35,24 @@ def test_processes_that_build_at_once_do_not_disturb_each_other(tmp_path):
     assert os.listdir(tmp_path / "cache") == [Path(path).name]  # and no scratch left
 
 
+def test_a_library_for_another_mujoco_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("QUADRL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("QUADRL_CFLAGS", "-O0")
+    shutil.copytree(Path(mujoco.__file__).parent / "include", tmp_path / "include")
+    header = tmp_path / "include" / "mujoco" / "mujoco.h"
+    running = mujoco.mj_version()
+    line = f"#define mjVERSION_HEADER {running}"
+    assert line in header.read_text()
+    header.write_text(header.read_text().replace(line, line + "0"))
+    path = native.build(include=tmp_path / "include")
+    with pytest.raises(native.NativeError, match=rf"{running}0.*{running}\b"):
+        native.load(path)
+    # The one for this mujoco stands beside it under another name.
+    right = native.build()
+    assert right != path
+    assert native.load(right).quadrl_mujoco_version() == running
+
+
 def fly_hover(seed):
     environment = Environment("hover", num_envs=2, seed=seed)
     environment.reset()
@@ -43,6 +67,29 @@ def test_a_spawned_process_flies_the_same():
     here = fly_hover(3)
     assert (here[:, 2] > 2.0).all()  # without callbacks it would be on the ground by now
     np.testing.assert_array_equal(elsewhere, here)
+
+
+def fly_on(given, actions):
+    """What pickled environments give."""
+    many = pickle.loads(given)
+    return [[one.copied(one.step(action[: one.rows])) for action in actions] for one in many]
+
+
+def test_environments_of_every_api_fly_on_in_another_process():
+    settings = {"randomization": {"mass": (0.9, 1.1)}, "engine": "free_flight"}
+    many = [api(seed=1, **settings) for api in APIS]
+    actions = varied_actions(12, 4)[:, 2:]
+    for one in many:
+        one.reset()
+        for action in actions[:5]:
+            one.step(action[: one.rows])
+    given = pickle.dumps(many)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        elsewhere = pool.apply(fly_on, (given, actions[5:]))
+    here = fly_on(given, actions[5:])
+    for one, other in zip(sum(here, []), sum(elsewhere, []), strict=True):
+        for name, value in one.items():
+            np.testing.assert_array_equal(value, other[name], err_msg=name)
 
 
 FLY = """

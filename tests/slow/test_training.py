@@ -16,11 +16,30 @@ from runs import assert_same_run, changed, metrics, train
 from scipy import stats
 
 import quadrl
+from quadrl import cli
+from quadrl.evaluation import evaluate, setting
 from quadrl.learning.config import TrainConfig
 from quadrl.policy import SHIPPED_AS, Policy, shipped
-from quadrl.rollout import EVALUATION_SEED, evaluate, fly, summarize
+from quadrl.rollout import EVALUATION_SEED, fly, summarize
 
 REPOSITORY = Path(quadrl.__file__).parents[1]
+
+
+# -------------------------------------------------------------------------- several seeds
+
+
+def test_several_seeds(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    short = "--num-envs 8 --rollout 4 --steps 192 --episodes 2 --task-options time_limit=0.5"
+    short = [*short.split(), "--no-video"]
+    cli.main(["train", "hover", *short, "--out", "runs", "--seeds", "0:2"])
+    said = capsys.readouterr().out
+    folders = [Path("runs") / f"hover-ppo-{seed}" for seed in (0, 1)]
+    assert all(str(folder) in said for folder in folders)
+    assert Path("runs", "hover-ppo-seeds.png").exists()
+    cli.main(["train", "hover", *short, "--seed", "1", "--out", "alone"])
+    trained = [Path(f, "policy.safetensors").read_bytes() for f in (folders[1], Path("alone"))]
+    assert trained[0] == trained[1]  # whatever was trained before it
 
 
 # ------------------------------------------------------------------- killed at any moment
@@ -125,8 +144,8 @@ def test_a_tumble_is_stopped(tmp_path, algo, settings):
     assert np.mean(returns[:3]) < -0.5
     assert np.mean(returns[-3:]) > 0.4
     task = config.make_task()
-    learned = evaluate(Policy.load(folder), task, episodes=64)[0]["return_mean"]
-    nothing = evaluate(lambda o: np.zeros((len(o), 4)), task, episodes=64)[0]["return_mean"]
+    learned = evaluate(Policy.load(folder), task, episodes=64).metrics["return_mean"]
+    nothing = evaluate(lambda o: np.zeros((len(o), 4)), task, episodes=64).metrics["return_mean"]
     assert learned > nothing + 0.3
 
 
@@ -135,7 +154,7 @@ def test_hover_is_learned_by_default(tmp_path, algo):
     """Seeds 0 to 3 of either succeed in all of the episodes, with mean errors of 1 to 4 cm."""
     config = TrainConfig("hover", algo=algo)
     policy = Policy.load(train(config, tmp_path / "run"))
-    reached, _ = evaluate(policy, config.make_task(), episodes=100)
+    reached = evaluate(policy, config.make_task(), episodes=100).metrics
     assert reached["success_rate"] >= 0.9
 
 
@@ -167,13 +186,16 @@ def test_a_shipped_policy_still_reaches_its_metrics(file):
     beside = json.loads(file.with_suffix(".json").read_text())
     policy, recorded = Policy.load(file), beside["evaluation"]
     config, metadata = beside["config"], policy.metadata
+    variant = metadata.get("variant", "ideal")
     for task, algo in ((policy.task, metadata["algo"]), (config["task"], config["algo"])):
-        assert file.stem == f"{task}_{SHIPPED_AS.get(algo, algo)}"
+        kind = SHIPPED_AS.get(algo, algo) if variant == "ideal" else variant
+        assert file.stem == f"{task}_{kind}"
     for name in ("seed", "vehicle"):
         assert config[name] == metadata[name]
     assert beside["command"].split()[:2] == ["quadrl", "train"]
     task = quadrl.tasks.make(policy.task, **metadata["task_options"])
-    settings = {"episodes": FRESH_EPISODES, "seed": FRESH_SEED, "vehicle": metadata["vehicle"]}
+    *_, vehicle = setting(policy)
+    settings = {"episodes": FRESH_EPISODES, "seed": FRESH_SEED, "vehicle": vehicle}
     reached = summarize(fly(policy, task, **settings))
     n, share = recorded["episodes"], recorded["success_rate"]
     hits = round(n * share)
@@ -191,9 +213,11 @@ def test_a_shipped_policy_still_reaches_its_metrics(file):
 TINY = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16", "--episodes", "2"]
 
 
-def test_interrupted_it_says_how_to_go_on(tmp_path):
-    folder = tmp_path / "run"
-    words = ["train", "hover", *TINY, "--steps", str(32 * 100_000), "--checkpoint-seconds", "0"]
+LONG = ["train", "hover", *TINY, "--steps", str(32 * 100_000), "--checkpoint-seconds", "0"]
+
+
+def stopped(words, folder, signal_number, awaited):
+    """Exit code and errors of a command that gets a signal as soon as a file is in its folder."""
     process = subprocess.Popen(
         [sys.executable, "-m", "quadrl", *words, "--out", str(folder)],
         env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
@@ -204,13 +228,34 @@ def test_interrupted_it_says_how_to_go_on(tmp_path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 300
-    while not (folder / "checkpoint.safetensors").exists() and time.monotonic() < deadline:
+    while not list(folder.glob(awaited)) and time.monotonic() < deadline:
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(signal_number)
     _, error = process.communicate()
-    assert process.returncode == 130
+    return process.returncode, error
+
+
+def test_interrupted_it_says_how_to_go_on(tmp_path):
+    folder = tmp_path / "run"
+    code, error = stopped(LONG, folder, signal.SIGINT, "checkpoint.safetensors")
+    assert code == 130
     (line,) = error.splitlines()
     assert line.startswith("quadrl: ") and line.endswith(f"quadrl train --resume {folder}")
+
+
+@pytest.mark.parametrize(
+    ("words", "awaited"),
+    [(LONG, "policy.safetensors"), (["train", "hover", *TINY], ".flight*")],
+    ids=["while it trains", "while it draws"],
+)
+def test_terminated_it_leaves_nothing_half_written(tmp_path, words, awaited):
+    folder = tmp_path / "run"
+    code, error = stopped(words, folder, signal.SIGTERM, awaited)
+    assert code == 128 + signal.SIGTERM and not error
+    left = {file.name for file in folder.iterdir()}
+    assert not {name for name in left if name.startswith(".") or name.endswith(".part")}
+    assert "flight.mp4" not in left  # it was not finished
+    assert evaluate(folder, episodes=1).metrics["episodes"] == 1
 
 
 def test_without_graphics_it_trains_and_says_that_there_is_no_video(tmp_path):

@@ -1,5 +1,6 @@
 """The command: what it writes and prints, and what it refuses with one line and exit code 2."""
 
+import csv
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from quadrl.cli.flown import parse_options
 from quadrl.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
 from quadrl.vehicle import VEHICLES
+from quadrl.weather import Weather
 
 SIZE = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16"]
 TINY = [*SIZE, "--task-options", "time_limit=0.5", "--episodes", "2", "--checkpoint-seconds", "0"]
@@ -39,7 +41,7 @@ def command(*arguments: object) -> int:
     try:
         cli.main([str(argument) for argument in arguments])
     except SystemExit as end:
-        return end.code
+        return end.code or 0
     return 0
 
 
@@ -59,7 +61,7 @@ def copy(run, tmp_path):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Trainings leave their pictures out, which take longer than they do."""
-    monkeypatch.setattr("quadrl.learning.run.draw", lambda *_, **__: None)
+    monkeypatch.setattr("quadrl.learning.run.Run.draw", lambda *_, **__: ())
 
 
 @pytest.fixture
@@ -102,13 +104,21 @@ def test_tasks(capsys):
     assert json.loads(capsys.readouterr().out) == read["landing"]
 
 
+class Begun(Exception):
+    """A training would begin."""
+
+
 def resolved(monkeypatch, *arguments: str) -> tuple[TrainConfig, Path]:
     """The settings and the folder that `quadrl train` resolves, without training."""
-    seen = []
-    monkeypatch.setattr("quadrl.learning.run.train", lambda *given, **_: seen.append(given))
-    with pytest.raises(TypeError):  # there is nothing to sum up
+
+    def begin(*given, **_):
+        raise Begun(*given)
+
+    monkeypatch.setattr("quadrl.learning.run.train_in", begin)
+    with pytest.raises(Begun) as begun:
         cli.main(["train", *arguments])
-    return seen[0]
+    folder, config = begun.value.args
+    return config, folder
 
 
 @pytest.mark.parametrize(
@@ -138,8 +148,12 @@ def test_settings_are_resolved_after_parsing(monkeypatch, arguments, expected):
 def test_help_says_what_each_setting_means(capsys):
     assert command("train", "--help") == 0
     text = " ".join(capsys.readouterr().out.split())
-    for words in ("--num-envs INT", "(default: 256)", "--ppo.clip FLOAT", "quadrl tasks TASK"):
-        assert words in text
+    for words in (
+        "--num-envs INT", "(default: 256)", "--ppo.clip FLOAT", "quadrl tasks TASK",
+        "{hover,", "--algo {ppo,trpo,vpg,gae}", "--vehicle {paper,", "--import FILE",
+        "--memory {none,gru}",
+    ):  # fmt: skip
+        assert words in text, words
     assert "None}" not in text
 
 
@@ -164,8 +178,8 @@ def test_train_writes_every_file(run):
     assert policy.metadata["steps"] == 192 and policy.weights[0].shape == (16, 22)
     for name in ("learning_curve.png", "trajectory.png"):
         assert (run / name).read_bytes().startswith(b"\x89PNG")
-    # An episode of 0.5 s has states at 0.05 to 0.5 s: 0.45 s at 25 frames a second are 12.
-    assert imageio_ffmpeg.count_frames_and_secs(str(run / "flight.mp4"))[0] == 12
+    # States at 0.05 to 0.5 s are 10 frames at 20 a second, and the end is held for a second.
+    assert imageio_ffmpeg.count_frames_and_secs(str(run / "flight.mp4"))[0] == 30
 
 
 def test_a_run_has_a_folder_of_its_own_unless_one_is_given(monkeypatch):
@@ -216,7 +230,8 @@ def test_render_writes_a_video_that_plays(run, tmp_path, capsys):
     size = ["--width", "160", "--height", "120", "--fps", "20", "--camera", "chase"]
     assert command("render", run, "--out", path, *size) == 0
     assert capsys.readouterr().out == f"wrote {path}\n"
-    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (10, 0.5)
+    # Ten of the flight, and a second of the outcome.
+    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (30, 1.5)
     played = subprocess.run(
         [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "null", "-"],
         capture_output=True,
@@ -279,12 +294,132 @@ def test_resume_takes_the_settings_of_the_run(run, copy, undrawn):
         assert (copy / name).read_bytes() == before[name]
     for name in ("policy.safetensors", "checkpoint.safetensors", "metrics.csv"):
         (copy / name).unlink()
-    # The settings of another training are ignored.
-    assert command("train", "landing", *words, "--gamma", "0.5") == 0
+    assert command("train", *words) == 0
     assert (copy / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
 
 
-OWN = """
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["landing"], "task"),
+        (["--gamma", "0.5"], "gamma"),
+        (["--ppo.clip", "0.1"], "ppo"),
+        (["--task-options", "tilt=0.1"], "task_options"),
+        (["--seed", "5"], "seed"),
+        (["--out", "elsewhere"], "out"),
+        (["--steps", "100"], "steps"),
+    ],
+)
+def test_a_run_keeps_its_settings(refusal, copy, words, name):
+    before = contents(copy)
+    assert refusal("train", "--resume", copy, *words)[0].name == name
+    assert contents(copy) == before
+
+
+def test_a_run_goes_on_further(copy, undrawn):
+    words = ["--resume", copy, "--no-video", "--episodes", "2"]
+    assert command("train", *words, "--steps", "320", "--num-threads", "1") == 0
+    assert [int(row["steps"]) for row in metrics(copy)] == list(range(32, 321, 32))
+    assert quadrl.Policy.load(copy).metadata["steps"] == 320
+    assert TrainConfig.of_folder(copy).steps == 320
+    assert (copy / "evaluation.json").exists()
+
+
+@pytest.mark.parametrize("seeds", ["5:5", "1,1", "a:b", "-1:2", "0:99999999999999", "1:2:3", "x"])
+def test_seeds_that_are_none(refusal, seeds):
+    assert refusal("train", "hover", *TINY, f"--seeds={seeds}")[0].name == "seeds"
+
+
+def test_seeds_go_with_neither_a_seed_nor_a_run(refusal, copy):
+    assert refusal("train", "--seeds", "0:2", "--seed", "1")[0].name == "--seed"
+    assert refusal("train", "--seeds", "0:2", "--resume", copy)[0].name == "--resume"
+
+
+def test_a_device_that_is_not_there(refusal, tmp_path):
+    for device in ("quantum", "meta"):
+        error, _ = refusal("train", *TINY, "--device", device, "--out", tmp_path / "run")
+        assert (error.name, error.value) == ("device", device)
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_interrupted_run_can_be_flown(tmp_path, capsys, monkeypatch):
+    folder, shown = tmp_path / "run", quadrl.progress.ProgressBar.show
+
+    def stop(bar, now):
+        shown(bar, now)
+        if now.iteration == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("quadrl.progress.ProgressBar.show", stop)
+    assert command("train", "hover", *TINY, "--out", folder) == 130
+    assert f"quadrl train --resume {folder}" in capsys.readouterr().err
+    assert quadrl.Policy.load(folder).metadata["steps"] == 64
+    assert command("evaluate", folder, "--episodes", "2") == 0
+
+
+def test_the_result_comes_before_the_pictures_and_these_can_be_skipped(
+    tmp_path, capsys, monkeypatch
+):
+    def skip(*_, **__):
+        assert "successful" in capsys.readouterr().out
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("quadrl.learning.figures.learning_curve", skip)
+    assert command("train", "hover", *TINY, "--out", tmp_path / "run") == 0
+    assert f"quadrl render {tmp_path / 'run'}" in capsys.readouterr().out
+
+
+def test_version(capsys):
+    assert command("--version") == 0
+    assert quadrl.__version__ in capsys.readouterr().out
+
+
+def test_completion_knows_the_names(capsys):
+    assert command("completion", "bash") == 0
+    script = capsys.readouterr().out
+    for words in (tasks.TASKS, VEHICLES, ("ppo", "gae"), ("geometric", "lqr"), ("chase",)):
+        assert all(word in script for word in words)
+    checked = subprocess.run(["bash", "-n"], input=script, text=True, capture_output=True)
+    assert checked.returncode == 0, checked.stderr
+
+
+def test_a_table_of_the_flights(tmp_path, capsys):
+    path = tmp_path / "new" / "flights.csv"
+    assert command("evaluate", "hover", "--episodes", "3", "--seed", "4", "--csv", path) == 0
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["seed"] for row in rows] == ["4", "5", "6"]
+    alone = quadrl.evaluate("hover", episodes=1, seed=5)
+    assert float(rows[1]["return"]) == pytest.approx(alone.metrics["return_mean"], rel=1e-5)
+
+
+def test_evaluations_in_wind_and_with_noise(capsys, refusal):
+    returns = []
+    for words in ((), ("--weather", "light"), ("--sampled",)):
+        assert command("evaluate", "hover", "--episodes", "3", "--json", *words) == 0
+        returns.append(json.loads(capsys.readouterr().out)["return_mean"])
+    assert len(set(returns)) == 3
+    words = ("--controller", "lqr", "--sampled")
+    assert refusal("evaluate", *words)[0].name == "sampled"
+    assert refusal("evaluate", "hover", "--weather", "windy")[0].name == "weather"
+
+
+def test_what_disturbs_may_be_given_by_its_fields(capsys, refusal):
+    drawn = {"mass": [0.9, 1.1], "noise": {"position": 0.01}}
+    words = ("--randomization", json.dumps(drawn), "--weather", '{"wind_speed": 2.0}')
+    assert command("evaluate", "hover", "--episodes", "3", "--json", *words) == 0
+    reached = json.loads(capsys.readouterr().out)["return_mean"]
+    alone = quadrl.evaluate(
+        "hover", episodes=3, randomization=drawn, weather=Weather(wind_speed=2.0)
+    )
+    assert reached == pytest.approx(alone.metrics["return_mean"], rel=1e-5)
+    for text in ('{"mass": [0.9', '{"masses": 1}'):
+        refused, _ = refusal("evaluate", "hover", "--randomization", text)
+        assert "randomization" in refused.name
+
+
+WORDS = '    "Largest distance from the waypoint at the start [m]."\n'
+OWN = f"""
 import dataclasses
 
 import quadrl
@@ -295,21 +430,21 @@ from quadrl.tasks.hover import Hover
 @dataclasses.dataclass(frozen=True)
 class NearHover(Hover):
     name = "near_hover"
-    training = {"gamma": 0.25}
+    training = {{"gamma": 0.25}}
     radius: float = 0.1
-
+{WORDS}
 
 quadrl.VEHICLES["heavy"] = dataclasses.replace(quadrl.Vehicle(), name="heavy", mass=0.8)
 """
 
 
 NEAR_HOVER = "quadrl/NearHover-v0"
+OWN_NAMES = (tasks.TASKS, "near_hover"), (VEHICLES, "heavy"), (gym.registry, NEAR_HOVER)
 
 
 @pytest.mark.parametrize("first", [True, False])
 def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, first):
-    registries = (tasks.TASKS, "near_hover"), (VEHICLES, "heavy"), (gym.registry, NEAR_HOVER)
-    for registry, name in registries:  # what it registers is taken out again
+    for registry, name in OWN_NAMES:  # what it registers is taken out again
         monkeypatch.setitem(registry, name, None)
         monkeypatch.delitem(registry, name)
     Path("own.py").write_text(OWN)
@@ -332,6 +467,11 @@ def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, firs
     [
         (["--num-envs", "0"], "num_envs", 0),
         (["--algo", "sac"], "algo", "sac"),
+        (["--task-options", "radius=-1"], "hover radius", -1),
+        (["--task-options", "tolerance=-1"], "hover tolerance", -1),
+        (["--task-options", "settle_time=11"], "hover settle_time", 11),
+        (["--task-options", "tilt=10"], "hover options", {"tilt": 10}),
+        (["--task-options", "radius=5"], "hover options", {"radius": 5}),
         (["--vehicle", "brick"], "vehicle", "brick"),
         (["--seed", "4294967296"], "seed", 2**32),
         (["--episodes", "0"], "episodes", 0),
@@ -378,6 +518,31 @@ def test_folders_that_cannot_be_used(refusal, copy, tmp_path):
     assert file.read_text() == "something"
 
 
+BEGIN = """    def begin(self, rng, parameters):
+        return super().begin(rng, parameters)[0]
+
+"""
+BROKEN = {
+    "a word that is none": ("import quadrl\n\nx = quadrl.nothing\n", 3),
+    "no Python": ("import quadrl\ndef f(:\n", 2),
+    "a start without a state": (
+        OWN.replace("    radius", BEGIN + "    radius"),
+        8,
+    ),
+    "an option without words": (OWN.replace("radius", "near").replace(WORDS, ""), 8),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_file_that_breaks_a_rule(refusal, monkeypatch, case):
+    for registry, name in OWN_NAMES:
+        monkeypatch.setitem(registry, name, None)
+        monkeypatch.delitem(registry, name)
+    text, line = BROKEN[case]
+    Path("own.py").write_text(text)
+    assert f"own.py, line {line}: " in refusal("tasks", "--import", "own.py")[1]
+
+
 def test_a_disk_that_fills_up(capsys, tmp_path, monkeypatch, undrawn):
     def full(*_):
         raise OSError(28, "No space left on device", str(tmp_path / "run" / "checkpoint"))
@@ -414,7 +579,7 @@ def test_a_policy_for_another_layout(refusal, run):
         (["render", "--width", "161"], "width"),
         (["render", "--height", "1081"], "height"),
         (["render", "--fps", "0"], "fps"),
-        (["render", "--out", "a.gif"], "path"),
+        (["render", "--out", "a.avi"], "path"),
         (["plot", "--out", "a.xyz"], "ending of a.xyz"),
     ],
 )

@@ -102,15 +102,15 @@ def test_without_the_legacy_step_the_numbers_are_the_same(control_mode):
     assert [step.reward for step in plain] == [step.reward for step in legacy]
 
 
-def test_task_options_vehicle_and_wind_arrive():
+def test_task_options_vehicle_and_randomization_arrive():
     heavy = dataclasses.replace(quadrl.Vehicle(), mass=1.3)
     environment = quadrl.load("hover", {"vehicle": heavy, "max_distance": 0.8, "random": 0})
     assert environment.physics.model.body_mass.sum() == pytest.approx(1.3)
     assert len(fly(environment)) < len(fly(quadrl.load("hover", {"random": 0})))
-    windy = quadrl.load("hover", {"random": 0, "ranges": {"wind": ((3, 0, 0), (4, 0, 0))}})
-    windy.reset()
-    assert 3 < windy.task.environment.engine.air[0, 0] < 4
-    assert windy.step(np.zeros(4)).observation["velocity"].any()
+    drawn = quadrl.load("hover", {"random": 0, "randomization": {"mass": (1.1, 1.2)}})
+    drawn.reset()
+    assert 1.1 < drawn.task.environment.disturbances.shown()["mass"][0] < 1.2
+    assert drawn.step(np.zeros(4)).observation["velocity"].any()
 
 
 @pytest.mark.parametrize(
@@ -185,3 +185,23 @@ def test_physics_render_draws():
     assert picture.shape == (96, 128, 3)
     assert picture.reshape(-1, 3).std(axis=0).min() > 5  # not blank
     environment.physics.free()
+
+
+@pytest.mark.usefixtures("cheap_pictures")
+def test_the_camera_follow_keeps_the_aircraft_in_view_wherever_it_is():
+    environment = quadrl.load("hover", {"random": 0})
+    environment.reset()
+    physics = environment.physics
+
+    def sees_it(camera):
+        shown = physics.render(96, 128, camera_id=camera, segmentation=True)
+        names = {physics.model.id2name(k, "geom") for k in np.unique(shown[..., 0]) if k >= 0}
+        return any(name.startswith("rotor_") for name in names)
+
+    for _ in range(2):
+        assert sees_it("follow")
+        assert physics.render(96, 128, camera_id="follow").std() > 5
+        physics.data.qpos[:3] += 5.0
+        physics.forward()
+    assert not sees_it("fixed")
+    physics.free()

@@ -14,37 +14,42 @@ from quadrl import dynamics, mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.parameters import Parameters, rows
 from quadrl.rotation import norm
-from quadrl.vehicle import GRAVITY, Vehicle, plus
+from quadrl.vehicle import GRAVITY, MAX_ROTORS, Vehicle, plus
 
 COUNT = 9  # more than free flight takes at a time
 FIELDS = [field.name for field in dataclasses.fields(dynamics.Motion)]
-every_layout = pytest.mark.parametrize("name", helpers.LAYOUTS)
+EVERY = helpers.LAYOUTS | helpers.IN_AIR
+every_layout = pytest.mark.parametrize("name", EVERY)
 
 
 @dataclasses.dataclass
 class Case:
-    """Aircraft that all differ, in motions that all differ, each in a wind of its own."""
+    """Aircraft that all differ, in motions that all differ, each in an air of its own."""
 
     vehicle: Vehicle
     table: np.ndarray
     motion: helpers.Motion
     command: np.ndarray
+    air: np.ndarray
 
     @classmethod
     def of(cls, name):
-        vehicle = helpers.LAYOUTS[name]
+        vehicle = EVERY[name]
         motion = helpers.random_motion(vehicle, COUNT, speed=6.0, turn=6.0, wind=5.0, rotor=0.4)
-        motion.position += helpers.UP
+        # Where the air acts, some are near the ground and others are not.
+        motion.position += (0, 0, 0.5) if name in helpers.IN_AIR else helpers.UP
         command = helpers.random_commands(vehicle, COUNT, 1, rotor=0.6)[0]
         rising = command > motion.rotor_speed
         assert rising.any() and not rising.all()
-        return cls(vehicle, helpers.parameter_rows(vehicle, COUNT), motion, command)
+        noise = np.random.default_rng(5).normal(size=(COUNT, MAX_ROTORS))
+        air = np.concatenate([motion.wind, noise], axis=-1)
+        return cls(vehicle, helpers.parameter_rows(vehicle, COUNT), motion, command, air)
 
     def equations(self, function, *more, array=np.asarray):
         """What a function of `dynamics` gives, in NumPy or with tensors."""
         p = Parameters.of(self.table).map(array)
         motion = dynamics.Motion(*(array(getattr(self.motion, name)) for name in FIELDS))
-        given = (array(self.command), array(self.motion.wind), -GRAVITY, *more)
+        given = (array(self.command), array(self.air), -GRAVITY, *more)
         return function(p, motion, *given)
 
 
@@ -64,7 +69,7 @@ def batch(case, engine):
     flying = BatchEngine(case.vehicle, COUNT, altitude=3.0, engine=engine, per_row=True)
     flying.write_parameters(np.arange(COUNT), case.table)
     helpers.put(flying, case.motion, origin=0)
-    flying.ctrl[:] = case.command
+    flying.ctrl[:], flying.air[:] = case.command, case.air
     return flying
 
 
@@ -126,7 +131,7 @@ def test_the_accelerations_of_mujoco_are_the_derivative(name):
         one.write_parameters(np.array([0]), case.table[row : row + 1])
         motion = helpers.Motion(*(x[row : row + 1] for x in vars(case.motion).values()))
         helpers.put(one, motion, origin=0)
-        one.ctrl[:] = case.command[row]
+        one.ctrl[:], one.air[:] = case.command[row], case.air[row]
         mujoco.mj_forward(model, data)
         acceleration[row], spin_up[row] = data.qacc, data.act_dot
     expected = (rate.velocity, rate.body_rate, rate.rotor_speed)
@@ -164,7 +169,7 @@ def mujoco_step(case):
         rotor_speed: np.ndarray
 
     def rate_at(motion):
-        d = dynamics.derivative(p, motion, case.command, start.wind, -GRAVITY)
+        d = dynamics.derivative(p, motion, case.command, case.air, -GRAVITY)
         return Rate(motion.velocity, motion.body_rate, d.velocity, d.body_rate, d.rotor_speed)
 
     first = rate_at(dynamics.Motion(*(getattr(start, name) for name in FIELDS)))
@@ -208,7 +213,7 @@ def test_tensors_give_the_same_numbers(name):
 
 @every_layout
 def test_the_wrench_of_the_rotors_is_the_mixer(name):
-    vehicle = helpers.LAYOUTS[name]
+    vehicle = EVERY[name]
     speed = helpers.random_motion(vehicle, COUNT, rotor=0.9).rotor_speed
     force, moment = dynamics.thrust_wrench(Parameters.of(rows(vehicle, COUNT)), speed)
     mixed = speed**2 @ vehicle.mixer.T

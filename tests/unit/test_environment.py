@@ -7,6 +7,7 @@ from helpers import begun, idle
 
 from quadrl import control, tasks
 from quadrl.environment import Environment
+from quadrl.errors import QuadrlError
 from quadrl.task import total
 from quadrl.tasks.hover import Hover
 
@@ -134,6 +135,21 @@ def test_control_costs_the_square_of_the_deviation():
     now = helpers.placed(count=2).step(np.array([[1, -1, 0.5, 0], [9.0] * 4]))
     np.testing.assert_allclose(now.reward_terms["control"], [-0.027059, -0.048105], atol=1e-6)
     np.testing.assert_array_equal(now.reward_terms["survival"], 10.0)
+
+
+def test_smoothness_costs_the_square_of_the_change_of_the_commands():
+    # From hover speed to 35 * (1, -1, 0.5, 0) above it, as above; then back by twice the half.
+    task = tasks.make("hover", smoothness_weight=2.0)
+    environment = helpers.begun(task)
+    first, second, third = (
+        environment.step(np.array([action])).reward_terms["smoothness"].item()
+        for action in ([1, -1, 0.5, 0], [1, -1, 0.5, 0], [1, 0, 0, 0])
+    )
+    assert first == pytest.approx(-2 * 0.027059, abs=1e-6) and second == 0
+    assert third == pytest.approx(-2 * 1225 * 1.25 / 101861, abs=1e-6)
+    assert "smoothness" not in helpers.begun("hover").term_names
+    with pytest.raises(QuadrlError):
+        tasks.make("hover", smoothness_weight=-1.0)
 
 
 def test_weights_weigh():

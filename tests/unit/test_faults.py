@@ -31,13 +31,13 @@ from quadrl.vehicle import Vehicle
     ],
 )
 def test_a_diverged_aircraft_is_terminated_and_disturbs_nobody(value, column, mode, engine):
-    ranges = {"wind": (-1.0, 1.0)} if column else None
-    settings = {"num_envs": 4, "seed": 1, "engine": engine, "control_mode": mode, "ranges": ranges}
+    settings = {"num_envs": 4, "seed": 1, "engine": engine, "control_mode": mode}
+    settings |= {"randomization": {"command_delay": (0.0, 0.05)}} if column else {}
     sound, faulty = begun(**settings), begun(**settings)
     row, others, actions = 2, [0, 1, 3], helpers.random_actions(8, 4) * 0.2
     for action in actions[:3]:
         sound.step(action), faulty.step(action)
-    last, wind = np.array(faulty.snapshot.state.position[row]), faulty.engine.air.copy()
+    last, wind = np.array(faulty.snapshot.state.position[row]), faulty.engine.wind.copy()
 
     def both(action):
         expected, got = (helpers.recorded(e, e.step(action)) for e in (sound, faulty))
@@ -56,7 +56,7 @@ def test_a_diverged_aircraft_is_terminated_and_disturbs_nobody(value, column, mo
         np.testing.assert_array_equal(got["observation.position"][row], last)
         np.testing.assert_array_equal(faulty.engine.qpos[row, :3], last + [0, 0, 3])
     assert faulty.snapshot.time[row] == pytest.approx(4 * 0.05)
-    np.testing.assert_array_equal(faulty.engine.air, wind)
+    np.testing.assert_array_equal(faulty.engine.wind, wind)
     for action in actions[4:]:
         assert np.linalg.norm(both(action)["observation.position"][row] - last) < 0.4
     # A reset makes it whole: the same next episode as that of the aircraft that stayed sound.

@@ -18,6 +18,7 @@ from quadrl.errors import QuadrlError
 from quadrl.vehicle import Vehicle
 
 PAPER = Vehicle()
+EVERY = helpers.LAYOUTS | helpers.IN_AIR
 
 
 @pytest.mark.parametrize("task", tasks.TASKS)
@@ -40,15 +41,17 @@ def test_both_engines_come_together_on_every_task(task):
 
 @pytest.mark.parametrize("per_row", [False, True])
 @pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("name", ["paper", "eight"])
+@pytest.mark.parametrize("name", ["paper", "eight", "leaning in air"])
 def test_an_aircraft_flies_the_same_whatever_flies_beside_it(name, threads, per_row):
-    count, vehicle = 1030, helpers.LAYOUTS[name]  # several threads' worth, no whole lanes
+    count, vehicle = 1030, EVERY[name]  # several threads' worth, no whole lanes
     settings = dict(altitude=3.0, engine="free_flight")
     batch = BatchEngine(vehicle, count, num_threads=threads, per_row=per_row, **settings)
     table = helpers.parameter_rows(vehicle, count)
     if per_row:
         batch.write_parameters(np.arange(count), table)
     motion = helpers.random_motion(vehicle, count, wind=3.0, rotor=0.3)
+    if name in helpers.IN_AIR:  # so that neighbours fly with and without ground effect
+        motion.position[:, 2] = np.random.default_rng(2).uniform(-99.5, 0.0, count)
     helpers.put(batch, motion)
     batch.ctrl[:] = command = helpers.random_commands(vehicle, count, 1, rotor=0.3)[0]
     batch.advance(5)
@@ -91,12 +94,12 @@ def test_what_could_touch_the_ground_is_mujocos_bit_by_bit():
     assert touched > 20
 
 
-@pytest.mark.parametrize("name", helpers.LAYOUTS)
+@pytest.mark.parametrize("name", EVERY)
 def test_nothing_that_free_flight_takes_comes_near_the_ground_in_a_step(name):
     # The wildest flights: fast, tilted, in wind, at any height. Whoever is handed over is flown
     # exactly as MuJoCo flies it; all others stay clear of the ground by more than their reach. For
     # the long control step, thrust and drag have their time to push it down.
-    vehicle, count = dataclasses.replace(helpers.LAYOUTS[name], control_timestep=0.2), 300
+    vehicle, count = dataclasses.replace(EVERY[name], control_timestep=0.2), 300
     wild = helpers.random_motion(vehicle, count, speed=12.0, turn=8.0, wind=12.0, rotor=0.4)
     reach = max(np.linalg.norm(r.position) + r.radius for r in vehicle.rotors)
     highest = reach + 30.0 * vehicle.control_timestep

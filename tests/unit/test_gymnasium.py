@@ -1,6 +1,8 @@
 """Gymnasium, single and vector; what all APIs have in common is in contract/."""
 
+import copy
 import dataclasses
+import pickle
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +32,7 @@ def test_every_task_has_an_id():
     assert dict(gym.registry) == registered
 
 
-def test_a_step_returns_pythons_own_types_and_the_terms_of_the_reward():
+def test_a_step_returns_pythons_own_types_and_an_info_of_scalars():
     environment = gym.make(HOVER)
     observation, info = environment.reset(seed=0)
     assert observation.dtype == np.float32
@@ -40,11 +42,13 @@ def test_a_step_returns_pythons_own_types_and_the_terms_of_the_reward():
         assert observation.dtype == np.float32
         assert type(reward) is float
         assert type(terminated) is type(truncated) is bool
+        terms = info["reward_terms"]
         assert set(info) == {"reward_terms", "is_success", "error", "diverged"}
-        assert type(info["is_success"]) is type(info["diverged"]) is bool
-        assert type(info["error"]) is float
-        assert all(type(term) is float for term in info["reward_terms"].values())
-        assert sum(info["reward_terms"].values()) == reward
+        assert terms.keys() == environment.unwrapped.environment.term_names
+        for name in ("is_success", "error", "diverged"):  # TorchRL reads nothing else
+            assert isinstance(info[name], (np.generic, np.ndarray)) and info[name].shape == ()
+        assert info["is_success"].dtype == info["diverged"].dtype == bool
+        assert sum(terms.values()) == reward
 
 
 def test_an_action_may_be_a_list():
@@ -54,6 +58,27 @@ def test_an_action_may_be_a_list():
     assert data_equivalence(given, expected)
 
 
+def test_reward_terms_are_an_array_with_names():
+    environment = gym.make(HOVER)
+    environment.reset(seed=0)
+    _, reward, _, _, info = environment.step(np.full(4, 0.1))
+    vector = gym.make_vec(HOVER, num_envs=2)
+    vector.reset(seed=0)
+    _, rewards, _, _, infos = vector.step(np.full((2, 4), 0.1))
+    names = environment.unwrapped.environment.term_names
+    for terms, total in ((info["reward_terms"], reward), (infos["reward_terms"], rewards)):
+        for same in (terms, pickle.loads(pickle.dumps(terms)), copy.deepcopy(terms)):
+            assert tuple(same.keys()) == names
+            np.testing.assert_allclose(same.sum(-1), total, rtol=1e-12)
+            np.testing.assert_allclose(sum(same.values()), total, rtol=1e-12)
+            for k, (name, term) in enumerate(same.items()):
+                np.testing.assert_array_equal(same[name], np.asarray(terms)[..., k])
+                np.testing.assert_array_equal(term, same[name])
+    np.testing.assert_array_equal(infos["reward_terms"][0], info["reward_terms"])
+    with pytest.raises(KeyError):
+        info["reward_terms"]["bonus"]
+
+
 def test_reward_terms_can_be_left_out():
     environment = gym.make(HOVER, reward_terms=False)
     environment.reset()
@@ -61,6 +86,13 @@ def test_reward_terms_can_be_left_out():
     vector = gym.make_vec(HOVER, num_envs=2, reward_terms=False)
     vector.reset()
     assert not {"reward_terms", "_reward_terms"} & set(vector.step(np.zeros((2, 4)))[4])
+
+
+def unnamed(value):
+    """Reward terms as plain arrays: stacked by Gymnasium, they lose their names."""
+    if isinstance(value, dict):
+        return {name: unnamed(one) for name, one in value.items()}
+    return np.asarray(value) if isinstance(value, np.ndarray) else value
 
 
 @every_mode
@@ -84,7 +116,7 @@ def test_the_vector_is_gymnasiums_own_vector_of_single_ones(name, mode):
             assert not info[key if key.startswith("_") else f"_{key}"].any()
         assert set(their_info) <= set(info)
         for key, value in their_info.items():
-            given = tuple(info[key]) if key == "final_obs" else info[key]
+            given = tuple(info[key]) if key == "final_obs" else unnamed(info[key])
             assert data_equivalence(given, tuple(value) if key == "final_obs" else value), key
         over = got[2] | got[3]
         ends += over.sum()
@@ -122,10 +154,10 @@ def test_an_impossible_mask_is_refused(mask):
 
 
 @pytest.mark.parametrize("make", [gym.make, gym.make_vec])
-def test_vehicle_task_options_ranges_and_the_time_limit_arrive(make):
-    ranges = {"mass": (1.2, 1.25)}
+def test_vehicle_task_options_randomization_and_the_time_limit_arrive(make):
+    drawn = {"mass": (0.92, 0.96)}
     settings = {"time_limit": 0.06} if make is gym.make else {"max_episode_steps": 3, "num_envs": 2}
-    made = make(HOVER, vehicle=HEAVY, tolerance=9.0, num_threads=1, ranges=ranges, **settings)
+    made = make(HOVER, vehicle=HEAVY, tolerance=9.0, num_threads=1, randomization=drawn, **settings)
     core = made.unwrapped.environment
     assert core.vehicle.mass == 1.3
     assert core.task.tolerance == 9.0

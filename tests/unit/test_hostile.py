@@ -18,8 +18,10 @@ from hypothesis.extra import numpy as hnp
 from quadrl import tasks
 from quadrl.environment import Environment
 from quadrl.errors import QuadrlError
-from quadrl.learning.config import ALGORITHM_CONFIGS, TrainConfig
-from quadrl.randomization import RANGES
+from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
+from quadrl.learning.config import TrainConfig
+from quadrl.observing import Observing
+from quadrl.randomization import Randomization
 from quadrl.task import Task
 from quadrl.tasks.hover import Hover
 from quadrl.vehicle import PAPER_ROTORS, VEHICLES, Vehicle
@@ -141,7 +143,7 @@ def test_an_option_that_came_through_once_is_refused(task, option):
 
 
 ARGUMENTS = {"num_envs": 2, "seed": 0, "vehicle": None, "num_threads": 1, "control_mode": "rotor"}
-ARGUMENTS |= {"engine": "mujoco", "task": "hover", "ranges": None}
+ARGUMENTS |= {"engine": "mujoco", "task": "hover", "randomization": None, "observe": None}
 SMALL = VALUES.filter(lambda v: not (isinstance(v, int) and 100 < v <= 1 << 20))
 
 
@@ -151,9 +153,10 @@ SMALL = VALUES.filter(lambda v: not (isinstance(v, int) and 100 < v <= 1 << 20))
 @example("vehicle", "racer")
 @example("vehicle", [])
 @example("num_threads", 1.5)
-@example("ranges", 5)
-@example("ranges", "mass")
-@example("ranges", [("mass", (1, 2))])
+@example("randomization", 5)
+@example("randomization", "mass")
+@example("randomization", [("mass", (1, 2))])
+@example("observe", "all")
 def test_arguments_of_an_environment_work_or_are_refused(name, value):
     with refusal():
         environment = Environment(**(ARGUMENTS | {name: value}))
@@ -163,17 +166,27 @@ def test_arguments_of_an_environment_work_or_are_refused(name, value):
 @profile
 @given(
     st.dictionaries(
-        st.sampled_from(RANGES),
+        st.sampled_from(fields(Randomization)),
         st.one_of(VALUES, st.tuples(VALUES, VALUES), st.tuples(st.floats(0, 1), st.floats(0, 1))),
         min_size=1,
         max_size=2,
     )
 )
-@example({"wind": (0.0, 100.0)})
-@example({"mass": (0.65, 0.65), "max_speed": (226.0, 1e6)})
-def test_ranges_fly_or_are_refused(ranges):
+@example({"noise": {"position": 1e300}})
+@example({"noise": {"attitude": 1e9}, "bias": {"attitude": 1e9}})
+@example({"pushes": {"rate": 1e9, "velocity": 3000.0, "body_rate": 49.0}})
+@example({"command_delay": 10.0, "observation_delay": (0.0, 10.0)})
+def test_randomizations_fly_or_are_refused(randomization):
     with refusal():
-        fly_briefly("hover", ranges=ranges)
+        fly_briefly("hover", randomization=randomization)
+
+
+@profile
+@given(st.dictionaries(st.sampled_from(fields(Observing)), VALUES, min_size=1, max_size=2))
+@example({"observation_history": 1000, "action_history": 1000})
+def test_options_of_the_observation_fly_or_are_refused(observe):
+    with refusal():
+        fly_briefly("hover", observe=observe)
 
 
 @profile
@@ -257,7 +270,9 @@ def test_a_configuration_is_sound_or_refused(name):
             accepted.append(config := kind(**values))
             for field in dataclasses.fields(config):
                 value, default = getattr(config, field.name), field.default
-                if isinstance(default, int):
+                if isinstance(default, bool):
+                    assert isinstance(value, bool)
+                elif isinstance(default, int):
                     assert isinstance(value, int) and not isinstance(value, bool)
                 elif isinstance(default, float):
                     assert isinstance(value, (int, float)) and math.isfinite(value)

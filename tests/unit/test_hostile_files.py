@@ -12,13 +12,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_hostile import EXAMPLES, profile, refusal
+from test_memory import make_policy
 
 from quadrl.errors import QuadrlError
 from quadrl.learning import checkpoint
-from quadrl.policy import FORMAT, SHIPPED, Policy
+from quadrl.policy import FORMAT, RECURRENT_FORMAT, SHIPPED, Policy
 
-FORMATS = {"policy": FORMAT, "checkpoint": checkpoint.FORMAT}
-LOADERS = {"policy": Policy.load, "checkpoint": checkpoint.load}
+FORMATS = {"policy": FORMAT, "memory": RECURRENT_FORMAT, "checkpoint": checkpoint.FORMAT}
+LOADERS = {"policy": Policy.load, "memory": Policy.load, "checkpoint": checkpoint.load}
 every_reader = pytest.mark.parametrize("reader", FORMATS)
 
 
@@ -28,7 +29,9 @@ def sound_files(folder):
     tensors = {"actor": {"weight": torch.ones(3, 2), "bias": torch.zeros(3)}, "steps": np.arange(4)}
     checkpoint.save(path, tensors, {"iteration": 3})
     policy = (SHIPPED / "hover_ppo.safetensors").read_bytes()
-    return {"policy": policy, "checkpoint": path.read_bytes()}
+    make_policy().save(folder / "memory")
+    remembers = (folder / "memory").read_bytes()
+    return {"policy": policy, "memory": remembers, "checkpoint": path.read_bytes()}
 
 
 def read_hostile(reader, path, content):
@@ -39,7 +42,7 @@ def read_hostile(reader, path, content):
         if isinstance(read, Policy):
             size = len(read.mean)
             seen = np.array([np.zeros(size), np.full(size, 1e30), np.full(size, -1e3)])
-            actions = read(seen)
+            actions, _ = read.step(seen, read.initial_state(3))
             assert actions.shape == (3, read.action_size) and (np.abs(actions) <= 1).all()
 
 
@@ -96,7 +99,8 @@ JSON = st.recursive(
     max_leaves=5,
 )
 SIZES = {"F32": 4, "F64": 8, "F16": 2, "BF16": 2, "F8_E4M3": 1, "I64": 8, "BOOL": 1, "U8": 1}
-NAMES = ["mean", "deviation", "weight_0", "bias_0", "weight_1", "a/b", "a", "/", "", "weight_-1"]
+NAMES = ["mean", "deviation", "weight_0", "bias_0", "weight_1", "a/b", "a", "/", "", "weight_-1",
+         "memory_input_weight", "memory_state_weight", "memory_state_bias"]  # fmt: skip
 TENSORS = st.dictionaries(
     st.sampled_from(NAMES),
     st.tuples(st.sampled_from(list(SIZES)), st.lists(st.integers(0, 8), max_size=3)),

@@ -49,7 +49,7 @@ HOSTILE = {  # methods, and what the error names
     "start of another shape": (changed_start(velocity=lambda s: s.velocity[:, :2]), "velocity"),
     "start for a batch": (changed_start(velocity=lambda s: np.zeros((5, 3))), "velocity"),
     "start that is NaN": (changed_start(velocity=lambda s: s.velocity * np.nan), "velocity"),
-    "start that is far": (changed_start(position=lambda s: s.position + 1e11), "position"),
+    "start that is far": (changed_start(position=lambda s: s.position + 1e11), "begin"),
     "quaternion of length 2": (changed_start(quaternion=lambda s: 2 * s.quaternion), "quaternion"),
     "no start": (changed("begin", lambda pair: pair[0]), "begin"),
     "a goal that is none": (changed("begin", lambda pair: (pair[0], TaskState(None))), "goal"),

@@ -6,9 +6,13 @@ import math
 
 import pytest
 from runs import TINY, refused
+from test_policy import linear
 
-from quadrl import tasks
-from quadrl.learning.config import PPOConfig, TrainConfig, TRPOConfig, VPGConfig
+import quadrl
+from quadrl import evaluation, tasks
+from quadrl.errors import QuadrlError
+from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
+from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import read_config, write_json
 from quadrl.tasks.hover import Hover
 
@@ -155,3 +159,58 @@ def test_a_run_of_a_task_or_an_aircraft_that_has_changed_is_not_continued(tmp_pa
     (tmp_path / "config.json").write_text(json.dumps(config))
     with refused():
         TrainConfig.of_folder(tmp_path)
+
+
+def test_a_variant_is_settings_that_go_together():
+    config, usual = TrainConfig("hover", variant="robust"), TrainConfig("hover")
+    assert (config.weather, usual.weather) == ("light", "calm")
+    assert config.steps == Hover.variants["robust"]["steps"] != usual.steps
+    assert config.ppo.learning_rate < usual.ppo.learning_rate
+    assert config.make_vehicle().action_scale > usual.make_vehicle().action_scale
+    assert usual.conditions() == {} and usual.task_options == {}
+    # What is given is added to the dicts, and stands in place of the rest.
+    own = TrainConfig("hover", variant="robust", weather="calm", observe={"airspeed": True})
+    assert own.observe == config.observe | {"airspeed": True} and own.weather == "calm"
+    again = TrainConfig(**json.loads(json.dumps(dataclasses.asdict(own))))
+    assert again == own
+    assert TrainConfig("hover", variant="robust", vehicle="racer").vehicle_options == {}
+    with pytest.raises(QuadrlError) as caught:
+        TrainConfig("hover", variant="sturdy")
+    assert caught.value.name == "variant"
+
+
+def test_numbers_of_the_aircraft_can_differ_and_go_with_the_policy(tmp_path):
+    config = TrainConfig("hover", vehicle_options={"mass": 0.7, "inertia": [0.01, 0.01, 0.015]})
+    vehicle = config.make_vehicle()
+    assert (vehicle.mass, vehicle.inertia) == (0.7, (0.01, 0.01, 0.015))
+    linear(22, 4, vehicle="paper", **config.conditions()).save(tmp_path / "policy.safetensors")
+    *_, flown = evaluation.setting(tmp_path)
+    assert flown == vehicle
+    *_, named = evaluation.setting(tmp_path, vehicle="paper")
+    assert named == vehicle
+    *_, given = evaluation.setting(tmp_path, vehicle=quadrl.Vehicle())
+    assert given == quadrl.Vehicle()
+    for options, name in (({"rotors": 3}, "vehicle option"), ({"mass": -1.0}, "mass")):
+        with pytest.raises(QuadrlError) as caught:
+            TrainConfig("hover", vehicle_options=options)
+        assert caught.value.name == name
+
+
+def test_a_randomization_and_options_of_the_observation_are_settings():
+    drawn = quadrl.Randomization(mass=(0.9, 1.1), noise={"position": 0.01})
+    config = TrainConfig("hover", randomization=drawn, observe=quadrl.Observing(airspeed=True))
+    assert config.observe == {"airspeed": True}
+    again = TrainConfig(**json.loads(json.dumps(dataclasses.asdict(config))))
+    assert again == config
+    assert again.conditions()["randomization"] == drawn.given()
+    assert TrainConfig("hover").conditions() == {}
+    for given, name in (
+        ({"randomization": "much"}, "randomization"),
+        ({"randomization": {"command_delay": 0.003}}, "command_delay"),
+        ({"observe": {"wind": True}}, "option of observe"),
+        ({"weather": "foul"}, "weather"),
+        ({"aerodynamics": "ground"}, "aerodynamics"),
+    ):
+        with pytest.raises(QuadrlError) as caught:
+            TrainConfig("hover", **given)
+        assert caught.value.name == name

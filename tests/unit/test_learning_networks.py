@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from torch.func import functional_call, jacrev
 
 import quadrl
-from quadrl.learning.config import PPOConfig, TrainConfig, TRPOConfig, VPGConfig
+from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
+from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import Normaliser, export, make_actor_critic
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
@@ -31,7 +32,8 @@ def one_thread():
 def actor_critic(seed=0, size=SIZE, actions=ACTIONS, hidden=(6,)):
     torch.manual_seed(seed)
     config = TrainConfig(hidden=hidden, critic_hidden=(6,), initial_deviation=0.5)
-    return make_actor_critic(size, actions, config)
+    actor, critic, normalisers = make_actor_critic(size, actions, config)
+    return actor, critic, normalisers["observation"]
 
 
 def disturbed(actor):

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import mjcf
+from quadrl import landmarks, mjcf
 from quadrl.rendering import Renderer
 from quadrl.vehicle import DRAWN_ROTOR_HEIGHT, VEHICLES
 
@@ -112,3 +112,16 @@ def test_the_feet_touch_first_and_then_what_must_not(name):
     side = {f"strike_{k + 1}" for k, r in enumerate(vehicle.rotors) if r.position[1] < y + 1e-9}
     assert touching(radius - y - 1e-4, math.pi / 2) == side
     assert touching(radius - y + 1e-4, math.pi / 2) == set()
+
+
+@pytest.mark.parametrize("vehicle", ["paper", "crazyflie"])
+def test_a_metre_on_the_ground_is_a_metre_for_every_aircraft(vehicle):
+    model = mjcf.compile_model(VEHICLES[vehicle])
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    geom = model.geom("marks")
+    mesh = model.mesh(model.geom_dataid[geom.id])
+    vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
+    placed = data.geom(geom.id).xpos + vertices @ data.geom(geom.id).xmat.reshape(3, 3).T
+    painted = landmarks.meshes()["marks"][0]
+    np.testing.assert_allclose(np.sort(placed, axis=0), np.sort(painted, axis=0), atol=1e-5)

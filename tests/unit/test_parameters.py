@@ -6,19 +6,23 @@ import helpers
 import mujoco
 import numpy as np
 import pytest
-from helpers import WIND, drawn, flying, ranges_of
+from helpers import EVERYTHING, drawn, flying
 
 from quadrl import mjcf, tasks
+from quadrl.aerodynamics import in_real_air
+from quadrl.draw import EACH_ROTOR
 from quadrl.engines import mujoco as engines
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
 from quadrl.errors import QuadrlError
+from quadrl.randomization import FACTORS
 from quadrl.rng import PARAMETERS, Rng
 from quadrl.tasks.hover import Hover
 from quadrl.vehicle import VEHICLES, Vehicle
 
 ENGINES = ("mujoco", "free_flight")
 PAPER = Vehicle()
+REAL = in_real_air(PAPER)
 
 
 # --------------------------------------------------------------------------------------- flown
@@ -39,7 +43,10 @@ def by_itself(vehicle, task, engine, altitude):
 @pytest.mark.parametrize("task", [tasks.make("hover"), LOW], ids=lambda task: task.name)
 def test_a_row_flies_as_the_aircraft_that_is_built_with_its_numbers(task, name, engine):
     vehicle = VEHICLES[name]
-    environment = flying(task, vehicle=vehicle, engine=engine)
+    # What can touch stays where it is when the centre of mass moves.
+    shift = 0.0 if task is LOW else EVERYTHING.centre_of_mass
+    randomization = dataclasses.replace(EVERYTHING, centre_of_mass=shift)
+    environment = flying(task, vehicle=vehicle, engine=engine, randomization=randomization)
     copies = []
     for i, row in enumerate(environment.engine.parameters):
         own = helpers.vehicle_of_row(vehicle, row)
@@ -69,40 +76,38 @@ def test_each_parameter_is_felt(engine):
     # From the same start, with the same commands, in still air: each range changes the flight.
     commands = helpers.random_commands(PAPER, 1, 3, rotor=0.3)[:, 0]
 
-    def end(ranges):
-        environment = flying(count=1, ranges=ranges, engine=engine)
+    def end(vehicle=PAPER, **randomization):
+        environment = flying(count=1, vehicle=vehicle, randomization=randomization, engine=engine)
         helpers.put(environment.engine, helpers.random_motion(PAPER, 1, speed=5.0, turn=5.0))
-        if "wind" in ranges:
-            environment.engine.air[:] = 1.0
         for command in commands:
             environment.engine.ctrl[:] = command
             environment.engine.advance(5)
         return helpers.coordinates(environment.engine)
 
-    whole = ranges_of(PAPER)
-    # A range of one number is what is specified.
-    paper = end({"mass": (PAPER.mass, PAPER.mass)})
-    assert all((end({n: whole[n]}) != paper).any() for n in whole if n != "max_speed")
+    paper = end()
+    # A range of one number is that number.
+    np.testing.assert_array_equal(end(mass=(1.0, 1.0)), paper)
+    for name in ("mass", "inertia", "thrust", "torque", "lag", "drag", "rotors"):
+        assert (end(**{name: (0.9, 1.1)}) != paper).any(), name
+    assert (end(centre_of_mass=0.01) != paper).any()
+    airy, real = end(vehicle=REAL), end(vehicle=REAL, inflow=(0.9, 1.1))
+    assert (airy != real).any()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_rotor_is_never_faster_than_its_own_largest_speed(engine):
-    # Full action commands 225.7 + 35 = 260.7 rad/s, the row's rotors reach less.
-    environment = flying(ranges={"max_speed": (230.0, 240.0)}, engine=engine)
+    # Full action commands 225.7 + 35 = 260.7 rad/s, the row's rotors 319 times 0.72 to 0.75.
+    environment = flying(randomization={"max_speed": (0.72, 0.75)}, engine=engine)
     for _ in range(40):
         environment.step(np.ones((4, 4)))
     largest = environment.engine.parameters["rotor"]["max_speed"][:, :4]
     np.testing.assert_allclose(environment.engine.act, largest, rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "column", "resolved"),
-    [("moment_coefficient", 5, "resolved_turn"), ("drag_coefficient", 0, "resolved_speed")],
-)
-def test_a_row_diverges_past_its_own_limit(name, column, resolved):
-    # J / (2 k_M dt): 46.9 to 7.5 rad/s; m / (2 k_D dt): 3611 to 65 m/s.
-    highest = {"moment_coefficient": (8e-3, 0.05), "drag_coefficient": (9e-3, 0.5)}[name]
-    engine = flying(count=8, ranges={name: highest}).engine
+@pytest.mark.parametrize(("column", "resolved"), [(5, "resolved_turn"), (0, "resolved_speed")])
+def test_a_row_diverges_past_its_own_limit(column, resolved):
+    # J / (2 k_M dt) from 417 rad/s down, but 50 at most; m / (2 k_D dt) from 3611 m/s down.
+    engine = flying(count=8, randomization={"drag": (9.0, 50.0)}).engine
     limit = engine.parameters[resolved]
     assert np.ptp(limit) > 0.3 * limit.max()
     for row in range(8):  # alone, so that the limit of no other row finds it out
@@ -113,12 +118,16 @@ def test_a_row_diverges_past_its_own_limit(name, column, resolved):
 
 
 def test_the_fields_of_a_row_are_those_that_mujoco_compiles():
-    engine = flying().engine
     names = ("body_mass", "body_subtreemass", "body_inertia", "body_invweight0", "body_user")
-    for name in (*names, "dof_M0", "dof_invweight0", "actuator_gear", "actuator_ctrlrange"):
-        for row, field in zip(engine.parameters, engine.batch.expand(name), strict=True):
-            model = mjcf.compile_model(helpers.vehicle_of_row(PAPER, row), drawn=False)
-            np.testing.assert_allclose(field, getattr(model, name), rtol=1e-14, err_msg=name)
+    names += ("dof_M0", "dof_invweight0", "actuator_gear", "actuator_ctrlrange", "site_pos")
+    # What is drawn and what can touch keep their size when the centre of mass moves.
+    for shift, compared in ((0.0, names), (0.002, ("site_pos", "body_mass"))):
+        drawn = dataclasses.replace(EVERYTHING, centre_of_mass=shift)
+        engine = flying(randomization=drawn).engine
+        for name in compared:
+            for row, field in zip(engine.parameters, engine.batch.expand(name), strict=True):
+                model = mjcf.compile_model(helpers.vehicle_of_row(PAPER, row), drawn=False)
+                np.testing.assert_allclose(field, getattr(model, name), rtol=1e-14, err_msg=name)
 
 
 # --------------------------------------------------------------------------------------- drawn
@@ -126,17 +135,36 @@ def test_the_fields_of_a_row_are_those_that_mujoco_compiles():
 
 def test_what_is_drawn_lies_in_its_range_and_differs_by_rotor_row_and_episode():
     environment = flying(count=200)
-    table, given = environment.engine.parameters.copy(), ranges_of(PAPER)
-    for name, (low, high) in given.items():
-        rotor = name in helpers.ROTOR_PARAMETERS
-        values = environment.engine.air if name == "wind" else table["rotor" if rotor else name]
-        values = values[name][:, :4] if rotor else values.reshape(200, -1)
-        assert (values >= low).all() and (values <= high).all()
-        wide = np.array(high) - low
-        assert (np.ptp(values, axis=0) > 0.9 * wide).all(), name
-        # No column follows another: |r| stays under 5 standard deviations of 1 / sqrt(200).
-        related = np.atleast_2d(np.corrcoef(values.T))
-        assert np.abs(related - np.eye(len(related))).max() < 5 / np.sqrt(200), name
+    shown, table = environment.disturbances.shown(), environment.engine.parameters.copy()
+    ends = {name: getattr(EVERYTHING, name) for name in FACTORS}
+    ends |= {f"{name}_{k}": EVERYTHING.rotors for name in EACH_ROTOR for k in range(1, 5)}
+    ends |= {f"centre_of_mass_{axis}": (-0.002, 0.002) for axis in "xyz"}
+    assert shown.keys() == ends.keys()
+    for name, (low, high) in ends.items():
+        assert (shown[name] >= low).all() and (shown[name] <= high).all()
+        assert np.ptp(shown[name]) > 0.9 * (high - low), name
+    # No number follows another: |r| stays under 5 standard deviations of 1 / sqrt(200).
+    related = np.corrcoef([*shown.values()])
+    assert np.abs(related - np.eye(len(related))).max() < 5 / np.sqrt(200)
+    rotor = table["rotor"][:, :4]
+    own = {name: np.stack([shown[f"{name}_{k}"] for k in range(1, 5)], 1) for name in EACH_ROTOR}
+    whole = {name: shown[name][:, None] for name in FACTORS}
+    place = np.stack([shown[f"centre_of_mass_{axis}"] for axis in "xyz"], 1)
+    first = PAPER.rotors[0]
+    for found, expected in (
+        (table["mass"], 0.65 * shown["mass"]),
+        (table["inertia"], PAPER.inertia * whole["inertia"]),
+        (table["drag_coefficient"], 9e-3 * shown["drag"]),
+        (table["moment_coefficient"], 9e-4 * shown["drag"]),
+        (table["blade_lift"], PAPER.aerodynamics.blade_lift * shown["inflow"]),
+        (rotor["thrust_coefficient"], 3.13e-5 * whole["thrust"] * own["thrust"]),
+        (rotor["torque_coefficient"], 7.5e-7 * whole["torque"] * own["torque"]),
+        (1 / rotor["lag_up"], 0.18 * whole["lag"] * own["lag"]),
+        (1 / rotor["lag_down"], 0.18 * whole["lag"] * own["lag"]),
+        (rotor["max_speed"], first.max_speed * np.tile(whole["max_speed"], 4)),
+        (rotor["position"][:, 0], np.array(first.position) - place),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
     first = drawn(environment)
     environment.reset()
     assert (drawn(environment) != first).any(axis=1).all()
@@ -154,17 +182,18 @@ def test_row_i_draws_and_flies_what_the_single_aircraft_of_seed_plus_i_does(engi
         helpers.assert_records(helpers.fly(single, actions[:, i : i + 1]), records, [i])
 
 
-def test_ranges_change_neither_the_starts_nor_each_other():
+def test_what_is_drawn_changes_neither_the_starts_nor_each_other():
     plain = Environment("hover", num_envs=4, seed=3)
     observation = plain.reset()
     environment = flying()
     for name, term in environment.task.observe(environment.snapshot).items():
         np.testing.assert_array_equal(term, observation[name], err_msg=name)
-    backwards = flying(ranges=dict(reversed(ranges_of(PAPER).items())))
-    np.testing.assert_array_equal(drawn(backwards), drawn(environment))
-    # Wind alone leaves the one row of parameters that all share.
-    windy = flying(ranges={"wind": WIND})
-    assert len(windy.engine.parameters) == 1 and np.ptp(windy.engine.air, axis=0).all()
+    light = flying(randomization={"mass": EVERYTHING.mass, "command_delay": (0.0, 0.1)})
+    np.testing.assert_array_equal(
+        light.engine.parameters["mass"], environment.engine.parameters["mass"]
+    )
+    # What is not of the aircraft leaves the one row of parameters that all share.
+    assert len(flying(randomization={"command_delay": 0.02}).engine.parameters) == 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,71 +229,70 @@ def test_a_task_sees_the_specified_aircraft_unless_it_asks_for_the_true_one(rest
 def test_starts_and_parameters_are_drawn_from_streams_of_their_own():
     rng, other = (Rng(np.array([5]), np.array([0]), *stream) for stream in ((), (PARAMETERS,)))
     assert not np.intersect1d(rng.uniform(0.0, 1.0, 8), other.uniform(0.0, 1.0, 8)).size
-    environment = flying(ranges={"mass": (0.6, 0.7)}, count=1)
-    share = (environment.engine.parameters["mass"] - 0.6) / (0.7 - 0.6)
+    environment = flying(randomization={"mass": (0.9, 1.1)}, count=1)
+    share = (environment.engine.parameters["mass"] / 0.65 - 0.9) / (1.1 - 0.9)
     place = environment._keys, environment._episodes - 1
     np.testing.assert_allclose(share, Rng(*place, PARAMETERS).uniform(0.0, 1.0, 1)[0])
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_reset_calms_the_air(count):
-    environment = flying(ranges=None, count=count)
-    environment.engine.air[:] = 2.0
+    environment = flying(randomization=None, count=count)
+    environment.engine.wind[:] = 2.0
     environment.reset(np.array([0]))
-    assert (environment.engine.air[0] == 0).all() and (environment.engine.air[1:] == 2).all()
+    assert (environment.engine.wind[0] == 0).all() and (environment.engine.wind[1:] == 2).all()
 
 
-def test_a_batch_of_equal_aircraft_takes_no_ranges():
+def test_a_batch_of_equal_aircraft_draws_no_parameters():
     alike = engines.make("mujoco", PAPER, 4, altitude=3.0)
     with pytest.raises(QuadrlError) as caught:
-        Environment("hover", engine=alike, ranges={"mass": (0.6, 0.7)})
+        Environment("hover", engine=alike, randomization={"mass": (0.9, 1.1)})
     assert caught.value.name == "engine"
-    Environment("hover", engine=alike, ranges={"wind": (-1.0, 1.0)}).reset()
+    Environment("hover", engine=alike, randomization={"command_delay": 0.02}).reset()
 
 
-REFUSED = [  # ranges, name, value, a part of what is allowed
-    ({"mas": (1, 2)}, "range", "mas", "did you mean mass?"),
-    ({"hover_speed": (1, 2)}, "range", "hover_speed", "mass"),
-    ({"mass": 1.0}, "range of mass", 1.0, "a pair"),
-    ({"mass": (0.5, 0.6, 0.7)}, "range of mass", (0.5, 0.6, 0.7), "a pair"),
-    ({"mass": (0.7, 0.6)}, "range of mass", (0.7, 0.6), "low at most high"),
-    ({"wind": ((0, 0, 1), (1, 1, 0))}, "range of wind", ..., "low at most high"),
-    ({"wind": ((0, 0), (1, 1))}, "range of wind", (0, 0), "3 numbers"),
-    ({"wind": (0, 101)}, "range of wind[0]", 101, "100"),
-    ({"mass": (np.nan, 1.0)}, "range of mass[0]", ..., "number"),
-    ({"mass": ("a", "b")}, "range of mass[0]", "a", "number"),
-    ({"lag_up": (True, 5)}, "range of lag_up[0]", True, "number"),
-    ({"mass": (0.0, 0.6)}, "mass", 0.0, "between"),
-    ({"thrust_coefficient": (-1e-5, 3e-5)}, "rotor thrust_coefficient", -1e-5, "between"),
-    # Hover with twice the mass takes the largest speed; 1.31 kg are more.
-    ({"mass": (0.5, 1.31)}, "max_speed of rotor 1", ..., "hover speed"),
-    ({"max_speed": (220.0, 300.0)}, "max_speed of rotor 1", 220.0, "225.7"),
-    (
-        {"mass": (0.5, 1.0), "thrust_coefficient": (2e-5, 4e-5)},
-        "max_speed of rotor 1",
-        ...,
-        "hover",
-    ),
-    ({"lag_down": (5.0, 101.0)}, "physics_timestep", 0.01, "0.0099"),
-    ({"moment_coefficient": (1e-4, 0.1)}, "physics_timestep", 0.01, "0.006"),
-    ({"mass": {0.5, 0.6}}, "range of mass", {0.5, 0.6}, "pair"),
-    ({"wind": (-50, 50), "drag_coefficient": (0.1, 0.5)}, "fastest wind [m/s]", ..., "0 and 65"),
-    # Each end alone can hover; one rotor that turns the aircraft far more than the others cannot.
-    (
-        {"thrust_coefficient": (2e-5, 4.2e-5), "torque_coefficient": (2e-7, 2e-6)},
-        "ranges",
-        ...,
-        "narrow",
-    ),
-    # J_z of 0.015 is possible with 7.5e-3 twice, but not with 7e-3.
-    ({"inertia": ((7e-3, 7e-3, 1e-2), (8e-3, 8e-3, 1.5e-2))}, "range of inertia", ..., "sum"),
+REFUSED = [  # randomization, name, value, a part of what is allowed
+    ("heavy", "randomization", "heavy", "light, full"),
+    (5, "randomization", 5, "mapping"),
+    ([("mass", (1, 2))], "randomization", ..., "mapping"),
+    ({"mas": (1, 2)}, "field of randomization", "mas", "did you mean mass?"),
+    ({"noise": {"speed": 1.0}}, "field of noise", "speed", "velocity"),
+    ({"noise": 0.1}, "noise", 0.1, "Errors"),
+    ({"mass": (0.5, 0.6, 0.7)}, "mass", (0.5, 0.6, 0.7), "2 numbers"),
+    ({"mass": (0.7, 0.6)}, "mass", (0.7, 0.6), "low at most high"),
+    ({"mass": (np.nan, 1.0)}, "mass[0]", ..., "number"),
+    ({"mass": ("a", "b")}, "mass[0]", "a", "number"),
+    ({"lag": (True, 2)}, "lag[0]", True, "number"),
+    ({"mass": (0.0, 1.0)}, "mass[0]", 0.0, "between"),
+    ({"mass": {0.9, 1.1}}, "mass[0]", {0.9, 1.1}, "between"),
+    ({"max_speed": (0.9, 1.1)}, "max_speed[1]", 1.1, "between"),
+    ({"centre_of_mass": -0.01}, "centre_of_mass", -0.01, "between"),
+    ({"noise": {"position": -0.1}}, "position", -0.1, "between"),
+    ({"bias": {"attitude": np.inf}}, "attitude", np.inf, "between"),
+    ({"pushes": {"rate": -1.0}}, "pushes rate", -1.0, "between"),
+    ({"command_delay": (0.0, 0.015)}, "command_delay", (0.0, 0.015), "0.01 s"),
+    ({"observation_delay": 0.07}, "observation_delay", (0.07, 0.07), "0.05 s"),
+    ({"command_delay": (-0.01, 0.0)}, "command_delay[0]", -0.01, "between"),
+    # Hover with twice the mass takes the largest speed; 2.01 times is more.
+    ({"mass": (0.8, 2.01)}, "max_speed of rotor 1", ..., "hover speed"),
+    ({"max_speed": (0.7, 1.0)}, "max_speed of rotor 1", ..., "225.7"),
+    ({"mass": (0.8, 1.6), "thrust": (0.7, 1.2)}, "max_speed of rotor 1", ..., "hover"),
+    # 1 / 0.18 s is 5.6 times a second: 18.5 times as fast is more than 100.
+    ({"lag": (0.054, 1.0)}, "physics_timestep", 0.01, "0.0097"),
+    ({"drag": (0.1, 99.0)}, "physics_timestep", 0.01, "at most"),
+    ({"pushes": {"rate": 1.0, "velocity": 1e6}}, "pushes velocity", 1e6, "between"),
+    ({"pushes": {"rate": 1.0, "body_rate": 60.0}}, "pushes body_rate", 60.0, "between"),
+    # All alike can hover; one rotor that turns the aircraft far more than the others cannot.
+    ({"rotors": (0.6, 1.4)}, "rotors", ..., "narrow"),
+    # The rotors stand 23 cm from the centre.
+    ({"centre_of_mass": 0.2}, "rotors", ..., "narrow"),
 ]
 
 
-@pytest.mark.parametrize(("ranges", "name", "value", "allowed"), REFUSED)
-def test_a_range_that_holds_what_cannot_be_is_refused(ranges, name, value, allowed):
+@pytest.mark.parametrize(("randomization", "name", "value", "allowed"), REFUSED)
+def test_a_randomization_that_holds_what_cannot_be_is_refused(randomization, name, value, allowed):
     with pytest.raises(QuadrlError) as caught:
-        Environment("hover", ranges=ranges)
+        Environment("hover", randomization=randomization)
     error = caught.value
     assert error.name == name and allowed in error.allowed
     assert value is ... or error.value == value

@@ -1,23 +1,37 @@
 """Pictures and videos: what is drawn is where it should be, and nothing is left half done."""
 
+import contextlib
 import ctypes
 import math
 import os
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
-from quadrl import mjcf, rendering
+from quadrl import landmarks, mjcf, rendering
+from quadrl.environment import Environment
+from quadrl.envs.common import Pictures
 from quadrl.errors import QuadrlError, RenderingUnavailable
 from quadrl.markers import Marker
-from quadrl.rendering import Renderer, gl, render_trajectory, write_video
-from quadrl.rendering.camera import aircraft_scale, follow_cameras, in_view
-from quadrl.rendering.overlay import Panel
+from quadrl.rendering import (
+    Renderer,
+    gl,
+    render_trajectory,
+    write_contact_sheet,
+    write_video,
+)
+from quadrl.rendering.camera import aircraft_scale, eased, follow_cameras, headings, in_view
+from quadrl.rendering.horizon import horizon
+from quadrl.rendering.live import LiveFlight
+from quadrl.rendering.overlay import Panel, outcome
 from quadrl.shield import shield_triton
 from quadrl.vehicle import VEHICLES
 
@@ -203,6 +217,92 @@ def test_follow_keeps_what_matters_in_view():
     assert (small, camera.distance) == pytest.approx((0.2, 0.27))
 
 
+def test_follow_frames_rings_pads_and_paths():
+    goal, north = np.zeros(3), np.array([0.0, 5.0, 2.0])
+    shown = in_view(
+        goal,
+        [
+            Marker("ring", (0, 5, 2), 0.5),
+            Marker("ring", (0, 5, 2), 0.5, end=(0, 9, 2)),
+            Marker("pad", (0, 5, 2), 0.5),
+            Marker("path", points=((1, 2, 3), (4, 5, 6))),
+            Marker("arrow", end=(9, 9, 9)),
+        ],
+    )
+    flat, upright = np.array([0.5, 0.5, 0]), np.array([0.5, 0, 0.5])
+    ground = north * (1, 1, 0)
+    expected = [goal, north - flat, north + flat, north - upright, north + upright]
+    expected += [ground - flat, ground + flat, (1, 2, 3), (4, 5, 6)]
+    np.testing.assert_allclose(shown, expected)
+    cameras = [follow_cameras(POSE[None, :3], [points])[0] for points in (POSE[None, :3], shown)]
+    assert cameras[1].distance > 3 * cameras[0].distance
+    # Before a small aircraft only the near part counts: of 10 m sqrt(0.2) * 3.5 = 1.565 m.
+    far = np.array([POSE[:3], POSE[:3] + (10, 0, 0)])
+    (camera,) = follow_cameras(POSE[None, :3], [far], scale=0.2)
+    assert camera.distance == pytest.approx(0.75 * 0.2 + 1.565, abs=1e-3)
+
+
+def test_chase_looks_where_the_aircraft_heads_and_does_not_jump():
+    poses = np.stack([yawed(math.radians(a)) for a in (170, 179, 188, 197)])
+    goal = [np.array([[0.0, 0.0, 3.0]])] * 4
+    cameras = follow_cameras(poses[:, :3], goal, heading=headings(poses))
+    np.testing.assert_allclose([c.azimuth for c in cameras], [170, 179, 188, 197])
+    assert {c.elevation for c in cameras} == {-17.0}
+    smooth = [c.azimuth for c in follow_cameras(poses[:, :3], goal, 2.0, 1.0, headings(poses))]
+    assert 0 < np.ptp(smooth) < 27 and np.all(np.diff(smooth) > 0)
+
+
+@pytest.mark.parametrize("camera", ["follow", "chase"])
+@pytest.mark.parametrize("heading", [0.0, 2.0, 4.0])
+@pytest.mark.parametrize("goal", [(3, 0, 3), (-2, -2, 3), (0, 1, 0)])
+def test_moving_cameras_keep_aircraft_and_goal_in_view(model, renderer, camera, heading, goal):
+    pose, away = yawed(heading), POSE + np.array([0, 0, 90, 0, 0, 0, 0])
+    chase = headings(pose[None]) if camera == "chase" else None
+    (view,) = follow_cameras(
+        pose[None, :3], [in_view(np.array(goal))], heading=chase, aspect=renderer.aspect
+    )
+    pictures = [renderer.frame(pose, camera=view, goal=g) for g in (goal, None)]
+    assert not changed(renderer.frame(pose, camera=camera, goal=goal), pictures[0]).any()
+    # A goal fades and a ring on the ground may hide it: its ball and its line cover some pixels.
+    assert changed(*pictures).sum() > 8
+    assert changed(pictures[1], renderer.frame(away, camera=view)).sum() > 30
+
+
+def test_the_camera_of_a_flight_in_progress_lags():
+    last = np.array([0.0, 0, 3, 2, 170, -17])
+    view = np.array([1.0, 0, 3, 4, -170, -17])  # 20 deg on, not 340 deg back
+    np.testing.assert_array_equal(eased(view, last, 0.0), last)
+    np.testing.assert_allclose(eased(view, last, 100.0), [1, 0, 3, 4, 190, -17])
+    half = eased(view, last, 0.3 * math.log(2))
+    np.testing.assert_allclose(half, [0.5, 0, 3, 3, 180, -17])
+
+
+@pytest.mark.parametrize("kind", ["goal", "sphere", "ring", "pad", "line", "arrow", "path"])
+def test_every_marker_can_have_a_label(renderer, kind):
+    points = ((0, 0, 3), (0.5, 0, 3)) if kind == "path" else ()
+    place = dict(end=(0.5, 0, 3) if kind in ("line", "arrow") else None, points=points)
+    if kind == "pad":
+        place["end"] = (0, 0, 9)  # at its position
+    markers = [[Marker(kind, (0, 0, 3), 0.05, label=label, **place)] for label in ("", "7")]
+    pictures = [renderer.frame(ELSEWHERE, camera=looking(), markers=m) for m in markers]
+    assert 5 < changed(*pictures).sum() < 400
+
+
+def test_what_is_painted_on_the_ground(model, renderer):
+    for name, (vertices, faces) in landmarks.meshes().items():
+        assert model.geom(name).contype == 0 and model.geom(name).conaffinity == 0
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        assert (np.cross(b - a, c - a)[:, 2] > 0).all()  # seen from above
+        assert np.abs(vertices[:, :2]).max() < landmarks.REACH + 0.5
+    # From above, looking along +y: north is up in the picture, and orange.
+    pixels = renderer.frame(ELSEWHERE, camera=looking((0, 0, 0), 5.0, -90.0)).astype(int)
+    rows, columns = np.nonzero(pixels[..., 0] - pixels[..., 2] > 60)
+    assert len(rows) > 20 and rows.max() <= SIZE / 2 + 1
+    assert columns.mean() == pytest.approx(SIZE / 2, abs=5)
+    lean = mjcf.compile_model(VEHICLES["paper"], drawn=False)
+    assert (lean.nmesh, lean.ntex, lean.ngeom) == (0, 0, 0)
+
+
 # -------------------------------------------------------------------------- flights and videos
 
 
@@ -244,16 +344,54 @@ def test_a_flight_is_drawn_as_it_was_flown(model, monkeypatch):
 
 @pytest.mark.parametrize("rotors", [4, 8])
 def test_the_panel_shows_rotor_speeds_in_its_corner(rotors):
-    panel, blank = Panel(240, "hover", [(1.0, 0.42, 0.1)] * rotors), np.full((240, 320, 3), 128)
+    panel, blank = Panel(240, "hover", [(1.0, 0.42, 0.1)] * rotors), np.full((240, 400, 3), 128)
     slow, fast = (blank.astype(np.uint8) for _ in range(2))
     for picture, share in ((slow, 0.0), (fast, 1.0)):
-        panel.draw(picture, [("error", "0.12 m")], np.full(rotors, share))
+        panel.draw(picture, ["0.10 s", "0.12 m"], np.full(rotors, share))
     rows, columns = np.nonzero(changed(blank, slow, by=3))
-    # 18 pixels of margin, 138 of height and 202 + 21 a rotor of width, times 0.72.
+    # 18 pixels of margin, 138 of height and 310 + 21 a rotor of width, times 0.72.
     assert 12 <= min(rows.min(), columns.min()) and rows.max() <= 13 + 99
-    assert columns.max() == pytest.approx(0.72 * (18 + 202 + 21 * rotors), abs=2)
+    assert columns.max() == pytest.approx(0.72 * (18 + 310 + 21 * rotors), abs=2)
     bars = changed(slow, fast) & (fast[..., 0] > 200)
     assert bars.sum() == pytest.approx(rotors * 12 * 86 * 0.72**2, rel=0.15)
+
+
+def test_the_panel_shows_the_outcome_below_itself_and_needs_room():
+    panel = Panel(240, "x" * 200, [(1.0, 0.4, 0.1)] * 4)  # a title that is cut
+    assert panel.fits(360, 280) and not panel.fits(160, 120) and not panel.fits(320, 240)
+    pictures = [np.full((240, 400, 3), 128, np.uint8) for _ in range(3)]
+    for picture, end in zip(pictures, ("", "successful", "failed"), strict=True):
+        panel.draw(picture, [], np.zeros(4), outcome=end)
+    rows, _ = np.nonzero(changed(*pictures[:2]))
+    assert rows.min() > 0.72 * (18 + 138) and len(rows) > 500
+    green, red = (p[rows.min() :].reshape(-1, 3).astype(int).sum(0) for p in pictures[1:])
+    assert green[1] > red[1] and red[0] > green[0]
+
+
+@pytest.mark.parametrize(
+    ("ended", "words"),
+    [((True, False, True), "successful"), ((False, True, True), "successful")]
+    + [((True, False, False), "failed"), ((False, True, False), "time over")]
+    + [((False, False, False), "")],
+)
+def test_the_outcome_in_words(ended, words):
+    assert outcome(*ended) == words
+
+
+def test_the_horizon_is_that_of_a_pilot():
+    def sky(x, y, *angles):
+        """Whether a point of the dial is blue, -1 to 1 to the right and up."""
+        attitude = Rotation.from_euler("ZYX", angles, degrees=True).as_quat(scalar_first=True)
+        dial, cover = horizon(101, attitude)
+        assert cover[50, 50] == 255 and cover[0, 0] == 0
+        red, _, blue = dial[round(50 - 50 * y), round(50 + 50 * x)].astype(int)
+        return blue > red
+
+    # Yaw, pitch and roll of axes that point ahead, left and up: nose down and right down count up.
+    assert sky(0.6, 0.3, 70, 0, 0) and not sky(0.6, -0.3, 70, 0, 0)
+    assert not sky(0.6, 0.2, 0, 0, 40) and sky(-0.6, -0.2, 0, 0, 40)  # the right wing is down
+    assert sky(0.2, -0.3, 0, -25, 0) and not sky(0.2, -0.6, 0, -25, 0)  # half a radius at 25 deg
+    assert not sky(0.6, 0.3, 0, 0, 180) and sky(0.6, -0.3, 0, 0, 180)
 
 
 # mediapy and imageio_ffmpeg leave pipes of processes that are over to the garbage collector.
@@ -277,13 +415,77 @@ def test_a_video_plays(model, tmp_path):
 @pytest.mark.parametrize(
     ("name", "value"),
     [("width", 161), ("height", 1), ("width", 0), ("width", 100_000), ("height", -2)]
-    + [("fps", 0.0), ("fps", 1e9), ("fps", math.nan), ("camera", "sky"), ("path", "a.gif")],
+    + [("fps", 0.0), ("fps", 1e9), ("fps", math.nan), ("camera", "sky"), ("path", "a.avi")],
 )
 def test_what_cannot_be_a_video_is_refused_before_anything_is_written(model, name, value):
     options = SMALL | {"path": "new/a.mp4", name: value}
     refused = refusal(write_video, flight(), model, **options)
     np.testing.assert_equal(refused[:2], (name, value))
     assert not list(Path().iterdir())
+
+
+@leaves_pipes
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit])
+def test_a_video_tells_its_progress_and_can_be_stopped(model, stop):
+    told = []
+    write_video(flight(5), model, "a.mp4", fps=20, **SMALL, on_frame=lambda *k: told.append(k))
+    assert told == [(k, 5) for k in range(1, 6)]
+
+    def stopping(done, total):
+        if done == 2:
+            raise stop
+
+    for write, path in (
+        (write_video, "b.mp4"),
+        (write_video, "b.gif"),
+        (write_contact_sheet, "b.png"),
+    ):
+        with pytest.raises(stop):
+            write(flight(5), model, path, **SMALL, on_frame=stopping)
+    assert [path.name for path in Path().iterdir()] == ["a.mp4"]
+
+
+@leaves_pipes
+def test_flights_side_by_side(model):
+    long, short = flight(9, outcome="time over"), flight(5, outcome="failed")
+    path = write_video([long, short, long], model, "a.mp4", fps=20, label=["a", "b", "c"], **SMALL)
+    meta, *frames = imageio_ffmpeg.read_frames(str(path))
+    assert meta["size"] == (320, 240) and len(frames) == 9 + 20  # and a second of the outcome
+    frames = [np.frombuffer(frame, np.uint8).reshape(240, 320, 3) for frame in frames]
+    assert frames[0][125:, 165:].max() < 20  # three of four places
+    moves = [
+        [changed(one[:120, x : x + 160], two[:120, x : x + 160], 40).sum() for x in (0, 160)]
+        for one, two in zip(frames, frames[1:], strict=False)
+    ]
+    assert all(first > 20 for first, _ in moves[:8])
+    assert all(second < 20 for _, second in moves[5:])  # it waits
+    assert all(max(pair) < 20 for pair in moves[9:])
+
+
+@leaves_pipes
+def test_a_gif_and_contact_sheets(model):
+    path = write_video(flight(5), model, "a.gif", fps=10, **SMALL)
+    with Image.open(path) as gif:
+        assert (gif.format, gif.size, gif.n_frames, gif.info["duration"]) == (
+            "GIF",
+            (160, 120),
+            3,
+            100,
+        )
+    for name, form in (("a.png", "PNG"), ("a.jpg", "JPEG"), ("a.jpeg", "JPEG")):
+        path = write_contact_sheet(flight(9), model, name, **SMALL, fine=False)
+        with Image.open(path) as sheet:
+            assert (sheet.format, sheet.size) == (form, (4 * 162, 3 * 122))
+    with Image.open(Path("a.png")) as sheet:
+        tiles = np.asarray(sheet).reshape(3, 122, 4, 162, 3)[:, 1:-1, :, 1:-1].swapaxes(1, 2)
+    first, last = next(render_trajectory(flight(9), model, **SMALL, overlay=False)), tiles[2, 3]
+    assert changed(tiles[0, 0], first).sum() < 0.2 * first[..., 0].size  # but for the time
+    assert changed(first, last).mean() > 0.05
+    two = write_contact_sheet([flight(9), flight(5)], model, "b.png", **SMALL, fine=False)
+    with Image.open(two) as sheet:
+        assert sheet.size == (4 * 162, 2 * 122)
+    refused = refusal(write_contact_sheet, flight(9), model, "new/a.mp4", **SMALL)
+    assert refused[:2] == ("path", "new/a.mp4") and not Path("new").exists()
 
 
 @pytest.mark.parametrize("error", [ValueError("half way"), KeyboardInterrupt()])
@@ -313,7 +515,107 @@ def test_an_encoder_that_fails_is_quoted(model, monkeypatch, tmp_path):
     assert not list(Path("new").iterdir())
 
 
+# --------------------------------------------------------------------------- flights in progress
+
+
+def without_panel(width, height):
+    """The first picture of an episode of hover."""
+    environment = Environment("hover", seed=0)
+    environment.reset()
+    pictures = Pictures(environment, "follow", width, height, overlay=False)
+    with contextlib.closing(pictures):
+        return pictures.frame()
+
+
+def test_gymnasium_shows_the_panel_and_the_outcome():
+    options = dict(render_mode="rgb_array", width=400, height=300, time_limit=0.15)
+    with contextlib.closing(gym.make("quadrl/Hover-v0", **options)) as env:
+        pictures = []
+        for _ in range(2):
+            env.reset(seed=0)
+            pictures.append([env.render(), env.render()])
+            pictures[-1] += [env.step(np.zeros(4)) and env.render() for _ in range(3)]
+        for one, other in zip(*pictures, strict=True):
+            assert changed(one, other).sum() < 5  # a new episode remembers nothing
+        begin, same, *_, late, end = pictures[0]
+        assert changed(begin, same).sum() < 5
+        panel = np.s_[13:112, 13:270]
+        plain = without_panel(400, 300)
+        assert begin[panel].mean() < 0.8 * plain[panel].mean()
+        assert changed(begin[150:], plain[150:]).sum() < 5
+        pill = np.s_[119:144, 13:100]
+        assert changed(late[pill], end[pill]).mean() > 0.5
+    for other in (dict(width=160, height=96), dict(overlay=False)):
+        environment = Environment("hover", seed=0)
+        environment.reset()
+        size = dict(width=400, height=300) | other
+        pictures = Pictures(environment, "follow", **size)
+        assert pictures.frame()[:12].mean() > 150  # sky in the corner
+        corner = pictures.frame()[5:40, 5:60]
+        pictures.close()
+        assert corner.std() < 60 and corner.mean() > 100
+
+
+def test_a_picture_of_a_flight_in_progress_shows_where_it_came_from(renderer):
+    seen = []
+
+    class Recorder:
+        scale, spins, aspect = renderer.scale, renderer.spins, renderer.aspect
+
+        def frame(self, qpos, **options):
+            seen.append(options)
+
+    flying = LiveFlight("follow")
+
+    def see(time, x):
+        pose = POSE + np.array([x, 0, 0, 0, 0, 0, 0])
+        flying.picture(Recorder(), time, pose, np.full(4, 10.0), pose[:3], ())
+        return seen[-1]
+
+    assert len(see(0.0, 0)["trail"]) == 1 and len(see(0.0, 0)["trail"]) == 1
+    later = see(0.1, 1.0)
+    np.testing.assert_allclose(later["trail"][:, 0], [0, 1])
+    np.testing.assert_allclose(later["rotor_angles"], [1, -1, 1, -1])
+    assert later["camera"].lookat[0] == pytest.approx(1 - math.exp(-0.1 / 0.3))
+    np.testing.assert_allclose(see(4.2, 2.0)["trail"][:, 0], [2])  # older than 4 s is gone
+    fresh = see(0.05, 5.0)
+    assert fresh["camera"].lookat[0] == 5 and not fresh["rotor_angles"].any()
+
+
 # ------------------------------------------------------------------------------ graphics library
+
+
+@pytest.mark.parametrize("fine", [True, False])
+def test_without_a_graphics_card_shadows_and_edges_are_cheap(model, monkeypatch, fine):
+    asked, begin = [], mujoco.Renderer.__init__
+
+    def record(self, given, *rest):
+        asked.append((given.vis.quality.offsamples, given.vis.quality.shadowsize))
+        begin(self, given, *rest)
+
+    monkeypatch.setattr("mujoco.Renderer.__init__", record)
+    monkeypatch.setattr(gl, "drawn_by_processor", lambda: not fine)
+    monkeypatch.setattr(model.vis.quality, "offsamples", 4)
+    below = looking((2.5, 0, 0), 2.0, -60.0)  # where the sun casts the shadow from 3 m: 0.84 * 3
+    with Renderer(model, SIZE, SIZE) as opened:
+        dark = [opened.frame(pose, camera=below).astype(int) for pose in (POSE, ELSEWHERE)]
+    assert asked == [(4, 512) if fine else (0, 0)]
+    assert (model.vis.quality.offsamples, model.vis.quality.shadowsize) == (4, 512)
+    rows, columns = np.nonzero((dark[1] - dark[0]).sum(-1) > 60)
+    assert len(rows) > 100 and abs(columns.mean() - SIZE / 2) < 12
+    assert abs(rows.mean() - SIZE / 2) < 12
+
+
+@pytest.mark.parametrize(
+    ("name", "software"),
+    [(b"llvmpipe (LLVM 15.0.6, 256 bits)", True), (b"softpipe", True), (None, False)]
+    + [(b"NVIDIA H200/PCIe/SSE2", False), (b"Mesa Intel(R) UHD Graphics 620", False)],
+)
+def test_who_draws_is_read_from_the_library(renderer, monkeypatch, name, software):
+    monkeypatch.setattr("OpenGL.GL.glGetString", lambda which: name if which == 0x1F01 else b"")
+    gl.drawn_by_processor.cache_clear()
+    assert gl.drawn_by_processor() == software
+    gl.drawn_by_processor.cache_clear()
 
 
 def test_no_graphics_library_is_reported(model, monkeypatch):

@@ -10,8 +10,9 @@ from runs import refused
 
 from quadrl import tasks
 from quadrl.environment import Environment
+from quadrl.evaluation import evaluate
 from quadrl.learning.config import MAX_SEED
-from quadrl.rollout import EVALUATION_SEED, Rollout, evaluate, fly, make_gusts, summarize
+from quadrl.rollout import EVALUATION_SEED, Rollout, fly, summarize
 from quadrl.vehicle import Vehicle
 
 
@@ -30,7 +31,7 @@ def make_rollout(**changes) -> Rollout:
     nothing = {
         name: np.zeros((steps, episodes, k))
         for name, k in (("position", 3), ("quaternion", 4), ("velocity", 3), ("body_rate", 3),
-                        ("rotor_speed", 4), ("goal", 3), ("action", 4))
+                        ("rotor_speed", 4), ("goal", 3), ("action", 4), ("wind", 3))
     }  # fmt: skip
     values = dict(
         error=error,
@@ -104,12 +105,14 @@ def test_episode_i_is_the_single_environment_of_its_seed():
 
 def test_an_evaluation_is_the_same_every_time_and_another_with_another_seed():
     task = tasks.make("hover", time_limit=1.0)
-    (one, first), (other, second) = (evaluate(brake, task, episodes=5) for _ in range(2))
-    assert one == other and one["task"] == "hover" and one["seed"] == 0
+    one, other = (evaluate(brake, task, episodes=5) for _ in range(2))
+    assert one.metrics == other.metrics
+    assert one.metrics["task"] == "hover" and one.metrics["seed"] == 0
+    first, second = one.rollout, other.rollout
     for field in dataclasses.fields(Rollout):
         if isinstance(value := getattr(first, field.name), np.ndarray):
             np.testing.assert_array_equal(value, getattr(second, field.name))
-    _, fresh = evaluate(brake, task, episodes=5, seed=5)
+    fresh = evaluate(brake, task, episodes=5, seed=5).rollout
     assert (fresh.position[0] != first.position[0]).all()
 
 
@@ -132,21 +135,19 @@ def test_a_trajectory_is_in_the_world_frame():
     assert trajectory.task == "hover"
 
 
-def test_gusts_are_those_of_their_process():
-    # One second apart the correlation is exp(-1); 1000 aircraft x 400 steps of 0.05 s.
-    wind = make_gusts(2.0, 400, 0.05, range(1000))
-    assert wind.shape == (400, 1000, 3)
-    assert wind[0].std() == pytest.approx(2.0, rel=0.05)
-    assert wind.std() == pytest.approx(2.0, rel=0.02)
-    assert (wind[20:] * wind[:-20]).mean() / 4.0 == pytest.approx(math.exp(-1), abs=0.02)
-    np.testing.assert_array_equal(make_gusts(2.0, 400, 0.05, range(7, 8))[:, 0], wind[:, 7])
-
-
-def test_gusts_blow_the_aircraft_about():
+def test_wind_blows_the_aircraft_about_and_is_kept():
     task = tasks.make("hover", time_limit=2.0)
-    calm, windy = (fly(brake, task, episodes=3, gusts=g) for g in (0.0, 2.0))
-    assert (windy.position[0] != calm.position[0]).all()
-    np.testing.assert_array_equal(windy.position, fly(brake, task, episodes=3, gusts=2.0).position)
+    calm, windy = (fly(brake, task, episodes=3, weather=w) for w in (None, "light"))
+    assert not np.nan_to_num(calm.wind).any() and (windy.position[0] != calm.position[0]).all()
+    again = fly(brake, task, episodes=3, weather="light")
+    np.testing.assert_array_equal(windy.position, again.position)
+    # The second aircraft alone, and in the same wind.
+    alone = Environment(task, seed=EVALUATION_SEED + 1, weather="light")
+    alone.reset()
+    for k in range(windy.length[1]):
+        alone.step(windy.action[k, 1:2])
+        np.testing.assert_array_equal(windy.wind[k, 1], alone.engine.wind[0])
+    assert np.isnan(windy.wind[windy.length[1] :, 1]).all()
 
 
 @pytest.mark.parametrize(
@@ -176,5 +177,5 @@ def test_actions_with_another_meaning_are_refused():
     assert rollout.length == [10]
     with refused("control_mode", "rotor"):
         fly(Hovering(), "hover", episodes=1, control_mode="rotor")
-    with refused("gusts", -1.0):
-        fly(Hovering(), "hover", episodes=1, gusts=-1.0)
+    with refused("weather", "windy"):
+        fly(Hovering(), "hover", episodes=1, weather="windy")

@@ -5,7 +5,7 @@ import dataclasses
 import helpers
 import numpy as np
 import pytest
-from helpers import WIND, drawn, flying, ranges_of
+from helpers import EVERYTHING, drawn, flying
 
 from quadrl import tasks
 from quadrl.errors import QuadrlError
@@ -52,7 +52,7 @@ def test_a_reset_of_some_rows_renews_all_that_is_theirs_and_nothing_else():
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_the_buffer_of_the_caller_is_not_kept(dtype):
-    environment, action = flying(ranges=None), np.full((4, 4), 0.25, dtype=dtype)
+    environment, action = flying(randomization=None), np.full((4, 4), 0.25, dtype=dtype)
     environment.step(action)
     action[:] = -1.0
     np.testing.assert_array_equal(environment.snapshot.action, 0.25)
@@ -79,10 +79,10 @@ def resumed(task, path, **settings):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("ranges", [ranges_of(PAPER), {"wind": WIND}], ids=["all", "wind"])
-def test_parameters_and_wind_survive_save_and_restore(ranges, engine, tmp_path):
+@pytest.mark.parametrize("randomization", [EVERYTHING, "full"], ids=["parameters", "full"])
+def test_what_was_drawn_survives_save_and_restore(randomization, engine, tmp_path):
     for task in (tasks.make("hover", time_limit=0.6), helpers.SHORT["a low landing"]):
-        settings = {"engine": engine, "ranges": ranges}
+        settings = {"engine": engine, "randomization": randomization}
         for _, got, expected in resumed(task, tmp_path / "saved.npz", **settings):
             helpers.assert_records(got, expected)
 
@@ -90,15 +90,15 @@ def test_parameters_and_wind_survive_save_and_restore(ranges, engine, tmp_path):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_wind_that_somebody_sets_survives_save_and_restore(engine):
     # The wind of a batch used to be a field of the model, which no state of MuJoCo's holds.
-    environment, other = (flying(ranges=None, engine=engine, seed=s) for s in (1, 2))
-    environment.engine.air[:] = np.arange(12.0).reshape(4, 3) / 4
+    environment, other = (flying(randomization=None, engine=engine, seed=s) for s in (1, 2))
+    environment.engine.wind[:] = np.arange(12.0).reshape(4, 3) / 4
     environment.step(np.zeros((4, 4)))
     saved = environment.save()
     other.restore(saved)
-    np.testing.assert_array_equal(other.engine.air, environment.engine.air)
-    calm = flying(ranges=None, engine=engine, seed=3)
+    np.testing.assert_array_equal(other.engine.wind, environment.engine.wind)
+    calm = flying(randomization=None, engine=engine, seed=3)
     calm.restore(saved)
-    calm.engine.air[:] = 0.0
+    calm.engine.wind[:] = 0.0
     for action in helpers.random_actions(5, 4):
         records = [helpers.recorded(e, e.step(action)) for e in (environment, other, calm)]
     helpers.assert_records(records[1:2], records[:1])
@@ -107,8 +107,8 @@ def test_wind_that_somebody_sets_survives_save_and_restore(engine):
 
 
 def test_parameters_of_another_aircraft_are_not_restored():
-    saved = flying(ranges=None).save()
-    other = flying(ranges=None, vehicle=dataclasses.replace(PAPER, mass=0.7))
+    saved = flying(randomization=None).save()
+    other = flying(randomization=None, vehicle=dataclasses.replace(PAPER, mass=0.7))
     before = drawn(other)
     with pytest.raises(QuadrlError) as caught:
         other.restore(saved)
@@ -116,11 +116,11 @@ def test_parameters_of_another_aircraft_are_not_restored():
     np.testing.assert_array_equal(drawn(other), before)
 
 
-def test_rows_that_the_ranges_cannot_hold_are_not_restored():
-    other = flying(ranges={"mass": (0.6, 0.7)})
+def test_rows_that_the_randomization_cannot_hold_are_not_restored():
+    other = flying(randomization={"mass": (0.9, 1.1)})
     before = drawn(other)
     heavy = dataclasses.replace(PAPER, inertia=(8e-3, 8e-3, 1.4e-2))
-    wrong = flying(ranges={"mass": (0.6, 0.7)}, vehicle=heavy).save()
+    wrong = flying(randomization={"mass": (0.9, 1.1)}, vehicle=heavy).save()
     broken = other.save()
     broken["engine.rows"][0, 0] = np.nan
     for saved, name in ((wrong, "engine.parameters"), (broken, "engine.rows")):

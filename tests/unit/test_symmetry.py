@@ -16,6 +16,7 @@ import pytest
 from quadrl.vehicle import VEHICLES
 
 ENGINES = ("mujoco", "free_flight")
+EVERY = VEHICLES | helpers.IN_AIR
 COUNT, STEPS = 8, 100
 TOLERANCE = 5e-13  # of positions, speeds and rates, as a share of the largest of the motion
 
@@ -129,41 +130,41 @@ def identity(vehicle, world=None):
 
 
 every = pytest.mark.parametrize(
-    ("engine", "name"), [(engine, name) for engine in ENGINES for name in VEHICLES]
+    ("engine", "name"), [(engine, name) for engine in ENGINES for name in EVERY]
 )
 
 
 @every
 @pytest.mark.parametrize("angle", [0.7, -1.9])
 def test_a_turn_about_the_vertical_turns_the_flight(engine, name, angle):
-    vehicle = VEHICLES[name]
+    vehicle = EVERY[name]
     assert_image(vehicle, engine, identity(vehicle, turn(angle)))
 
 
 @every
 def test_a_flight_elsewhere_is_the_same_flight(engine, name):
-    vehicle = VEHICLES[name]
+    vehicle = EVERY[name]
     assert_image(vehicle, engine, identity(vehicle), shift=(12.0, -7.0, 0.0))
     assert_image(vehicle, engine, identity(vehicle), shift=(0.0, 0.0, 9.0))
 
 
 @every
 def test_a_flight_in_air_that_drifts_drifts_with_it(engine, name):
-    vehicle = VEHICLES[name]
+    vehicle = EVERY[name]
     assert_image(vehicle, engine, identity(vehicle), drift=(1.5, -2.0, 0.8))
 
 
 CASES = [
     (engine, name, symmetry)
-    for engine, name in itertools.product(ENGINES, VEHICLES)
-    for symmetry in symmetries(VEHICLES[name])
+    for engine, name in itertools.product(ENGINES, EVERY)
+    for symmetry in symmetries(EVERY[name])
 ]
 
 
 @pytest.mark.parametrize(("engine", "name", "symmetry"), CASES)
 def test_a_symmetry_of_the_layout_is_one_of_its_flights(engine, name, symmetry):
     """And the image may head anywhere: the world is turned on."""
-    vehicle = VEHICLES[name]
+    vehicle = EVERY[name]
     body, order = symmetries(vehicle)[symmetry]
     assert_image(vehicle, engine, Image(turn(0.4) @ body, body, order))
 

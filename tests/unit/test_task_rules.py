@@ -125,7 +125,7 @@ def test_landings_in_flight():
         ((0, 0, 0.02), (0, 0, -0.3), 0, -0.2, (1, 1, 0)),
         ((0, 0, 0.2), (0, 0, -0.7), 0, 0, (1, 0, -300)),  # a touchdown at 0.7 m/s
         ((0, 0, 0.2), (0.6, 0, -0.2), 0, 0, (1, 0, -300)),  # at 0.6 m/s, mostly sideways
-        ((0, 0, 0.025), (0, 0, -0.3), math.radians(20), 0, (1, 0, -300)),  # tilted
+        ((0, 0, 0.07), (0, 0, -0.3), math.radians(20), 0, (1, 0, -300)),  # tilted
         ((0.51, 0, 0), (0, 0, 0), 0, -1, (0, 0, 0)),  # beside the pad until the clock ends it
     ]
     position, velocity, roll, action, expected = (np.array(c) for c in zip(*starts, strict=True))

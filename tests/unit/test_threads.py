@@ -24,7 +24,7 @@ def environment(thread: int) -> np.ndarray:
     engine = ("mujoco", "free_flight")[thread % 2]
     task = ("hover", "landing", "target_following", "straight_and_level")[thread // 2 % 4]
     vehicle, count = VEHICLES[NAMES[thread % 4]], 1 if thread % 4 == 3 else 4
-    settings = {"ranges": {"wind": (-2, 2), "mass": (vehicle.mass, 1.05 * vehicle.mass)}}
+    settings = {"randomization": {"command_delay": (0.0, 0.02), "mass": (1.0, 1.05)}}
     flown = Environment(
         task,
         num_envs=count,

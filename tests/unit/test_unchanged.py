@@ -70,7 +70,7 @@ def flown(case, arrays):
 
     seen = [flat(environment.reset())]
     if case["wind"]:
-        environment.engine.air[:] = case["wind"]
+        environment.engine.wind[:] = case["wind"]
     log = {name: [] for name in arrays if "start" not in name and not name.startswith("task/")}
     for k, action in enumerate(arrays["action"]):
         now = environment.step(action)

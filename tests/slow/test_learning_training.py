@@ -1,5 +1,6 @@
 """Training: the same seed, checkpoints that lose nothing, what the critic sees, the metrics."""
 
+import dataclasses
 import os
 import shutil
 from pathlib import Path
@@ -15,9 +16,10 @@ import quadrl
 from quadrl.environment import Environment
 from quadrl.learning import checkpoint
 from quadrl.learning.config import ALGORITHMS
+from quadrl.learning.environments import SEED_STRIDE
 from quadrl.learning.figures import learning_curve, read_metrics
 from quadrl.learning.figures import trajectory as draw_trajectory
-from quadrl.learning.train import SEED_STRIDE, Training
+from quadrl.learning.train import Training
 from quadrl.rollout import fly
 
 
@@ -88,9 +90,37 @@ def test_every_algorithm_continues_where_it_was_stopped(tmp_path, algo):
     stopped(config, tmp_path / "run", 1)
     stopped(config, tmp_path / "run", 3, resume=True)
     folder = stopped(config, tmp_path / "run", 6, resume=True)
-    assert len(metrics(folder)) == 6 and not (folder / "policy.safetensors").exists()
+    assert len(metrics(folder)) == 6
+    assert quadrl.Policy.load(folder).metadata["steps"] == 5 * 32  # of the last checkpoint
     assert_same_run(alone, train(config, tmp_path / "run", resume=True))
     assert quadrl.Policy.load(alone).metadata["algo"] == algo
+
+
+def test_an_uncertain_training_continues_and_its_policy_knows_what_it_met(tmp_path):
+    config = changed(
+        randomization="full",
+        weather="light",
+        aerodynamics="rotor_drag",
+        observe={"action_history": 1, "rotor_speed": "estimated", "privileged": True},
+    )
+    alone = train(config, tmp_path / "alone")
+    stopped(config, tmp_path / "run", 3)
+    assert_same_run(alone, train(config, tmp_path / "run", resume=True))
+    policy = quadrl.Policy.load(alone)
+    assert policy.conditions["observe"] == {"action_history": 1, "rotor_speed": "estimated"}
+    assert policy.metadata["aerodynamics"] == "rotor_drag"
+    drawn = quadrl.Randomization(**policy.conditions["randomization"])
+    assert drawn == quadrl.RANDOMIZATIONS["full"]
+    # An evaluation is that of the training unless it is told otherwise.
+    usual, same, ideal = (
+        quadrl.evaluate(policy, episodes=4, **given).metrics["return_mean"]
+        for given in (
+            {},
+            {"randomization": "full", "weather": "light", "aerodynamics": "rotor_drag"},
+            {"randomization": "none", "weather": "calm", "aerodynamics": "none"},
+        )
+    )
+    assert usual == same != ideal
 
 
 def test_stopped_again_and_again_between_rare_checkpoints(finished, tmp_path):
@@ -117,7 +147,10 @@ def test_resuming_a_finished_run_changes_nothing(finished, copy):
     for a, b in zip(policy.weights, quadrl.Policy.load(finished).weights, strict=True):
         np.testing.assert_array_equal(a, b)
     # Stopped between its last checkpoint and the policy, it writes the policy.
-    (copy / "policy.safetensors").unlink()
+    file = copy / "policy.safetensors"
+    file.unlink()
+    assert_same_run(finished, train(TINY, copy, resume=True))
+    dataclasses.replace(quadrl.Policy.load(copy), task="of an earlier checkpoint").save(file)
     assert_same_run(finished, train(TINY, copy, resume=True))
 
 

@@ -1,0 +1,79 @@
+// An episode as the page shows it: a flight, who flies it, and what happens to it from outside.
+//
+// What happens from outside is a list of events { step, kind, values }, by the control step that
+// they come before. A push changes the velocity (world frame) and the body rates (body frame); a
+// wind event sets the mean wind (world frame) and the standard deviation of the gusts.
+
+import { Flight } from "./flight.mjs";
+
+const GUSTS = 0x67757374; // a stream of random numbers that no task uses
+
+export class Episode {
+  constructor(kernel, slot, { task, aircraft, seed }, controller, events) {
+    this.flight = new Flight(kernel, slot, task, aircraft);
+    this.flight.begin(seed);
+    Object.assign(this, { controller, events });
+    this.steps = 0; // control steps
+    this.ticks = 0; // physics steps
+    this.outcome = ""; // why it is over, in words
+    this.solved = null; // whether the task was done, once the episode's time is up
+    this.air = { mean: [0, 0, 0], deviation: 0 };
+    this.gust = null;
+    const { vehicle } = this.flight;
+    this.keep = Math.exp(-vehicle.controlTimestep / kernel.book.gustTime);
+    const command = [...this.flight.act.subarray(0, vehicle.rotors)];
+    this.history = [{ time: 0, error: this.flight.error, command }];
+  }
+
+  get time() {
+    return this.ticks * this.flight.vehicle.physicsTimestep;
+  }
+
+  // One physics step; false once it is over.
+  tick() {
+    if (this.outcome) return false;
+    const { vehicle } = this.flight;
+    if (this.ticks % vehicle.substeps === 0) this.#control();
+    if (!this.flight.advance()) {
+      this.outcome = "near the ground";
+      return false;
+    }
+    this.ticks += 1;
+    if (this.ticks % vehicle.substeps === 0) this.#finish();
+    return true;
+  }
+
+  #control() {
+    const { flight } = this;
+    const action = this.controller?.act(flight.seen);
+    for (const { kind, values } of this.events.filter((event) => event.step === this.steps)) {
+      if (kind === "push") values.forEach((value, k) => (flight.qvel[k] += value));
+      else this.air = { mean: values.slice(0, 3), deviation: values[3] };
+    }
+    this.#blow();
+    flight.command(action);
+  }
+
+  // Gusts: an Ornstein-Uhlenbeck process in each direction, a step per control step.
+  #blow() {
+    const numbers = this.flight.uniform(GUSTS, 4 * this.steps, 4);
+    const lengths = [0, 2].map((k) => Math.sqrt(-2 * Math.log(1 - numbers[k])));
+    const turns = [1, 3].map((k) => 2 * Math.PI * numbers[k]);
+    const [cosine, sine] = [Math.cos(turns[0]), Math.sin(turns[0])];
+    const normal = [lengths[0] * cosine, lengths[0] * sine, lengths[1] * Math.cos(turns[1])];
+    const fresh = Math.sqrt(1 - this.keep ** 2);
+    this.gust = this.gust ? normal.map((x, k) => this.keep * this.gust[k] + fresh * x) : normal;
+    this.flight.wind.set(this.gust.map((x, k) => this.air.mean[k] + this.air.deviation * x));
+  }
+
+  #finish() {
+    const { flight } = this;
+    flight.finish();
+    this.steps += 1;
+    const command = [...flight.ctrl.subarray(0, flight.vehicle.rotors)];
+    this.history.push({ time: this.time, error: flight.error, command });
+    if (flight.truncated) this.solved = flight.succeeded;
+    if (flight.diverged[0]) this.outcome = "faster than a physics step resolves";
+    else if (flight.terminated) this.outcome = "the task ended it";
+  }
+}

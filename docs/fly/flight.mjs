@@ -1,0 +1,135 @@
+// One aircraft in an episode. All that is computed here is quadrl's own C: the kernels of free
+// flight, of the state and of the random numbers, and the functions that
+// scripts/reports/flights.py writes from the tasks and the geometric controller.
+
+export const SLOTS = 4; // flights that the memory has room for
+
+const ONE = 1n;
+
+// The bytes of base64.
+export function decoded(text) {
+  return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+}
+
+// The compiled C, and where the parts of a flight stand in its memory.
+export class Kernel {
+  // bytes: the WebAssembly; book: what scripts/reports/web.py exports.
+  static async load(bytes, book) {
+    const { instance } = await WebAssembly.instantiate(bytes, {});
+    return new Kernel(instance.exports, book);
+  }
+
+  constructor(exports, book) {
+    this.functions = exports;
+    this.book = book;
+    exports._initialize?.();
+  }
+
+  address(slot, part) {
+    return this.functions.flight_memory(slot) + 8 * this.book.layout[part][0];
+  }
+
+  // A live view of a part of a flight's memory.
+  view(slot, part, type = Float64Array) {
+    const size = (8 * this.book.layout[part][1]) / type.BYTES_PER_ELEMENT;
+    return new type(this.functions.memory.buffer, this.address(slot, part), size);
+  }
+}
+
+export class Flight {
+  constructor(kernel, slot, taskName, vehicleName) {
+    const { book } = kernel;
+    Object.assign(this, { kernel, slot });
+    this.task = book.tasks[taskName];
+    this.vehicle = book.vehicles[vehicleName];
+    this.pair = book.pairs[`${taskName}_${vehicleName}`];
+    this.call = (name) => kernel.functions[`${taskName}_${vehicleName}_${name}`](this.memory);
+    this.memory = kernel.functions.flight_memory(slot);
+    new Float64Array(kernel.functions.memory.buffer, this.memory, book.flightSize).fill(0);
+    const motion = ["qpos", "qvel", "act", "ctrl", "wind"];
+    for (const part of [...motion, "action", "observation", "given", "drawn"]) {
+      this[part] = kernel.view(slot, part);
+    }
+    this.keys = kernel.view(slot, "keys", BigInt64Array);
+    this.episodes = kernel.view(slot, "episodes", BigInt64Array);
+    this.diverged = kernel.view(slot, "diverged");
+    kernel.view(slot, "parameters").set(this.vehicle.row);
+    kernel.view(slot, "limits").set(this.vehicle.limits);
+    kernel.view(slot, "world").set(this.pair.world);
+    kernel.view(slot, "origin").set(this.pair.origin);
+    this.#point("flight_rows", "qpos qvel act ctrl warm wind parameters world near", [0, 0]);
+    this.#point("state_rows", "qpos qvel act origin limits", [0, 0, 1, this.vehicle.rotors]);
+  }
+
+  // Fills a struct of pointers, then of int64, for the kernels of C.
+  #point(part, names, numbers) {
+    const pointers = this.kernel.view(this.slot, part, Int32Array);
+    const parts = names.split(" ");
+    parts.forEach((name, k) => (pointers[k] = this.kernel.address(this.slot, name)));
+    const longs = this.kernel.view(this.slot, part, BigInt64Array);
+    longs.set(numbers.map(BigInt), Math.ceil(parts.length / 2));
+  }
+
+  // Numbers of a stream of the episode, uniform in [0, 1), as quadrl/rng.py gives them.
+  uniform(stream, first, count) {
+    const { functions } = this.kernel;
+    const at = (part) => this.kernel.address(this.slot, part);
+    const places = [at("keys"), at("episodes")];
+    const numbers = [stream, first, count].map(BigInt);
+    functions.quadrl_uniform(ONE, ...places, ...numbers, at("drawn"));
+    return this.drawn.subarray(0, count);
+  }
+
+  // Begins an episode of a seed.
+  begin(seed, episode = 0) {
+    this.keys[0] = BigInt(seed);
+    this.episodes[0] = BigInt(episode);
+    this.uniform(this.kernel.book.startStream, 0, this.pair.drawn);
+    this.call("begin");
+    this.diverged[0] = 0;
+    this.wind.fill(0);
+    this.first();
+  }
+
+  // What is seen first, from where the aircraft is.
+  first() {
+    this.#read();
+    this.call("first");
+  }
+
+  // Commands to the rotors from an action; without one the geometric controller gives it.
+  command(action) {
+    if (action) this.action.set(action);
+    else this.call("geometric");
+    this.call("command");
+  }
+
+  // Flies some physics steps; whether there was nothing near that it could touch.
+  advance(steps = 1) {
+    const rows = this.kernel.address(this.slot, "flight_rows");
+    return this.kernel.functions.quadrl_free_flight(rows, 0n, ONE, BigInt(steps)) === 0n;
+  }
+
+  // The transition of a control step, after its physics steps.
+  finish() {
+    this.#read();
+    this.call("step");
+  }
+
+  #read() {
+    const at = (part) => this.kernel.address(this.slot, part);
+    const broken = this.kernel.functions.quadrl_state(at("state_rows"), ONE, 0, at("state"));
+    if (broken) this.diverged[0] = 1;
+  }
+
+  // What the policy sees, float32.
+  get seen() {
+    return Float32Array.from(this.observation.subarray(0, this.pair.size));
+  }
+
+  get error() { return this.given[0]; } // [m]
+  get goal() { return this.given.subarray(2, 5); } // [m], world
+  get terminated() { return this.given[5] !== 0; }
+  get truncated() { return this.given[6] !== 0; }
+  get succeeded() { return this.given[7] !== 0; }
+}

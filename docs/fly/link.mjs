@@ -1,0 +1,37 @@
+// The settings of a session as the fragment of its address, so that a link shows the same flight.
+
+const DIGITS = 4;
+export const DEFAULTS = { task: "hover", aircraft: "paper", left: "", right: "geometric", seed: 0, at: 0, events: [] };
+
+export function toFragment({ task, aircraft, left, right, seed, at, events }) {
+  const parts = { task, aircraft, left, right, seed, at };
+  const text = Object.entries(parts).map(([name, value]) => `${name}=${encodeURIComponent(value)}`);
+  const listed = events.map(({ step, kind, values }) => `${kind}@${step}:${values.join(",")}`);
+  return `#${[...text, ...(listed.length ? [`events=${listed.join(";")}`] : [])].join("&")}`;
+}
+
+// What cannot be read is left as it is by default.
+export function fromFragment(fragment, book) {
+  const found = new URLSearchParams(fragment.replace(/^#/, ""));
+  const settings = { ...DEFAULTS, events: [] };
+  for (const [name, known] of [["task", book.tasks], ["aircraft", book.vehicles]]) {
+    if (Object.hasOwn(known, found.get(name))) settings[name] = found.get(name);
+  }
+  for (const side of ["left", "right"]) settings[side] = found.get(side) ?? settings[side];
+  for (const [name, largest] of [["seed", Number.MAX_SAFE_INTEGER], ["at", 20000]]) {
+    const number = Number(found.get(name));
+    if (Number.isInteger(number) && number >= 0) settings[name] = Math.min(number, largest);
+  }
+  for (const [, kind, step, list] of (found.get("events") ?? "").matchAll(/(push|wind)@(\d+):([-\d.,e]+)/g)) {
+    const values = list.split(",").map(Number);
+    if (values.length === (kind === "push" ? 6 : 4) && values.every((x) => Math.abs(x) <= 100)) {
+      settings.events.push({ step: Number(step), kind, values });
+    }
+  }
+  return settings;
+}
+
+// As a link writes it, so that what is flown now and what the link shows are the same numbers.
+export function rounded(values) {
+  return values.map((x) => Number(x.toFixed(DIGITS)));
+}

@@ -1,0 +1,91 @@
+// A trained policy: reads the file and gives the mean action, as quadrl/policy.py does.
+
+const LAYERS = ["weight", "bias"];
+const DAMAGED = "The file is damaged or not a safetensors file.";
+
+// Arrays (float32) and the text table of a safetensors file.
+export function readSafetensors(buffer) {
+  const bytes = new Uint8Array(buffer);
+  const size = bytes.length < 8 ? NaN : Number(new DataView(bytes.buffer).getBigUint64(0, true));
+  if (!(size <= bytes.length - 8)) throw new Error(DAMAGED);
+  const arrays = {};
+  let texts;
+  try {
+    const table = JSON.parse(new TextDecoder().decode(bytes.subarray(8, 8 + size)));
+    const { __metadata__: own = {}, ...entries } = table, data = bytes.subarray(8 + size);
+    texts = own;
+    for (const [name, { dtype, data_offsets: [from, to] }] of Object.entries(entries)) {
+      if (dtype !== "F32" || to > data.length) throw new Error(DAMAGED);
+      arrays[name] = new Float32Array(data.slice(from, to).buffer);
+    }
+  } catch {
+    throw new Error(DAMAGED);
+  }
+  return { arrays, texts };
+}
+
+export class Policy {
+  // rules: the `policy` entry of the book.
+  constructor(buffer, rules) {
+    const { arrays, texts } = readSafetensors(buffer);
+    let header = {};
+    try {
+      header = JSON.parse(texts[rules.header] ?? "{}");
+    } catch {
+      // The format below is missing then.
+    }
+    if (header.format !== rules.format) throw new Error("The file holds no policy of quadrl.");
+    const length = Math.max(1, Math.floor(Object.keys(arrays).length / 2) - 1);
+    const names = Array.from({ length }, (_, k) => LAYERS.map((name) => `${name}_${k}`));
+    for (const name of ["mean", "deviation", ...names.flat()]) {
+      if (!arrays[name]) throw new Error(`The file is damaged: the array ${name} is missing.`);
+    }
+    this.clip = rules.clip;
+    this.task = header.task;
+    this.metadata = header.metadata ?? {};
+    this.mean = arrays.mean;
+    this.deviation = arrays.deviation;
+    this.layers = names.map(([weight, bias]) => ({ weight: arrays[weight], bias: arrays[bias] }));
+    let width = this.mean.length, sound = this.deviation.length === width;
+    for (const { weight, bias } of this.layers) {
+      sound &&= weight.length === bias.length * width;
+      width = bias.length;
+    }
+    sound &&= Object.values(arrays).every((array) => array.every(Number.isFinite));
+    if (!sound || !this.deviation.every((x) => x > 0)) {
+      throw new Error("The file is damaged: its arrays do not make a network.");
+    }
+    this.size = this.mean.length;
+    this.actionSize = width / 2;
+  }
+
+  // Why this policy cannot fly an aircraft of the book in a task; nothing if it can.
+  unfit(book, taskName, vehicleName) {
+    const { rotors, layout } = book.vehicles[vehicleName], { actionSize, metadata } = this;
+    const { size } = book.pairs[`${taskName}_${vehicleName}`];
+    const mode = metadata.control_mode ?? "rotor";
+    if (mode !== "rotor") return `Its control mode is ${mode}, and this page knows rotor alone.`;
+    if (actionSize !== rotors) return `It commands ${actionSize} rotors; ${vehicleName} has ${rotors}.`;
+    if (this.size !== size) return `It observes ${this.size} numbers; ${taskName} shows ${size}.`;
+    const trained = book.vehicles[metadata.vehicle]?.layout ?? layout;
+    const alike = JSON.stringify(trained) === JSON.stringify(layout);
+    return alike ? "" : `It has learned the rotor layout of ${metadata.vehicle}.`;
+  }
+
+  // The mean action of a flat observation (float32), within [-1, 1].
+  act(observation) {
+    let values = Float32Array.from(observation, (x, k) => {
+      const normal = Math.fround(Math.fround(x - this.mean[k]) / this.deviation[k]);
+      return Math.min(Math.max(normal, -this.clip), this.clip);
+    });
+    this.layers.forEach(({ weight, bias }, layer) => {
+      const width = values.length, last = layer === this.layers.length - 1;
+      values = Float32Array.from(bias, (offset, row) => {
+        let sum = offset;
+        for (let k = 0; k < width; ++k) sum += weight[row * width + k] * values[k];
+        return last ? sum : Math.tanh(sum);
+      });
+    });
+    return values.subarray(0, this.actionSize).map((x) => Math.min(Math.max(x, -1), 1));
+  }
+}

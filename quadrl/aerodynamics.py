@@ -1,0 +1,259 @@
+"""What the air does to rotors beside equation 7, and which of it acts on an aircraft.
+
+All of it is off by default, so that the paper's equations stay what they are. The forces stand in
+`native/aero.h` and in `quadrl/dynamics.py`; docs/physics.md has the equations with their sources.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from quadrl.errors import QuadrlError
+from quadrl.rotors import GRAVITY, MAX, MIN
+from quadrl.validation import choice, number
+
+if TYPE_CHECKING:
+    from quadrl.vehicle import Vehicle
+
+DENSITIES = (1e-3, 100.0)  # [kg/m^3]
+MAX_BODY_LIFT = 2.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Aerodynamics:
+    """Effects of the air on the rotors of an aircraft. Every number is part of its row.
+
+    An effect is off where its flag is False or its number 0. The other numbers say how strong an
+    effect is that is on; their defaults are those of the paper's aircraft, which is the OS4.
+    """
+
+    inflow: bool = False
+    """Thrust that answers climb, descent and flight across the wind (blade element and momentum
+    theory)."""
+    ground_effect: bool = False
+    """Thrust that grows near the ground, at z = 0 of the world."""
+    rotor_drag: float = 0.0
+    """k_H [N s^2/(m rad)]: drag of a rotor in its plane over rotor speed and airspeed."""
+    flapping_moment: float = 0.0
+    """k_flap [N s^2/rad]: moment on the hub over rotor speed and airspeed; nose up in forward
+    flight."""
+    vortex_ring: float = 0.0
+    """D, 0 to 1: loss of thrust in fast descent, as a share of the answer to inflow."""
+    vortex_ring_noise: float = 0.0
+    """sigma_T, 0 to 1: standard deviation of the thrust in the middle of the vortex ring state, as
+    a share of it."""
+    rotor_inertia: float = 0.0
+    """J_r [kg m^2] of a rotor and its drive about its axis: reaction to its acceleration, and
+    gyroscopic moment."""
+    blade_lift: float = 0.953
+    """s: solidity of the disc times lift slope of the blades [1/rad]. Acts with `inflow`."""
+    translational_lift: float = 4.9e-3
+    """k_h [N s^2/m^2]: lift over the square of the airspeed in the plane of the rotor. Acts with
+    `inflow`."""
+    body_lift: float = 2.0
+    """K_b, 0 to 2: lift of the air that rises between the rotors. Acts with `ground_effect`."""
+    air_density: float = 1.225
+    """rho [kg/m^3]."""
+
+    def __post_init__(self) -> None:
+        """Validate the numbers."""
+        for name in ("inflow", "ground_effect"):
+            if not isinstance(getattr(self, name), bool):
+                raise QuadrlError(name=name, value=getattr(self, name), allowed="True or False")
+        ranges = dict.fromkeys(
+            ("rotor_drag", "flapping_moment", "rotor_inertia", "translational_lift"), (0.0, MAX)
+        ) | dict.fromkeys(("vortex_ring", "vortex_ring_noise"), (0.0, 1.0))
+        ranges |= {"blade_lift": (MIN, MAX), "body_lift": (0.0, MAX_BODY_LIFT)}
+        for name, (low, high) in (ranges | {"air_density": DENSITIES}).items():
+            object.__setattr__(self, name, number(name, getattr(self, name), low, high))
+        if (self.vortex_ring or self.vortex_ring_noise) and not self.inflow:
+            name = "vortex_ring" if self.vortex_ring else "vortex_ring_noise"
+            reason = "the vortex ring state takes away from the thrust that inflow gives"
+            raise QuadrlError(reason, name=name, value=getattr(self, name), allowed="inflow=True")
+
+    @classmethod
+    def full(cls) -> Aerodynamics:
+        """Every effect, with the numbers of the paper's aircraft; `in_real_air` has others'."""
+        return REAL_AIR["paper"][0]
+
+    @property
+    def uses_discs(self) -> bool:
+        """Whether an effect depends on the radius of the discs."""
+        return self.inflow or self.ground_effect
+
+    @property
+    def effects(self) -> int:
+        """Which copy of the kernels an aircraft needs: 0 none, 1 rotors, 2 and ground effect."""
+        return 2 if self.ground_effect else int(any(getattr(self, name) for name in SWITCHES))
+
+
+SWITCHES = (
+    *("inflow", "ground_effect", "rotor_drag", "flapping_moment"),
+    *("vortex_ring", "vortex_ring_noise", "rotor_inertia"),
+)
+"""Fields that are False or 0 where an effect is off."""
+EFFECTS = {
+    "inflow": ("inflow",),
+    "rotor_drag": ("rotor_drag", "flapping_moment"),
+    "ground_effect": ("ground_effect",),
+    "vortex_ring": ("inflow", "vortex_ring", "vortex_ring_noise"),
+    "rotor_inertia": ("rotor_inertia",),
+}
+"""What can be asked for by name, and the fields that it takes from the full set."""
+NONE, FULL = "none", "full"
+
+_ALL = Aerodynamics(inflow=True, ground_effect=True, vortex_ring=0.44, vortex_ring_noise=0.1)
+REAL_AIR = {
+    "paper": (
+        dataclasses.replace(
+            _ALL,
+            # Blade theory of the OS4, with stiff plastic blades: the physics page says how.
+            rotor_drag=1.25e-4,
+            rotor_inertia=6e-5,  # OS4, with its gear
+        ),
+        1.0,  # equation 8 is its drag beside the rotors' already
+    ),
+    "crazyflie": (
+        dataclasses.replace(
+            _ALL,
+            rotor_drag=9.18e-7,  # Foerster 2015
+            flapping_moment=9e-8,  # identified in flights: 6.4e-4 N m per m/s sideways
+            rotor_inertia=6e-8,  # identified in flights (ARPL, IMRCLab)
+            blade_lift=0.384,  # gives the heave damping of drone-models, 0.0128 N s/m
+            translational_lift=0.0,  # unknown
+        ),
+        0.2,  # estimated from its frontal area
+    ),
+    "racer": (
+        dataclasses.replace(
+            _ALL,
+            rotor_drag=6.2e-5,  # estimated
+            rotor_inertia=0.0,  # unknown
+            blade_lift=0.9,  # estimated, for three blades
+            translational_lift=0.0,  # unknown
+        ),
+        0.3,  # estimated from its frontal area
+    ),
+    "hexa": (
+        dataclasses.replace(
+            _ALL,
+            rotor_drag=8.06e-5,  # RotorS, for the same rotor on the hummingbird
+            rotor_inertia=0.0,  # unknown
+            blade_lift=0.8,  # estimated, for two blades
+            translational_lift=0.0,  # unknown
+        ),
+        0.3,  # estimated, as the racer's
+    ),
+}
+"""By aircraft: its full set, and the share of its quadratic drag that is not the rotors' own."""
+
+
+def check_air(vehicle: Vehicle) -> None:
+    """Refuse discs that make power from nothing, and effects that are too fast for the step.
+
+    Raises:
+        QuadrlError: The message says what would be allowed.
+    """
+    air = vehicle.aerodynamics
+    if not isinstance(air, Aerodynamics):
+        raise QuadrlError(name="aerodynamics", value=air, allowed="an Aerodynamics")
+    for k, rotor in enumerate(vehicle.rotors):
+        merit = rotor.figure_of_merit(air.air_density)
+        if air.uses_discs and merit > 1:
+            raise QuadrlError(
+                f"with its thrust and torque it would hover on {1 / merit:.2g} of the power that "
+                "momentum theory asks for",
+                name=f"disc_radius of rotor {k + 1}",
+                value=rotor.disc,
+                allowed=f"at least {rotor.disc * merit:.3g} m",
+            )
+    if vehicle.rotor_count * air.rotor_inertia > vehicle.inertia[2]:
+        allowed = f"at most {vehicle.inertia[2] / vehicle.rotor_count:.3g} kg m^2, a rotor's share"
+        raise QuadrlError(name="rotor_inertia", value=air.rotor_inertia, allowed=allowed)
+    what, rate = max(_rates(vehicle).items(), key=lambda item: item[1])
+    if rate * vehicle.physics_timestep > 1:
+        reason = f"{what} changes the flight at up to {rate:.3g} 1/s, and rate times step may be 1"
+        step, allowed = vehicle.physics_timestep, f"at most {1 / rate:.3g} s"
+        raise QuadrlError(reason, name="physics_timestep", value=step, allowed=allowed)
+
+
+def _rates(vehicle: Vehicle) -> dict[str, float]:
+    """Upper bounds of the rates [1/s] at which each effect damps or turns the aircraft."""
+    air, mass, inertia = vehicle.aerodynamics, vehicle.mass, np.array(vehicle.inertia)
+    rotors, fastest = vehicle.rotors, vehicle.max_speed
+    arms = np.array([math.hypot(*rotor.position) for rotor in rotors])
+    # Lift over climb speed: in fast descent the flow through the disc changes as much as the climb.
+    thrust = np.array([rotor.thrust_coefficient for rotor in rotors]) * fastest
+    disc = np.array([rotor.disc for rotor in rotors])
+    slope = air.inflow * air.blade_lift * air.air_density * math.pi * disc**3 * fastest / 4
+    drag, spin = air.rotor_drag * fastest, air.rotor_inertia * fastest.sum()
+    flap = air.flapping_moment * fastest.sum() / inertia.min()
+    steep = thrust * fastest / (disc / 2)  # no rotor gains more over half a radius
+    rates = {
+        "inflow": max(slope.sum() / mass, (slope * arms**2).sum() / inertia.min()),
+        "rotor_drag": max(drag.sum() / mass, (drag * arms**2).sum() / inertia.min()),
+        "flapping_moment": (flap * GRAVITY) ** (1 / 3),  # it falls to the side that it turns to
+        "rotor_inertia": spin / inertia.min(),
+        "ground_effect": air.ground_effect * math.sqrt(steep.sum() / mass),
+    }
+    return {name: float(rate) for name, rate in rates.items()}
+
+
+def in_real_air(vehicle: Vehicle) -> Vehicle:
+    """A vehicle with every effect of the air: its own set, or that of the known one of its name.
+
+    With rotor drag on, the quadratic drag is what remains beside it: the presets whose
+    `drag_coefficient` stands for both keep a share.
+
+    Raises:
+        QuadrlError: It has no set of its own, and its name is not one of `REAL_AIR`.
+    """
+    return with_effects(vehicle, FULL)
+
+
+def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> Vehicle:
+    """A vehicle in the air that is asked for.
+
+    Args:
+        vehicle: The aircraft.
+        aerodynamics: "none", "full", names of EFFECTS with commas between them (each with the
+            numbers of the full set), an Aerodynamics; None for what the vehicle has.
+
+    Raises:
+        QuadrlError: Unknown name, or a vehicle for which there is no full set.
+    """
+    if aerodynamics is None:
+        return vehicle
+    if isinstance(aerodynamics, Aerodynamics):
+        return dataclasses.replace(vehicle, aerodynamics=aerodynamics)
+    if not isinstance(aerodynamics, str):
+        allowed = f"an Aerodynamics, {NONE}, {FULL}, or names of {', '.join(EFFECTS)}"
+        raise QuadrlError(name="aerodynamics", value=aerodynamics, allowed=allowed)
+    if aerodynamics == NONE:
+        return dataclasses.replace(vehicle, aerodynamics=Aerodynamics())
+    own, share = _full_set(vehicle)
+    kept = set(SWITCHES)
+    if aerodynamics != FULL:
+        names = [name.strip() for name in aerodynamics.split(",")]
+        choices = [*EFFECTS, *([NONE, FULL] if len(names) == 1 else [])]
+        kept = {f for name in names for f in EFFECTS[choice("aerodynamics", name, choices)]}
+    off = {name: Aerodynamics.__dataclass_fields__[name].default for name in SWITCHES}
+    chosen = dataclasses.replace(own, **{n: off[n] for n in SWITCHES if n not in kept})
+    drag = vehicle.drag_coefficient * (share if chosen.rotor_drag else 1.0)
+    return dataclasses.replace(vehicle, aerodynamics=chosen, drag_coefficient=drag)
+
+
+def _full_set(vehicle: Vehicle) -> tuple[Aerodynamics, float]:
+    """Every effect of a vehicle, and the share of its quadratic drag beside its rotor drag."""
+    own = vehicle.aerodynamics
+    if own.effects:
+        return own, 1.0  # its drag is what it says
+    if vehicle.name not in REAL_AIR:
+        reason = f"quadrl knows the full set of {', '.join(REAL_AIR)}; give this one its own"
+        allowed = "an aircraft with aerodynamics=Aerodynamics(...)"
+        raise QuadrlError(reason, name="vehicle", value=vehicle.name, allowed=allowed)
+    return REAL_AIR[vehicle.name]

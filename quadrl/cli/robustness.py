@@ -1,0 +1,84 @@
+"""`quadrl robustness`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from quadrl.cli import choices
+from quadrl.cli.console import console, make_table, say
+from quadrl.cli.flown import parse_options
+from quadrl.control import CONTROLLERS
+from quadrl.disturbed import robustness
+from quadrl.errors import QuadrlError
+from quadrl.evaluation import comes_with_quadrl
+from quadrl.validation import choice
+
+
+@dataclasses.dataclass(frozen=True)
+class Robustness:
+    """Fly policies or controllers through graded disturbances, and map where they recover from."""
+
+    policies: Positional[tuple[str, ...]] = ()
+    """Run folders, .safetensors files, names of tasks, for the policies for them that come with
+    quadrl, or of such policies, as hover_robust (write ./NAME for a folder of that name)."""
+    controller: Annotated[
+        UseAppendAction[tuple[choices.ControllerName, ...]],
+        arg(help_behavior_hint="(repeatable)"),
+    ] = ()
+    """A controller that flies as well: geometric or lqr."""
+    task: choices.TaskName = choices.TaskName("")
+    """The task; by default the one that the first policy was trained for, and hover for a
+    controller."""
+    vehicle: choices.VehicleName = choices.VehicleName("")
+    """The aircraft; by default the one that the first policy was trained with."""
+    aerodynamics: str = ""
+    """Effects of the air on the rotors: none, full, or names of single ones with commas between
+    them; by default those of the first policy's training."""
+    axes: tuple[str, ...] = ()
+    """Names of the disturbances; by default all."""
+    recovery: bool = True
+    """Also fly the recovery maps."""
+    episodes: int = 300
+    """Flights of each level; a cell of a recovery map has a tenth of them."""
+    seed: int = 0
+    """Seed of the episodes, between 0 and 2^32 - 1."""
+    engine: choices.EngineName = choices.EngineName("")
+    """free_flight or mujoco; by default free flight, unless the task touches the ground."""
+    out: Path = Path("robustness")
+    """Folder for the pictures (.png, .pdf), the numbers (.json) and the table (.csv)."""
+    task_options: tuple[str, ...] = ()
+    """Options of the task that differ from the training's, such as time_limit=5."""
+
+    def run(self) -> None:
+        """Fly, print where half of the flights fail, and write the files."""
+        if not (self.policies or self.controller):
+            raise QuadrlError(
+                "give policies (run folders, .safetensors files, or names of tasks), or "
+                f"--controller {' or '.join(CONTROLLERS)}"
+            )
+        for name in self.controller:
+            choice("controller", name, CONTROLLERS)
+        # The name of a controller is no policy here: a folder may be called so.
+        flown = [name if comes_with_quadrl(name) else Path(name) for name in self.policies]
+        chosen: dict[str, Any] = {name: getattr(self, name) or None for name in GIVEN}
+        card = robustness(
+            [*flown, *(str(name) for name in self.controller)],
+            self.task or None,
+            episodes=self.episodes,
+            seed=self.seed,
+            recovery=self.recovery,
+            **chosen,
+            **parse_options(self.task_options),
+        )
+        head, *rows = card.table
+        console.print(make_table(head, rows, numbers=len(head) - 1))
+        for path in card.save(self.out):
+            say(f"wrote {path}")
+
+
+GIVEN = ("vehicle", "aerodynamics", "engine", "axes")
+"""Options that stand for a default where they are empty."""

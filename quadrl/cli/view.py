@@ -1,0 +1,88 @@
+"""`quadrl view`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from quadrl.cli.console import say
+from quadrl.cli.flown import Flown
+from quadrl.control import CONTROLLERS
+from quadrl.control import make as make_controller
+from quadrl.errors import RenderingUnavailable
+from quadrl.policy import Policy, shipped
+from quadrl.rollout import Controller
+from quadrl.task import Task
+from quadrl.tasks import TASKS
+from quadrl.vehicle import VEHICLES, Vehicle
+
+
+@dataclasses.dataclass(frozen=True)
+class View(Flown):
+    """Watch a policy or a controller fly, live in the browser: push it, let the wind blow, fly."""
+
+    num_envs: int = 1
+    """Aircraft that fly at the same time."""
+    host: str = "localhost"
+    """Address that the page is served at; 0.0.0.0 lets other machines see it."""
+    port: int = 8080
+    """Port that the page is served at; 0 for any that is free."""
+    native: bool = False
+    """Open MuJoCo's own viewer instead, on this machine's screen."""
+
+    def run(self) -> None:
+        """Serve the page, or show the window, until Ctrl-C."""
+        try:
+            self._native() if self.native else self._browser()
+        except KeyboardInterrupt:
+            say("stopped")
+
+    def _native(self) -> None:
+        from quadrl.view import native
+        from quadrl.view.flight import Flight
+
+        native.check_screen()
+        _, controller, task, vehicle = self.setting()
+        native.run(Flight(controller, task, vehicle, **self._settings(controller)))
+
+    def _settings(self, controller: Controller) -> dict[str, Any]:
+        drawn = self.of_all("randomization", [controller])
+        return {"num_envs": self.num_envs, "seed": self.seed, "randomization": drawn}
+
+    def _browser(self) -> None:
+        try:
+            from quadrl.view.browser import Page
+        except ImportError as error:
+            raise RenderingUnavailable(
+                f"quadrl view needs {error.name}: install the extra `view` of quadrl"
+            ) from error
+        from quadrl.view.flight import Flight
+
+        _, controller, task, vehicle = self.setting()
+        flight = Flight(controller, task, vehicle, **self._settings(controller))
+        name = self.controller or self.policy
+        if name in TASKS:
+            name = f"{name}_{self.algo or 'ppo'}"
+        choices = {name: lambda: controller} | others(task, vehicle)
+        page = Page(flight, choices, host=self.host, port=self.port)
+        try:
+            say(f"{name} flies {task.name}: open {page.address} (Ctrl-C ends it)")
+            page.run()
+        finally:
+            page.close()
+
+
+def others(task: Task, vehicle: Vehicle) -> dict[str, Callable[[], Controller]]:
+    """What else can fly a task: the policies for it that come with quadrl, and the controllers."""
+    usual = VEHICLES.get(vehicle.name, vehicle).action_scale
+    policies = {}
+    for file in shipped():
+        policy = Policy.load(file)
+        # The aircraft stays the same, so that its commands have to mean what they did in training.
+        scale = policy.metadata.get("vehicle_options", {}).get("action_scale", usual)
+        if policy.task == task.name and scale == vehicle.action_scale:
+            policies[file.stem] = lambda policy=policy: policy
+    return policies | {
+        name: lambda name=name: make_controller(name, task, vehicle) for name in CONTROLLERS
+    }

@@ -1,0 +1,91 @@
+"""The settings of each algorithm."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+from quadrl.validation import number
+
+
+@dataclasses.dataclass(frozen=True)
+class AlgorithmConfig:
+    """Numbers of an algorithm: whole ones are counts, the others are positive unless listed."""
+
+    training: ClassVar[dict[str, Any]] = {}
+    """Settings of `TrainConfig` that have other defaults with this algorithm."""
+    may_be_zero: ClassVar[tuple[str, ...]] = ("entropy", "critic", "damping")
+
+    def __post_init__(self) -> None:
+        """Validate the numbers."""
+        prefix = type(self).__name__.removesuffix("Config").lower()
+        for field in dataclasses.fields(self):
+            value, name = getattr(self, field.name), f"{prefix}.{field.name}"
+            if isinstance(field.default, int):
+                checked = number(name, value, 1, whole=True)
+            else:
+                checked = number(name, value, 0, positive=field.name not in self.may_be_zero)
+            object.__setattr__(self, field.name, checked)
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig(AlgorithmConfig):
+    """Settings of PPO."""
+
+    learning_rate: float = 4e-3
+    """Initial rate of Adam; it falls linearly to zero over the training."""
+    epochs: int = 5
+    """Passes over each batch."""
+    minibatch: int = 1024
+    """Transitions in a gradient step: few large ones, since each step costs milliseconds."""
+    clip: float = 0.2
+    """Bound on the change of the probability ratio."""
+    entropy: float = 0.0
+    """Weight of the entropy bonus."""
+    critic: float = 1.0
+    """Weight of the critic's squared error."""
+    max_gradient: float = 1.0
+    """Norm to which gradients are clipped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TRPOConfig(AlgorithmConfig):
+    """Settings of TRPO."""
+
+    max_kl: float = 0.02
+    """Bound on the mean KL divergence of a step."""
+    damping: float = 0.01
+    """Added to the diagonal of the Fisher matrix."""
+    iterations: int = 10
+    """Iterations of the conjugate gradient method."""
+    backtracks: int = 10
+    """Steps tried in the line search."""
+    shrink: float = 0.7
+    """Factor from one tried step to the next."""
+    critic_rate: float = 3e-3
+    """Initial learning rate of the critic; it falls linearly to zero."""
+    critic_epochs: int = 8
+    """Passes of the critic over each batch."""
+    minibatch: int = 1024
+    """Transitions in a gradient step of the critic."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VPGConfig(AlgorithmConfig):
+    """Settings of the plain policy gradient."""
+
+    training = {"num_envs": 128, "rollout": 8}  # one step per batch: more batches, and smaller
+
+    learning_rate: float = 3e-3
+    """Initial rate of the policy's one step on each batch; it falls linearly to zero."""
+    critic_rate: float = 6e-3
+    """Initial learning rate of the critic; it falls linearly to zero."""
+    critic_epochs: int = 8
+    """Passes of the critic over each batch."""
+    minibatch: int = 1024
+    """Transitions in a gradient step of the critic."""
+    max_gradient: float = 1.0
+    """Norm to which gradients are clipped."""
+
+
+ALGORITHM_CONFIGS = {"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig}

@@ -1,0 +1,81 @@
+"""The aircraft of a training, what a recurrent policy remembers of each, and their collector."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Unbounded
+
+from quadrl.envs.torchrl import QuadrotorEnv
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.networks import STATE
+
+with warnings.catch_warnings():
+    # TorchRL 0.14 warns about its own classes at this import.
+    warnings.filterwarnings("ignore", message=".*WeightUpdater.*", category=DeprecationWarning)
+    from torchrl.collectors import Collector
+
+SEED_STRIDE = 1 << 20
+"""Distance between the aircraft's seeds of two trainings: the most aircraft that there can be."""
+
+
+class RememberingEnv(QuadrotorEnv):
+    """Aircraft with the state of a recurrent policy beside each, (N, width); zero at each reset."""
+
+    def __init__(self, width: int, *given: Any, **settings: Any) -> None:
+        """Make the environments for states of a width."""
+        super().__init__(*given, **settings)
+        self._state = torch.zeros(self.num_envs, width, device=self.device)
+        observation = self.observation_spec.clone()
+        observation[STATE] = Unbounded(self._state.shape, device=self.device)
+        self.observation_spec = observation
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Go on from what `environment.save` gave, and the states beside it."""
+        super().restore({name: value for name, value in saved.items() if name != STATE})
+        self._state = torch.from_numpy(saved[STATE]).to(self.device).reshape(self._state.shape)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        fresh = super()._reset(tensordict)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or mask.all():  # otherwise the states of the others stay: see maybe_reset
+            fresh.set(STATE, self._state if self._restored else torch.zeros_like(self._state))
+        return fresh
+
+
+def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
+    """The aircraft of a training."""
+    settings: dict[str, Any] = dict(
+        task=config.make_task(),
+        num_envs=config.num_envs,
+        seed=config.seed * SEED_STRIDE,
+        device=device,
+        vehicle=config.make_vehicle(),
+        control_mode=config.control_mode,
+        num_threads=config.num_threads,
+        engine=config.engine,
+        weather=config.weather,
+        randomization=config.randomization,
+        observe=config.observe,
+    )
+    if config.memory == "none":
+        return QuadrotorEnv(**settings)
+    return RememberingEnv(config.memory_width, **settings)
+
+
+def make_collector(env: QuadrotorEnv, actor: torch.nn.Module, frames: int) -> Collector:
+    """TorchRL's collector of batches of `frames` steps, without what a training does not use."""
+    return Collector(
+        env,
+        actor,
+        frames_per_batch=frames,
+        total_frames=-1,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+        use_buffers=False,
+        trust_policy=True,
+    )

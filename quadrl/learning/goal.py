@@ -1,0 +1,54 @@
+"""The goal state of a task as a policy sees it: where policies that hold the goal stand still."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from quadrl.environment import Environment
+from quadrl.errors import QuadrlError
+from quadrl.learning.config import TrainConfig
+from quadrl.task import layout
+
+DRAWN = 16  # goal states that are compared
+YAW = 2  # place of the yaw among the three angles
+ROUNDING = 1e-5  # of observations in single precision
+
+
+def goal_state(config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
+    """The observation at the goal, at rest, and which of its numbers a policy may look at.
+
+    It may not look at what differs between goal states and has nothing to do with the way to the
+    goal: the position in the world, which the way to the goal replaces, and the yaw where the
+    heading is free. What is left is the same however the aircraft is turned about the vertical.
+
+    Returns:
+        The observation (size,) float32, and a mask (size,) of the numbers that are looked at.
+
+    Raises:
+        QuadrlError: The observation of the task's goal states differs in anything else.
+    """
+    task, vehicle = config.make_task(), config.make_vehicle()
+    settings: Any = {"control_mode": config.control_mode, "observe": config.observe}
+    environment = Environment(task, vehicle=vehicle, num_envs=DRAWN, seed=0, **settings)
+    environment.reset()
+    goals = environment.goals() - environment.origin
+    yaw = np.zeros(DRAWN) if task.heading_matters else np.linspace(-3.0, 3.0, DRAWN)
+    level = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
+    start = {"position": goals, "quaternion": level}
+    start |= {"velocity": np.zeros(3), "body_rate": np.zeros(3), "rotor_speed": vehicle.hover_speed}
+    environment.seed(0)  # the same episodes, which have the same goals
+    seen = environment.flatten(environment.reset(start=start))
+    looks = np.ones(environment.size, dtype=bool)
+    places = layout(task.observation, vehicle.rotor_count)
+    looks[places["position"]] = False
+    if not task.heading_matters:
+        for name in ("sin_attitude", "cos_attitude"):
+            looks[places[name].start + YAW] = False
+    differs = looks & (np.ptp(seen, axis=0) > ROUNDING)
+    if differs.any():
+        entries = [name for name, place in places.items() if differs[place].any()]
+        reason = f"goal states of {task.name} differ in {', '.join(entries) or 'the history'}"
+        raise QuadrlError(reason, name="holds_goal", value=True, allowed="False for this task")
+    return seen[0], looks

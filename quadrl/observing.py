@@ -1,0 +1,72 @@
+"""Options of the observation: what a policy sees beside or instead of the task's own entries."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from quadrl.errors import QuadrlError
+from quadrl.validation import choice, keys, number
+
+ROTOR_SPEEDS = ("true", "estimated", "none")
+LONGEST_HISTORY = 1000
+
+
+@dataclasses.dataclass(frozen=True)
+class Observing:
+    """Options of the observation."""
+
+    action_history: int = 0
+    """How many of the last actions are seen, the newest first; zeros before the first."""
+    observation_history: int = 0
+    """How many observations before the present one are seen, the newest first; the first one
+    stands for those before it."""
+    rotor_speed: Literal["true", "estimated", "none"] = "true"
+    """Which rotor speeds are seen: the true ones, those that follow from the commands with the lag
+    that is specified, or none."""
+    airspeed: bool = False
+    """Whether the velocity through the air is seen, in the body frame."""
+    disturbance: bool = False
+    """Whether the acceleration is seen that weight and the thrust of the specified aircraft do not
+    explain, body frame: what an accelerometer feels beside that thrust, smoothed."""
+    privileged: bool = False
+    """Whether there is an observation for the critic alone: the true one, what was drawn, and the
+    wind in the body frame."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        for name in ("action_history", "observation_history"):
+            value = number(name, getattr(self, name), 0, LONGEST_HISTORY, whole=True)
+            object.__setattr__(self, name, value)
+        choice("rotor_speed", self.rotor_speed, ROTOR_SPEEDS)
+        for name in ("airspeed", "disturbance", "privileged"):
+            if not isinstance(value := getattr(self, name), bool):
+                raise QuadrlError(name=name, value=value, allowed="True or False")
+
+    def given(self) -> dict[str, Any]:
+        """The options that differ from the usual."""
+        usual = vars(Observing())
+        return {name: value for name, value in vars(self).items() if value != usual[name]}
+
+    def for_policy(self) -> dict[str, Any]:
+        """Those of them that change what a policy sees."""
+        return {name: value for name, value in self.given().items() if name != "privileged"}
+
+
+Observed = Observing | Mapping[str, Any] | None
+"""What `resolve` takes."""
+
+
+def resolve(given: Observed) -> Observing:
+    """Options of the observation, from a mapping of some of them, or the usual ones for None.
+
+    Raises:
+        QuadrlError: It is something else, or an option is unknown or out of range.
+    """
+    if given is None or isinstance(given, Observing):
+        return given or Observing()
+    if not isinstance(given, Mapping):
+        raise QuadrlError(name="observe", value=given, allowed="an Observing, or a mapping")
+    keys("option of observe", given, [field.name for field in dataclasses.fields(Observing)])
+    return Observing(**given)

@@ -1,0 +1,95 @@
+"""A progress bar: redrawn in a terminal and in a notebook, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from typing import TYPE_CHECKING, Any
+
+from rich import progress
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from quadrl.learning.train import Progress
+
+
+class ProgressBar:
+    """Of a training or of anything else that is counted; use it in a `with`."""
+
+    LINE_SECONDS = 5.0  # between two lines where nothing can be redrawn
+    NOTEBOOK_SECONDS = 0.2  # between two updates in a notebook
+    WIDTH = 24  # characters of the bar
+
+    def __init__(self, console: Console | None = None) -> None:
+        """Make the bar."""
+        self._console = console or Console()
+        self._notebook: Any = None  # the handle of what is displayed
+        self._progress = progress.Progress(
+            progress.BarColumn(bar_width=self.WIDTH),
+            progress.TextColumn("{task.description}"),
+            progress.TimeRemainingColumn(compact=True),
+            console=self._console,
+            disable=not self._redrawn,
+        )
+        self._row: progress.TaskID | None = None
+        self._begun: tuple[int, float] | None = None  # iteration and seconds of the first update
+        self._last_line = time.monotonic()
+        self._metrics: dict[str, float] = {}
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._progress.stop()
+
+    @property
+    def _redrawn(self) -> bool:
+        return self._console.is_terminal and not self._console.is_jupyter
+
+    def update(self, done: int, total: int, text: str) -> None:
+        """Show that `done` of `total` are done, with a text behind the bar."""
+        last = done == total
+        if self._redrawn:
+            if self._row is None:
+                self._progress.start()
+                self._row = self._progress.add_task(text, total=total)
+            self._progress.update(self._row, completed=done, description=text)
+            if last:
+                self._progress.stop()
+            return
+        seconds = self.NOTEBOOK_SECONDS if self._console.is_jupyter else self.LINE_SECONDS
+        now = time.monotonic()
+        # A drawing that takes no time needs no line; a training always has its last one.
+        wanted = self._begun is not None or self._console.is_jupyter
+        if now - self._last_line < seconds and not (last and wanted):
+            return
+        self._last_line = now
+        if self._console.is_jupyter:
+            filled = round(self.WIDTH * done / total)
+            self._display(f"{'━' * filled}{'╌' * (self.WIDTH - filled)}  {text}")
+        else:
+            line = f"{100 * done / total:3.0f} %  {text}"
+            self._console.print(line, soft_wrap=True, highlight=False)
+
+    def show(self, now: Progress) -> None:
+        """Show steps, steps/s, return and success after an iteration of a training."""
+        if self._begun is None:
+            self._begun = (now.iteration - 1, 0.0 if now.iteration == 1 else now.seconds)
+        first, since = self._begun
+        share = (now.iteration - first) / now.iteration
+        rate = now.steps * share / max(now.seconds - since, 1e-9)
+        self._metrics |= now.metrics
+        report = (
+            f"{now.steps:>9,} steps  {rate:>7,.0f}/s  "
+            f"return {self._metrics.get('return', float('nan')):>7.0f}  "
+            f"success {100 * self._metrics.get('success', 0.0):>3.0f} %"
+        )
+        self.update(now.iteration, now.iterations, report)
+
+    def _display(self, line: str) -> None:
+        """Show a line in a notebook, in place of the last one."""
+        display = importlib.import_module("IPython.display").display
+        if self._notebook is None:
+            self._notebook = display({"text/plain": line}, raw=True, display_id=True)
+        else:
+            self._notebook.update({"text/plain": line}, raw=True)

@@ -1,0 +1,92 @@
+"""Pictures of a flight in progress, one at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from quadrl.markers import Marker
+from quadrl.rendering.camera import (
+    CHASE,
+    MOVING,
+    eased,
+    headings,
+    in_view,
+    moving_camera,
+    moving_views,
+)
+from quadrl.rendering.scene import TRAIL_SECONDS, Renderer
+from quadrl.rendering.streaks import streaks
+from quadrl.rotation import Array
+
+
+class LiveFlight:
+    """What one picture of a flight hands on to the next: camera, trail, angles of the rotors."""
+
+    def __init__(self, camera: str) -> None:
+        """Nothing has been seen yet."""
+        self._camera = camera
+        self._time = math.inf
+        self._view = np.zeros(6)
+        self._angles = np.zeros(0)
+        self._drift = np.zeros(3)
+        self._trail: list[tuple[float, Array]] = []
+
+    def picture(
+        self,
+        renderer: Renderer,
+        time: float,
+        qpos: Array,
+        rotor_speed: Array,
+        goal: Array,
+        markers: Sequence[Marker],
+        wind: Array | None = None,
+    ) -> Array:
+        """Draw the flight as it is now.
+
+        Args:
+            renderer: What draws.
+            time: Since the episode began [s]; if it goes back, this is another flight.
+            qpos: (7,) position [m] and attitude (w, x, y, z), world frame.
+            rotor_speed: (R,) [rad/s].
+            goal: (3,) [m], world frame.
+            markers: World frame.
+            wind: (3,) [m/s], world frame, since the last picture; None for calm air.
+
+        Returns:
+            (height, width, 3) colours.
+        """
+        position, camera = np.array(qpos[:3]), self._camera
+        seconds = time - self._time
+        begins = seconds < 0
+        if begins:
+            self._trail, self._angles = [], np.zeros(len(rotor_speed))
+            self._drift = np.zeros(3)
+        else:
+            self._angles = self._angles + renderer.spins * rotor_speed * seconds
+        if not self._trail or seconds > 0:
+            self._trail.append((time, position))
+        self._trail = [point for point in self._trail if point[0] >= time - TRAIL_SECONDS]
+        shown: Any = camera
+        if camera in MOVING:
+            chase = camera == CHASE
+            heading = headings(qpos[None]) if chase else None
+            target = [in_view(goal, () if chase else markers)]
+            view = moving_views(position[None], target, renderer.scale, heading, renderer.aspect)[0]
+            self._view = view if begins else eased(view, self._view, seconds)
+            shown = moving_camera(self._view)
+        if wind is not None:
+            self._drift = self._drift + wind * max(seconds, 0.0)
+            markers = (*markers, *streaks(position, wind, self._drift, renderer.scale))
+        self._time = time
+        return renderer.frame(
+            qpos,
+            camera=shown,
+            rotor_angles=self._angles,
+            goal=goal,
+            trail=np.array([point for _, point in self._trail]),
+            markers=markers,
+        )

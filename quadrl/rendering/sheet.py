@@ -1,0 +1,78 @@
+"""Contact sheets: moments of flights in one picture."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from quadrl.files import write_whole
+from quadrl.rendering.overlay import Panel, require
+from quadrl.rendering.trajectory import Trajectory
+from quadrl.rendering.video import OneOrMore, OnFrame, checked, listed, render_trajectory
+
+SHEETS = ("png", "jpg", "jpeg")
+"""What their names end in."""
+COLUMNS, PICTURES = 4, 12
+
+
+def write_contact_sheet(
+    trajectory: OneOrMore[Trajectory],
+    model: OneOrMore[mujoco.MjModel],
+    path: str | os.PathLike[str],
+    *,
+    width: int = 480,
+    height: int = 270,
+    label: OneOrMore[str] = "",
+    on_frame: OnFrame = lambda done, total: None,
+    **options: Any,
+) -> Path:
+    """Write moments of a flight, with their times, as one picture; of several, a row for each.
+
+    Args:
+        trajectory: What was flown, or several.
+        model: The drawn model of the aircraft that flew it; one for all, or one for each.
+        path: The file, ending in .png, .jpg or .jpeg.
+        width: Of a moment [pixels].
+        height: Of a moment [pixels].
+        label: Written beside the first moment, one for each flight.
+        on_frame: Is called after each moment with the number of those drawn and of all.
+        **options: Others of `render_trajectory`: camera, fine.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        RenderingUnavailable: There is no graphics library, or no Pillow.
+        QuadrlError: The path, the size or the camera does not suit a picture.
+    """
+    path, _ = checked(path, SHEETS)
+    flights = listed(trajectory)
+    labels, models = listed(label, len(flights)), listed(model, len(flights))
+    count = PICTURES if len(flights) == 1 else COLUMNS
+    options = {"fine": True} | options | {"width": width, "height": height, "overlay": False}
+    rows, total = [], count * len(flights)
+    for flight, of, text in zip(flights, models, labels, strict=True):
+        times = np.linspace(flight.time[0], flight.time[-1], count)
+        panel, tiles = Panel(height, "", []), []
+        for k, drawn in enumerate(render_trajectory(flight, of, times=times, **options)):
+            tile, words = drawn.copy(), [text] if text and not k else []
+            words += [
+                f"{times[k]:.2f} s",
+                *[flight.outcome] * bool(flight.outcome and k == count - 1),
+            ]
+            panel.write(tile, ", ".join(words), 14, 14)
+            tiles.append(np.pad(tile, ((1, 1), (1, 1), (0, 0)), constant_values=255))
+            on_frame(COLUMNS * len(rows) + k + 1, total)
+        for k in range(0, count, COLUMNS):
+            rows.append(np.hstack(tiles[k : k + COLUMNS]))
+    sheet, image = io.BytesIO(), require("PIL.Image", "Pillow").fromarray(np.vstack(rows))
+    kind = "png" if path.suffix.lower() == ".png" else "jpeg"
+    image.save(sheet, format=kind, **({"quality": 90} if kind == "jpeg" else {}))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, sheet.getvalue())
+    return path

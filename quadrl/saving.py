@@ -1,0 +1,120 @@
+"""All that the next steps of an environment depend on, as arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quadrl import records
+from quadrl.compiled import MOMENT
+from quadrl.errors import QuadrlError
+from quadrl.task import Snapshot
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from quadrl.environment import Environment
+
+
+class Copied:
+    """An environment that is pickled and copied: made anew, it takes up where the other was."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Keep the arguments: copies are made with them too."""
+        self = super().__new__(cls)
+        self._made_with = args, kwargs
+        return self
+
+    def __getstate__(self: Any) -> tuple[Any, ...]:
+        """For pickle and deepcopy: how it was made, and all that the next steps depend on."""
+        return self._made_with, self._keys, self._episodes, self.save() if self._episode else None
+
+    def __setstate__(self: Any, state: Any) -> None:
+        """Make it anew and take up where the other was."""
+        (args, kwargs), keys, episodes, saved = state
+        self._made_with = args, kwargs
+        self.__init__(*args, **kwargs)
+        if saved is not None:
+            self.restore(saved)
+        self._keys[:], self._episodes[:] = keys, episodes
+
+
+def save(environment: Environment) -> dict[str, np.ndarray]:
+    """Copies of those arrays by name."""
+    if environment._episode is None:
+        raise RuntimeError("call reset before save")
+    now = environment.snapshot
+    saved = {f"engine.{name}": value for name, value in environment.engine.save().items()}
+    saved |= records.arrays("task", now.task) | records.arrays("episode", environment._episode)
+    saved |= {name: np.array(getattr(now, name)) for name in MOMENT}
+    for name, part in _parts(environment).items():
+        saved |= {f"{name}.{k}": value for k, value in part.save().items()}
+    if environment.blowing:
+        saved |= environment.blowing.save()
+    return saved | {"keys": environment._keys.copy(), "episodes": environment._episodes.copy()}
+
+
+def _parts(environment: Environment) -> dict[str, Any]:
+    """What remembers something of its own, by the name that its arrays begin with."""
+    parts: dict[str, Any] = {}
+    if environment.disturbances.active:
+        parts["disturbances"] = environment.disturbances
+    if environment.observer is not None:
+        parts["observer"] = environment.observer
+    return parts
+
+
+def _check_sound(
+    environment: Environment, saved: dict[str, np.ndarray], own: dict[str, np.ndarray]
+) -> None:
+    """Refuse a saved state that is not finite, or of an aircraft that this environment never has.
+
+    Raises:
+        QuadrlError: The message names the array.
+    """
+    table, disturbances = "engine.parameters", environment.disturbances
+    for name in own:
+        begins = name.startswith(("disturbances.", "observer."))
+        if (begins or name == "engine.rows") and not np.isfinite(saved[name]).all():
+            raise QuadrlError(name=name, value=saved[name], allowed="finite")
+    if disturbances.active:
+        disturbances.check_saved(saved)
+    drawn = disturbances.draw.given.per_row and disturbances.draw.holds(saved[table])
+    if not (drawn or np.array_equal(saved[table], own[table])):
+        reason = "the state was saved with another aircraft"
+        raise QuadrlError(reason, name=table, value=saved[table], allowed="this aircraft's")
+
+
+def restore(environment: Environment, saved: dict[str, np.ndarray]) -> Snapshot:
+    """Take up what `save` gave; returns the snapshot of that moment.
+
+    Raises:
+        QuadrlError: It is not of such an environment; nothing has changed then.
+    """
+    if environment._episode is None:
+        environment.reset()  # makes the records, which are filled below
+        environment._episodes[:] = 0  # this episode does not count
+    own = save(environment)
+    records.check_alike(saved, own)
+    _check_sound(environment, saved, own)
+    if blowing := environment.blowing:
+        blowing.check(saved)
+        blowing.restore(saved)
+    elif "weather.table" in saved:
+        reason = "the state was saved in wind"
+        raise QuadrlError(reason, name="weather", value=None, allowed="the saved one's")
+    engine = environment.engine
+    engine.restore({key.removeprefix("engine."): saved[key] for key in saved})
+    environment._keys[:], environment._episodes[:] = saved["keys"], saved["episodes"]
+    for name, part in _parts(environment).items():
+        start = f"{name}."
+        mine = {k.removeprefix(start): v for k, v in saved.items() if k.startswith(start)}
+        part.restore(mine)
+    episode = records.of_arrays("episode", environment._episode, saved)
+    task_state = records.of_arrays("task", environment.snapshot.task, saved)
+    action, command, time = (np.array(saved[name]) for name in MOMENT)
+    now = Snapshot(engine.state, task_state, environment._parameters, action, command, time)
+    now.potentials = environment.task.measure(now)
+    environment._take(now, episode)
+    return now

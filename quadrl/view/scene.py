@@ -1,0 +1,212 @@
+"""The picture in the browser: the nodes of viser's scene, and what is sent to move them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import trimesh
+import viser
+from scipy.spatial.transform import Rotation
+
+from quadrl import mjcf
+from quadrl.rendering.scene import TRAIL_NEW, TRAIL_OLD
+from quadrl.rotation import Array
+from quadrl.view import meshes, shapes
+from quadrl.view.flight import Flight
+
+CAMERAS = ("free", "follow", "chase")
+# Where the camera stands, seen from where it looks, in sizes of what it shows.
+VIEWS = {"free": (-0.7, -1.0, 0.5), "follow": (-1.2, -1.7, 0.9), "chase": (-2.2, 0.0, 0.7)}
+LAG = 0.15  # [s], of the camera behind the aircraft
+SEGMENTS = 3000  # of all trails together
+PIECE = 0.1  # [s], of a trail
+SKY = np.array([(78, 128, 196), (232, 240, 247), (214, 222, 229)])  # above, horizon, below
+GROUND, METRES, TENS = (0.30, 0.37, 0.44), (0.43, 0.51, 0.58), (0.58, 0.66, 0.72)
+FOV = math.radians(42)
+BALL = trimesh.creation.icosphere(3, 1.0)
+DISC = trimesh.creation.cylinder(1.0, 1.0, sections=64)
+DISC_HEIGHT = 0.004  # [m]
+UPRIGHT = np.array([(1.0, 0.0, 0.0, 0.0)])
+
+
+class Scene:
+    """Draws a flight for every browser that looks."""
+
+    def __init__(self, server: viser.ViserServer, flight: Flight) -> None:
+        """Send what there is to see."""
+        self._server, self._flight, self._scene = server, flight, server.scene
+        count = flight.environment.num_envs
+        self._columns = math.ceil(math.sqrt(count))
+        self._home = flight.environment.origin  # where cameras look
+        self._centre, self._heading = self._home.copy(), np.array([1.0, 0.0])
+        self._shown: Any = None
+        self._labels, self._labelled = [], ()
+        model = mjcf.compile_model(flight.vehicle, scene=flight.task.scene)
+        self._add_world(meshes.world(model), count)
+        places = np.zeros((count, 3)), np.repeat(UPRIGHT, count, axis=0)
+        solid, clear = meshes.airframe(model)
+        self._airframe = self._scene.add_batched_glb("/world/airframe", solid, *places[::-1])
+        self._clear = [
+            self._scene.add_batched_meshes_simple(
+                f"/world/clear_{k}", mesh.vertices, mesh.faces, *places[::-1],
+                batched_colors=_bytes(rgba[:3]), opacity=rgba[3], cast_shadow=False,
+            )
+            for k, (mesh, rgba) in enumerate(clear)
+        ]  # fmt: skip
+        self._rotors = []
+        for k in range(model.nu):
+            glb, frame = meshes.blades(model, k)
+            node = self._scene.add_batched_glb(f"/world/rotor_{k + 1}", glb, *places[::-1])
+            self._rotors.append((node, Rotation.from_matrix(frame[:3, :3]), frame[:3, 3]))
+
+    def view(self, camera: str, apart: float) -> None:
+        """Place every browser's camera, and that of those to come."""
+        field = 2.5 + 0.95 * apart * (self._columns - 1)
+        size = field if camera == "free" else max(0.7 * self._flight.vehicle.scale, 0.05)
+        stand = self._home + size * np.array(VIEWS[camera])
+        cameras = [client.camera for client in self._server.get_clients().values()]
+        for one in (self._server.initial_camera, *cameras):
+            one.position, one.look_at, one.fov = stand, self._home, FOV
+
+    def draw(self, seconds: float, row: int, camera: str, apart: float) -> None:
+        """Send the poses of this moment; the camera belongs to the aircraft of a row."""
+        pose, offsets = self._flight.drawn(), self.offsets(apart)
+        places, attitude = (
+            pose[:, :3] + offsets,
+            Rotation.from_quat(pose[:, 3:7], scalar_first=True),
+        )
+        for node in (self._airframe, *self._clear):
+            node.batched_positions, node.batched_wxyzs = places, pose[:, 3:7]
+        for (node, frame, hub), angle in zip(self._rotors, pose[:, 7:].T, strict=True):
+            turned = attitude * frame * Rotation.from_rotvec(angle[:, None] * (0, 0, 1))
+            node.batched_positions = places + attitude.apply(hub)
+            node.batched_wxyzs = turned.as_quat(scalar_first=True)
+        if self._obstacles is not None:
+            self._obstacles.batched_positions = offsets
+        self._move_world(seconds, camera, places[row], attitude[row].apply((1, 0, 0))[:2])
+
+    def draw_paths(self, apart: float, markers: bool, trails: bool) -> None:
+        """Send goals, markers and trails."""
+        flight, offsets = self._flight, self.offsets(apart)
+        count = len(offsets)
+        shown = [
+            (marker, offsets[row])
+            for row in range(count if markers else 0)
+            for marker in flight.markers(row)
+        ]
+        sketch = shapes.sketch(shown)
+        balls, discs = sketch.balls, sketch.discs
+        upright = np.repeat(UPRIGHT, len(balls), axis=0)
+        size = np.repeat(balls[:, 3:4], 3, axis=1)
+        self._send_batch("balls", BALL, np.hstack([balls[:, :3], upright]), size, balls[:, 4:])
+        size = discs[:, 7:8] * (1, 1, 0) + (0, 0, DISC_HEIGHT)
+        self._send_batch("discs", DISC, discs[:, :7], size, discs[:, 8:])
+        if len(self._marks.points) != len(sketch.lines):
+            self._marks = self._add_lines("marks", len(sketch.lines), 2.0)
+        self._marks.points = sketch.lines.astype(np.float32)
+        self._marks.colors = _bytes(sketch.colours)
+        self._send_labels(sketch.labels)
+        self._trails.visible = trails
+        trail = flight.trail[::-1][:: self._every][::-1]
+        # As many segments as ever: viser's client draws no more than it was sent first.
+        trail = np.where(np.isfinite(trail), trail, flight.pose[:, :3]) + offsets
+        youth = np.linspace(0, 1, len(trail))[:, None, None]
+        colours = (TRAIL_OLD + youth * (TRAIL_NEW - TRAIL_OLD))[..., :3]
+        for name, values in (("points", trail), ("colors", np.broadcast_to(colours, trail.shape))):
+            pairs = np.stack([values[:-1], values[1:]], axis=2).reshape(-1, 2, 3)
+            sent = pairs.astype(np.float32) if name == "points" else _bytes(pairs)
+            setattr(self._trails, name, sent)
+
+    def offsets(self, apart: float) -> Array:
+        """Where each aircraft's world stands in the picture, (N, 3) [m]: on a square grid."""
+        numbers = np.arange(self._flight.environment.num_envs)
+        across, along = numbers % self._columns, numbers // self._columns
+        grid = np.stack([across, -along, 0 * numbers], axis=1).astype(float)
+        return apart * (grid - (grid.min(0) + grid.max(0)) / 2)
+
+    def _move_world(self, seconds: float, camera: str, place: Array, ahead: Array) -> None:
+        """Follow an aircraft: the browser's camera stays its user's, the world moves under it."""
+        share = 1 - math.exp(-seconds / LAG)
+        if camera == "free":
+            place = self._home
+        if self._shown != camera:
+            share = 1.0
+        self._shown = camera
+        self._centre += share * (place - self._centre)
+        self._heading += share * (ahead - self._heading)
+        angle = -math.atan2(*self._heading[::-1]) if camera == "chase" else 0.0
+        turn = Rotation.from_rotvec((0, 0, angle))
+        self._world.wxyz = turn.as_quat(scalar_first=True)
+        self._world.position = self._home - turn.apply(self._centre)
+
+    def _add_world(self, obstacles: bytes | None, count: int) -> None:
+        scene = self._scene
+        ramp = np.interp(np.arange(512), (0, 300, 511), (0, 1, 2))
+        sky = np.stack([np.interp(ramp, (0, 1, 2), part) for part in SKY.T], axis=1)
+        scene.set_background_image(np.tile(sky[:, None].astype(np.uint8), (1, 2, 1)), "png")
+        scene.configure_default_lights(False)
+        scene.configure_fog(30.0, 140.0, color=tuple(SKY[1]))
+        self._world = scene.add_frame("/world", show_axes=False)
+        scene.add_light_hemisphere(
+            "/world/light", sky_color=(235, 242, 255), ground_color=(140, 140, 135), intensity=1.1
+        )
+        scene.add_light_directional(
+            "/world/sun", color=(255, 247, 232), intensity=1.6, position=(-4.0, -2.0, 8.0),
+            cast_shadow=True,
+        )  # fmt: skip
+        scene.add_grid(
+            "/world/ground", 200, 200, cell_size=1.0, section_size=10.0, cell_color=_bytes(METRES),
+            section_color=_bytes(TENS), section_thickness=1.5, infinite_grid=True,
+            fade_distance=120.0, shadow_opacity=0.45, plane_color=_bytes(GROUND), plane_opacity=1.0,
+        )  # fmt: skip
+        self._obstacles = None
+        if obstacles is not None:
+            places = np.zeros((count, 3)), np.repeat(UPRIGHT, count, axis=0)
+            self._obstacles = scene.add_batched_glb("/world/obstacles", obstacles, *places[::-1])
+        steps, timestep = len(self._flight.trail), self._flight.vehicle.control_timestep
+        # Nothing is seen of a line of short pieces: each shorter than a pixel is left out.
+        self._every = max(math.ceil(PIECE / timestep), math.ceil(count * steps / SEGMENTS))
+        self._trails = self._add_lines("trails", (math.ceil(steps / self._every) - 1) * count, 3.0)
+        self._marks = self._add_lines("marks", 0, 2.0)
+        self._batches: dict[str, Any] = {}
+
+    def _add_lines(self, name: str, count: int, pixels: float) -> viser.LineSegmentsHandle:
+        none = np.zeros((count, 2, 3), dtype=np.float32)
+        return self._scene.add_line_segments(
+            f"/world/{name}", none, none, thickness=pixels, thickness_units="screen"
+        )
+
+    def _send_batch(self, name: str, mesh: Any, poses: Array, scales: Array, rgba: Array) -> None:
+        """Copies of a mesh: poses (n, 7) position and quaternion, scales (n, 3), rgba (n, 4)."""
+        node = self._batches.get(name)
+        if node is not None and len(node.batched_positions) != len(poses):
+            node.remove()
+            node = self._batches[name] = None
+        if node is None and len(poses):
+            node = self._batches[name] = self._scene.add_batched_meshes_simple(
+                f"/world/{name}", mesh.vertices, mesh.faces, poses[:, 3:], poses[:, :3],
+                batched_scales=scales, batched_colors=_bytes(rgba[:, :3]),
+                batched_opacities=rgba[:, 3], opacity=1.0, cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+        elif node is not None:
+            node.batched_positions, node.batched_wxyzs = poses[:, :3], poses[:, 3:]
+            node.batched_scales, node.batched_opacities = scales, rgba[:, 3]
+            node.batched_colors = _bytes(rgba[:, :3])
+
+    def _send_labels(self, labels: tuple[tuple[str, tuple[float, float, float]], ...]) -> None:
+        if labels == self._labelled:
+            return
+        for node in self._labels:
+            node.remove()
+        self._labelled = labels
+        self._labels = [
+            self._scene.add_label(f"/world/label_{k}", text, position=place)
+            for k, (text, place) in enumerate(labels)
+        ]
+
+
+def _bytes(colours: Any) -> Array:
+    """Colours of the screen, 0 to 1, as bytes of light, which the browser takes for them."""
+    return np.round(255 * np.asarray(colours, dtype=float) ** 2.2).astype(np.uint8)

@@ -1,0 +1,252 @@
+"""The page docs/fly, whole in one file: quadrl's C as WebAssembly, policies, aircraft, three.js.
+
+`scripts/web` runs it, with emcc on the path. It exports what the page's JavaScript has to know
+(the book), compiles quadrl's kernels and the C of `scripts.reports.flights`, and puts everything
+into one index.html, which needs no server and asks no other host for anything.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from quadrl import mjcf, native, parameters
+from quadrl.engines.free_flight import world
+from quadrl.environment import Environment
+from quadrl.files import HEADER
+from quadrl.policy import CLIP, FORMAT, Policy, shipped
+from quadrl.rng import START
+from quadrl.state import c_rows
+from quadrl.tasks import TASKS
+from quadrl.vehicle import VEHICLES, Vehicle
+from scripts.reports import flights
+from scripts.reports.report import DOCS, REPOSITORY, say
+
+GUST_TIME = 1.0  # [s], correlation time of the page's gusts
+SOURCE, BUILD = DOCS / "fly", REPOSITORY / "build" / "web"
+SITE = REPOSITORY / "build" / "site" / "fly"
+THREE = "nicegui/elements/lib/three/three.module.js"
+"""Where the wheel that `scripts/web` downloads holds three.js."""
+KERNELS = {
+    "free_flight.c": "quadrl_free_flight",
+    "state.c": "quadrl_state",
+    "random.c": "quadrl_uniform",
+}
+"""Of quadrl/native, with what they export."""
+MODULES = ("flight", "policy", "episode", "link", "scene", "plot", "main")
+"""Of docs/fly, each after those that it imports."""
+HEAD = """// Written by scripts/reports/flights.py.
+#include <math.h>
+static double memory[{slots}][{size}];
+double* flight_memory(int slot) {{ return memory[slot]; }}
+"""
+KINDS = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+}
+
+
+def main() -> None:
+    """Build the page."""
+    BUILD.mkdir(parents=True, exist_ok=True)
+    book, source = make_book()
+    wasm = compile_flights(source)
+    book["wasm"] = encoded(wasm)
+    (BUILD / "book.json").write_text(json.dumps(book))
+    page = join(book)
+    SITE.mkdir(parents=True, exist_ok=True)
+    (SITE / "index.html").write_text(page)
+    say(f"{SITE / 'index.html'}: {len(page) / 1e6:.2f} MB, WebAssembly {len(wasm) / 1e3:.0f} kB")
+
+
+def make_book() -> tuple[dict[str, Any], str]:
+    """What the JavaScript has to know, as JSON can hold it, and the C of the flights."""
+    slots = int(found(r"export const SLOTS = (\d+)", (SOURCE / "flight.mjs").read_text()))
+    size = sum(flights.PARTS.values())
+    # Those that leave the air's laws alone: contact is MuJoCo's.
+    tasks = {name: kind() for name, kind in TASKS.items() if not kind.contact}
+    pairs, sources = {}, [HEAD.format(slots=slots, size=size)]
+    for task in tasks.values():
+        for vehicle in VEHICLES.values():
+            environment = Environment(task, vehicle=vehicle, seed=0)
+            written = flights.write(environment)
+            sources.append(written.source)
+            pairs[f"{task.name}_{vehicle.name}"] = {
+                "drawn": written.drawn,
+                "size": environment.size,
+                "origin": environment.origin.tolist(),
+                # JSON knows no infinity, which is where the floor of these tasks is.
+                "world": np.nan_to_num(world(environment.engine.model)).tolist(),
+            }
+    book = {
+        "layout": {name: [flights.LAYOUT[name], size] for name, size in flights.PARTS.items()},
+        "flightSize": size,
+        "startStream": START,
+        "gustTime": GUST_TIME,
+        "policy": {"format": FORMAT, "header": HEADER, "clip": CLIP},
+        "tasks": {
+            name: {
+                **{word: getattr(task, word) for word in ("asks", "starts", "ends", "solved")},
+                "timeLimit": task.time_limit,
+            }
+            for name, task in tasks.items()
+        },
+        "vehicles": {name: describe(vehicle) for name, vehicle in VEHICLES.items()},
+        "pairs": pairs,
+        # Those that see no more than the task's own entries, which is what the page computes.
+        "policies": {
+            file.stem: {"task": policy.task, "file": encoded(file.read_bytes())}
+            for file in shipped()
+            if (policy := Policy.load(file)).task in tasks and not policy.conditions
+        },
+    }
+    return book, "\n".join(sources)
+
+
+def describe(vehicle: Vehicle) -> dict[str, Any]:
+    """The numbers of an aircraft, and what it looks like."""
+    row = parameters.numbers(parameters.rows(vehicle))[0]
+    return {
+        "row": row.tolist(),
+        "limits": [vehicle.resolved_speed, vehicle.resolved_turn],
+        "rotors": vehicle.rotor_count,
+        "substeps": vehicle.substeps,
+        "physicsTimestep": vehicle.physics_timestep,
+        "controlTimestep": vehicle.control_timestep,
+        "layout": vehicle.layout.tolist(),
+        "size": vehicle.size,
+        "scale": vehicle.scale,
+        "mass": vehicle.mass,
+        "hoverSpeed": vehicle.hover_speed.tolist(),
+        "maxSpeed": vehicle.max_speed.tolist(),
+        "spin": [rotor.spin for rotor in vehicle.rotors],
+        "axis": [list(rotor.axis) for rotor in vehicle.rotors],
+        "radius": [rotor.radius for rotor in vehicle.rotors],
+        "colour": [list(mjcf.rotor_colour(rotor.position)) for rotor in vehicle.rotors],
+        **shapes(mjcf.compile_model(vehicle, drawn=True)),
+    }
+
+
+def shapes(model: mujoco.MjModel) -> dict[str, Any]:
+    """What MuJoCo would draw of the aircraft: shapes in the body frame, and their meshes."""
+    geoms, meshes = [], {}
+    for k in np.flatnonzero(model.geom_bodyid == 1):
+        material, kind = model.geom_matid[k], KINDS[mujoco.mjtGeom(model.geom_type[k])]
+        name = model.geom(k).name
+        # What only touches is not drawn, and the page has rims of its own.
+        if model.geom_group[k] == 3 or name.endswith("_rim"):
+            continue
+        shape: dict[str, Any] = {
+            "name": name,
+            "kind": kind,
+            "size": rounded(model.geom_size[k]),
+            "position": rounded(model.geom_pos[k]),
+            "quaternion": rounded(model.geom_quat[k]),
+            "rgba": rounded(model.geom_rgba[k] if material < 0 else model.mat_rgba[material]),
+        }
+        if material >= 0:
+            shape["shine"] = float(model.mat_shininess[material])
+            shape["glow"] = float(model.mat_emission[material])
+        if kind == "mesh":
+            number = model.geom_dataid[k]
+            shape["mesh"] = name = model.mesh(number).name
+            vertex, face = (
+                slice(first, first + count)
+                for first, count in (
+                    (model.mesh_vertadr[number], model.mesh_vertnum[number]),
+                    (model.mesh_faceadr[number], model.mesh_facenum[number]),
+                )
+            )
+            meshes[name] = {
+                "vertices": encoded(model.mesh_vert[vertex].astype("<f4").tobytes()),
+                "faces": encoded(model.mesh_face[face].astype("<u2").tobytes()),
+            }
+        geoms.append(shape)
+    return {"shapes": geoms, "meshes": meshes}
+
+
+def compile_flights(source: str) -> bytes:
+    """The WebAssembly of quadrl's kernels and of the C of the flights."""
+    (BUILD / "layout.h").write_text(parameters.c_structs() + c_rows())
+    (BUILD / "flights.c").write_text(source)
+    exported = ["flight_memory", *KERNELS.values(), *re.findall(r"^void (\w+)", source, re.M)]
+    names = BUILD / "exported.json"
+    names.write_text(json.dumps([f"_{name}" for name in exported]))
+    folder = Path(native.__file__).parent
+    kept = [flag for flag in native.FLAGS if flag not in ("-fPIC", "-shared")]
+    command = [
+        *("emcc", *kept, "-Wno-logical-op-parentheses", f"-I{BUILD}", f"-I{folder}"),
+        *(str(folder / name) for name in KERNELS),
+        *(str(BUILD / "flights.c"), "--no-entry", "-sSTANDALONE_WASM=1", "-sWASM_BIGINT=1"),
+        *("-sTOTAL_STACK=131072", "-sINITIAL_MEMORY=1048576", "-sFILESYSTEM=0"),
+        *(f"-sEXPORTED_FUNCTIONS=@{names}", "-o", str(BUILD / "flights.wasm")),
+    ]
+    subprocess.run(command, check=True)
+    return (BUILD / "flights.wasm").read_bytes()
+
+
+def join(book: dict[str, Any]) -> str:
+    """The whole page in one text."""
+    code = []
+    for name in MODULES:
+        text = (SOURCE / f"{name}.mjs").read_text()
+        text = re.sub(r'^import .* from "\./.*";\n', "", text, flags=re.M)
+        code.append(re.sub(r"^export ", "", text, flags=re.M))
+    script = "\n".join(code)
+    imports = {"three": "data:text/javascript;base64," + encoded(three().encode())}
+    parts = {
+        "style": (SOURCE / "style.css").read_text(),
+        "imports": json.dumps({"imports": imports}),
+        # "</script" inside of a text would end the element.
+        "book": json.dumps(book).replace("</", "<\\/"),
+        "script": script,
+    }
+    page = (SOURCE / "index.html").read_text()
+    for name, text in parts.items():
+        mark = f"/*{name}*/"
+        if page.count(mark) != 1:
+            sys.exit(f"docs/fly/index.html must hold {mark} once")
+        page = page.replace(mark, text)
+    return page
+
+
+def three() -> str:
+    """three.js, from the newest wheel in build/web/wheels."""
+    (wheel,) = (BUILD / "wheels").glob("nicegui-*.whl")
+    with zipfile.ZipFile(wheel) as opened:
+        return opened.read(THREE).decode()
+
+
+def encoded(content: bytes) -> str:
+    """Base64."""
+    return base64.b64encode(content).decode()
+
+
+def rounded(values: np.ndarray) -> list[float]:
+    """Numbers that are only drawn, with six digits."""
+    return [float(f"{value:.6g}") for value in values]
+
+
+def found(pattern: str, text: str) -> str:
+    """The first group of a pattern that must be there."""
+    match = re.search(pattern, text)
+    if not match:
+        sys.exit(f"there is no {pattern}")
+    return match[1]
+
+
+if __name__ == "__main__":
+    main()

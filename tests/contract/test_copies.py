@@ -1,0 +1,105 @@
+"""Environments of every API are pickled and copied, and the copies go on bit for bit."""
+
+import copy
+import pickle
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import pytest
+from apis import APIS, Gymnasium
+
+import quadrl
+from quadrl.environment import Environment
+from quadrl.testing import varied_actions
+
+WAYS = {
+    "pickle": lambda thing: pickle.loads(pickle.dumps(thing)),
+    "cloudpickle": lambda thing: pickle.loads(cloudpickle.dumps(thing)),
+    "deepcopy": copy.deepcopy,
+}
+SEEN = {"observation_history": 2, "rotor_speed": "estimated", "airspeed": True, "disturbance": True}
+SETTINGS = {
+    "alone": {},
+    "randomized": {"randomization": "full", "observe": SEEN},
+    "free flight": {"engine": "free_flight", "randomization": {"command_delay": (0.0, 0.1)}},
+    "loops": {"control_mode": "velocity", "vehicle": "crazyflie", "task": "target_following"},
+    "contact": {"task": "landing", "start_height": 0.05},
+}
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+@pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
+def test_a_copy_goes_on_bit_for_bit(api, settings):
+    settings = {"time_limit": 0.3} | settings  # six steps
+    copied, untouched = (api(seed=4, **settings) for _ in range(2))
+    size = untouched.core.action_size
+    actions = varied_actions(14, 4, size)[:, 2 : 2 + api.rows]
+    # Before the first reset, after a reset, in the middle of an episode, and in a later one.
+    ways = {"before": "pickle", 0: "deepcopy", 3: "pickle", 10: "cloudpickle"}
+    others = [WAYS[ways["before"]](copied)]
+    for t, action in enumerate(actions):
+        if t % 7 == 0:
+            met = untouched.copied(untouched.reset())
+            for flown in (*others, copied):
+                assert_same(flown.copied(flown.reset()), met)
+        if t in ways:
+            others.append(WAYS[ways[t]](copied))
+        given = untouched.copied(untouched.step(action))
+        for flown in (*others, copied):
+            assert_same(flown.copied(flown.step(action)), given)
+    assert len(others) == 4
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_wrappers_of_gymnasium_are_copied_with_it(way):
+    environment = gym.make("quadrl/Hover-v0", time_limit=0.5)
+    for wrapper in ("RecordEpisodeStatistics", "NormalizeObservation", "NormalizeReward"):
+        environment = getattr(gym.wrappers, wrapper)(environment)
+    environment.reset(seed=0)
+    environment.step(np.ones(4))
+    other = way(environment)
+    assert other.spec == environment.spec
+    for _ in range(9):
+        one, same = environment.step(np.ones(4)), other.step(np.ones(4))
+        np.testing.assert_array_equal(one[0], same[0])
+        assert one[1:4] == same[1:4]
+    assert one[3] and one[4]["episode"]["l"] == same[4]["episode"]["l"] == 10
+
+
+def test_a_copy_is_seeded_and_flown_alone():
+    flown = Gymnasium(seed=0)
+    flown.reset()
+    other = copy.deepcopy(flown)
+    before = flown.core.engine.qpos.copy()
+    other.environment.reset(seed=99)
+    other.step(np.ones((1, 4)))
+    np.testing.assert_array_equal(flown.core.engine.qpos, before)
+    assert flown.environment.reset()[0].tolist() != other.environment.reset()[0].tolist()
+
+
+def test_what_was_written_into_the_rows_is_copied():
+    environment = Environment("hover", num_envs=3, seed=0)
+    environment.reset()
+    environment.engine.wind[1] = (3.0, 0.0, 0.0)
+    other = copy.deepcopy(environment)
+    np.testing.assert_array_equal(other.engine.wind, environment.engine.wind)
+    other.engine.wind[1] = 0.0
+    assert environment.engine.wind[1, 0] == 3.0
+
+
+def test_a_copied_physics_of_dm_control_is_drawn_and_measured_as_the_other():
+    environment = quadrl.load("hover", {"random": 0})
+    environment.reset()
+    environment.step(np.full(4, 0.3))
+    other = copy.deepcopy(environment)
+    for name in ("xpos", "geom_xpos", "qpos", "sensordata"):
+        one, same = (getattr(env.physics.data, name) for env in (environment, other))
+        np.testing.assert_array_equal(one, same)
+    assert other.task.environment.engine.data is other.physics.data.ptr

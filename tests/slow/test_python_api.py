@@ -1,0 +1,176 @@
+"""quadrl.train, evaluate, render and plot, and what they return shows of itself."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import TINY, refused
+
+import quadrl
+from quadrl.cli import main
+from quadrl.control import make as make_controller
+from quadrl.errors import QuadrlError
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.folder import free_folder
+
+SETTINGS = dict(
+    num_envs=8, rollout=4, steps=192, hidden=(16,), task_options={"time_limit": 0.5}, episodes=2
+)
+SMALL = dict(width=160, height=120, fps=10, progress=False)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return quadrl.train("hover", seed=3, out=tmp_path_factory.mktemp("runs") / "run", **SETTINGS)
+
+
+def test_train_is_the_command(run, tmp_path):
+    words = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16", "--seed", "3"]
+    more = ["--task-options", "time_limit=0.5", "--episodes", "2", "--no-video"]
+    main(["train", "hover", *words, *more, "--out", str(tmp_path / "run")])
+    names = ("policy.safetensors", "config.json")
+    for name in names:
+        assert (run.folder / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    assert run.config == TrainConfig.of_folder(run.folder)
+    assert run.evaluation.metrics["episodes"] == 2 and run.seconds > 0
+
+
+def test_train_takes_all_settings_at_once(run, tmp_path):
+    again = quadrl.train(run.config, out=tmp_path / "run", episodes=2, on_progress=lambda _: None)
+    name = "policy.safetensors"
+    assert (again.folder / name).read_bytes() == (run.folder / name).read_bytes()
+
+
+def test_train_goes_on_further(run, tmp_path):
+    import shutil
+
+    folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
+    further = quadrl.train(resume=folder, steps=256, episodes=2)
+    assert further.policy.metadata["steps"] == 256 == further.config.steps
+    with refused("seed", 4):
+        quadrl.train(resume=folder, seed=4)
+
+
+def test_the_folder_of_a_run_is_a_new_one(tmp_path, monkeypatch):
+    assert free_folder(tmp_path / "a") == tmp_path / "a"
+    for name in ("a", "a-2"):
+        assert free_folder(tmp_path / "a") == tmp_path / name
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").touch()
+    assert free_folder(tmp_path / "a") == tmp_path / "a-3"
+
+
+def test_evaluate_takes_whatever_flies(run, tmp_path):
+    short = dict(episodes=2, time_limit=0.5)
+    forms = (run, run.policy, run.folder, str(run.folder / "policy.safetensors"))
+    found = [quadrl.evaluate(form, **short).metrics for form in forms]
+    found.append(quadrl.evaluate(lambda seen: run.policy(seen), "hover", **short).metrics)
+    assert all(metrics == found[0] for metrics in found)
+    shipped = [quadrl.evaluate(form, **short).metrics for form in (
+        "hover", quadrl.Policy.pretrained("hover"))]  # fmt: skip
+    assert shipped[0] == shipped[1] != found[0]
+    own = make_controller("geometric", "hover", "hexa")
+    flown = [quadrl.evaluate(form, "hover", vehicle="hexa", **short).metrics for form in (
+        "geometric", own)]  # fmt: skip
+    assert flown[0] == flown[1] and flown[0]["vehicle"] == "hexa"
+
+
+def test_an_evaluation_has_the_task_and_the_vehicle_of_the_training(run):
+    flown = quadrl.evaluate(run, episodes=1)
+    assert flown.task.time_limit == 0.5 and flown.vehicle.name == "paper"
+    assert quadrl.evaluate(run, "static_waypoint", episodes=1).task.time_limit == 10.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (dict(controller=3), "controller"),
+        (dict(controller=lambda seen: seen), "task"),
+        (dict(controller="hover", episodes=0), "episodes"),
+        (dict(controller="hover", seed=-1), "seed"),
+        (dict(controller="hover", radius=-1.0), "hover radius"),
+        (dict(controller="hover", vehicle="brick"), "vehicle"),
+        (dict(controller="geometric", sampled=True), "sampled"),
+    ],
+)
+def test_evaluations_that_cannot_be(arguments, name):
+    with refused(name):
+        quadrl.evaluate(**arguments)
+    with pytest.raises(QuadrlError):
+        quadrl.evaluate("nowhere")
+
+
+def test_weather_and_samples_change_a_flight(run):
+    plain, *others = (
+        quadrl.evaluate("hover", episodes=2, **more).metrics["return_mean"]
+        for more in ({}, {"weather": "light"}, {"sampled": True})
+    )
+    assert plain not in others and others[0] != others[1]
+
+
+@pytest.mark.parametrize(("kind", "begins"), [("mp4", b"ftyp"), ("gif", b"GIF8"), ("png", b"PNG")])
+def test_render(run, tmp_path, kind, begins):
+    video = quadrl.render(run, kind=kind, **SMALL)
+    assert begins in video.content[:12]
+    path = video.save(tmp_path / "new" / f"flight.{kind}")
+    assert path.read_bytes() == video.content
+    with refused("path"):
+        video.save(tmp_path / "flight.txt")
+
+
+def test_plot(run, tmp_path):
+    other = quadrl.train("hover", seed=4, out=tmp_path / "other", **SETTINGS)
+    pictures = [
+        quadrl.plot(run), quadrl.plot(run.folder, other), quadrl.plot(run.evaluation)
+    ]  # fmt: skip
+    assert all(picture.content.startswith(b"\x89PNG") for picture in pictures)
+    assert len({picture.content for picture in pictures}) == 3
+    third = quadrl.train("landing", out=tmp_path / "third", **SETTINGS)
+    with refused("task"):
+        quadrl.plot(run, third)
+    with pytest.raises(QuadrlError):
+        quadrl.plot()
+
+
+def test_everything_says_what_it_is_in_short(run):
+    shown = (
+        run, run.policy, run.evaluation, run.evaluation.rollout, run.config,
+        quadrl.VEHICLES["racer"], quadrl.plot(run),
+    )  # fmt: skip
+    for one in shown:
+        assert len(repr(one)) < 300 and "\n" not in repr(one)
+    assert repr(TINY.seed) in repr(TINY) and "num_envs=8" in repr(TINY)
+
+
+def test_notebooks_show_results(run):
+    for one in (run, run.evaluation):
+        assert "<table>" in one._repr_html_() and "success_rate" in one._repr_html_()
+    assert 'src="data:image/png;base64,' in quadrl.plot(run)._repr_html_()
+
+
+def test_a_notebook_updates_one_line(run, monkeypatch):
+    lines = []
+
+    class Handle:
+        def update(self, content, raw):
+            lines.append(content["text/plain"])
+
+    def display(content, raw, display_id):
+        assert display_id
+        lines.append(content["text/plain"])
+        return Handle()
+
+    class Display:
+        pass
+
+    Display.display = staticmethod(display)
+    monkeypatch.setitem(__import__("sys").modules, "IPython.display", Display)
+    from rich.console import Console
+
+    from quadrl.progress import ProgressBar
+
+    with ProgressBar(Console(force_jupyter=True)) as bar:
+        for done in range(1, 5):
+            bar.update(done, 4, "drawing")
+    assert lines and "━" * ProgressBar.WIDTH in lines[-1] and "drawing" in lines[-1]
+    assert np.all([len(line) == len(lines[0]) for line in lines])

@@ -1,0 +1,213 @@
+"""The robustness card: its statistics, what its levels and its maps fly, its files."""
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from runs import refused
+
+import quadrl
+from quadrl import Randomization, disturbed
+from quadrl.axes import AXES
+from quadrl.card import Card, half_level, wilson
+from quadrl.cli import main
+from quadrl.draw import Draw
+from quadrl.environment import Environment
+from quadrl.errors import QuadrlError
+from quadrl.parameters import rows
+from quadrl.recovery import MAPS, begin
+from quadrl.rollout import flights
+from quadrl.vehicle import Vehicle
+from quadrl.weather import Weather
+
+SHORT: Any = dict(episodes=4, progress=False, time_limit=0.5)
+
+
+@pytest.fixture(scope="module")
+def card():
+    flown = {"a": "hover", "again": "hover", "geometric": "geometric"}
+    return quadrl.robustness(flown, axes=("mass", "gust"), **SHORT)
+
+
+@pytest.mark.parametrize("successes", [0, 1, 17, 49, 50])
+def test_intervals_are_wilsons(successes):
+    from scipy.stats import binomtest
+
+    exact = binomtest(successes, 50).proportion_ci(method="wilson")
+    np.testing.assert_allclose(wilson(successes, 50), exact, rtol=1e-9, atol=1e-12)
+
+
+def test_half_of_the_flights_fail_where_the_line_crosses():
+    assert half_level((0, 1, 2, 4), (1.0, 0.9, 0.7, 0.2)) == pytest.approx(2 + 2 * 0.2 / 0.5)
+    assert half_level((1.0, 0.9, 0.8), (1.0, 0.75, 0.25)) == pytest.approx(0.85)
+    assert half_level((0, 1), (1.0, 0.5)) is None
+    assert half_level((3, 4), (0.4, 0.9)) == 3
+    assert half_level((0, 1, 2), (1.0, 0.8, None)) is None
+
+
+def test_a_level_disturbs_what_it_says(monkeypatch):
+    seen = []
+
+    def noted(controller, task, **given):
+        seen.append(given)
+        raise InterruptedError
+
+    monkeypatch.setattr(disturbed, "fly", noted)
+    for name, level in (("mass", 1.3), ("gust", 8.0)):
+        with pytest.raises(InterruptedError):
+            given = {"episodes": 3, "vehicle": Vehicle(), "engine": "free_flight", "seed": 1}
+            disturbed.measured(None, None, AXES[name].at(level), **given)  # type: ignore[arg-type]
+    heavy, windy = seen
+    assert heavy["weather"] == Weather() and windy["randomization"] == Randomization()
+    assert windy["weather"] == Weather(gust_speed=8.0)
+    environment = Environment("hover", num_envs=3, seed=0, randomization=heavy["randomization"])
+    environment.reset()
+    mass = environment.engine.parameters.view(rows(Vehicle()).dtype)["mass"].ravel()
+    np.testing.assert_allclose(mass, 1.3 * Vehicle().mass)
+
+
+@pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
+def test_only_the_usual_level_disturbs_nothing(axis):
+    nothing = (Randomization(), Weather())
+    assert axis.usual in axis.levels and list(axis.levels) == sorted(set(axis.levels))
+    assert [x for x in axis.levels if axis.at(x) in nothing] == [axis.usual]
+
+
+def test_one_rotor_is_weaker_and_it_may_be_any():
+    draw, paper = Draw(Randomization(one_rotor=(0.8, 0.8)), Vehicle()), rows(Vehicle())
+    shares = np.random.default_rng(0).random((200, len(draw.names)))
+    drawn = draw.of(shares)
+    table, before = draw.table(drawn), paper["rotor"]["thrust_coefficient"]
+    factor = table["rotor"]["thrust_coefficient"][:, :4] / before[:, :4]
+    assert set(np.round(np.sort(factor, axis=1), 9).ravel()) == {0.8, 1.0}
+    assert (np.isclose(factor, 0.8).sum(axis=1) == 1).all()
+    assert set(np.argmin(factor, axis=1)) == {0, 1, 2, 3}
+    np.testing.assert_array_equal(np.argmin(factor, axis=1), drawn[:, -1])
+    with refused("rotors"):
+        Draw(Randomization(one_rotor=(0.01, 0.01)), Vehicle())
+
+
+def test_all_fly_the_same_episodes(card):
+    for axis in card.found["axes"].values():
+        assert axis["flown"]["a"] == axis["flown"]["again"] != axis["flown"]["geometric"]
+    for chart in card.found["recovery"].values():
+        assert chart["flown"]["a"] == chart["flown"]["again"]
+
+
+def test_an_action_means_what_it_meant_in_training():
+    usual = quadrl.Policy.pretrained("hover")
+    options = {"vehicle_options": {"action_scale": 50.0}}
+    wide = dataclasses.replace(usual, metadata=usual.metadata | options)
+    found = quadrl.robustness(
+        {"usual": usual, "wide": wide}, episodes=3, axes=["thrust"], recovery=False, progress=False
+    ).found["axes"]["thrust"]["flown"]
+    for name, policy in (("usual", usual), ("wide", wide)):
+        errors = flights(quadrl.evaluate(policy, episodes=3).rollout)["position_error_m"]
+        assert found[name]["error_m"][0][1] == pytest.approx(np.median(errors), abs=1e-3)
+    assert found["usual"]["error_m"] != found["wide"]["error_m"]
+
+
+def test_the_undisturbed_level_is_an_evaluation(card):
+    flown = quadrl.evaluate("hover", episodes=4, time_limit=0.5).metrics
+    axis = card.found["axes"]["mass"]
+    assert axis["flown"]["a"]["success"][axis["levels"].index(1.0)] == flown["success_rate"]
+
+
+def test_what_no_aircraft_can_fly_is_left_open():
+    given = {"episodes": 2, "vehicle": Vehicle(), "engine": "free_flight", "seed": 0}
+    nothing = Randomization(mass=(5.0, 5.0))
+    assert disturbed.measured(None, None, nothing, **given) is None  # type: ignore[arg-type]
+
+
+def test_a_card_is_read_as_it_was_written(card, tmp_path):
+    paths = card.save(tmp_path / "new" / "card")
+    assert all(path.stat().st_size > 0 for path in paths)
+    assert {path.suffix for path in paths} == {".json", ".csv", ".png", ".pdf"}
+    assert Card.load(tmp_path / "new" / "card").found == card.found == Card.load(paths[0]).found
+    lines = (tmp_path / "new" / "card" / "robustness.csv").read_text().splitlines()
+    levels = sum(len(axis["levels"]) for axis in card.found["axes"].values())
+    assert len(lines) == 1 + 3 * levels
+    (tmp_path / "other.json").write_text(json.dumps({"format": "other"}))
+    (tmp_path / "list.json").write_text("[1]")
+    for name in ("other.json", "list.json", "missing.json"):
+        with pytest.raises(QuadrlError, match=name):
+            Card.load(tmp_path / name)
+
+
+def test_a_card_shows_itself(card):
+    head, *lines = card.table
+    assert head[1:] == ("a", "again", "geometric") and len(lines) == 2
+    assert repr(card).count("\n") == 0 and len(repr(card)) < 200
+    page = card._repr_html_()
+    assert "<table>" in page and page.count("<img") == 2
+
+
+@pytest.mark.parametrize("chart", MAPS.values(), ids=lambda chart: chart.name)
+@pytest.mark.parametrize("task", ["hover", "random_waypoint"])
+def test_maps_start_where_they_say(task, chart):
+    environment = Environment(task, num_envs=40, seed=5, engine="free_flight")
+    environment.reset()
+    own = np.array(environment.snapshot.state.position), environment.goals().copy()
+    heading = environment.snapshot.state.rotation[:, :2, 0].copy()
+    environment.seed(5)
+    x, y = np.linspace(1.0, 5.0, 40), np.linspace(1.0, 6.0, 40)
+    begin(environment, chart, x, y, 5)
+    state = environment.snapshot.state
+    np.testing.assert_allclose(environment.goals(), own[1])
+    if chart.name == "falling":
+        np.testing.assert_allclose(state.height, y)
+        np.testing.assert_allclose(state.velocity, np.stack([0 * x, 0 * x, -x], axis=-1))
+        np.testing.assert_allclose(state.position[:, :2], own[0][:, :2])
+        return
+    np.testing.assert_allclose(np.degrees(np.arccos(state.cos_tilt)), x, rtol=1e-6)
+    np.testing.assert_allclose(state.position, own[0])
+    length = state.angular_speed if chart.name == "tumbling" else state.speed
+    np.testing.assert_allclose(length, y)
+    ahead = state.rotation[:, :2, 0]  # a small tilt hardly turns the nose
+    cosine = (ahead * heading).sum(-1)
+    cosine /= np.linalg.norm(ahead, axis=-1) * np.linalg.norm(heading, axis=-1)
+    assert cosine.min() > np.cos(0.1)
+
+
+def test_who_falls_too_fast_too_low_does_not_recover(card):
+    chart = quadrl.robustness("geometric", "hover", axes=("gust",), episodes=20, progress=False)
+    shares = np.array(chart.found["recovery"]["falling"]["flown"]["geometric controller"])
+    heights, speeds = MAPS["falling"].y.levels, MAPS["falling"].x.levels
+    assert shares[heights.index(3.0), speeds.index(0.0)] == 1
+    # 6 m/s from 0.5 m: with an upward acceleration of at most g/3 it falls 5 m.
+    assert shares[heights.index(0.5), speeds.index(6.0)] == 0
+
+
+def test_the_command_writes_the_files(tmp_path, capsys):
+    out = tmp_path / "card"
+    few = ["--episodes", "2", "--axes", "delay", "--no-recovery", "--out", str(out)]
+    main(["robustness", "hover", "--controller", "geometric", *few, "--task-options",
+          "time_limit=0.5"])  # fmt: skip
+    found = Card.load(out).found
+    assert found["flown"] == ["hover", "geometric controller"] and [*found["axes"]] == ["delay"]
+    assert found["recovery"] == {} and "delay of commands" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("axis", {"axes": ("mas",)}),
+        ("episodes", {"episodes": 0}),
+        ("seed", {"seed": -1}),
+        ("engine", {"engine": "jet"}),
+    ],
+)
+def test_what_cannot_be_flown_is_refused(name, given):
+    with refused(name):
+        quadrl.robustness("hover", **SHORT | given)
+
+
+def test_nothing_to_fly_is_refused(capsys):
+    with refused("controller"):
+        quadrl.robustness([])
+    for words in ([], ["--controller", "geometrik"], ["nowhere"]):
+        with pytest.raises(SystemExit):
+            main(["robustness", *words])
+    assert "geometric" in capsys.readouterr().err

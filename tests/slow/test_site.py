@@ -1,0 +1,86 @@
+"""The documentation site: it builds strictly, its links lead somewhere, and it loads nothing."""
+
+import html.parser
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+from quadrl import tasks
+
+REPOSITORY = Path(__file__).parents[2]
+LOADED = {"img": "src", "script": "src", "link": "href", "iframe": "src", "source": "src"}
+
+
+class Parsed(html.parser.HTMLParser):
+    """The links, the loaded files and the anchors of a page."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.links, self.loads, self.anchors = [], [], {""}
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.anchors |= {given.get("id"), given.get("name")} - {None}
+        if tag == "a" and given.get("href"):
+            self.links.append(given["href"])
+        if given.get(LOADED.get(tag)):
+            self.loads.append(given[LOADED[tag]])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    config = REPOSITORY / "scripts" / "site" / "mkdocs.yml"
+    command = (sys.executable, "-m", "mkdocs", "build", "--strict", "--config-file", config)
+    done = subprocess.run((*command, "--site-dir", folder), capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    # The page of missing pages has addresses from the root of a server.
+    return {path: Parsed(path) for path in site.rglob("*.html") if path.name != "404.html"}
+
+
+def test_every_page_is_there(site, pages):
+    names = {path.relative_to(site).with_suffix("").as_posix() for path in pages}
+    docs = REPOSITORY / "docs"
+    wanted = {path.relative_to(docs).with_suffix("").as_posix() for path in docs.rglob("*.md")}
+    assert wanted <= names
+    assert {f"source/tasks/{name}.py" for name in tasks.TASKS} <= names
+
+
+def test_links_lead_somewhere(site, pages):
+    for page, parsed in pages.items():
+        for link in parsed.links + parsed.loads:
+            if ":" in link.partition("/")[0]:  # https:, mailto:
+                continue
+            path, _, anchor = unquote(link).partition("#")
+            there = (page.parent / path).resolve() if path else page
+            if there.is_relative_to(site / "fly"):  # scripts/web makes it afterwards
+                continue
+            assert there.exists(), f"{page.relative_to(site)}: {link}"
+            if there in pages:
+                found = anchor in pages[there].anchors or anchor.startswith("__")
+                assert found, f"{page.relative_to(site)}: {link}"
+
+
+def test_nothing_is_loaded_from_elsewhere(site, pages):
+    for page, parsed in pages.items():
+        loads = (load for load in parsed.loads if not load.startswith("data:"))
+        foreign = [load for load in loads if "//" in load]
+        assert not foreign, f"{page.relative_to(site)}: {foreign}"
+    for sheet in site.rglob("*.css"):
+        assert "url(http" not in sheet.read_text() and "@import" not in sheet.read_text(), sheet
+
+
+def test_the_search_knows_the_pages(site):
+    index = (site / "search" / "search_index.json").read_text()
+    for words in ("target_velocity", "geometric controller", "write_video", "gladLoadGL"):
+        assert words in index
+    assert "class Hover(Task)" not in index  # the sources are not searched

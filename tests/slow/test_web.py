@@ -1,0 +1,350 @@
+"""The page docs/fly: what its WebAssembly and its JavaScript compute is what Python computes.
+
+Where a tool is missing the tests are skipped; with QUADRL_REQUIRE_WEB=1 they fail.
+"""
+
+import base64
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+
+import chromium
+import numpy as np
+import pytest
+
+from quadrl import tasks
+from quadrl.control.geometric import GeometricController
+from quadrl.environment import Environment
+from quadrl.policy import SHIPPED, Policy
+from quadrl.vehicle import VEHICLES
+from scripts.reports import report, web
+
+FLOWN = [name for name, task in tasks.TASKS.items() if not task.contact]
+PAIRS = [(task, vehicle) for task in FLOWN for vehicle in VEHICLES]
+# Sine and cosine are the C library's, and differ in the last bit between two of them.
+SINES = 1e-14
+TRAINED = "hover_ppo"
+
+
+def need(*commands):
+    """Skip without these commands, or fail where they are required."""
+    missing = [command for command in commands if not shutil.which(command)]
+    if missing:
+        lacking(f"{', '.join(missing)} is not installed")
+
+
+def lacking(what):
+    reason = f"{what}: run scripts/web"
+    pytest.fail(reason) if os.environ.get("QUADRL_REQUIRE_WEB") == "1" else pytest.skip(reason)
+
+
+@pytest.fixture(scope="module")
+def page():
+    """The page, built."""
+    need("emcc", "node")
+    if not any((web.BUILD / "wheels").glob("*.whl")):
+        lacking("the wheel that holds three.js is not in build/web")
+    command = [sys.executable, "-m", "scripts.reports.web"]
+    result = subprocess.run(command, capture_output=True, text=True, env=report.ENVIRONMENT)
+    assert result.returncode == 0, result.stderr
+    return web.SITE / "index.html"
+
+
+@pytest.fixture(scope="module")
+def node(page):
+    """Run jobs of tests/fly.mjs."""
+    command = ["node", report.REPOSITORY / "tests/fly.mjs", web.BUILD / "book.json"]
+
+    def run(*jobs):
+        text = json.dumps(jobs)
+        done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return run
+
+
+def begun(task, vehicle, seed=0):
+    environment = Environment(task, vehicle=vehicle, engine="free_flight", seed=seed)
+    return environment, environment.flatten(environment.reset())
+
+
+def coordinates(environment):
+    engine = environment.engine
+    return np.concatenate([engine.qpos[0], engine.qvel[0], engine.act[0]])
+
+
+def test_physics_is_the_native_kernel_bit_for_bit(node):
+    rng, jobs, expected = np.random.default_rng(0), [], []
+    for name, vehicle in VEHICLES.items():
+        environment, _ = begun("hover", vehicle)
+        engine, start, wind = environment.engine, coordinates(environment), rng.normal(size=3)
+        command = vehicle.hover_speed * rng.uniform(0.7, 1.3, (1000, vehicle.rotor_count))
+        engine.wind[:] = wind
+        flown = []
+        for each in command:
+            engine.ctrl[:] = each
+            engine.advance(1)
+            flown.append(coordinates(environment))
+        expected.append(flown)
+        place = dict(task="hover", aircraft=name, seed=0, start=start.tolist())
+        jobs.append(dict(job="physics", **place, wind=wind.tolist(), commands=command.tolist()))
+    for found, flown in zip(node(*jobs), expected, strict=True):
+        np.testing.assert_array_equal(found, flown)
+        assert np.ptp(flown, axis=0).max() > 1  # it went somewhere
+
+
+def test_a_seed_gives_the_same_episode(node):
+    jobs, expected = [], []
+    for task, vehicle in PAIRS:
+        for seed in (0, 7, 2**40 + 1):
+            environment, observation = begun(task, vehicle, seed)
+            for episode in range(2):
+                jobs.append(
+                    dict(job="begin", task=task, aircraft=vehicle, seed=seed, episode=episode)
+                )
+                expected.append((coordinates(environment), observation[0]))
+                observation = environment.flatten(environment.reset())
+    for found, (place, observation) in zip(node(*jobs), expected, strict=True):
+        np.testing.assert_allclose(found["coordinates"], place, rtol=SINES, atol=SINES)
+        np.testing.assert_allclose(found["observation"], observation, rtol=1e-6, atol=1e-7)
+
+
+def test_policies_act_as_in_python(node):
+    rng = np.random.default_rng(0)
+    jobs, expected = [], []
+    for file in sorted(SHIPPED.glob("*.safetensors")):
+        policy = Policy.load(file)
+        if policy.task in FLOWN and not policy.conditions:
+            scale = rng.uniform(0, 3, (200, 1))  # past where the observations are clipped
+            observation = policy.mean + scale * policy.deviation * rng.normal(
+                size=(200, policy.size)
+            )
+            observation = observation.astype(np.float32)
+            jobs.append(dict(job="act", name=file.stem, observations=observation.tolist()))
+            expected.append(policy(observation))
+    assert len(jobs) > 5
+    for found, action in zip(node(*jobs), expected, strict=True):
+        np.testing.assert_allclose(found, action, rtol=0, atol=1e-5)
+
+
+def fly(task, vehicle, controller, steps, events=(), seed=3):
+    """The flight in Python: what each control step saw, did and gave."""
+    environment, observation = begun(task, vehicle, seed)
+    engine, flown = environment.engine, []
+    for step in range(steps):
+        seen, action = observation[0], np.asarray(controller(observation))
+        for event in events:
+            if event["step"] == step and event["kind"] == "push":
+                engine.qvel[0] += event["values"]
+            elif event["step"] == step:
+                engine.wind[0] = event["values"][:3]
+        now = environment.step(action)
+        observation = environment.flatten(now.observation)
+        flown.append(
+            {
+                "observation": seen,
+                "action": action[0],
+                "coordinates": coordinates(environment),
+                "error": now.error[0],
+                "reward": now.reward[0],
+                **{name: bool(getattr(now, name)[0]) for name in ("terminated", "truncated")},
+                "succeeded": bool(now.is_success[0]),
+                "goal": environment.goals()[0],
+            }
+        )
+        if now.terminated[0]:
+            break
+    return flown
+
+
+def worst(found, expected):
+    """Largest difference of each quantity of two flights of the same length."""
+    assert len(found) == len(expected)
+    names = expected[0].keys()
+    return {
+        name: max(
+            float(np.abs(np.subtract(a[name], b[name], dtype=float)).max())
+            for a, b in zip(found, expected, strict=True)
+        )
+        for name in names
+    }
+
+
+PUSHES = [
+    {"step": 20, "kind": "wind", "values": [1.5, -0.5, 0.0, 0.0]},
+    {"step": 40, "kind": "push", "values": [0.8, -0.4, 0.2, 1.0, -2.0, 0.0]},
+]
+
+
+@pytest.mark.parametrize("events", ([], PUSHES), ids=("calm", "pushed"))
+def test_a_flight_of_the_hover_policy_is_pythons(node, events):
+    policy = Policy.pretrained("hover")
+    expected = fly("hover", "paper", policy, 200, events)
+    settings = {"task": "hover", "aircraft": "paper", "seed": 3}
+    job = dict(job="fly", settings=settings, controller=TRAINED, steps=200, events=events)
+    ((found, outcome),) = ((each["flown"], each["outcome"]) for each in node(job))
+    differences = worst(found, expected)
+    assert outcome == "" and expected[-1]["truncated"] and expected[-1]["succeeded"]
+    # The action is rounded to float32 and its sums to another order: what follows is stable.
+    for name, bound in {"observation": 1e-5, "action": 1e-5, "coordinates": 1e-4}.items():
+        assert differences[name] < bound
+    assert differences["error"] < 1e-6 and differences["reward"] < 1e-3
+
+
+@pytest.mark.parametrize("task, vehicle", PAIRS)
+def test_a_flight_of_the_geometric_controller_is_pythons(node, task, vehicle):
+    controller = GeometricController(VEHICLES[vehicle], tasks.make(task))
+    expected = fly(task, vehicle, controller, 200)
+    settings = {"task": task, "aircraft": vehicle, "seed": 3}
+    start = coordinates(begun(task, vehicle, 3)[0]).tolist()
+    job = dict(job="fly", settings=settings, controller=None, steps=200, events=[], start=start)
+    (found,) = node(job)
+    differences = worst(found["flown"], expected)
+    # Where the goal comes from sines, a last bit can round an observation to another float32.
+    bound = 0 if task in ("hover", "static_waypoint") else 1e-6
+    assert max(differences.values()) <= bound, differences
+
+
+def test_gusts_have_the_deviation_that_is_asked_for(node):
+    settings = {"task": "hover", "aircraft": "paper", "seed": 1}
+    events = [{"step": 0, "kind": "wind", "values": [1.0, 0.0, 0.0, 0.3]}]
+    jobs = [
+        dict(
+            job="fly",
+            settings=settings | {"seed": seed},
+            controller=TRAINED,
+            steps=200,
+            events=events,
+        )
+        for seed in range(30)
+    ]
+    wind = np.array([[step["wind"] for step in each["flown"]] for each in node(*jobs)])
+    # 30 flights of 10 s with a correlation time of 1 s are about 150 numbers: 3 deviations.
+    np.testing.assert_allclose(wind.mean(axis=(0, 1)), [1, 0, 0], atol=0.08)
+    np.testing.assert_allclose(wind.std(axis=(0, 1)), 0.3, rtol=0.18)
+    keep = np.exp(-0.05)
+    steps = wind[:, 1:] - 1 * np.array([1, 0, 0]) - keep * (wind[:, :-1] - np.array([1, 0, 0]))
+    np.testing.assert_allclose(steps.std(), 0.3 * np.sqrt(1 - keep**2), rtol=0.05)
+
+
+def test_files_that_cannot_fly_are_refused(node, tmp_path):
+    content = (SHIPPED / "hover_ppo.safetensors").read_bytes()
+    landing = (SHIPPED / "target_following_ppo.safetensors").read_bytes()
+    cases = [
+        (content, "hover", "paper", "^$"),
+        (content, "random_waypoint", "paper", "^$"),
+        (content, "hover", "hexa", "4 rotors"),
+        (content, "hover", "crazyflie", "layout"),
+        (landing, "hover", "paper", "observes"),
+        (content[:1000], "hover", "paper", "damaged"),
+        (content[:-8], "hover", "paper", "damaged"),
+        (b"", "hover", "paper", "damaged"),
+        (b"not a policy at all", "hover", "paper", "damaged"),
+        (b"\x02" + bytes(7) + b"{}", "hover", "paper", "no policy"),
+    ]
+    jobs = [
+        dict(job="read", file=base64.b64encode(file).decode(), task=task, aircraft=vehicle)
+        for file, task, vehicle, _ in cases
+    ]
+    for message, (*_, pattern) in zip(node(*jobs), cases, strict=True):
+        assert re.search(pattern, message), message
+
+
+def test_a_link_keeps_the_settings(node):
+    settings = {"task": "static_waypoint", "aircraft": "racer", "left": "static_waypoint_ppo"}
+    settings |= {"right": "geometric", "seed": 12, "at": 34, "events": PUSHES}
+    (found,) = node(dict(job="link", settings=settings))
+    assert found == settings
+    wrong = "#task=constructor&aircraft=%3Cb%3E&seed=-1&at=1e99&events=push@1:1;wind@x:1,2,3,4"
+    (found,) = node(dict(job="open", fragment=wrong))
+    assert found == {"task": "hover", "aircraft": "paper", "left": "", "right": "geometric",
+                     "seed": 0, "at": 20000, "events": []}  # fmt: skip
+
+
+def metres(side):
+    """JavaScript: the error that the page shows of a side [m]."""
+    return f"Number(document.getElementById('{side}-error').dataset.metres)"
+
+
+TIME = "Number(document.documentElement?.dataset.time)"  # [s]; JavaScript
+STAYS = "!document.getElementById('problem').textContent"
+
+
+@pytest.fixture
+def browse(page, tmp_path):
+    """Open the page with a fragment."""
+    need("chromium")
+    return lambda fragment: chromium.Page(page.as_uri() + fragment, tmp_path / "profile")
+
+
+def test_the_page_flies_and_is_pushed(browse):
+    with browse("#task=hover&aircraft=paper&seed=3") as shown:
+        shown.wait(f"{TIME} > 4.5")
+        for side in ("left", "right"):
+            assert shown.value(metres(side)) < 0.08
+        shown.press("ArrowLeft")
+        shown.wait(f"{metres('left')} > 0.15 && {metres('right')} > 0.15")
+        shown.press(" ")
+        paused = shown.value(TIME)
+        shown.press("l")
+        shown.wait("/at=[1-9]\\d+&events=push@\\d+:/.test(location.hash)")
+        time.sleep(1)
+        assert shown.value(TIME) - paused < 0.3  # a figure behind at most
+        errors, link = (
+            [shown.value(metres(s)) for s in ("left", "right")],
+            shown.value("location.hash"),
+        )
+        assert shown.value(STAYS) and not shown.complaints
+    with browse(link) as again:  # another page shows the same moment
+        again.wait(f"{TIME} > 0")
+        assert [again.value(metres(side)) for side in ("left", "right")] == errors
+        assert again.value(STAYS) and not again.complaints
+
+
+def test_every_task_and_aircraft_is_shown(browse):
+    with browse("") as shown:
+        shown.wait(f"{TIME} > 0")
+        for task in FLOWN:
+            for vehicle in VEHICLES:
+                shown.value(f"location.hash = 'task={task}&aircraft={vehicle}&at=40'")
+                pressed = "document.querySelector('#aircraft [aria-pressed=true]')"
+                shown.wait(
+                    f"document.getElementById('task').value === '{task}' && "
+                    f"{pressed}?.value === '{vehicle}'"
+                )
+                flown = 40 * VEHICLES[vehicle].control_timestep
+                shown.wait(f"Math.abs({TIME} - {flown}) < 0.01")
+                assert shown.value(metres("left")) < 3
+        assert shown.value(STAYS) and not shown.complaints
+
+
+def test_a_dropped_policy_flies(browse, tmp_path):
+    mine, other = tmp_path / "mine.safetensors", tmp_path / "other.safetensors"
+    mine.write_bytes((SHIPPED / "hover_trpo.safetensors").read_bytes())
+    other.write_bytes(b"nothing")
+    with browse("#task=target_following&aircraft=racer") as shown:
+        shown.wait(f"{TIME} > 0")
+        shown.give("#file", mine)  # goes to its own task and aircraft
+        chosen = "document.getElementById('left-controller').value"
+        shown.wait(f"{chosen} === 'my mine' && document.getElementById('task').value === 'hover'")
+        shown.wait(f"{TIME} > 4")
+        assert shown.value(metres("left")) < 0.1
+        shown.give("#file", other)
+        shown.wait("/damaged/.test(document.getElementById('note').textContent)")
+        assert shown.value(chosen) == "my mine" and not shown.complaints
+
+
+def test_the_page_asks_no_other_host(page):
+    document = page.read_text()
+    assert "default-src 'none'" in document
+    # Names of formats and licences stand in three.js; nothing is loaded from anywhere.
+    assert not re.search(r"<(script|link|img|iframe)[^>]+(src|href)=.https?:", document)
+    own = list(web.SOURCE.iterdir())
+    assert not any(
+        re.search(r"https?://|fetch\(|XMLHttpRequest|WebSocket", f.read_text()) for f in own
+    )

@@ -1,0 +1,93 @@
+"""The C that scripts/reports/flights.py writes for the page docs/fly, compiled for this machine."""
+
+import ctypes
+
+import numpy as np
+import pytest
+
+from quadrl import native, parameters, tasks
+from quadrl.control.geometric import GeometricController
+from quadrl.environment import Environment
+from quadrl.rng import START, uniform
+from quadrl.vehicle import VEHICLES
+from scripts.reports import flights
+
+
+class Memory:
+    """The memory of a flight, and the functions that work on it."""
+
+    def __init__(self, environment):
+        self.numbers = np.zeros(sum(flights.PARTS.values()))
+        written = flights.write(environment)
+        self.drawn = written.drawn
+        self._library = native.compile_generated("#include <math.h>\n" + exported(written.source))
+        self._prefix = f"{environment.task.name}_{environment.vehicle.name}"
+
+    def __getitem__(self, part):
+        first = flights.LAYOUT[part]
+        return self.numbers[first : first + flights.PARTS[part]]
+
+    def call(self, name):
+        getattr(self._library, f"{self._prefix}_{name}")(ctypes.c_void_p(self.numbers.ctypes.data))
+
+
+def exported(source):
+    """With its functions visible, since the flags hide them."""
+    return source.replace("void ", '__attribute__((visibility("default"))) void ')
+
+
+@pytest.mark.parametrize("task, vehicle", [("hover", "paper"), ("target_following", "hexa")])
+def test_a_flight_is_that_of_the_environment_bit_for_bit(task, vehicle):
+    seed, steps = 11, 30
+    environment = Environment(task, vehicle=vehicle, engine="free_flight", seed=seed)
+    observation = environment.flatten(environment.reset())
+    controller = GeometricController(VEHICLES[vehicle], tasks.make(task))
+    memory, engine = Memory(environment), environment.engine
+    rotors, size = environment.vehicle.rotor_count, environment.size
+    memory["parameters"][:] = parameters.rows(environment.vehicle).view(float)
+    memory["drawn"][: memory.drawn] = uniform(
+        np.array([seed]), np.array([0]), START, 0, memory.drawn
+    )[0]
+    memory.call("begin")
+    # NumPy's sine is not that of the C library.
+    np.testing.assert_allclose(memory["qpos"], engine.qpos[0], rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(memory["qvel"], engine.qvel[0], rtol=1e-14, atol=1e-14)
+    np.testing.assert_array_equal(memory["act"][:rotors], engine.act[0])
+    state = engine.frames[0]
+    memory["state"][: len(state.table)] = state.table[:, 0]
+    memory.call("first")
+    np.testing.assert_allclose(memory["observation"][:size], observation[0], rtol=1e-6, atol=1e-7)
+    for _ in range(steps):
+        memory["observation"][:size] = observation[0]
+        memory.call("geometric")
+        action = controller(observation)
+        np.testing.assert_array_equal(memory["action"][:rotors], action[0])
+        memory.call("command")
+        now = environment.step(action)
+        np.testing.assert_array_equal(memory["ctrl"][:rotors], engine.ctrl[0])
+        memory["state"][: len(state.table)] = engine.frames[0].table[:, 0]
+        memory.call("step")
+        observation = environment.flatten(now.observation)
+        error, reward, *goal = memory["given"][:5]
+        # What a path of sines remembers has their last bits.
+        np.testing.assert_allclose(error, now.error[0], rtol=1e-11)
+        np.testing.assert_allclose(reward, now.reward[0], rtol=1e-11)
+        np.testing.assert_allclose(goal, environment.goals()[0], rtol=1e-12)
+        np.testing.assert_array_equal(memory["given"][5:], [now.terminated[0], 0, 0])
+
+
+def test_an_end_is_told():
+    environment = Environment("hover", engine="free_flight", seed=0)
+    environment.reset()
+    memory = Memory(environment)
+    memory["parameters"][:] = parameters.rows(environment.vehicle).view(float)
+    environment.step(np.zeros((1, 4)))
+    memory["state"][: len(environment.engine.frames[0].table)] = environment.engine.frames[0].table[
+        :, 0
+    ]
+    memory.call("first")
+    memory.call("step")
+    assert not memory["given"][5:].any()
+    memory["diverged"][:] = 1
+    memory.call("step")
+    assert memory["given"][5:].tolist() == [1, 0, 0]  # terminated, and nothing else

@@ -1,0 +1,106 @@
+"""Policies that hold the goal: there their mean action is to hover, whatever the weights."""
+
+import numpy as np
+import pytest
+import torch
+from runs import assert_same_run, changed, stopped, train
+from tensordict import TensorDict
+
+from quadrl.environment import Environment
+from quadrl.errors import QuadrlError
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.environments import make_env
+from quadrl.learning.networks import export, make_actor_critic
+
+HELD = ("hover", "static_waypoint", "random_waypoint")
+
+
+def some_policy(task, **settings):
+    """Of weights that nobody has trained, with a normaliser that has seen something; its actor."""
+    config = TrainConfig(task, holds_goal=True, **settings)
+    environment = make_env(config, torch.device("cpu")).environment
+    torch.manual_seed(0)
+    actor, _, normalisers = make_actor_critic(environment.size, environment.action_size, config)
+    seen = 0.3 + torch.rand(50, environment.size)
+    normalisers["observation"].update(seen)
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter += 0.3 * torch.randn_like(parameter)
+    return export(actor, task, {"vehicle_options": config.vehicle_options}), actor
+
+
+def at_rest(environment, goal, yaw):
+    """Begin at a goal with a heading."""
+    rest = {"velocity": np.zeros(3), "body_rate": np.zeros(3)}
+    rest["rotor_speed"] = environment.vehicle.hover_speed
+    attitude = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+    return environment.flatten(
+        environment.reset(start=rest | {"position": goal, "quaternion": attitude})
+    )
+
+
+@pytest.mark.parametrize("task", HELD)
+def test_at_the_goal_it_hovers_and_stays(task):
+    policy, _ = some_policy(task)
+    environment = Environment(task, num_envs=3, seed=1, engine="free_flight")
+    environment.reset()
+    environment.seed(1)
+    environment.reset()
+    goals = environment.goals() - environment.origin
+    environment.seed(1)
+    seen = at_rest(environment, goals, 0.0 if environment.task.heading_matters else 2.0)
+    np.testing.assert_allclose(policy(seen), 0, atol=2e-6)
+    away = policy(seen + np.float32(0.1))
+    assert np.abs(away).max() > 0.01
+    for _ in range(20):
+        seen = environment.flatten(environment.step(policy(seen)).observation)
+    np.testing.assert_allclose(environment.engine.qpos[:, :3], environment.goals(), atol=1e-4)
+
+
+@pytest.mark.parametrize("variant", ["ideal", "robust"])
+def test_its_file_is_a_plain_network(variant):
+    policy, actor = some_policy("hover", variant=variant)
+    seen = torch.randn(30, policy.size)
+    with torch.no_grad():
+        mean = actor.get_dist(TensorDict({"observation": seen}, [30])).mean.numpy()
+    assert 0.01 < np.abs(mean).max()
+    np.testing.assert_allclose(policy(seen.numpy()), np.clip(mean, -1, 1), atol=1e-5)
+
+
+def test_where_the_heading_is_free_it_flies_the_same_in_every_direction():
+    policy, _ = some_policy("random_waypoint")
+    environment = Environment("random_waypoint", num_envs=2, seed=0)
+    environment.reset()
+    goal = environment.goals()[0] - environment.origin
+    turned = np.array([-goal[1], goal[0], goal[2]])
+    # A quarter turn about the vertical through the goal: all that it sees turns with it.
+    place = [goal + (0.4, -0.2, 0.3), turned + (0.2, 0.4, 0.3)]
+    seen = []
+    for k, yaw in enumerate((0.3, 0.3 + np.pi / 2)):
+        environment.seed(0)
+        flat = at_rest(environment, place[k], yaw)[0]
+        flat[-3:] = 0.1, 0.2, 0.3  # the way to the goal, in the body frame: the same for both
+        seen.append(flat)
+    assert np.abs(seen[0] - seen[1]).max() > 0.1
+    np.testing.assert_allclose(*policy(np.array(seen)), atol=1e-6)
+
+
+def test_it_is_trained_and_continued_bit_for_bit(tmp_path):
+    config = changed(holds_goal=True)
+    stopped(config, tmp_path / "begun", after=3)
+    train(config, tmp_path / "begun", resume=True)
+    assert_same_run(train(config, tmp_path / "whole"), tmp_path / "begun")
+
+
+@pytest.mark.parametrize("task", ["straight_and_level", "target_following"])
+def test_a_task_without_one_goal_state_is_refused(task):
+    with pytest.raises(QuadrlError) as caught:
+        some_policy(task)
+    assert caught.value.name == "holds_goal" and "target_velocity" in str(caught.value)
+
+
+def test_a_memory_is_refused():
+    for given in ({"memory": "gru", "holds_goal": True}, {"holds_goal": 1}):
+        with pytest.raises(QuadrlError) as caught:
+            TrainConfig("hover", **given)
+        assert caught.value.name == "holds_goal"

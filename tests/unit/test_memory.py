@@ -1,0 +1,483 @@
+"""Policies that remember: the unit, its gradients, its training, its file, its flights."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from runs import assert_same_run, changed, contents, refused, stopped, train
+from safetensors.numpy import save
+from tensordict import TensorDict
+from torchrl.data import Unbounded
+from torchrl.modules import set_recurrent_mode
+
+from quadrl import tasks
+from quadrl.environment import Environment
+from quadrl.evaluation import evaluate
+from quadrl.learning import checkpoint, environments
+from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
+from quadrl.learning.config import ALGORITHMS, TrainConfig
+from quadrl.learning.networks import BEGINS, STATE, Memory, export, make_actor_critic
+from quadrl.learning.ppo import PPO
+from quadrl.learning.train import Training
+from quadrl.learning.trpo import TRPO
+from quadrl.learning.vpg import VPG
+from quadrl.memory import GRU
+from quadrl.policy import RECURRENT_FORMAT, Policy
+from quadrl.rollout import fly
+from quadrl.vehicle import Vehicle
+from quadrl.view.flight import Flight
+
+SIZE, ACTIONS, WIDTH = 5, 2, 7
+ROWS, STEPS = 6, 9
+RECURRENT = changed(memory="gru", memory_width=WIDTH)
+KINDS = {PPO: PPOConfig(), TRPO: TRPOConfig(), VPG: VPGConfig()}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def actor_critic(seed=0, privileged=0):
+    """Networks away from the start, where the mean hardly depends on the weights."""
+    torch.manual_seed(seed)
+    config = TrainConfig(
+        memory="gru", memory_width=WIDTH, hidden=(6,), critic_hidden=(6,), initial_deviation=0.5
+    )
+    actor, critic, normalisers = make_actor_critic(SIZE, ACTIONS, config, privileged)
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter += 0.3 * torch.randn_like(parameter)
+    normalisers["observation"].update(2 * torch.randn(100, SIZE) + 1)
+    return actor, critic, normalisers
+
+
+def sequences(seed=0):
+    """Observations (ROWS, STEPS, SIZE), first states, and begins in the middle and at the first."""
+    generator = torch.Generator().manual_seed(seed)
+    observation = 2 * torch.randn(ROWS, STEPS, SIZE, generator=generator)
+    state = torch.rand(ROWS, WIDTH, generator=generator) - 0.5
+    begins = torch.zeros(ROWS, STEPS, 1, dtype=torch.bool)
+    begins[0, 3] = begins[1, 1] = begins[1, 2] = begins[2, STEPS - 1] = True
+    state[3] = 0.0
+    return observation, state, begins
+
+
+def cell_of(actor):
+    """torch's own unit with the actor's weights."""
+    (memory,) = (module for module in actor.modules() if isinstance(module, Memory))
+    cell = torch.nn.GRUCell(SIZE, WIDTH)
+    cell.load_state_dict(memory.cell.state_dict())
+    return cell, memory
+
+
+def unrolled(actor, observation, state, begins):
+    """Mean and deviation (ROWS, STEPS, ACTIONS) by a loop over time with torch's own unit."""
+    _, memory = cell_of(actor)
+    own = memory.cell
+    loc, scale = [], []
+    for t in range(observation.shape[1]):
+        state = torch.where(begins[:, t], torch.zeros_like(state), state)
+        seen = memory.normaliser(observation[:, t])
+        weights = (own.weight_ih, own.weight_hh, own.bias_ih, own.bias_hh)
+        state = torch.gru_cell(seen, state, *weights)
+        mean, deviation = memory.network(torch.cat([seen, state], -1))
+        loc.append(mean)
+        scale.append(deviation)
+    return torch.stack(loc, 1), torch.stack(scale, 1)
+
+
+def sequence_batch(observation, state, begins):
+    states = torch.full((ROWS, STEPS, WIDTH), 9.0)  # only the first counts
+    states[:, 0] = state
+    entries = {"observation": observation, STATE: states, BEGINS: begins}
+    return TensorDict(entries, [ROWS, STEPS])
+
+
+# ------------------------------------------------------------------- what it computes
+
+
+def test_the_unit_is_torchs():
+    actor, _, _ = actor_critic()
+    cell, _ = cell_of(actor)
+    unit = export(actor, "hover", {}).memory
+    observation, state, _ = sequences()
+    for t in range(STEPS):
+        expected = cell(observation[:, t], state).detach()
+        got = unit.step(observation[:, t].numpy(), state.numpy())
+        np.testing.assert_allclose(got, expected, atol=3e-7)
+        state = expected
+    huge = unit.step(np.full((1, SIZE), 1e6, "f"), np.zeros((1, WIDTH), "f"))
+    assert (np.abs(huge) <= 1).all()  # without a warning
+
+
+def test_an_exported_policy_flies_a_sequence_as_the_actor_does(tmp_path):
+    actor, _, _ = actor_critic()
+    observation, state, begins = sequences()
+    with torch.no_grad(), set_recurrent_mode():
+        mean = actor.get_dist(sequence_batch(observation, state, begins)).mean
+    assert (mean.abs() > 1).any() and (mean.abs() < 1).any()
+    export(actor, "hover", {}).save(tmp_path / "policy.safetensors")
+    policy = Policy.load(tmp_path)
+    state = state.numpy()
+    for t in range(STEPS):
+        state[begins[:, t, 0].numpy()] = policy.initial_state()
+        action, state = policy.step(observation[:, t].numpy(), state)
+        np.testing.assert_allclose(action, mean[:, t].clamp(-1, 1), atol=2e-6)
+
+
+def test_a_sequence_is_its_steps_one_by_one():
+    actor, _, _ = actor_critic()
+    observation, state, begins = sequences()
+    with torch.no_grad(), set_recurrent_mode():
+        whole = actor.get_dist(sequence_batch(observation, state, begins))
+    for t in range(STEPS):
+        state = torch.where(begins[:, t], torch.zeros_like(state), state)
+        with torch.no_grad():
+            now = actor(TensorDict({"observation": observation[:, t], STATE: state}, [ROWS]))
+        torch.testing.assert_close(now["loc"], whole.base_dist.loc[:, t], rtol=0, atol=2e-6)
+        state = now["next", STATE]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_are_those_of_a_loop_over_time(kind):
+    """Of the surrogate at the policy that acted: of ratio times advantage."""
+    actor, critic, _ = actor_critic()
+    observation, state, begins = sequences()
+    torch.manual_seed(1)
+    batch = sequence_batch(observation, state, begins)
+    with torch.no_grad():
+        loc, scale = unrolled(actor, observation, state, begins)
+        batch["action"] = torch.normal(loc, scale)
+        batch["action_log_prob"] = (
+            torch.distributions.Normal(loc, scale).log_prob(batch["action"]).sum(-1)
+        )
+    batch["loc"], batch["scale"] = loc, scale
+    batch["advantage"] = torch.randn(ROWS, STEPS, 1)
+    batch["value_target"] = torch.randn(ROWS, STEPS, 1)
+    loss = kind(actor, critic, KINDS[kind]).loss
+    got = torch.autograd.grad(loss(batch.clone())["loss_objective"], list(actor.parameters()))
+    loc, scale = unrolled(actor, observation, state, begins)
+    log_prob = torch.distributions.Normal(loc, scale).log_prob(batch["action"]).sum(-1)
+    # The gradient of a ratio that is 1 is that of its logarithm.
+    expected = -(log_prob * batch["advantage"][..., 0]).mean()
+    for a, b in zip(got, torch.autograd.grad(expected, list(actor.parameters())), strict=True):
+        assert b.abs().max() > 1e-4
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-6)
+
+
+# ------------------------------------------------------------------- training
+
+
+def batches_of(config, folder):
+    """Each batch of a training as it is learned from, with the log-probabilities anew."""
+    training, seen = Training(config, folder), []
+    update = training.algorithm.update
+
+    def spy(batch, remaining):
+        with torch.no_grad(), set_recurrent_mode():
+            present = training.actor.get_dist(batch.select(*training.actor.in_keys))
+        again = present.log_prob(batch["action"])
+        seen.append((batch.clone(), again))
+        return update(batch, remaining)
+
+    training.algorithm.update = spy
+    training.run()
+    return seen
+
+
+def test_what_is_learned_from_is_what_was_flown(tmp_path):
+    """Episodes of ten steps in batches of four: they begin at steps 0, 10 and 20."""
+    seen = batches_of(RECURRENT, tmp_path / "run")
+    assert len(seen) == 6
+    for k, (batch, again) in enumerate(seen):
+        assert batch.batch_size == (8, 4)  # whole aircraft
+        torch.testing.assert_close(again, batch["action_log_prob"], rtol=0, atol=1e-5)
+        steps = range(4 * k, 4 * k + 4)
+        assert (batch[BEGINS][0, 1:, 0].tolist()) == [t % 10 == 0 for t in steps[1:]]
+        assert (batch[STATE] == 0).all(-1)[0].tolist() == [t % 10 == 0 for t in steps]
+
+
+@pytest.mark.parametrize("memory", ["none", "gru"])
+def test_a_minibatch_holds_as_many_transitions(memory):
+    algorithm = PPO(*make_actor_critic(3, 2, changed(memory=memory))[:2], PPOConfig(minibatch=48))
+    assert algorithm.rows(TensorDict({}, [256, 16])) == 3
+    assert algorithm.rows(TensorDict({}, [256 * 16])) == 48
+    assert algorithm.rows(TensorDict({}, [4, 100])) == 1
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_it_continues_bit_for_bit(tmp_path, algo):
+    config = dataclasses.replace(RECURRENT, algo=algo, task="target_following")
+    alone = train(config, tmp_path / "alone")
+    # Checkpoints are those of the iteration before: at step 4 of an episode, and where all begin.
+    stopped(config, tmp_path / "run", 2)
+    stopped(config, tmp_path / "run", 6, resume=True)
+    assert_same_run(alone, train(config, tmp_path / "run", resume=True))
+
+
+def test_a_checkpoint_without_the_memory_is_refused(tmp_path):
+    folder = stopped(RECURRENT, tmp_path / "run", 3)
+    path = folder / checkpoint.CHECKPOINT
+    tensors, numbers = checkpoint.load(path)
+    for damaged in (
+        {k: v for k, v in tensors["environment"].items() if k != STATE},
+        tensors["environment"] | {STATE: torch.zeros(8, WIDTH + 1)},
+    ):
+        checkpoint.save(path, tensors | {"environment": damaged}, numbers)
+        before = contents(folder)
+        with refused() as caught:
+            Training(RECURRENT, folder, resume=True)
+        assert str(path) in str(caught.value) and contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"), [({"memory": "lstm"}, "memory"), ({"memory_width": 0}, "memory_width")]
+)
+def test_memories_that_there_are_not(settings, name):
+    with refused(name):
+        TrainConfig("hover", **settings)
+
+
+# ------------------------------------------------------------------- the privileged critic
+
+
+def telling(kind):
+    """Environments that tell the critic the way to the goal, far from zero."""
+
+    class Telling(kind):
+        def __init__(self, *given, **settings):
+            super().__init__(*given, **settings)
+            observation = self.observation_spec.clone()
+            observation["privileged"] = Unbounded((self.num_envs, 3))
+            self.observation_spec = observation
+
+        def _pack(self, columns, terms):
+            packed = super()._pack(columns, terms)
+            way = self.environment.snapshot.potentials.to_goal
+            return packed.set("privileged", torch.from_numpy(50 + way).float())
+
+    return Telling
+
+
+@pytest.mark.parametrize("memory", ["none", "gru"])
+def test_the_critic_alone_reads_what_is_privileged(monkeypatch, tmp_path, memory):
+    for name in ("QuadrotorEnv", "RememberingEnv"):
+        monkeypatch.setattr(environments, name, telling(getattr(environments, name)))
+    config = dataclasses.replace(RECURRENT, memory=memory)
+    training = Training(config, tmp_path / "run")
+    assert training.critic.in_keys == ["observation", "privileged"]
+    assert "privileged" not in training.actor.in_keys
+    policy = training.run()
+    assert policy.size == training.env.environment.size
+    np.testing.assert_allclose(training.normalisers["privileged"].mean, 50, atol=2)
+    stopped(config, tmp_path / "other", 3)
+    assert_same_run(tmp_path / "run", train(config, tmp_path / "other", resume=True))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_critic_learns_what_only_it_is_told(kind):
+    """The value is a random number of each transition, which the privileged observation holds."""
+    losses = []
+    for privileged in (0, 1):
+        actor, critic, normalisers = actor_critic(privileged=privileged)
+        algorithm = kind(actor, critic, KINDS[kind])
+        batch = sequence_batch(*sequences())
+        value = torch.randn(ROWS, STEPS, 1)
+        batch["privileged"], batch["value_target"] = 100 + 7 * value, value
+        batch["action"] = torch.randn(ROWS, STEPS, ACTIONS)
+        batch["advantage"] = torch.zeros(ROWS, STEPS, 1)
+        with torch.no_grad(), set_recurrent_mode():
+            batch["action_log_prob"] = actor.get_dist(batch).log_prob(batch["action"])
+        if privileged:
+            normalisers["privileged"].update(batch["privileged"])
+        for _ in range(25):
+            found = algorithm.update(batch.clone(), 1.0)
+        losses.append(found["critic_loss"])
+    assert losses[1] < 0.3 * losses[0], losses
+
+
+# ------------------------------------------------------------------- the policy
+
+
+def make_policy(seed=0, size=22, actions=4, **metadata) -> Policy:
+    """One layer behind a memory, of random numbers, for hover."""
+    random = np.random.default_rng(seed)
+
+    def array(*shape):
+        return random.normal(0, 0.3, shape).astype(np.float32)
+
+    unit = GRU(array(3 * WIDTH, size), array(3 * WIDTH, WIDTH), array(3 * WIDTH), array(3 * WIDTH))
+    weights, biases = (array(2 * actions, size + WIDTH),), (array(2 * actions),)
+    return Policy(weights, biases, array(size), array(size) + 2, "hover", metadata, unit)
+
+
+def test_it_does_not_forget_in_silence():
+    policy = make_policy()
+    for call in (policy, policy.sampled):
+        with refused() as caught:
+            call(0)
+        assert "flying" in str(caught.value)
+    assert "memory of 7" in repr(policy) and policy.state_size == WIDTH
+    plain = Policy.pretrained("hover")
+    assert plain.state_size == 0 and plain.initial_state(3).shape == (3, 0)
+
+
+@pytest.mark.parametrize(
+    ("observation", "state"),
+    [((3, 22), (2, WIDTH)), ((3, 22), (3, WIDTH + 1)), ((22,), (1, WIDTH)), ((3, 22), (WIDTH,))],
+)
+def test_a_state_of_another_shape_is_refused(observation, state):
+    with refused(name="state shape", value=state):
+        make_policy().step(np.zeros(observation), np.zeros(state))
+
+
+def test_a_flyer_remembers_and_forgets_rows():
+    policy = make_policy()
+    observation = np.random.default_rng(1).normal(size=(4, 3, 22))
+    flyer, state = policy.flying(3), policy.initial_state(3)
+    for seen in observation[:3]:
+        expected, state = policy.step(seen, state)
+        np.testing.assert_array_equal(flyer(seen), expected)
+    first, _ = policy.step(observation[3], policy.initial_state(3))
+    later, _ = policy.step(observation[3], state)
+    assert (first != later).any(-1).all()
+    flyer.reset(np.array([False, True, False]))
+    mixed = flyer(observation[3])
+    np.testing.assert_array_equal(mixed, np.where([[False], [True], [False]], first, later))
+    flyer.reset()
+    np.testing.assert_allclose(flyer(observation[3]), first, atol=1e-7)
+    alone = policy.flying()
+    np.testing.assert_allclose(alone(observation[3, 0]), first[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("policy", [make_policy(), Policy.pretrained("hover")], ids=repr)
+def test_every_policy_flies_with_its_memory(policy):
+    rollout = fly(policy, "hover", episodes=3)
+    environment = Environment("hover", num_envs=3, seed=1 << 53)
+    observation, state = environment.flatten(environment.reset()), policy.initial_state(3)
+    for taken in rollout.action[: rollout.length.min()]:
+        action, state = policy.step(observation, state)
+        np.testing.assert_array_equal(taken, action)
+        observation = environment.flatten(environment.step(action).observation)
+    again = fly(policy.flying(3), "hover", episodes=3)
+    np.testing.assert_array_equal(again.action, rollout.action)
+
+
+def test_sampled_actions_of_a_memory_are_those_of_its_seed():
+    policy = make_policy()
+    one, other = (evaluate(policy, episodes=3, sampled=True).metrics for _ in range(2))
+    assert one == other != evaluate(policy, episodes=3).metrics
+
+
+def test_a_sampled_policy_commands_what_it_was_trained_to():
+    # Velocity setpoints of zero hold an aircraft in the air; as rotor commands they would, too, but
+    # a policy with a mode is not to be flown in another.
+    policy = make_policy(control_mode="velocity")
+    assert policy.flying(2, seed=0).control_mode == "velocity"
+    with refused("control_mode"):
+        fly(policy.flying(2, seed=0), "hover", episodes=2, control_mode="rotor")
+
+
+def test_a_live_flight_forgets_the_rows_that_begin_anew():
+    task = tasks.make("hover", time_limit=0.2)
+    flight = Flight(make_policy(), task, Vehicle(), num_envs=2)
+    for _ in range(4):  # to the end of the episodes
+        flight.step()
+    assert flight.episodes == 2 and (flight._act.state == 0).all()
+    flight.step()
+    assert (flight._act.state != 0).all()
+    flight.reset()
+    assert (flight._act.state == 0).all()
+
+
+# ------------------------------------------------------------------- the file
+
+
+def parts(policy):
+    arrays = {"mean": policy.mean, "deviation": policy.deviation}
+    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
+    return arrays | policy.memory.arrays()
+
+
+HEADER = {"format": RECURRENT_FORMAT, "task": "hover", "metadata": {}}
+
+
+def write(path, arrays, **header):
+    path.write_bytes(save(arrays, metadata={"quadrl": json.dumps(HEADER | header)}))
+    return path
+
+
+def test_saved_and_loaded_it_is_the_same(tmp_path):
+    policy = make_policy(seed=3, algo="ppo")
+    policy.save(tmp_path / "policy.safetensors")
+    loaded = Policy.load(tmp_path)
+    assert (loaded.task, loaded.metadata) == (policy.task, policy.metadata)
+    for name, array in parts(policy).items():
+        np.testing.assert_array_equal(parts(loaded)[name], array)
+
+
+def replaced(**arrays):
+    return lambda own: own | {k: np.asarray(v, np.float32) for k, v in arrays.items()}
+
+
+def without(name):
+    return lambda own: {k: v for k, v in own.items() if k != name}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without("memory_state_bias"),
+        without("weight_0"),
+        lambda own: {k: v for k, v in own.items() if not k.startswith("memory")},
+        replaced(memory_input_weight=np.zeros((3 * WIDTH, 21))),
+        replaced(memory_state_weight=np.zeros((3 * WIDTH, WIDTH + 1))),
+        replaced(memory_state_weight=np.zeros((3 * WIDTH,))),
+        replaced(memory_state_weight=0.0),
+        replaced(memory_state_bias=np.zeros((3 * WIDTH, 1))),
+        replaced(memory_input_bias=np.full(3 * WIDTH, np.nan)),
+        replaced(memory_state_weight=np.full((3 * WIDTH, WIDTH), 3e38)),
+        replaced(memory_input_weight=np.full((3 * WIDTH, 22), 3e37)),  # times the clip
+        replaced(weight_0=np.zeros((8, 22))),  # without what is remembered
+        replaced(weight_0=np.full((8, 22 + WIDTH), 1e38)),
+        lambda own: own | {"memory_input_bias": np.zeros(3 * WIDTH)},  # double precision
+        replaced(
+            memory_input_weight=np.zeros((0, 22)),
+            memory_state_weight=np.zeros((0, 0)),
+            memory_input_bias=np.zeros(0),
+            memory_state_bias=np.zeros(0),
+            weight_0=np.zeros((8, 22)),
+        ),
+    ],
+)
+def test_arrays_that_make_no_policy_are_refused(tmp_path, change):
+    path = write(tmp_path / "policy.safetensors", parts(make_policy()))
+    Policy.load(path)
+    with refused():
+        Policy.load(write(path, change(parts(make_policy()))))
+
+
+def test_the_format_says_whether_it_has_a_memory(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    with refused():
+        Policy.load(write(path, parts(make_policy()), format="quadrl-policy-2"))
+    with refused(name=f"format of {path}"):
+        Policy.load(write(path, parts(make_policy()), format="quadrl-policy-gru-9"))
+    Policy.pretrained("hover").save(path)
+    assert Policy.load(path).memory is None
+
+
+def test_the_numbers_stay_finite_whatever_is_seen():
+    policy = make_policy()
+    seen = np.array([np.zeros(22), np.full(22, 1e30), np.full(22, -1e3)])
+    state = policy.initial_state(3)
+    for _ in range(50):
+        action, state = policy.step(seen, state)
+        assert (np.abs(action) <= 1).all() and (np.abs(state) <= 1 + 1e-6).all()

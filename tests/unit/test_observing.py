@@ -1,0 +1,252 @@
+"""Options of the observation: histories, rotor speeds, airspeed, delay, and the critic's own."""
+
+import math
+
+import helpers
+import numpy as np
+import pytest
+from apis import APIS
+from test_policy import linear
+
+from quadrl.environment import Environment
+from quadrl.envs.gymnasium import QuadrotorVectorEnv
+from quadrl.errors import QuadrlError
+from quadrl.evaluation import evaluate
+from quadrl.observer import SMOOTHING
+from quadrl.observing import Observing
+from quadrl.rotation import to_body
+from quadrl.rotors import GRAVITY
+from quadrl.vehicle import Vehicle
+
+PAPER = Vehicle()
+ACTIONS = helpers.random_actions(12, 3)
+REST = {name: np.zeros(3) for name in ("position", "velocity", "body_rate")}
+REST |= {"quaternion": np.array([1.0, 0, 0, 0])}
+
+
+def seen(observe, actions=ACTIONS, **settings):
+    """Copies of the observations (T + 1) of a flight, and its environment."""
+    environment = Environment("hover", num_envs=3, seed=1, observe=observe, **settings)
+    found = [{name: np.array(part) for name, part in environment.reset().items()}]
+    for action in actions:
+        given = environment.step(action).observation
+        found.append({name: np.array(part) for name, part in given.items()})
+    return found, environment
+
+
+def flat(observation, names):
+    return np.concatenate([observation[name] for name in names], axis=-1)
+
+
+def test_the_task_own_entries_stay_what_they_are():
+    usual, plain = seen(None)
+    options = {"action_history": 1, "observation_history": 1, "airspeed": True}
+    found, environment = seen(options)
+    for one, other in zip(found, usual, strict=True):
+        assert [*one] == [*other, "airspeed", "action_history", "observation_history"]
+        for name, part in other.items():
+            np.testing.assert_array_equal(one[name], part, err_msg=name)
+        np.testing.assert_array_equal(one["airspeed"], one["velocity"])  # in calm air
+    assert plain.size == 22 and environment.size == 22 + 3 + 4 + 25
+    assert environment.layout["observation_history"] == slice(29, 54)
+    vector = environment.flatten(environment.step(ACTIONS[0]).observation)
+    assert vector.shape == (3, 54) and vector.dtype == np.float32
+
+
+def test_histories_are_those_of_the_flight_the_newest_first():
+    found, environment = seen({"action_history": 3, "observation_history": 2})
+    names = environment.task.observation
+    for t, one in enumerate(found):
+        last = [ACTIONS[k] if k >= 0 else 0 * ACTIONS[0] for k in (t - 1, t - 2, t - 3)]
+        taken = [np.clip(action, -1, 1) for action in last]
+        np.testing.assert_array_equal(one["action_history"], np.concatenate(taken, axis=-1))
+        before = [flat(found[max(0, t - k)], names) for k in (1, 2)]
+        np.testing.assert_array_equal(one["observation_history"], np.concatenate(before, axis=-1))
+    fresh = environment.reset(np.array([1]))
+    assert not fresh["action_history"].any()
+    twice = np.tile(flat(fresh, names), 2)
+    np.testing.assert_array_equal(fresh["observation_history"], twice)
+
+
+def test_observations_are_as_late_as_is_drawn_for_each_row():
+    usual, _ = seen(None)
+    found, environment = seen(None, randomization={"observation_delay": (0.0, 0.15)})
+    late = np.rint(environment.disturbances.shown()["observation_delay"] / 0.05).astype(int)
+    assert len(set(late)) > 1
+    for t, one in enumerate(found):
+        for row, steps in enumerate(late):
+            for name, part in one.items():
+                np.testing.assert_array_equal(part[row], usual[max(0, t - steps)][name][row])
+
+
+def test_rotor_speeds_are_left_out_on_demand():
+    found, environment = seen({"rotor_speed": "none"})
+    assert "rotor_speed" not in found[0] and environment.size == 18
+
+
+@pytest.mark.parametrize("mode", ["rotor", "velocity"])
+def test_rotor_speeds_are_estimated_with_the_lag_that_is_specified(mode):
+    found, environment = seen({"rotor_speed": "estimated"}, control_mode=mode)
+    # Without anything drawn the estimate is the truth, but for the error of the integrator: the
+    # fourth-order method with a step of 0.01 / 0.18 leaves (0.056)^5 / 120 of each change.
+    true = environment.engine.act / PAPER.max_speed
+    np.testing.assert_allclose(found[-1]["rotor_speed"], true, atol=1e-7)
+    slow = {"lag": 2.0}
+    slower, other = seen({"rotor_speed": "estimated"}, control_mode=mode, randomization=slow)
+    assert np.abs(slower[-1]["rotor_speed"] - other.engine.act / PAPER.max_speed).max() > 1e-3
+    if mode == "rotor":  # the estimate follows from the commands alone
+        np.testing.assert_array_equal(slower[-1]["rotor_speed"], found[-1]["rotor_speed"])
+
+
+def test_the_airspeed_is_the_velocity_through_the_air():
+    found, environment = seen({"airspeed": True}, weather="moderate")
+    state, wind = environment.engine.state, environment.engine.wind
+    assert np.abs(wind).max() > 1
+    np.testing.assert_array_equal(
+        found[-1]["airspeed"], to_body(state.rotation, state.velocity - wind)
+    )
+
+
+@pytest.mark.parametrize("rotor_speed", ["true", "estimated", "none"])
+@pytest.mark.parametrize("mass", [0.8, 1.25])
+def test_a_mass_that_is_not_the_specified_one_shows_as_acceleration(mass, rotor_speed):
+    options = {"disturbance": True, "rotor_speed": rotor_speed}
+    environment = helpers.begun("hover", 2, observe=options, randomization={"mass": mass})
+    environment.reset(start=REST)
+    for k in range(1, 6):
+        found = helpers.idle(environment).observation["disturbance"]
+        arrived = 1 - math.exp(-k * PAPER.control_timestep / SMOOTHING)
+        expected = arrived * GRAVITY * (1 / mass - 1)  # the rotors turn as if it were the specified
+        np.testing.assert_allclose(found, [[0, 0, expected]] * 2, atol=0.05)
+    assert not environment.reset(np.array([1]), REST)["disturbance"].any()
+
+
+def test_the_push_of_the_wind_shows_as_acceleration_in_the_body_frame():
+    east = {**REST, "quaternion": np.array([1, 0, 0, 1]) / math.sqrt(2)}  # x of the body is north
+    environment = helpers.begun("hover", 1, observe={"disturbance": True})
+    environment.reset(start=east)
+    environment.engine.wind[:] = 4.0, 0.0, 0.0
+    for _ in range(4):
+        found = helpers.idle(environment).observation["disturbance"]
+    push = PAPER.drag_coefficient * 4.0**2 / PAPER.mass * (1 - math.exp(-4 * 0.05 / SMOOTHING))
+    np.testing.assert_allclose(found, [[0, -push, 0]], atol=0.1 * push)
+
+
+def test_the_privileged_observation_is_the_truth_what_was_drawn_and_the_wind():
+    settings = {"randomization": "full", "weather": "light"}
+    found, environment = seen({"privileged": True}, **settings)
+    privileged, state = environment.privileged, environment.engine.state
+    shown = environment.disturbances.shown()
+    true = flat(environment.task.observe(environment.snapshot), environment.task.observation)
+    np.testing.assert_array_equal(privileged[:, :22], true)
+    assert (flat(found[-1], environment.task.observation) != true).any()
+    drawn = privileged[:, 22:-3]
+    assert drawn.shape[1] == len(shown) and (np.abs(drawn) <= 1).all()
+    low, high = environment.randomization.mass
+    column = 22 + [*shown].index("mass")
+    np.testing.assert_allclose(
+        low + (privileged[:, column] + 1) / 2 * (high - low), shown["mass"], rtol=1e-12
+    )
+    wind = to_body(state.rotation, environment.engine.wind)
+    np.testing.assert_array_equal(privileged[:, -3:], wind)
+    before = privileged.copy()
+    environment.reset(np.array([2]))
+    np.testing.assert_array_equal(privileged, before)  # what was handed out stays
+    np.testing.assert_array_equal(environment.privileged[:2], before[:2])
+    assert (environment.privileged[2, 22:-3] != before[2, 22:-3]).all()
+
+
+# ------------------------------------------------------------------------------------ the APIs
+
+
+@pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
+def test_every_api_observes_alike_and_tells_what_was_drawn(api):
+    observe = {"action_history": 1, "rotor_speed": "estimated", "privileged": True}
+    settings = {"randomization": "full", "observe": observe, "weather": "light"}
+    settings |= {"aerodynamics": "rotor_drag"}
+    flown = api(seed=4, **settings)
+    core = Environment("hover", num_envs=flown.rows, seed=4, vehicle=flown.core.vehicle,
+                       **{k: v for k, v in settings.items() if k != "aerodynamics"})  # fmt: skip
+    assert core.vehicle.aerodynamics.rotor_drag > 0
+    met = flown.reset()
+    expected = core.flatten(core.reset())
+    np.testing.assert_array_equal(flown.observation(met).astype(np.float32), expected)
+    for action in helpers.random_actions(3, flown.rows) * 0.1:
+        given = flown.step(action)
+        now = core.step(action)
+        found = flown.observation(given).astype(np.float32)
+        np.testing.assert_array_equal(found, core.flatten(now.observation))
+    np.testing.assert_array_equal(flown.core.privileged, core.privileged)
+    if api.__name__ in ("Gymnasium", "Vector"):
+        info, shown = given[-1], core.disturbances.shown()
+        mass = np.reshape(info["drawn"]["mass"], -1)
+        np.testing.assert_array_equal(mass, shown["mass"])
+        assert info["drawn"].names == tuple(shown)
+        told = np.reshape(info["privileged"], core.privileged.shape)
+        np.testing.assert_array_equal(told, core.privileged.astype(np.float32))
+    if api.__name__ == "TorchRL":
+        told = given["privileged"].numpy()
+        np.testing.assert_array_equal(told, core.privileged.astype(np.float32))
+        flown.environment.check_env_specs()
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
+def test_a_vector_tells_what_was_drawn_for_the_present_episode(mode):
+    environment = QuadrotorVectorEnv(
+        "hover", 3, autoreset_mode=mode, time_limit=0.1, randomization={"mass": (0.9, 1.1)}
+    )
+    _, info = environment.reset(seed=0)
+    first = info["drawn"]["mass"].copy()
+    assert info["_drawn"].all()
+    for _ in range(2):
+        *_, info = environment.step(np.zeros((3, 4)))
+    if mode == "SAME_STEP":
+        np.testing.assert_array_equal(info["final_info"]["drawn"]["mass"], first)
+    if mode == "NEXT_STEP":
+        np.testing.assert_array_equal(info["drawn"]["mass"], first)
+        *_, info = environment.step(np.zeros((3, 4)))
+    if mode == "DISABLED":
+        _, info = environment.reset(options={"reset_mask": np.array([True, True, True])})
+    now = environment.environment.disturbances.shown()["mass"]
+    np.testing.assert_array_equal(info["drawn"]["mass"], now)
+    assert (now != first).all()
+
+
+# ------------------------------------------------------------------------------------ policies
+
+
+def test_a_policy_flies_with_the_options_of_its_training_and_no_others():
+    observe = {"action_history": 2}
+    policy = linear(30, 4, observe=observe, randomization={"mass": [0.9, 1.1]}, weather={})
+    found = evaluate(policy, "hover", episodes=2, time_limit=0.2)
+    assert found.metrics["episodes"] == 2
+    for other in ({}, {"action_history": 1}, {"action_history": 2, "airspeed": True}):
+        with pytest.raises(QuadrlError) as caught:
+            evaluate(policy, "hover", episodes=2, observe=other)
+        assert caught.value.name == "observe" and "action_history" in caught.value.allowed
+    # What only the critic sees makes no difference.
+    evaluate(policy, "hover", episodes=1, time_limit=0.1, observe=observe | {"privileged": True})
+
+
+@pytest.mark.parametrize(
+    ("observe", "name", "value"),
+    [
+        ("all", "observe", "all"),
+        ({"history": 2}, "option of observe", "history"),
+        ({"action_history": -1}, "action_history", -1),
+        ({"action_history": 1.5}, "action_history", 1.5),
+        ({"observation_history": 10**6}, "observation_history", 10**6),
+        ({"rotor_speed": "guessed"}, "rotor_speed", "guessed"),
+        ({"airspeed": 1}, "airspeed", 1),
+        ({"privileged": "yes"}, "privileged", "yes"),
+    ],
+)
+def test_an_impossible_option_is_refused(observe, name, value):
+    with pytest.raises(QuadrlError) as caught:
+        Environment("hover", observe=observe)
+    assert (caught.value.name, caught.value.value) == (name, value)
+
+
+def test_options_that_are_the_usual_ones_change_nothing():
+    environment = helpers.begun("hover", 2, observe=Observing())
+    assert environment.observer is None and environment.privileged is None

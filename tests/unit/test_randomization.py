@@ -1,0 +1,266 @@
+"""What disturbs a flight: late commands, errors of the estimate, pushes; and whose they are."""
+
+import dataclasses
+import math
+
+import helpers
+import numpy as np
+import pytest
+
+from quadrl import tasks
+from quadrl.engines.mujoco import BatchEngine
+from quadrl.environment import Environment
+from quadrl.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.rng import NOISE, uniform_array_api
+from quadrl.rotation import norm
+from quadrl.vehicle import VEHICLES, Vehicle
+
+ENGINES = ("mujoco", "free_flight")
+PAPER = Vehicle()
+SEEN = {
+    "action_history": 2,
+    "observation_history": 1,
+    "rotor_speed": "estimated",
+    "airspeed": True,
+    "disturbance": True,
+    "privileged": True,
+}
+WILD = dataclasses.replace(
+    RANDOMIZATIONS["full"],
+    observation_delay=(0.0, 0.1),
+    pushes=Pushes(rate=5.0, velocity=0.3, body_rate=0.5),
+)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("mode", ["rotor", "velocity"])
+def test_row_i_is_disturbed_as_the_single_aircraft_of_seed_plus_i(engine, mode):
+    task = tasks.make("hover", time_limit=0.4)
+    settings = {"engine": engine, "control_mode": mode, "weather": "light"}
+    settings |= {"randomization": WILD, "observe": SEEN}
+    actions = helpers.random_actions(20, 3)
+    whole = helpers.flying(task, count=3, seed=40, **settings)
+    drawn, records = whole.disturbances.drawn, helpers.fly(whole, actions)
+    told = whole.privileged
+    for i in range(3):
+        single = helpers.flying(task, count=1, seed=40 + i, **settings)
+        np.testing.assert_array_equal(single.disturbances.drawn[0], drawn[i])
+        helpers.assert_records(helpers.fly(single, actions[:, i : i + 1]), records, [i])
+        np.testing.assert_array_equal(single.privileged[0], told[i])
+
+
+def test_presets_fit_every_aircraft():
+    for vehicle in VEHICLES:
+        for name in RANDOMIZATIONS:
+            environment = helpers.begun("hover", 2, vehicle=vehicle, randomization=name)
+            assert (environment.disturbances.shown() == {}) == (name == "none")
+            assert np.isfinite(helpers.idle(environment).reward).all()
+
+
+def test_none_is_the_usual_flight_and_remembers_nothing():
+    for given in (None, "none", {}, {"mass": 1.0}, Randomization()):
+        environment = helpers.begun("hover", 2, randomization=given)
+        assert environment.observer is None and not environment.disturbances.active
+        assert not any(name.startswith("disturbances") for name in environment.save())
+
+
+# ---------------------------------------------------------------------------------------- delay
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("late", [1, 3, 5, 12])  # physics steps of 0.01 s, 5 in a control step
+def test_commands_arrive_so_many_physics_steps_late(engine, late):
+    environment = helpers.begun(
+        "hover", 3, engine=engine, randomization={"command_delay": late / 100}
+    )
+    other = BatchEngine(PAPER, 3, altitude=3.0, engine=engine)
+    for field in ("qpos", "qvel", "act"):
+        getattr(other, field)[:] = getattr(environment.engine, field)
+    # Until the first command arrives the rotors keep their speed.
+    commands = [np.array(other.act)] * late
+    for action in helpers.random_actions(6, 3):
+        commands += [PAPER.rotor_command(action)] * 5
+        environment.step(action)
+        for _ in range(5):
+            other.ctrl[:] = commands.pop(0)
+            other.advance(1)
+        np.testing.assert_array_equal(
+            helpers.coordinates(environment.engine), helpers.coordinates(other)
+        )
+
+
+def test_the_commands_of_loops_are_late_too():
+    late = 7
+    environment = helpers.begun(
+        "hover", 2, control_mode="velocity", randomization={"command_delay": late / 100}
+    )
+    mode, asked, given = environment.control_mode, [], []
+    asked += [np.array(environment.engine.act)] * late
+    command = mode.rotor_command
+    mode.rotor_command = lambda *state: asked.append(command(*state)) or asked[-1]
+    advance = environment.engine.advance
+    environment.engine.advance = lambda n: (
+        given.append(environment.engine.ctrl.copy()) or advance(n)
+    )
+    for action in helpers.random_actions(4, 2):
+        environment.step(action)
+    assert len(given) == 20
+    np.testing.assert_array_equal(given, asked[:20])
+
+
+def test_each_row_has_a_delay_of_its_own_and_every_one_is_drawn_as_often():
+    environment = helpers.begun("hover", 500, randomization={"command_delay": (0.01, 0.04)})
+    drawn = environment.disturbances.shown()["command_delay"]
+    values, counts = np.unique(drawn.round(9), return_counts=True)
+    np.testing.assert_allclose(values, [0.01, 0.02, 0.03, 0.04])
+    # 125 of each; a binomial of 500 and 1/4 has a deviation of 9.7.
+    assert (np.abs(counts - 125) < 5 * 9.7).all()
+    action = np.full((500, 4), 0.5)
+    environment.step(action)
+    moved = np.abs(environment.engine.act - PAPER.hover_speed[0]).max(axis=1)
+    earlier = drawn[:, None] < drawn[None] - 1e-9
+    assert (moved[:, None] > moved[None])[earlier].all()
+
+
+# ---------------------------------------------------------------------------------------- errors
+
+SIZES = Errors(position=0.01, attitude=0.02, velocity=0.03, body_rate=0.04)
+
+
+def errors(environment):
+    """Of the estimated state: position, angles about the axes, velocity, body rate, (N, 12)."""
+    seen, true = environment.observer.frame.state, environment.engine.state
+    turn = np.swapaxes(true.rotation, -1, -2) @ seen.rotation  # I + [angles]x
+    angles = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0],
+                       turn[:, 1, 0] - turn[:, 0, 1]], axis=-1) / 2  # fmt: skip
+    np.testing.assert_allclose(norm(seen.quaternion), 1.0, rtol=1e-12)
+    parts = (seen.position - true.position, angles, seen.velocity - true.velocity)
+    return np.concatenate([*parts, seen.body_rate - true.body_rate], axis=-1)
+
+
+def test_the_noise_is_white_of_the_sizes_that_are_given_and_the_bias_lasts():
+    bias = Errors(position=0.1, attitude=0.05, velocity=0.2, body_rate=0.3)
+    environment = helpers.begun("hover", 400, randomization=Randomization(noise=SIZES, bias=bias))
+    found = []
+    for _ in range(6):
+        found.append(errors(environment))
+        helpers.idle(environment)
+    found, shown = np.array(found), environment.disturbances.shown()
+    lasting = np.stack([shown[f"{name}_bias_{axis}"] for name in vars(bias) for axis in "xyz"], 1)
+    assert (np.abs(lasting) <= bias.sizes).all()
+    assert (np.ptp(lasting, axis=0) > 1.9 * bias.sizes).all()
+    noise = (found - lasting) / SIZES.sizes
+    # 2400 numbers of each kind: means within 5 / sqrt(2400), deviations within 5 / sqrt(4800);
+    # angles of 0.07 rad are known to a few parts in a thousand.
+    assert np.abs(noise.mean(axis=(0, 1))).max() < 0.11
+    assert np.abs(noise.std(axis=(0, 1)) - 1).max() < 0.08
+    assert np.abs(noise).max() < math.sqrt(12) * 1.01
+    related = np.corrcoef(
+        np.concatenate([noise[:-1].reshape(-1, 12), noise[1:].reshape(-1, 12)], 1).T
+    )
+    assert np.abs(related - np.eye(24)).max() < 5 / math.sqrt(2000)
+    first = lasting.copy()
+    environment.reset()
+    again = environment.disturbances.shown()["position_bias_x"]
+    assert (again != first[:, 0]).all()
+
+
+def test_the_noise_is_the_definition_bit_for_bit():
+    environment = helpers.begun("hover", 3, seed=2**40, randomization={"noise": SIZES})
+    for step in range(4):
+        keys, episodes = environment.disturbances.place
+        words = uniform_array_api(keys, episodes, NOISE, 24 * step, 24) * 2.0**32
+        halves = np.floor(words / 65536) + words % 65536
+        normal = (halves[:, ::2] + halves[:, 1::2] - 131070) * (math.sqrt(3) / 65536)
+        seen, engine = environment.observer.frame.state, environment.engine
+        expected = engine.qpos[:, :3] + SIZES.position * normal[:, :3] - engine.origin
+        np.testing.assert_array_equal(seen.position, expected)
+        np.testing.assert_array_equal(seen.body_rate, engine.qvel[:, 3:] + 0.04 * normal[:, 9:])
+        helpers.idle(environment)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_reward_end_and_success_are_those_of_the_true_state(compiled):
+    task = helpers.SHORT["static_waypoint"]
+    kind = type("Written", (type(task),), {"compiled": compiled})
+    task = kind(**{field.name: getattr(task, field.name) for field in dataclasses.fields(task)})
+    plain = helpers.flying(task, randomization=None)
+    noisy = helpers.flying(task, randomization={"noise": SIZES, "bias": SIZES})
+    assert (noisy.compiled is not None) == compiled
+    for action in helpers.random_actions(15, 4):
+        expected, found = plain.step(action), noisy.step(action)
+        for name in ("reward", "error", "terminated", "truncated", "is_success", "diverged"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+        for name, term in expected.observation.items():
+            np.testing.assert_array_equal(found.truth[name], term)
+            if name != "rotor_speed":
+                assert (found.observation[name] != term).any(axis=1).all(), name
+        over = expected.terminated | expected.truncated
+        if over.any():
+            plain.reset(over), noisy.reset(over)
+
+
+def test_the_goal_is_seen_from_where_the_estimate_is():
+    environment = helpers.begun("hover", 50, randomization={"noise": {"position": 0.1}})
+    seen = helpers.idle(environment).observation
+    state = environment.engine.state
+    to_goal = np.einsum("nij,nj->ni", state.rotation, seen["goal"])
+    np.testing.assert_allclose(seen["position"] + to_goal, 0.0, atol=1e-12)  # the goal of hover
+    assert np.abs(seen["position"] - state.position).max() > 0.1
+
+
+# ---------------------------------------------------------------------------------------- pushes
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_pushes_come_by_chance_and_change_velocity_and_body_rate(engine):
+    pushes = Pushes(rate=2.0, velocity=0.5, body_rate=1.0)
+    environment = helpers.begun("hover", 200, engine=engine, randomization={"pushes": pushes})
+    hits = []
+    for _ in range(10):
+        before, advance = environment.engine.qvel.copy(), environment.engine.advance
+
+        def measured(steps, before=before, advance=advance):
+            hits.append(environment.engine.qvel - before)
+            advance(steps)
+
+        environment.engine.advance = measured
+        assert not helpers.idle(environment).diverged.any()
+        environment.engine.advance = advance
+    hits = np.array(hits).reshape(-1, 6)
+    hit = hits.any(axis=1)
+    # 2000 chances of 1 - exp(-2 * 0.05) = 0.095: 190, with a deviation of 13.
+    assert abs(hit.sum() - 190) < 5 * 13
+    np.testing.assert_allclose(norm(hits[hit, :3]), 0.5, rtol=1e-9)
+    np.testing.assert_allclose(norm(hits[hit, 3:]), 1.0, rtol=1e-9)
+    # Evenly over the sphere: each component has mean 0 and deviation 1 / sqrt(3).
+    assert np.abs(hits[hit].mean(axis=0) / ([0.5] * 3 + [1.0] * 3)).max() < 5 / math.sqrt(3 * 190)
+
+
+def test_what_diverges_is_counted_and_finite():
+    # A racer resolves 25 rad/s or so; pushes of 20 rad/s in the same direction add up.
+    pushes = Pushes(rate=1e9, velocity=5.0, body_rate=20.0)
+    environment = helpers.begun("hover", 50, vehicle="racer", randomization={"pushes": pushes})
+    diverged = 0
+    for _ in range(20):
+        now = helpers.idle(environment)
+        assert all(np.isfinite(part).all() for part in (now.reward, *now.observation.values()))
+        assert (now.terminated >= now.diverged).all()
+        diverged += now.diverged.sum()
+    assert diverged
+
+
+# ---------------------------------------------------------------------------------------- wind
+
+
+def test_each_row_has_a_share_of_the_weather():
+    environment = Environment(
+        "hover", num_envs=200, seed=0, weather="light", randomization={"wind": (0.0, 1.0)}
+    )
+    environment.reset()
+    share = environment.disturbances.shown()["wind"]
+    mean = np.zeros((200, 2))
+    for _ in range(40):
+        helpers.idle(environment)
+        mean += environment.engine.wind[:, :2] / 40
+    assert np.corrcoef(share, norm(mean))[0, 1] > 0.8

@@ -1,0 +1,394 @@
+"""`quadrl view`: the flight that goes on, its page without a browser, and what is refused."""
+
+import contextlib
+import io
+import socket
+import sys
+import urllib.request
+
+import mujoco
+import numpy as np
+import pytest
+import scipy.spatial
+from scipy.spatial.transform import Rotation
+
+from quadrl import cli, mjcf, tasks
+from quadrl.cli.view import others
+from quadrl.control import make as make_controller
+from quadrl.errors import QuadrlError
+from quadrl.evaluation import trained_with
+from quadrl.markers import Marker
+from quadrl.policy import Policy
+from quadrl.vehicle import resolve
+from quadrl.view import readout
+from quadrl.view.flight import Flight, Keyboard
+from quadrl.view.shapes import sketch
+
+VEHICLE = resolve(None)
+STEP = VEHICLE.control_timestep
+
+
+def hover(count=1, vehicle=VEHICLE, **options):
+    task = tasks.make("hover", **options)
+    return Flight(make_controller("geometric", task, vehicle), task, vehicle, num_envs=count)
+
+
+@pytest.fixture
+def page():
+    """A page of two aircraft, served to nobody."""
+    browser = pytest.importorskip("quadrl.view.browser", exc_type=ModuleNotFoundError)
+    task = tasks.make("hover")
+    geometric = make_controller("geometric", task, VEHICLE)
+    choices = {
+        "geometric": lambda: geometric,
+        "policy": lambda: Policy.pretrained("hover"),
+        "of another task": lambda: Policy.pretrained("target_following"),
+    }
+    flight = Flight(geometric, task, VEHICLE, num_envs=2)
+    with contextlib.closing(browser.Page(flight, choices, port=0)) as page:
+        yield page
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return probe.getsockname()[1]
+
+
+def command(*arguments):
+    """Exit code of the command in this process."""
+    try:
+        cli.main([str(argument) for argument in arguments])
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+def test_time_passes_as_fast_as_it_is_told_to():
+    flight = hover()
+    assert flight.advance(0.5 * STEP) == 1  # the first is due at once
+    assert flight.advance(0.5 * STEP) == 1
+    flight.speed = 4.0
+    assert flight.advance(0.5 * STEP) == 2
+    flight.paused = True
+    assert flight.advance(1.0) == 0
+    flight.paused = False
+    assert flight.advance(60.0) <= 1 + 0.25 / STEP  # nobody waits for what was missed
+
+
+def test_between_two_steps_the_aircraft_is_drawn_between_their_poses():
+    flight = hover(2)
+    flight.push(np.array([1.0, 0.0, 0.0]))
+    flight.advance(0.0)
+    before = flight.pose.copy()
+    flight.advance(1.25 * STEP)
+    flight._before[:, 3:7] *= -1  # the same attitude
+    drawn = flight.drawn()
+    expected = 0.75 * before[:, :3] + 0.25 * flight.pose[:, :3]
+    np.testing.assert_allclose(drawn[:, :3], expected, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(drawn[:, 3:7], axis=1), 1.0)
+    assert (np.abs((drawn[:, 3:7] * flight.pose[:, 3:7]).sum(1)) > 0.99).all()
+
+
+def test_wind_blows_in_the_engine_and_is_felt():
+    calm, windy = hover(2), hover(2)
+    windy.wind[:] = (6.0, 0.0, 0.0)
+    for flight in (calm, windy):
+        for _ in range(10):
+            flight.step()
+    np.testing.assert_array_equal(windy.environment.engine.wind, [[6.0, 0.0, 0.0]] * 2)
+    assert (windy.pose[:, 0] > calm.pose[:, 0] + 1e-3).all()
+
+
+def test_wind_blows_on_in_the_next_episode():
+    flight = hover(1, time_limit=2 * STEP, settle_time=STEP)
+    flight.wind[:] = (0.0, 2.0, 0.0)
+    for _ in range(3):
+        flight.step()
+    assert flight.episodes == 1
+    np.testing.assert_array_equal(flight.environment.engine.wind, [[0.0, 2.0, 0.0]])
+
+
+def test_a_push_changes_the_velocity_of_one_aircraft():
+    flight = hover(2)
+    was = flight.environment.engine.qvel.copy()
+    flight.push(np.array([0.0, 0.0, 2.0]), 1)
+    np.testing.assert_allclose(flight.environment.engine.qvel - was, [[0] * 6, [0, 0, 2, 0, 0, 0]])
+    height = flight.pose[:, 2].copy()
+    flight.step()
+    rose = flight.pose[:, 2] - height
+    assert rose[1] - rose[0] > 0.5 * 2.0 * STEP
+
+
+def test_blades_turn_as_the_rotors_do():
+    flight = hover()
+    flight.step()
+    spins = np.sign([rotor.spin for rotor in VEHICLE.rotors])
+    np.testing.assert_array_equal(np.sign(flight.pose[0, 7:]), spins)
+
+
+def test_an_episode_that_ends_begins_anew_without_a_jump_in_the_picture():
+    flight = hover(2, time_limit=3 * STEP, settle_time=STEP)
+    for _ in range(3):
+        flight.step()
+    assert flight.episodes == 2
+    np.testing.assert_array_equal(flight.time, 0.0)
+    np.testing.assert_array_equal(flight.drawn()[:, :3], flight.pose[:, :3])
+    assert np.isnan(flight.trail).all()
+    flight.endless = True
+    for _ in range(5):
+        flight.step()
+    assert flight.episodes == 2
+    assert np.isfinite(flight.trail[-5:]).all()
+
+
+def test_keys_fly_velocities():
+    flight, keyboard = hover(2), Keyboard()
+    flight.fly_with(keyboard)
+    assert flight.environment.control_mode.name == "velocity"
+    flight.endless = True
+    for _ in range(3):
+        keyboard.press("I")
+    for _ in range(40):
+        flight.step()
+    velocity = flight.environment.engine.qvel[:, :3]
+    wanted = 0.75 * flight.environment.control_mode.scale[0]
+    np.testing.assert_allclose(np.linalg.norm(velocity, axis=1), wanted, rtol=0.1)
+    for _ in range(9):
+        keyboard.press("K")
+    np.testing.assert_array_equal(keyboard.action, [-1.0, 0.0, 0.0, 0.0])
+    keyboard.press("X")
+    np.testing.assert_array_equal(keyboard.action, 0.0)
+
+
+def test_a_controller_that_does_not_fit_changes_nothing():
+    flight = hover()
+    flown = flight.controller
+    with pytest.raises(QuadrlError):
+        flight.fly_with(Policy.pretrained("target_following"))
+    assert flight.controller is flown
+    flight.step()
+
+
+def test_markers_become_balls_discs_lines_and_words():
+    drawn = sketch(
+        [
+            (Marker("goal", (0, 0, 2), 0.1), np.array([5.0, 0, 0])),
+            (Marker("sphere", (1, 0, 1), 0.2, label="1"), np.zeros(3)),
+            (Marker("ring", (0, 0, 1), 0.5, end=(1, 0, 1)), np.zeros(3)),
+            (Marker("pad", (3, 0, 2), 0.4), np.zeros(3)),
+            (Marker("arrow", (0, 0, 0), 0.01, end=(0, 0, 1)), np.zeros(3)),
+            (Marker("path", points=[(0, 0, 7), (0, 1, 7), (0, 2, 7)]), np.zeros(3)),
+        ]
+    )
+    np.testing.assert_allclose(
+        drawn.balls[:, :4], [[5, 0, 2, 0.1], [5, 0, 2, 0.022], [1, 0, 1, 0.2]]
+    )
+    np.testing.assert_allclose(drawn.discs[0, :8], [3, 0, 0, 1, 0, 0, 0, 0.4])  # on the ground
+    assert [text for text, _ in drawn.labels] == ["1"]
+    ring = drawn.lines[np.isclose(np.linalg.norm(drawn.lines - (0, 0, 1), axis=2), 0.5).all(1)]
+    assert len(ring) == 48
+    np.testing.assert_allclose(ring[..., 0], 0, atol=1e-12)  # it faces east
+    assert (drawn.lines[..., 2] == 7).all(1).sum() == 2
+    assert drawn.lines.shape == drawn.colours.shape
+
+
+def test_nothing_to_draw_is_drawn_too():
+    drawn = sketch([])
+    assert drawn.balls.shape == (0, 8) and drawn.lines.shape == (0, 2, 3)
+
+
+def test_numbers_are_those_of_the_aircraft():
+    flight = hover(2)
+    flight.step()
+    flight.error[:] = (0.1, 0.25)
+    assert "10.0 cm" in readout.html(flight, 0)
+    assert "25.0 cm" in readout.html(flight, 1)
+    assert readout.html(flight, 0).count("background:rgb(") == VEHICLE.rotor_count
+
+
+@pytest.mark.parametrize("vehicle", ["paper", "hexa"])
+def test_meshes_are_those_of_the_model(vehicle):
+    trimesh = pytest.importorskip("trimesh")
+    from quadrl.view import meshes
+
+    model = mjcf.compile_model(resolve(vehicle))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    solid, clear = meshes.airframe(model)
+    parts = [(solid, np.eye(4)), *(meshes.blades(model, rotor) for rotor in range(model.nu))]
+    points = [mesh.vertices for mesh, _ in clear]
+    for glb, frame in parts:
+        mesh = trimesh.load_scene(io.BytesIO(glb), file_type="glb").to_mesh()
+        points.append(trimesh.transform_points(mesh.vertices, frame))
+    drawn = scipy.spatial.KDTree(np.concatenate(points))
+    checked = 0
+    for geom in range(model.ngeom):
+        is_mesh = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+        if not is_mesh or not model.geom_bodyid[geom]:  # what is painted on the ground
+            continue
+        mesh = model.mesh(model.geom_dataid[geom])
+        vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
+        axes = data.geom_xmat[geom].reshape(3, 3)
+        where = data.geom_xpos[geom] + vertices @ axes.T - data.body("aircraft").xpos
+        assert drawn.query(where)[0].max() < 1e-6, model.geom(geom).name
+        checked += 1
+    assert sorted(rgba[3] < 1 for _, rgba in clear) == [True] * 3  # the discs: front, side, back
+    assert checked > 4 * model.nu  # arm, sleeve, two blades and rim of each rotor
+    assert meshes.world(model) is None
+
+
+def test_what_stands_in_the_world_is_drawn():
+    pytest.importorskip("trimesh")
+    from quadrl.view import meshes
+
+    def wall(spec):
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.1, 2, 1), pos=(3, 0, 1))
+
+    assert meshes.world(mjcf.compile_model(VEHICLE, scene=wall))
+
+
+def test_controls_act_on_the_flight(page):
+    engine = page.flight.environment.engine
+    page.wind[1].value = 4.0
+    page.frame(STEP)
+    np.testing.assert_array_equal(engine.wind, [[0.0, 4.0, 0.0]] * 2)
+    page.speed.value, page.endless.value = 2.0, True
+    steps = page.flight.time[0] / STEP
+    page.frame(STEP)
+    assert page.flight.time[0] / STEP == pytest.approx(steps + 2)
+    page.paused.value = True
+    was, place = page.flight.time.copy(), engine.qvel[:, 0].copy()
+    page.strength.value, page.aircraft.value = 3.0, 2
+    page.push("east")
+    page.frame(STEP)
+    np.testing.assert_allclose(engine.qvel[:, 0] - place, [0.0, 3.0])
+    np.testing.assert_array_equal(page.flight.time, was)
+
+
+def test_what_flies_can_be_changed(page):
+    page.flown_by.value = "policy"
+    page.frame(STEP)
+    assert isinstance(page.flight.controller, Policy)
+    page.flown_by.value = "of another task"
+    page.frame(STEP)
+    assert page.flown_by.value == "policy"
+    assert page.flight.controller.task == "hover"
+    page.flown_by.value = "keyboard"
+    page.frame(STEP)
+    assert page.flight.controller is page.keyboard
+    page.frame(STEP)
+
+
+@pytest.mark.parametrize("scale", [None, 90.0])
+def test_what_is_offered_commands_what_it_did_in_its_training(scale):
+    task, vehicle = tasks.make("hover"), resolve(None, {"action_scale": scale} if scale else {})
+    offered = {name: make() for name, make in others(task, vehicle).items()}
+    assert ("hover_ppo" in offered) == (scale is None)
+    flight = Flight(offered["geometric"], task, vehicle)
+    for controller in offered.values():
+        flight.fly_with(controller)
+        flight.step()
+        if isinstance(controller, Policy):
+            assert controller.task == "hover"
+            assert trained_with(controller).action_scale == vehicle.action_scale
+
+
+def test_aircraft_are_drawn_apart_and_where_they_are(page):
+    page.frame(STEP)
+    node = page.scene._airframe
+    drawn = page.flight.drawn()
+    apart = node.batched_positions - drawn[:, :3]
+    np.testing.assert_allclose(np.abs(apart[0] - apart[1]), [page.apart.value, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(node.batched_wxyzs, drawn[:, 3:7], atol=1e-6)
+    page.apart.value = 0.0
+    page.frame(0.0)
+    np.testing.assert_allclose(node.batched_positions, page.flight.drawn()[:, :3], atol=1e-6)
+
+
+def test_trails_end_at_the_aircraft(page):
+    node = page.scene._trails
+    begun = len(node.points)
+    page.push("east")
+    for _ in range(8):
+        page.frame(STEP)
+    assert len(node.points) == begun  # viser's client draws no more than there were at first
+    places = page.flight.pose[:, :3] + page.scene.offsets(page.apart.value)
+    np.testing.assert_allclose(node.points[-2:, 1], places, atol=1e-5)
+    lengths = np.linalg.norm(node.points[:, 1] - node.points[:, 0], axis=1).reshape(-1, 2)
+    assert (lengths[-3:] > 0).all() and lengths[0].max() == 0
+
+
+@pytest.mark.parametrize("camera", ["follow", "chase"])
+def test_the_camera_stays_with_its_aircraft(page, camera):
+    page.camera.value, page.aircraft.value = camera, 2
+    page.frame(STEP)
+    world, place = page.scene._world, page.scene._airframe.batched_positions[1]
+    turn = Rotation.from_quat(world.wxyz, scalar_first=True)
+    home = page.flight.environment.origin
+    np.testing.assert_allclose(world.position + turn.apply(place), home, atol=1e-5)
+    ahead = Rotation.from_quat(page.flight.drawn()[1, 3:7], scalar_first=True).apply((1, 0, 0))
+    seen = turn.apply(ahead)
+    if camera == "chase":  # the nose points away from the camera
+        assert seen[1] == pytest.approx(0.0, abs=1e-6) and seen[0] > 0
+
+
+def test_a_task_with_a_pad_and_one_with_labels_are_drawn():
+    browser = pytest.importorskip("quadrl.view.browser", exc_type=ModuleNotFoundError)
+    for name in ("landing", "static_waypoint"):
+        task = tasks.make(name)
+        flight = Flight(make_controller("geometric", task, VEHICLE), task, VEHICLE)
+        with contextlib.closing(browser.Page(flight, {}, port=0)) as page:
+            page.frame(STEP)
+            page.show_markers.value = False
+            page.frame(STEP)
+
+
+def test_a_port_that_is_taken_is_named(capsys):
+    pytest.importorskip("viser")
+    with socket.socket() as taken:
+        taken.bind(("localhost", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert command("view", "hover", "--port", port) == 2
+    said = capsys.readouterr().err
+    assert str(port) in said and said.count("\n") == 1
+
+
+def test_without_the_extra_there_is_one_line(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.delitem(sys.modules, "quadrl.view.browser", raising=False)
+    assert command("view", "hover") == 2
+    said = capsys.readouterr().err
+    assert "view" in said and said.count("\n") == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a screen")
+def test_without_a_screen_there_is_one_line(capsys, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert command("view", "hover", "--native") == 2
+    said = capsys.readouterr().err
+    assert "screen" in said and said.count("\n") == 1
+
+
+def test_the_command_serves_until_it_is_interrupted(capsys, monkeypatch):
+    browser = pytest.importorskip("quadrl.view.browser", exc_type=ModuleNotFoundError)
+    frames = []
+
+    def frame(page, seconds):
+        frames.append(fetch(page.address))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(browser.Page, "frame", frame)
+    port = free_port()
+    assert command("view", "--controller", "lqr", "--num-envs", 3, "--port", port) == 0
+    assert b"<html" in frames[0]
+    assert str(port) in capsys.readouterr().out
+    with socket.socket() as probe:
+        assert probe.connect_ex(("localhost", port)) != 0
+
+
+def fetch(address):
+    with urllib.request.urlopen(address, timeout=10) as answer:
+        return answer.read()

@@ -1,0 +1,135 @@
+"""Wind in pictures: streaks that go where the air goes, its strength in the panel."""
+
+import dataclasses
+
+import helpers
+import numpy as np
+import pytest
+
+from quadrl import mjcf
+from quadrl.envs.common import Pictures
+from quadrl.evaluation import evaluate
+from quadrl.rendering import Renderer, overlay, render_trajectory
+from quadrl.rendering.live import LiveFlight
+from quadrl.rendering.streaks import COUNT, TAIL, streaks
+from quadrl.weather import Weather
+
+WEST = Weather(wind_speed=12.0, direction=np.pi)
+HIGH = np.array([0.0, 0.0, 30.0])
+
+
+def heads(markers):
+    """Where the streaks end that are seen well, (n, 3), and where they begin."""
+    groups = [markers[k : k + len(TAIL)] for k in range(0, len(markers), len(TAIL))]
+    seen = [group for group in groups if group[-1].rgba[3] > 0.5]
+    return (np.array([group[end].points[end] for group in seen]) for end in (-1, 0))
+
+
+def test_streaks_point_where_the_air_goes_and_drift_with_it():
+    wind = np.array([6.0, -3.0, 0.5])
+    shown = streaks(HIGH, wind, np.zeros(3), 1.0)
+    assert len(TAIL) * COUNT / 4 < len(shown) <= len(TAIL) * COUNT
+    ends, begins = heads(shown)
+    assert len(ends) > 5 and abs(ends - HIGH).max() < 1.2
+    np.testing.assert_allclose(ends - begins, np.tile(wind * 0.05, (len(ends), 1)))
+    opacity = [marker.rgba[3] for marker in shown[: len(TAIL)]]
+    assert opacity == sorted(opacity)  # the head leads
+    # A centimetre of drift moves each by a centimetre, and so does none of the aircraft's ways.
+    moved, _ = heads(streaks(HIGH, wind, np.array([0.01, 0, 0]), 1.0))
+    shifted = ends + (0.01, 0, 0)
+    apart = np.linalg.norm(moved[:, None] - shifted, axis=-1).min(axis=0)
+    assert np.sort(apart)[: len(apart) // 2].max() < 1e-12
+    still, _ = heads(streaks(HIGH + (0.01, 0, 0), wind, np.zeros(3), 1.0))
+    apart = np.linalg.norm(still[:, None] - ends, axis=-1).min(axis=0)
+    assert np.sort(apart)[: len(apart) // 2].max() < 1e-12
+
+
+def test_streaks_are_short_in_a_storm_small_with_a_small_aircraft_and_above_the_ground():
+    ends, begins = heads(streaks(HIGH, np.array([100.0, 0, 0]), np.zeros(3), 1.0))
+    assert np.linalg.norm(ends - begins, axis=1).max() == pytest.approx(0.8)
+    small, _ = heads(streaks(HIGH, np.array([5.0, 0, 0]), np.zeros(3), 0.25))
+    assert abs(small - HIGH).max() < 1.2 / 2
+    low = streaks(np.array([0, 0, 0.1]), np.array([5.0, 0, -3.0]), np.zeros(3), 1.0)
+    assert low and min(np.min(np.array(marker.points)[:, 2]) for marker in low) > 0
+    for calm in (0.0, 0.05):
+        assert streaks(HIGH, np.array([calm, 0, 0]), np.zeros(3), 1.0) == ()
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """A flight in wind, and one in calm air."""
+    return [evaluate("hover", episodes=1, weather=w, time_limit=0.5) for w in (WEST, None)]
+
+
+def test_a_flight_is_drawn_in_its_wind(flown, monkeypatch, cheap_pictures):
+    asked, written = [], []
+    monkeypatch.setattr(Renderer, "frame", lambda self, *_, **o: asked.append(o) or _blank())
+    monkeypatch.setattr(overlay.Panel, "draw", lambda self, _, lines, *__: written.append(lines))
+    model = mjcf.compile_model(flown[0].vehicle)
+    for one in flown:
+        flight = one.rollout.trajectory(one.vehicle)
+        list(render_trajectory(flight, model, width=160, height=120))
+    steps = len(asked) // 2
+    windy, calm = asked[:steps], asked[steps:]
+    wind = flown[0].rollout.wind[:, 0]
+    for k, one in enumerate(windy):
+        assert written[k][-1] == f"{np.linalg.norm(wind[k]):.1f} m/s" and len(written[k]) == 5
+        ends, begins = heads(one["markers"])
+        np.testing.assert_allclose(ends - begins, np.tile(wind[k] * 0.05, (len(ends), 1)))
+    # From one picture to the next the air goes on by its wind.
+    one, other = (next(heads(windy[k]["markers"])) for k in (4, 5))
+    way = 0.05 * (wind[4] + wind[5]) / 2
+    apart = np.linalg.norm(other[:, None] - (one + way), axis=-1).min(axis=0)
+    assert np.sort(apart)[: len(apart) // 3].max() < 1e-9
+    assert all(one["markers"] == () for one in calm) and len(written[-1]) == 4
+
+
+def _blank():
+    return np.zeros((120, 160, 3), np.uint8)
+
+
+def test_pictures_of_an_environment_show_its_wind(monkeypatch, cheap_pictures):
+    asked = []
+    monkeypatch.setattr(LiveFlight, "picture", lambda self, *given: asked.append(given) or large())
+    for weather in (WEST, None):
+        environment = helpers.begun("hover", 2, weather=weather)
+        pictures = Pictures(environment, "follow", 400, 300)
+        picture = pictures.frame(1)
+        pictures.close()
+        assert (picture[:200] != 128).any()  # the panel
+        rows = np.flatnonzero((picture != 128).any(axis=(1, 2)))
+        assert rows.max() == pytest.approx(0.72 * (18 + 138 + 21 * bool(weather)), abs=2)
+        wind = asked[-1][-1]
+        assert (wind is None) == (weather is None)
+        if weather:
+            np.testing.assert_array_equal(wind, environment.engine.wind[1])
+
+
+def large():
+    return np.full((300, 400, 3), 128, np.uint8)
+
+
+def test_a_flight_in_progress_hands_on_how_far_the_air_has_come():
+    seen = []
+
+    class Recorder:
+        scale, aspect, spins = 1.0, 1.0, np.ones(4)
+
+        def frame(self, qpos, **options):
+            seen.append(next(heads(options["markers"])))
+
+    flying, pose = LiveFlight("track"), np.array([*HIGH, 1.0, 0, 0, 0])
+    wind = np.array([4.0, 0, 0])
+    for time in (0.0, 0.01, 0.0):
+        flying.picture(Recorder(), time, pose, np.zeros(4), HIGH, (), wind)
+    apart = np.linalg.norm(seen[1][:, None] - (seen[0] + 0.01 * wind), axis=-1).min(axis=0)
+    assert np.sort(apart)[: len(apart) // 2].max() < 1e-12
+    np.testing.assert_array_equal(seen[2], seen[0])  # another flight begins anew
+
+
+def test_a_resampled_flight_has_its_wind(flown):
+    flight, calm = (one.rollout.trajectory(one.vehicle) for one in flown)
+    assert calm.wind is None and calm.resampled(40).wind is None
+    np.testing.assert_array_equal(flight.wind, flown[0].rollout.wind[:, 0])
+    np.testing.assert_allclose(flight.resampled(40).wind[::2], flight.wind, atol=1e-12)
+    assert dataclasses.replace(flight, wind=None).resampled(20).wind is None
