@@ -13,6 +13,7 @@ import abc
 import dataclasses
 import functools
 import itertools
+import math
 import operator
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -278,6 +279,11 @@ class Task(abc.ABC):
             return dataclasses.replace(self, **options)
         except (TypeError, ArithmeticError) as error:  # of a check that is the task's own
             raise QuadrlError(f"{self.name} options {options}: {error}") from error
+
+
+def heads_east(now: Snapshot, tolerance: float) -> Array:
+    """Whether the heading is at most `tolerance` [rad] off east, (N,) bool."""
+    return now.state.cos_attitude[..., 2] >= math.cos(tolerance)
 
 
 def reward_share(parameters: Parameters) -> float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from quadrl.contact import touches_ground
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng, hovering
 from quadrl.rotation import Array, namespace
 from quadrl.state import Start
-from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState
+from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,13 +21,20 @@ class Hover(Task):
     asks = "hold a static waypoint for the whole episode, heading east"
     starts = "within 0.5 m of it, any heading, tilted up to 0.2 rad, at up to 0.3 m/s and 0.3 rad/s"
     ends = "more than 3 m away, on the ground, tilted past 90 degrees"
-    solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
+    solved = (
+        "in the air to the end, mean error of the last 2 s under 0.1 m, within 10 degrees of east"
+    )
     targets = (
         Target("success_rate", "successful", 1.0, True),
         Target("position_error_m", "error over the last 2 s", 0.05, unit="cm"),
-        Target("heading_error_deg", "off east", 15.0, unit="deg"),
+        Target("heading_error_deg", "off east", 5.0, unit="deg"),
     )
-    training = {"gamma": 0.9, "steps": 204_800, "ppo": {"learning_rate": 8e-3}}
+    training = {
+        "gamma": 0.9,
+        "steps": 204_800,
+        "holds_goal": True,
+        "ppo": {"learning_rate": 8e-3},
+    }
     variants = {"robust": {"steps": 4_096_000}}
     heading_matters = True
 
@@ -42,6 +50,8 @@ class Hover(Task):
     """Distance from the waypoint that ends the episode [m]."""
     tolerance: float = 0.1
     """Largest final error that counts as success [m]."""
+    heading_tolerance: float = math.radians(10.0)
+    """Largest angle off east at the end that counts as success [rad]."""
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
         """Near the waypoint, nearly level and slow; the rotors at hover speed."""
@@ -61,5 +71,6 @@ class Hover(Task):
         return away | touches_ground(now) | (now.state.cos_tilt < 0)
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
-        """Still flying at the end, and close."""
-        return end.truncated & (end.final_error < self.tolerance)
+        """Still flying at the end, close, and heading east."""
+        close = end.final_error < self.tolerance
+        return end.truncated & close & heads_east(now, self.heading_tolerance)

@@ -15,7 +15,7 @@ from quadrl.parameters import Parameters
 from quadrl.rng import Rng
 from quadrl.rotation import Array, namespace, norm, square_norm, stack
 from quadrl.state import Start
-from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, reward_share
+from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east, reward_share
 
 if TYPE_CHECKING:
     from quadrl.reading import Reading
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 DESCENT_RATE = 0.8  # [1/s], sink speed over the height
 TOUCHDOWN_SPEED = 0.2  # [m/s]
 MAX_DESCENT_SPEED = 1.2  # [m/s]
+WAITING_HEIGHT = 0.5  # [m], where they wait for the heading
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Landing(Task):
         "hull strikes, touchdown faster than 0.5 m/s or tilted more than 15 degrees; more than "
         "5 m away"
     )
-    solved = "at rest on the pad, upright"
+    solved = "at rest on the pad, upright, within 10 degrees of east"
     targets = (
         Target("success_rate", "successful", 0.98, True),
         Target("crash_rate", "crashes", 0.0),
@@ -96,6 +97,8 @@ class Landing(Task):
     """Distance from the pad that ends the episode [m]."""
     pad_radius: float = 0.5
     """Radius of the pad [m]."""
+    heading_tolerance: float = math.radians(10.0)
+    """Largest angle off east at the end that counts as success [rad]."""
     rest_time: float = 0.25
     """How long the aircraft has to be at rest [s]."""
 
@@ -120,10 +123,11 @@ class Landing(Task):
         return strikes_ground(now) | (down & (tilted | hard)) | sinks | away | rested
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
-        """At rest on the pad for long enough, upright, neither rotor nor hull on the ground."""
+        """At rest on the pad for long enough, upright, on its feet alone, and heading east."""
         rested = self._rest(now) * now.parameters.control_timestep >= self.rest_time
         upright = now.state.cos_tilt >= math.cos(self.max_tilt)
-        return end.terminated & rested & upright & ~strikes_ground(now)
+        stood = end.terminated & rested & upright & ~strikes_ground(now)
+        return stood & heads_east(now, self.heading_tolerance)
 
     def update(self, before: Snapshot, now: Snapshot) -> Touchdown:
         """Remember the touchdown, the speed and how long the aircraft has been at rest."""
@@ -152,12 +156,15 @@ class Landing(Task):
         return terms
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
-        """Over the pad, and down on it, slower the lower; it presses on when the pad is reached."""
+        """Over the pad, then down, slower the lower, once it heads east; then it presses on."""
         xp = namespace(reading.to_goal)
         height = xp.clip(-reading.to_goal[..., 2], 0.0, None)
         aside = norm(reading.to_goal[..., :2])
         sink = xp.clip(DESCENT_RATE * height + TOUCHDOWN_SPEED, None, MAX_DESCENT_SPEED)
         sink = sink * xp.clip(1.5 - aside / (0.2 + 0.2 * height), 0.0, 1.0)  # within a cone
+        wide, narrow = math.cos(2 * self.heading_tolerance), math.cos(self.heading_tolerance)
+        turned = xp.clip((reading.heading[..., 0] - wide) / (narrow - wide), 0.0, 1.0)
+        sink = xp.where(height > WAITING_HEIGHT, sink, sink * turned)
         zero = xp.zeros_like(sink)
         offset = stack(reading.to_goal[..., 0], reading.to_goal[..., 1], zero)
         return offset, stack(zero, zero, -sink)

@@ -25,7 +25,7 @@ class RandomWaypoint(Task):
         Target("success_rate", "successful", 0.99, True),
         Target("position_error_m", "error over the last 2 s", 0.06, unit="cm"),
     )
-    training = {"steps": 2_621_440}
+    training = {"steps": 2_621_440, "holds_goal": True}
     variants = {"robust": {"steps": 4_096_000}}
 
     nearest: float = 1.0

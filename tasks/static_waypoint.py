@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,7 +15,7 @@ from quadrl.parameters import Parameters
 from quadrl.rng import Rng, hovering
 from quadrl.rotation import Array, namespace
 from quadrl.state import Start
-from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState
+from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.validation import MAX_OPTION, numbers
 
 WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
@@ -38,13 +39,16 @@ class StaticWaypoint(Task):
     )
     starts = "at rest at the origin, heading east, disturbed by up to 0.05 rad, m/s and rad/s"
     ends = "more than 5 m from the current waypoint, on the ground"
-    solved = "in the air to the end, mean error of the last 2 s under 0.1 m, on the last waypoint"
+    solved = (
+        "in the air to the end, mean error of the last 2 s under 0.1 m, on the last waypoint, "
+        "within 10 degrees of east"
+    )
     targets = (
         Target("success_rate", "successful", 1.0, True),
         Target("position_error_m", "error over the last 2 s", 0.05, unit="cm"),
-        Target("heading_error_deg", "off east", 15.0, unit="deg"),
+        Target("heading_error_deg", "off east", 5.0, unit="deg"),
     )
-    training = {"gamma": 0.9, "ppo": {"learning_rate": 8e-3}}
+    training = {"gamma": 0.9, "holds_goal": True, "ppo": {"learning_rate": 8e-3}}
     heading_matters = True
 
     waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)
@@ -57,6 +61,8 @@ class StaticWaypoint(Task):
     """Distance from the current waypoint that ends the episode [m]."""
     tolerance: float = 0.1
     """Largest final error that counts as success [m]."""
+    heading_tolerance: float = math.radians(10.0)
+    """Largest angle off east at the end that counts as success [rad]."""
 
     def __post_init__(self) -> None:
         """Validate the route."""
@@ -99,9 +105,10 @@ class StaticWaypoint(Task):
         return (now.potentials.distance > self.max_distance) | touches_ground(now)
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
-        """Still flying at the end, and close to the last waypoint."""
+        """Still flying at the end, close to the last waypoint, and heading east."""
         last = now.task.leg == len(self.waypoints) - 1
-        return end.truncated & (end.final_error < self.tolerance) & last
+        close = end.final_error < self.tolerance
+        return end.truncated & close & last & heads_east(now, self.heading_tolerance)
 
     def markers(self, now: Snapshot) -> Sequence[Marker]:
         """The route, and the waypoints that are still to come, by number."""

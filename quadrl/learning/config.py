@@ -136,6 +136,8 @@ class TrainConfig:
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
         named = (settings.get(name, getattr(TrainConfig, name)) for name in ("vehicle", "variant"))
         values = training_defaults(_base(), task, algo, *named)
+        if settings.get("memory", values["memory"]) != "none":
+            values["holds_goal"] = False  # what is remembered differs at the goal
         for name, kind in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
             if isinstance(given, dict):
