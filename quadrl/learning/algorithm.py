@@ -53,14 +53,20 @@ class Algorithm(abc.ABC):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """The update at the present learning rates."""
 
-    def step(self, name: str, loss: Tensor) -> None:
-        """One gradient step of an optimiser."""
-        adam, parameters, _ = self._optimisers[name]
-        adam.zero_grad()
+    def step(self, loss: Tensor, *names: str) -> None:
+        """One gradient step of each of the named optimisers, all on the same loss.
+
+        Each clips the norm of its own gradient: a critic that is far off, as at the begin of a
+        training, does not hold the policy back.
+        """
+        named = [self._optimisers[name] for name in names]
+        for adam, _, _ in named:
+            adam.zero_grad()
         loss.backward()
-        if hasattr(self.config, "max_gradient"):
-            torch.nn.utils.clip_grad_norm_(parameters, self.config.max_gradient)
-        adam.step()
+        for adam, parameters, _ in named:
+            if hasattr(self.config, "max_gradient"):
+                torch.nn.utils.clip_grad_norm_(parameters, self.config.max_gradient)
+            adam.step()
 
     def rows(self, batch: TensorDictBase) -> int:
         """Of a minibatch: transitions, or the aircraft that have as many."""
@@ -74,7 +80,7 @@ class Algorithm(abc.ABC):
         for _ in range(self.config.critic_epochs):
             for rows in torch.randperm(len(batch)).split(self.rows(batch)):
                 value = loss(batch[rows])
-                self.step("critic", value)
+                self.step(value, "critic")
         return {"critic_loss": value.item()}
 
     def save(self) -> dict[str, Any]:

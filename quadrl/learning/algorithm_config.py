@@ -45,7 +45,7 @@ class PPOConfig(AlgorithmConfig):
     critic: float = 1.0
     """Weight of the critic's squared error."""
     max_gradient: float = 1.0
-    """Norm to which gradients are clipped."""
+    """Norm to which the gradients of policy and critic are clipped, each on its own."""
 
 
 @dataclasses.dataclass(frozen=True)

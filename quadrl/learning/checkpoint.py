@@ -17,7 +17,7 @@ from quadrl.errors import QuadrlError
 from quadrl.files import HEADER, read_safetensors, write_whole
 from quadrl.learning.folder import CHANGEABLE
 
-FORMAT = "quadrl-checkpoint-4"
+FORMAT = "quadrl-checkpoint-5"
 CHECKPOINT = "checkpoint.safetensors"
 
 

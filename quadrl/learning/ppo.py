@@ -20,7 +20,7 @@ class PPO(Algorithm):
     def __init__(
         self, actor: ProbabilisticActor, critic: TensorDictModule, config: PPOConfig
     ) -> None:
-        """Make the loss and the optimiser."""
+        """Make the loss and the optimisers."""
         super().__init__(config)
         self.loss = ClipPPOLoss(
             actor,
@@ -33,7 +33,8 @@ class PPO(Algorithm):
             log_explained_variance=False,
             functional=False,  # nothing needs the parameters as arguments, and that costs time
         )
-        self.add_optimiser("both", self.loss.parameters(), config.learning_rate, fused=True)
+        self.add_optimiser("policy", actor.parameters(), config.learning_rate, fused=True)
+        self.add_optimiser("critic", critic.parameters(), config.learning_rate, fused=True)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Epochs over minibatches."""
@@ -42,12 +43,11 @@ class PPO(Algorithm):
         for _ in range(self.config.epochs):
             for part in batch[torch.randperm(len(batch))].split(self.rows(batch)):
                 losses = self.loss(part)
-                objective = losses["loss_objective"] + losses["loss_critic"]
-                if self.config.entropy > 0:
-                    objective = objective + losses["loss_entropy"]
-                self.step("both", objective)
+                weighted = [loss for name, loss in losses.items() if name.startswith("loss_")]
+                self.step(torch.stack(weighted).sum(), "policy", "critic")
+        last = losses.detach()
         return {
-            "critic_loss": losses["loss_critic"].item(),
-            "kl": losses["kl_approx"].item(),
-            "clip_fraction": losses["clip_fraction"].item(),
+            "critic_loss": float(last.get("loss_critic", 0.0)),  # with no weight it has none
+            "kl": float(last["kl_approx"]),
+            "clip_fraction": float(last["clip_fraction"]),
         }

@@ -35,5 +35,5 @@ class VPG(Algorithm):
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """The policy's step, then the critic's epochs."""
-        self.step("policy", self.loss(batch)["loss_objective"])
+        self.step(self.loss(batch)["loss_objective"], "policy")
         return self.fit_critic(lambda part: self.loss(part)["loss_critic"], batch)

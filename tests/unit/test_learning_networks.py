@@ -149,6 +149,32 @@ def test_without_remaining_training_only_trpo_moves_the_policy(kind):
     assert any(moved[:policy]) == (kind is TRPO) and not any(moved[policy:])
 
 
+def test_a_critic_that_is_far_off_does_not_hold_the_policy_back():
+    """Each clips its own gradient: with a common norm the policy's would be a millionth here."""
+    policies = []
+    for target in (0.0, 1e6):
+        actor, critic, _ = actor_critic()
+        batch = batch_of(disturbed(actor), rows=256)
+        batch["value_target"][:] = target
+        algorithm = PPO(actor, critic, PPOConfig(minibatch=64, max_gradient=0.01))
+        algorithm.update(batch, remaining=1.0)
+        policies.append(flat([parameter.detach() for parameter in actor.parameters()]))
+        for network in (actor, critic):
+            norm = flat([parameter.grad for parameter in network.parameters()]).norm().item()
+            assert norm == pytest.approx(0.01, rel=1e-3)
+    assert torch.equal(*policies)
+
+
+def test_a_critic_without_weight_stays_as_it_is():
+    actor, critic, _ = actor_critic()
+    batch = batch_of(disturbed(actor))
+    before = [flat(list(network.parameters())).detach().clone() for network in (actor, critic)]
+    metrics = PPO(actor, critic, PPOConfig(critic=0.0)).update(batch, remaining=1.0)
+    after = [flat(list(network.parameters())) for network in (actor, critic)]
+    moved = [not torch.equal(a, b) for a, b in zip(before, after, strict=True)]
+    assert moved == [True, False] and metrics["critic_loss"] == 0.0
+
+
 # ---------------------------------------------------------------------------- TRPO
 
 
