@@ -30,10 +30,10 @@ class Hover(Task):
         Target("heading_error_deg", "off east", 5.0, unit="deg"),
     )
     training = {
-        "gamma": 0.9,
+        "gamma": 0.92,
         "steps": 204_800,
         "holds_goal": True,
-        "ppo": {"learning_rate": 8e-3},
+        "ppo": {"learning_rate": 1e-2},
     }
     variants = {"robust": {"steps": 4_096_000}}
     heading_matters = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -53,16 +53,20 @@ class Algorithm(abc.ABC):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """The update at the present learning rates."""
 
-    def step(self, loss: Tensor, *names: str) -> None:
-        """One gradient step of each of the named optimisers, all on the same loss.
+    def step(self, loss: Tensor | Sequence[Tensor], *names: str) -> None:
+        """One gradient step of each of the named optimisers, all on one loss.
 
         Each clips the norm of its own gradient: a critic that is far off, as at the begin of a
         training, does not hold the policy back.
+
+        Args:
+            loss: A scalar, or several whose sum it is.
+            *names: Of the optimisers.
         """
         named = [self._optimisers[name] for name in names]
         for adam, _, _ in named:
             adam.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         for adam, parameters, _ in named:
             if hasattr(self.config, "max_gradient"):
                 torch.nn.utils.clip_grad_norm_(parameters, self.config.max_gradient)

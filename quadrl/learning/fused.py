@@ -1,0 +1,236 @@
+"""PPO's loss with a backward that is written by hand, for networks that are plain layers.
+
+Of a gradient step with TorchRL's ClipPPOLoss only a third is arithmetic of the networks: the rest
+is a graph of small operations, their tensordicts, and the tanh of torch. `FusedPPOLoss` is that
+loss with one node in its graph for both networks and all that lies between them and the means.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
+
+from quadrl.learning.plain import plain_policy, plain_value, rows
+from quadrl.policy import LOG_VARIANCE
+
+LOG_2_PI = math.log(2 * math.pi)
+USUAL: dict[str, Any] = {
+    "loss_critic_type": "l2",
+    # Without what costs time: a figure for the log, and the parameters as arguments.
+    "log_explained_variance": False,
+    "functional": False,
+}
+"""Settings of TorchRL's loss that are always the same."""
+
+
+def make_loss(actor: ProbabilisticActor, critic: TensorDictModule, **settings: Any) -> ClipPPOLoss:
+    """The loss of PPO: fused where both networks are plain, TorchRL's for any other.
+
+    Args:
+        actor: Of a normal distribution.
+        critic: Gives `state_value`.
+        **settings: Of `FusedPPOLoss`.
+    """
+    if plain_policy(actor) is not None and plain_value(critic) is not None:
+        return FusedPPOLoss(actor, critic, **settings)
+    return ClipPPOLoss(actor, critic, **USUAL, **settings)
+
+
+# ------------------------------------------------------------------- gradients by hand
+
+
+def forward(seen: Tensor, weights: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
+    """What each layer reads, and the output, all (n, ...).
+
+    Args:
+        seen: What the first layer reads, (n, inputs).
+        weights: Weights and biases of the layers in turn, with tanh between the layers.
+    """
+    values, output = [], seen
+    for weight, bias in zip(weights[::2], weights[1::2], strict=True):
+        if values:
+            # tanh(x) = 2 sigmoid(2 x) - 1, to rounding; on a CPU torch's tanh takes four times
+            # as long.
+            output.mul_(2).sigmoid_().mul_(2).sub_(1)
+        values.append(output)
+        # The narrower of two factors first: that is quicker, here and in the backward.
+        if len(weight) < weight.shape[1]:
+            output = torch.addmm(bias[:, None], weight, output.t()).t()
+        else:
+            output = torch.addmm(bias, output, weight.t())
+    return values, output
+
+
+def backward(error: Tensor, values: Sequence[Tensor], weights: Sequence[Tensor]) -> list[Tensor]:
+    """Gradients of weights and biases in turn, from that of the output (n, outputs)."""
+    found: list[Tensor] = []
+    for value, weight in zip(reversed(values), reversed(weights[::2]), strict=True):
+        narrow = error.shape[1] < value.shape[1]
+        found += [error.sum(0), error.t() @ value if narrow else (value.t() @ error).t()]
+        if value is not values[0]:
+            error = torch.ops.aten.tanh_backward(error @ weight, value)
+    return found[::-1]
+
+
+class Terms(torch.autograd.Function):
+    """What the losses are means of, by the weights of policy and critic."""
+
+    @staticmethod
+    def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, part: Mapping[str, Tensor], bounds: Sequence[Tensor], count: int, *weights: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Clipped gain, entropy, the critic's squared error, and the log-ratio, each (n,).
+
+        Args:
+            ctx: Keeps what the backward needs.
+            part: What `FusedPPOLoss.prepare` gives. The policy may see one row more than there are
+                transitions: the goal, whose mean is taken away from the others.
+            bounds: Logarithms of the least and the largest ratio; beyond them nothing is gained.
+            count: How many of the weights are the policy's.
+            *weights: Of the policy's layers, then of the critic's.
+        """
+        seen, action, advantage = (part[name] for name in ("policy", "action", "advantage"))
+        size = action.shape[1]
+        values, output = forward(seen, weights[:count])
+        mean, free = output[: len(action)].chunk(2, -1)
+        holds = len(output) > len(action)
+        if holds:
+            mean = mean - output[-1, :size]
+        log_variance = free.clamp(*LOG_VARIANCE)
+        off = action - mean
+        by_mean = off * (-log_variance).exp()
+        square = off * by_mean
+        log_probability = -0.5 * ((square + log_variance).sum(-1) + size * LOG_2_PI)
+        log_ratio = log_probability - part["before"]
+        gain = log_ratio.exp() * advantage
+        clipped = log_ratio.clamp(*bounds).exp() * advantage
+        slope = torch.where(gain <= clipped, gain, 0.0)  # by the log-ratio: clipped, it is constant
+        entropy = 0.5 * (log_variance.sum(-1) + size * (1 + LOG_2_PI))
+        critic_values, value = forward(part["value"], weights[count:])
+        error = value[:, 0] - part["target"]
+        ctx.save_for_backward(*weights)
+        ctx.networks = count, values, critic_values, holds
+        ctx.terms = slope, by_mean, square, free == log_variance, error
+        ctx.mark_non_differentiable(log_ratio)
+        return torch.minimum(gain, clipped), entropy, error.square(), log_ratio
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, gain: Tensor, entropy: Tensor, squared_error: Tensor, _: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        """Gradients of the weights, from those of the terms."""
+        weights = ctx.saved_tensors
+        count, values, critic_values, holds = ctx.networks
+        slope, by_mean, square, inside, error = ctx.terms
+        share = (gain * slope)[:, None]
+        mean = share * by_mean
+        log_variance = 0.5 * (share * (square - 1) + entropy[:, None]) * inside
+        output = torch.cat([mean, log_variance], -1)
+        if holds:
+            goal = torch.cat([-mean.sum(0), torch.zeros_like(mean[0])])
+            output = torch.cat([output, goal[None]])
+        value = (2 * squared_error * error)[:, None]
+        found = backward(output, values, weights[:count])
+        return None, None, None, *found, *backward(value, critic_values, weights[count:])
+
+
+# ------------------------------------------------------------------- the loss
+
+
+class FusedPPOLoss(ClipPPOLoss):
+    """TorchRL's ClipPPOLoss of plain networks: the same entries, losses and gradients, to rounding.
+
+    Once for a batch `prepare` does what stays the same while it is learned from, and `losses` is
+    what a minibatch costs; the forward is one after the other. The critic's loss is its squared
+    error ("l2").
+    """
+
+    entropy_coeff: Tensor
+    critic_coeff: Tensor
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticActor,
+        critic_network: TensorDictModule,
+        *,
+        clip_epsilon: float | tuple[float, float] = 0.2,
+        entropy_bonus: bool = True,
+        entropy_coeff: float | None = None,
+        critic_coeff: float | None = None,
+        reduction: str | None = None,
+    ) -> None:
+        """Keep the networks, which `plain_policy` and `plain_value` must know; see ClipPPOLoss."""
+        policy, value = plain_policy(actor_network), plain_value(critic_network)
+        if policy is None or value is None:
+            raise TypeError("the networks are not plain; make_loss chooses the loss that fits")
+        super().__init__(
+            actor_network,
+            critic_network,
+            clip_epsilon=clip_epsilon,
+            entropy_bonus=entropy_bonus,
+            entropy_coeff=entropy_coeff,
+            critic_coeff=critic_coeff,
+            reduction=reduction,
+            **USUAL,
+        )
+        self._policy, self._value = policy, value
+
+    @dispatch  # pyright: ignore[reportArgumentType] - it takes a function, too
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The entries of ClipPPOLoss."""
+        advantage = tensordict.get(self.tensor_keys.advantage, None)
+        masks = [tensordict.get(name, None) for name in self._loss_mask_keys()]
+        if advantage is None or any(mask is not None for mask in masks):
+            return super().forward(tensordict)
+        found = self.losses(self.prepare(tensordict))
+        shape = advantage.shape[:-1]
+        log_ratio = found.pop("log_ratio").reshape(shape)
+        ratio = log_ratio.exp()
+        effective = (2 * log_ratio.logsumexp(0) - (2 * log_ratio).logsumexp(0)).exp()
+        found |= {"ESS": effective / len(log_ratio)}
+        found |= {"max_ratio": ratio.max(), "mean_ratio": ratio.mean()}
+        if self.reduction == "none":
+            for name in found.keys() & {"loss_objective", "loss_entropy", "loss_critic"}:
+                found[name] = found[name].reshape(shape)
+        return TensorDict(found)
+
+    def prepare(self, batch: TensorDictBase) -> TensorDict:
+        """What `losses` reads of a batch (...), as n rows; it normalises the observations."""
+        keys: Any = self.tensor_keys
+        action = rows(batch.get(keys.action))
+        entries = {
+            "policy": self._policy.seen(batch),
+            "value": self._value.seen(batch),
+            "action": action,
+            "before": batch.get(keys.sample_log_prob).reshape(-1),
+            "advantage": batch.get(keys.advantage).reshape(-1),
+            "target": batch.get(keys.value_target).reshape(-1),
+        }
+        return TensorDict(entries, batch_size=[len(action)])
+
+    def losses(self, part: TensorDictBase) -> dict[str, Tensor]:
+        """Losses and what is logged of n rows that are prepared, and their `log_ratio` (n,)."""
+        given = {name: part.get(name) for name in part.keys()}
+        given["policy"] = self._policy.and_goal(given["policy"])
+        bounds, own = self._clip_bounds, self._policy.weights()
+        terms = Terms.apply(given, bounds, len(own), *own, *self._value.weights())
+        gain, entropy, squared_error, log_ratio = terms  # pyright: ignore[reportGeneralTypeIssues]
+        clipped = (log_ratio != log_ratio.clamp(*bounds)).to(gain.dtype)
+        found = {"loss_objective": -self._reduce_loss(gain)}
+        found |= {"clip_fraction": clipped.mean(), "kl_approx": -log_ratio.mean()}
+        if self.entropy_bonus:
+            found["entropy"] = entropy.detach().mean()
+            found["loss_entropy"] = -self.entropy_coeff * self._reduce_loss(entropy)
+        if self._has_critic:
+            found["loss_critic"] = self.critic_coeff * self._reduce_loss(squared_error)
+        return found | {"log_ratio": log_ratio}
