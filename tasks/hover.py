@@ -31,6 +31,7 @@ class Hover(Task):
     )
     training = {
         "gamma": 0.92,
+        "gae_lambda": 0.97,
         "steps": 204_800,
         "holds_goal": True,
         "ppo": {"learning_rate": 1e-2},

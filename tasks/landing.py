@@ -14,7 +14,7 @@ from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng
 from quadrl.rotation import Array, namespace, norm, square_norm, stack
-from quadrl.state import Start
+from quadrl.state import REST_SPEED, Start
 from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east, reward_share
 
 if TYPE_CHECKING:
@@ -163,7 +163,8 @@ class Landing(Task):
         sink = xp.clip(DESCENT_RATE * height + TOUCHDOWN_SPEED, None, MAX_DESCENT_SPEED)
         sink = sink * xp.clip(1.5 - aside / (0.2 + 0.2 * height), 0.0, 1.0)  # within a cone
         wide, narrow = math.cos(2 * self.heading_tolerance), math.cos(self.heading_tolerance)
-        turned = xp.clip((reading.heading[..., 0] - wide) / (narrow - wide), 0.0, 1.0)
+        east = reading.rotation[..., 0, 0]  # of the unit vector along body x
+        turned = xp.clip((east - wide) / (narrow - wide), 0.0, 1.0)
         sink = xp.where(height > WAITING_HEIGHT, sink, sink * turned)
         zero = xp.zeros_like(sink)
         offset = stack(reading.to_goal[..., 0], reading.to_goal[..., 1], zero)
@@ -179,11 +180,14 @@ class Landing(Task):
         first = down.argmax(0)
         flights = np.flatnonzero(down.any(0) & (first > 0))
         speed = np.linalg.norm(rollout.velocity[first[flights] - 1, flights], axis=-1)
+        last = rollout.length - 1, np.arange(len(rollout.length))
+        still = norm(rollout.velocity[last]) < REST_SPEED
+        crashed = rollout.terminated & ~rollout.is_success & ~(still & down[last])
         landed = rollout.length[rollout.is_success] * rollout.control_timestep
         return {
             "touchdown_speed_median_m_s": float(np.median(speed)) if len(speed) else math.nan,
             "touchdown_speed_max_m_s": float(speed.max()) if len(speed) else math.nan,
-            "crash_rate": float((rollout.terminated & ~rollout.is_success).mean()),
+            "crash_rate": float(crashed.mean()),
             "landing_time_mean_s": float(landed.mean()) if len(landed) else math.nan,
         }
 

@@ -178,6 +178,24 @@ def test_a_route_is_flown_in_order():
     assert not task.succeeded(now, held).any()
 
 
+@pytest.mark.parametrize("name", tasks.TASKS)
+def test_the_heading_counts_where_it_is_asked_for(name):
+    task, degrees = tasks.make(name), np.array([0.0, 9.9, -9.9, 10.1, -10.1, 180.0])
+    start = placed([(0, 0, 0)] * len(degrees))
+    half = np.radians(degrees) / 2
+    start.quaternion[:, 0], start.quaternion[:, 3] = np.cos(half), np.sin(half)
+    memory = {"rest": 4.0 + 0 * half} if name == "landing" else {}  # one more step is 0.25 s
+    now, _ = snapshot(task, start.position, **memory)
+    own = {name: getattr(start, name) for name in Start.__dataclass_fields__}
+    height = max(task.altitude, VEHICLE.ground_clearance)
+    now = dataclasses.replace(now, state=State.of_coordinates(**own, origin_height=height))
+    over = np.full((2, len(degrees)), [[name == "landing"], [name != "landing"]])
+    held = transition.EpisodeEnd(*over, 200, 0, np.zeros(len(degrees)), 40)
+    asked = name in ("hover", "static_waypoint", "landing")
+    expected = np.abs(degrees) < 10 if asked else np.full(len(degrees), True)
+    np.testing.assert_array_equal(task.succeeded(now, held), expected)
+
+
 def test_what_ends_a_flight_early():
     away = [(8, 0, 0), (0, 0, -2.95), (0, 0, 0)]  # away; on the ground, 3 m below; and not
     following = [(5.1, 0, 0), (0, 0, -2.95), (4.9, 0, 0)]
