@@ -1,4 +1,4 @@
-"""A process that carries out one training of a study: `python -m quadrl.studies.worker`.
+"""A process that carries out one training of a study.
 
 It reads its order, a line of JSON, from standard input, and ends as soon as standard input ends:
 whoever ordered it is gone. A run that is killed at any moment can be continued.
@@ -47,7 +47,7 @@ def start(what: dict[str, Any], log: Path) -> subprocess.Popen[bytes]:
     search = os.pathsep.join(path or os.getcwd() for path in sys.path)
     with open(log, "wb") as file:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", __name__],
+            [sys.executable, "-P", "-c", f"from {__name__} import main; main()"],
             env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": search},
             stdin=subprocess.PIPE,
             stdout=file,
@@ -126,7 +126,3 @@ def main() -> None:
     # What hangs at the end of the interpreter must not turn a finished training into a lost one.
     sys.stdout.flush()
     os._exit(0 if (Path(what["folder"]) / EVALUATION).exists() else FAILED)
-
-
-if __name__ == "__main__":
-    main()

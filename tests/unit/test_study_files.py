@@ -56,7 +56,9 @@ def test_json_and_a_dict_are_the_same(write):
     content = {"tasks": ["hover"], "settings": {"hidden": [8]}}
     file = read_plan(write(json.dumps(content), "one.json"), None)
     assert [str(run.folder) for run in file.runs] == ["runs/one/hover-ppo-0"]
-    assert [run.config for run in file.runs] == [run.config for run in read_plan(content, None).runs]
+    assert [run.config for run in file.runs] == [
+        run.config for run in read_plan(content, None).runs
+    ]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +112,9 @@ def test_a_run_with_other_settings_stops_the_study_before_it_begins(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["hover-ppo-1"]
 
 
-@pytest.mark.parametrize("given", ["", "a", "1,1", "2:2", "5:1", "-1:2", [], [0.5], [True], 3, "4294967296"])
+@pytest.mark.parametrize(
+    "given", ["", "a", "1,1", "2:2", "5:1", "-1:2", [], [0.5], [True], 3, "4294967296"]
+)
 def test_wrong_seeds(given):
     with pytest.raises(QuadrlError, match="seeds"):
         parse_seeds(given)
