@@ -26,7 +26,7 @@ SETTINGS = {
     "hidden": [16],
     "critic_hidden": [16],
     "task_options": {"time_limit": 0.5},
-    "checkpoint_seconds": 0,
+    "checkpoint_seconds": 0.1,
     "ppo": {"epochs": 2, "minibatch": 16},
 }
 SHORT = SETTINGS | {"steps": 8 * 4 * 6}
@@ -54,7 +54,7 @@ def alone(tmp_path_factory):
     found = []
     for seed in (0, 1):
         folder = tmp_path_factory.mktemp("alone") / "run"
-        train("hover", seed=seed, num_threads=1, out=folder, episodes=2, **LONG)
+        train("hover", seed=seed, num_threads=1, out=folder, episodes=2, **(LONG | {"checkpoint_seconds": 60}))
         found.append(digest(folder))
     assert found[0] != found[1]
     return found
