@@ -54,7 +54,14 @@ def alone(tmp_path_factory):
     found = []
     for seed in (0, 1):
         folder = tmp_path_factory.mktemp("alone") / "run"
-        train("hover", seed=seed, num_threads=1, out=folder, episodes=2, **(LONG | {"checkpoint_seconds": 60}))
+        train(
+            "hover",
+            seed=seed,
+            num_threads=1,
+            out=folder,
+            episodes=2,
+            **(LONG | {"checkpoint_seconds": 60}),
+        )
         found.append(digest(folder))
     assert found[0] != found[1]
     return found
@@ -209,3 +216,18 @@ def test_without_ray(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(QuadrlError, match=r"pip install 'quadrl\[ray\]'"):
         quadrl.study(STUDY, out=tmp_path, ray="local")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_example_with_collectors_on_two_nodes_repeats_itself(tmp_path, cluster):
+    made, _ = cluster
+    script = Path(quadrl.__file__).parents[1] / "docs" / "examples" / "ray_collector.py"
+    options = ["--num-envs", "8", "--steps", "1024", "--episodes", "2", "--address", made.address]
+    runs = []
+    for seed in (0, 0, 1):
+        command = [sys.executable, str(script), *options, "--seed", str(seed)]
+        said = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+        assert said.returncode == 0, said.stderr
+        runs.append(json.loads(said.stdout.splitlines()[-1]) | {"seconds": 0})
+    assert runs[0] == runs[1] and runs[0]["steps"] == 1024
+    assert runs[0]["sum_of_weights"] != runs[2]["sum_of_weights"]

@@ -1,6 +1,7 @@
 """Study files: what they expand to, and the one line with which a wrong one is refused."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -131,3 +132,9 @@ def test_intervals_by_hand():
     assert (mean, low) == (2.0, 0.0) and high == pytest.approx(2 + 2.484, abs=1e-3)
     assert interval([0.5]) == (0.5, None, None)
     assert interval([None, float("nan")]) == (None, None, None)
+
+
+def test_the_file_on_the_page(write):
+    page = (Path(__file__).parents[2] / "docs" / "study.md").read_text()
+    plan = read_plan(write(page.partition("```toml\n")[2].partition("```")[0]), None)
+    assert len(plan.runs) == 40 and {run.config.seed for run in plan.runs[:8]} == {0}
