@@ -169,14 +169,26 @@ def cluster(monkeypatch):
 
     monkeypatch.setenv("PYTHONPATH", search())
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_worker_register_timeout_seconds", str(int(PATIENCE)))
     small = {"object_store_memory": 80 << 20, "include_dashboard": False}
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **small})
+    head = {"num_cpus": 0, **small}
+    made = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
     try:
-        nodes = [made.add_node(num_cpus=1, **small) for _ in range(2)]
-        yield made, nodes
+        yield made, [patiently(lambda: made.add_node(num_cpus=1, **small)) for _ in range(2)]
     finally:
         ray.shutdown()
         made.shutdown()
+
+
+def patiently(start):
+    """What a start returns: Ray gives a node 30 s, which a machine with much to do may not have."""
+    for _ in range(4):
+        try:
+            return start()
+        except Exception as error:
+            if "timed out" not in str(error):
+                raise
+    return start()
 
 
 @pytest.mark.filterwarnings("ignore")
