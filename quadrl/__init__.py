@@ -31,12 +31,13 @@ if TYPE_CHECKING:
     from quadrl.evaluation import evaluate
     from quadrl.learning.run import train
     from quadrl.show import plot, render
+    from quadrl.studies import study
 
 __version__ = "0.1.0"
 __all__ = [
     "RANDOMIZATIONS", "VEHICLES", "Observing", "Policy", "Randomization", "Task", "Vehicle", "envs",
-    "evaluate", "load", "plot", "register", "render", "rendering", "robustness", "suite", "tasks",
-    "testing", "train",
+    "evaluate", "load", "plot", "register", "render", "rendering", "robustness", "study", "suite",
+    "tasks", "testing", "train",
 ]  # fmt: skip
 LAZY = {
     "train": "quadrl.learning.run",
@@ -44,6 +45,7 @@ LAZY = {
     "render": "quadrl.show",
     "plot": "quadrl.show",
     "robustness": "quadrl.disturbed",
+    "study": "quadrl.studies",
 }
 """Functions that are imported on first use, and their modules."""
 

@@ -28,6 +28,7 @@ from quadrl.cli.evaluate import Evaluate
 from quadrl.cli.plot import Plot
 from quadrl.cli.render import Render
 from quadrl.cli.robustness import Robustness
+from quadrl.cli.study import Study
 from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
 from quadrl.cli.view import View
@@ -37,6 +38,7 @@ from quadrl.tasks import TASKS
 Command = (
     Annotated[Tasks, subcommand("tasks")]
     | Annotated[Train, subcommand("train")]
+    | Annotated[Study, subcommand("study")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Robustness, subcommand("robustness")]
     | Annotated[Render, subcommand("render")]

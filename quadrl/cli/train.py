@@ -19,14 +19,14 @@ from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import PAIRS
 from quadrl.progress import ProgressBar
-from quadrl.rollout import MAX_EPISODES, MAX_SEED
+from quadrl.rollout import MAX_EPISODES
+from quadrl.studies.plan import parse_seeds
 from quadrl.validation import number
 
 if TYPE_CHECKING:
     from quadrl.learning.run import Run
 
 
-MAX_SEEDS = 1000  # in one command
 FEW = 16  # aircraft: with less, most of the time goes into calls from Python
 
 
@@ -148,19 +148,7 @@ class Train:
         for name, other in (("--seed", settings.get("seed")), ("--resume", self.resume)):
             if other is not None:
                 raise QuadrlError(name=name, value=str(other), allowed="left out beside --seeds")
-        first, colon, last = self.seeds.partition(":")
-        words = self.seeds.split(",")
-        try:
-            count = int(last) - int(first) if colon else len(words)
-            wanted = range(int(first), int(last)) if colon else map(int, words)
-            seeds = list(wanted) if 0 < count <= MAX_SEEDS else []
-        except ValueError:
-            seeds = []
-        within = seeds and 0 <= min(seeds) and max(seeds) <= MAX_SEED
-        if not within or len(set(seeds)) < len(seeds):
-            allowed = f"FIRST:END such as 0:5, or numbers such as 3,5,8; at most {MAX_SEEDS}"
-            raise QuadrlError(name="seeds", value=self.seeds, allowed=allowed)
-        return seeds
+        return parse_seeds(self.seeds)
 
 
 def given(settings: dict[str, Any]) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from quadrl.learning.figures import read_metrics
 from quadrl.learning.folder import EVALUATION, METRICS
 from quadrl.policy import Policy
 from quadrl.rollout import EVALUATION_SEED, FINAL_STRETCH, Rollout, fly, summarize
+from quadrl.studies.plan import PlannedRun
 from scripts.reports.report import Result
-from scripts.reports.study import Run
 
 SMOOTHING = 0.05  # share of a training over which its curve is averaged for best and final
 NOISE_SEED = 0  # of sampled actions and of noise on the weights
@@ -25,7 +25,7 @@ WOBBLE_HZ = 2.0  # body rates above it are wobble, not flight: a position loop i
 ROUGHNESS = ("action_variation_1_s", "body_rate_rad_s", "angular_acceleration_rad_s2", "jerk_m_s3")
 
 
-def trained(run: Run) -> Result:
+def trained(run: PlannedRun) -> Result:
     """What a finished run was: task, vehicle, engine, algorithm, seed, steps, seconds."""
     config = run.config
     known = {name: getattr(config, name) for name in ("task", "vehicle", "engine", "algo", "seed")}
@@ -34,7 +34,7 @@ def trained(run: Run) -> Result:
     return known | {"steps": steps, "training_s": took}
 
 
-def measure(run: Run, *, episodes: int, weathers: Iterable[str]) -> Result:
+def measure(run: PlannedRun, *, episodes: int, weathers: Iterable[str]) -> Result:
     """All figures of a finished run.
 
     Args:

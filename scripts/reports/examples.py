@@ -17,9 +17,9 @@ import tyro
 
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import EVALUATION
+from quadrl.studies.plan import PlannedRun
 from scripts.reports import evaluation, report
 from scripts.reports.report import ENVIRONMENT, Result, say, table
-from scripts.reports.study import Run
 
 EXAMPLES = ("torchrl_ppo", "cleanrl_ppo", "sb3_ppo")
 FIGURES = ("episodes", "success_rate", "survival_rate", "position_error_m")
@@ -58,9 +58,11 @@ def main(
 def train(seed: int, steps: int | None) -> Result:
     """A run of `quadrl train hover` in MuJoCo, where the examples fly too."""
     with tempfile.TemporaryDirectory() as scratch:
-        config = TrainConfig("hover", engine="mujoco", seed=seed, steps=steps)
-        run = Run(config, Path(scratch) / "run")
-        call(*run.command(100))
+        run = PlannedRun(
+            TrainConfig("hover", engine="mujoco", seed=seed, steps=steps), Path(scratch) / "run"
+        )
+        options = ("--engine=mujoco", f"--seed={seed}", f"--steps={run.config.steps}", "--no-video")
+        call(sys.executable, "-m", "quadrl", "train", "hover", *options, f"--out={run.folder}")
         summary = json.loads((run.folder / EVALUATION).read_text())
         trained = evaluation.trained(run)
     known = {"example": "quadrl train", "settings": "quadrl", "seed": seed}

@@ -14,10 +14,11 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import WIDE
 from quadrl.policy import Policy
 from quadrl.rollout import fly, summarize
+from quadrl.studies.crew import train_here
+from quadrl.studies.plan import PlannedRun
 from quadrl.vehicle import Vehicle, resolve
-from scripts.reports import report, study
-from scripts.reports.report import Result, table
-from scripts.reports.study import Run
+from scripts.reports import report
+from scripts.reports.report import Result, say, table
 
 TASK, EFFECT = "landing", "ground_effect"
 SEEDS = (260, 261, 262)  # not used for tuning
@@ -32,12 +33,14 @@ SHOWN = {
 CONTROLLER = "geometric controller"
 
 
-def plan() -> list[Run]:
+def plan() -> list[PlannedRun]:
     """The trainings with the wide action scale."""
     given: Any = {"aerodynamics": EFFECT, "vehicle_options": {"action_scale": WIDE}}
     folder = report.RUNS / "ground"
     return [
-        Run(TrainConfig(TASK, seed=seed, num_threads=1, **given), folder / f"{WIDE:g}-{seed}")
+        PlannedRun(
+            TrainConfig(TASK, seed=seed, num_threads=1, **given), folder / f"{WIDE:g}-{seed}"
+        )
         for seed in SEEDS
     ]
 
@@ -49,7 +52,7 @@ def main(jobs: int = 2) -> None:
         jobs: Trainings at the same time.
     """
     runs = plan()
-    study.train(runs, jobs, 20)
+    train_here(runs, jobs, 20, say)
     usual, wide = (resolve(None, {"action_scale": scale}) for scale in (USUAL, WIDE))
     trained = [Policy.load(run.folder) for run in runs]
     rows: list[tuple[str, Vehicle, list[Any]]] = [

@@ -16,10 +16,11 @@ from quadrl.learning.config import TrainConfig
 from quadrl.policy import Policy
 from quadrl.randomization import RANDOMIZATIONS, Randomization
 from quadrl.rollout import fly, summarize
-from scripts.reports import report, study
+from quadrl.studies.crew import train_here
+from quadrl.studies.plan import PlannedRun
+from scripts.reports import report
 from scripts.reports.evaluation import NOISE_SEED
-from scripts.reports.report import Result, table
-from scripts.reports.study import Run
+from scripts.reports.report import Result, say, table
 
 TASK = "hover"
 SEEDS = tuple(range(250, 260))  # not used for tuning
@@ -45,11 +46,13 @@ QUESTIONS = (
 """Each compares the first with the second."""
 
 
-def plan(name: str) -> list[Run]:
+def plan(name: str) -> list[PlannedRun]:
     """The trainings of one kind."""
     folder = report.RUNS / "noise"
     return [
-        Run(TrainConfig(TASK, seed=seed, num_threads=1, **TRAINED[name]), folder / f"{name}-{seed}")
+        PlannedRun(
+            TrainConfig(TASK, seed=seed, num_threads=1, **TRAINED[name]), folder / f"{name}-{seed}"
+        )
         for seed in SEEDS
     ]
 
@@ -61,7 +64,7 @@ def main(jobs: int = 2) -> None:
         jobs: Trainings at the same time.
     """
     runs = {name: plan(name) for name in TRAINED}
-    study.train(itertools.chain(*runs.values()), jobs, 20)
+    train_here(itertools.chain(*runs.values()), jobs, 20, say)
     found: Result = {"episodes": EPISODES, "weather": WEATHER, "seeds": SEEDS, "success": {}}
     for name, action in itertools.product(TRAINED, ACTIONS):
         policies = [Policy.load(run.folder) for run in runs[name]]

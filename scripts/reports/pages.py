@@ -19,6 +19,7 @@ from scripts.reports import (
     report,
     robust,
     robustness,
+    scaling,
     speed,
     step_size,
     task_pages,
@@ -27,8 +28,8 @@ from scripts.reports import (
 from scripts.reports.report import table
 
 MODULES = (
-    describe, examples, ground, noise, paper, peers, reference, robust, robustness, speed,
-    step_size, task_pages, training,
+    describe, examples, ground, noise, paper, peers, reference, robust, robustness, scaling,
+    speed, step_size, task_pages, training,
 )  # fmt: skip
 
 

@@ -19,8 +19,10 @@ from quadrl.learning.figures import COLOURS, STYLE, learning_curves, read_metric
 from quadrl.learning.folder import METRICS
 from quadrl.policy import Policy
 from quadrl.rollout import fly, summarize
+from quadrl.studies.crew import train_here
+from quadrl.studies.plan import PlannedRun
 from quadrl.weather import WEATHERS
-from scripts.reports import evaluation, report, study
+from scripts.reports import evaluation, report
 from scripts.reports.claims import judged
 from scripts.reports.report import Result, factor, say, spread, table
 from scripts.reports.trial import LABELS, LEVEL, SOLVED, WAYS, Trial, column, trials
@@ -51,7 +53,7 @@ def main(
     # The paper's network; quadrl's own default for two of the tasks holds the goal.
     settings = {"steps": steps, "num_threads": 1 if jobs > 1 else 0, "holds_goal": False}
     runs = [
-        study.Run(
+        PlannedRun(
             TrainConfig(task, algo=algo, seed=seed, **settings),
             report.RUNS / name / f"{task}-{algo}-{seed}",
         )
@@ -59,7 +61,7 @@ def main(
         for task in TASKS
         for algo in LABELS
     ]
-    study.train(runs, jobs, episodes)
+    train_here(runs, jobs, episodes, say)
     result: Result = {"command": f"scripts/report paper --jobs {jobs}", "episodes": episodes}
     result["weathers"] = WINDY
     result["geometric"] = {task: yardstick(task, episodes) for task in TASKS}
@@ -80,9 +82,9 @@ def yardstick(task: str, episodes: int) -> Result:
     return {"mean": mean, "windy": windy}
 
 
-def draw(runs: list[study.Run], result: Result, folder: Path) -> None:
+def draw(runs: list[PlannedRun], result: Result, folder: Path) -> None:
     """Figures 3 to 7 of the paper, and two of our own."""
-    groups: dict[tuple[str, str], list[study.Run]] = {}
+    groups: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in runs:
         groups.setdefault((run.config.task, run.config.algo), []).append(run)
     for number, task in enumerate(TASKS, 3):

@@ -16,6 +16,7 @@ from quadrl.cli.completion import Completion
 from quadrl.cli.evaluate import Evaluate
 from quadrl.cli.plot import Plot
 from quadrl.cli.render import Render
+from quadrl.cli.study import Study
 from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
 from quadrl.cli.view import View
@@ -194,7 +195,7 @@ def observing() -> str:
 
 COMMANDS = {
     kind.__name__.lower(): kind
-    for kind in (Tasks, Train, Evaluate, Render, View, Plot, Benchmark, Completion)
+    for kind in (Tasks, Train, Study, Evaluate, Render, View, Plot, Benchmark, Completion)
 }
 PARTS: Parts = {
     **{f"command-{name}": functools.partial(command, name) for name in COMMANDS},

@@ -20,11 +20,12 @@ from quadrl.learning.defaults import WIDE
 from quadrl.policy import Policy
 from quadrl.randomization import Randomization
 from quadrl.rollout import flights, fly
+from quadrl.studies.crew import train_here
+from quadrl.studies.plan import PlannedRun
 from quadrl.vehicle import resolve
-from scripts.reports import report, study
+from scripts.reports import report
 from scripts.reports.evaluation import trained
 from scripts.reports.report import Result, say, table
-from scripts.reports.study import Run
 from scripts.reports.tuning import FRESH, UNCERTAIN, controller_of
 
 SEEDS = (242, 243, 244, 245, 246)  # not used for tuning
@@ -62,11 +63,11 @@ LATE: dict[str, Any] = {
 }
 
 
-def plan(task: str, way: str) -> list[Run]:
+def plan(task: str, way: str) -> list[PlannedRun]:
     """The trainings of a task in one way."""
     folder, name = report.RUNS / "robust", way.replace(",", "").replace(" ", "-")
     return [
-        Run(
+        PlannedRun(
             TrainConfig(task, variant="robust", seed=seed, num_threads=1, **WAYS[way]),
             folder / f"{task}-{name}-{seed}",
         )
@@ -95,7 +96,7 @@ def main(
         entry = found["tasks"].setdefault(task, {})
         for way in ways if task == "hover" else ["robust"]:
             runs = plan(task, way)[:seeds]
-            study.train(runs, jobs, 100)
+            train_here(runs, jobs, 100, say)
             entry[way] = [
                 trained(run) | {"flown": all_flown(Policy.load(run.folder), task)} for run in runs
             ]

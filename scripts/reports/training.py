@@ -14,9 +14,10 @@ from quadrl.engines.mujoco import ENGINES
 from quadrl.learning.config import TrainConfig
 from quadrl.policy import Policy
 from quadrl.rollout import Controller, fly, summarize
-from scripts.reports import evaluation, report, study
-from scripts.reports.report import Result, asked, factor, number, table
-from scripts.reports.study import Run
+from quadrl.studies.crew import train_here
+from quadrl.studies.plan import PlannedRun
+from scripts.reports import evaluation, report
+from scripts.reports.report import Result, asked, factor, number, say, table
 
 HOVER_SEEDS = (225, 226, 227, 228, 229)  # not used for tuning, like those below
 SEEDS = (230, 231, 232)
@@ -24,7 +25,7 @@ EPISODES = 100
 LONGEST = 300.0  # [s] that a training of any task may take
 
 
-def plan(jobs: int) -> dict[int, list[Run]]:
+def plan(jobs: int) -> dict[int, list[PlannedRun]]:
     """The trainings, by how many are made at the same time."""
     folder = report.RUNS / "training"
     alone = [
@@ -38,7 +39,9 @@ def plan(jobs: int) -> dict[int, list[Run]]:
         for seed in SEEDS
     ]
     name = "{0.task}-{0.vehicle}-{0.engine}-{0.seed}".format
-    return {k: [Run(c, folder / name(c)) for c in x] for k, x in ((1, alone), (jobs, together))}
+    return {
+        k: [PlannedRun(c, folder / name(c)) for c in x] for k, x in ((1, alone), (jobs, together))
+    }
 
 
 def main(jobs: int = 2) -> None:
@@ -49,7 +52,7 @@ def main(jobs: int = 2) -> None:
     """
     planned = plan(jobs)
     for jobs, runs in planned.items():
-        study.train(runs, jobs, EPISODES)
+        train_here(runs, jobs, EPISODES, say)
     found = []
     for run in (run for runs in planned.values() for run in runs):
         known = evaluation.trained(run)

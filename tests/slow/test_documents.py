@@ -24,7 +24,7 @@ from scripts.reports import pages, report
 REPOSITORY = Path(__file__).parents[2]
 PAGES = [*report.pages(), REPOSITORY / "CONTRIBUTING.md"]
 TEXTS = {str(page.relative_to(REPOSITORY)): page.read_text() for page in PAGES}
-LANGUAGES = {"python", "bash", "bibtex", "diff", ""}  # the first two are run
+LANGUAGES = {"python", "bash", "bibtex", "diff", "toml", ""}  # the first two are run
 SCRIPTS = ("scripts/quickstart", "scripts/test")
 SHORT_TRAINING = ("--steps", "8192", "--episodes", "4", "--no-video")
 SHORTER = {

@@ -14,6 +14,8 @@ from quadrl.learning.config import TrainConfig
 from quadrl.policy import Policy
 from quadrl.randomization import Randomization
 from quadrl.rollout import fly, summarize
+from quadrl.studies.crew import train_here
+from quadrl.studies.plan import PlannedRun
 from scripts.reports import (
     claims,
     evaluation,
@@ -26,7 +28,6 @@ from scripts.reports import (
     robust,
     ship,
     step_size,
-    study,
     trial,
     tuning,
 )
@@ -203,10 +204,11 @@ def test_smoothness_by_hand():
 
 
 def test_a_run_is_measured_by_flying_its_policy(tmp_path):
-    run = study.Run(TrainConfig("hover", steps=4096, num_threads=1), tmp_path / "run")
-    study.train([run], 1, episodes=2)
+    run = PlannedRun(TrainConfig("hover", steps=4096, num_threads=1), tmp_path / "run")
+    said = []
+    train_here([run], 1, 2, said.append)
     assert run.done
-    study.train([run], 1, episodes=2)  # there is nothing left to do
+    train_here([run], 1, 2, said.append)  # there is nothing left to do
     measured = evaluation.measure(run, episodes=3, weathers=("light",))
     policy = Policy.load(run.folder)
     assert summarize(fly(policy, "hover", episodes=3)).items() <= measured["mean"].items()

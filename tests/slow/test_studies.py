@@ -1,0 +1,245 @@
+"""Studies: every training as if it were alone, whatever dies, here and on a Ray cluster."""
+
+import contextlib
+import csv
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import quadrl
+from quadrl import cli
+from quadrl.errors import QuadrlError
+from quadrl.learning.run import train
+from quadrl.studies import crew, worker
+
+SETTINGS = {
+    "num_envs": 8,
+    "rollout": 4,
+    "hidden": [16],
+    "critic_hidden": [16],
+    "task_options": {"time_limit": 0.5},
+    "checkpoint_seconds": 0.1,
+    "ppo": {"epochs": 2, "minibatch": 16},
+}
+SHORT = SETTINGS | {"steps": 8 * 4 * 6}
+LONG = SETTINGS | {"steps": 8 * 4 * 300}
+"""So many iterations that a kill comes in the middle."""
+STUDY = {"tasks": ["hover"], "seeds": "0:2", "episodes": 2, "settings": LONG}
+PATIENCE = 240.0  # [s] for what takes a few seconds on an idle machine
+
+
+def digest(folder: Path) -> str:
+    return hashlib.sha256((folder / "policy.safetensors").read_bytes()).hexdigest()
+
+
+def wait_for(happened, what):
+    until = time.monotonic() + PATIENCE
+    while not (found := happened()):
+        assert time.monotonic() < until, what
+        time.sleep(0.02)
+    return found
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Digests of the study's policies, each trained in this process by `quadrl.train`."""
+    found = []
+    for seed in (0, 1):
+        folder = tmp_path_factory.mktemp("alone") / "run"
+        train(
+            "hover",
+            seed=seed,
+            num_threads=1,
+            out=folder,
+            episodes=2,
+            **(LONG | {"checkpoint_seconds": 60}),
+        )
+        found.append(digest(folder))
+    assert found[0] != found[1]
+    return found
+
+
+@contextlib.contextmanager
+def once_begun(folder, act):
+    """Acts in a thread as soon as the folder holds a checkpoint of a training that goes on."""
+    errors = []
+
+    def work():
+        try:
+            wait_for((folder / "checkpoint.safetensors").exists, f"a checkpoint in {folder}")
+            assert not (folder / "evaluation.json").exists()
+            act()
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    yield
+    thread.join()
+    assert not errors, errors
+
+
+def test_a_killed_worker_goes_on_and_ends_as_if_alone(alone, tmp_path, monkeypatch):
+    begun, lines, start = [], [], worker.start
+
+    def noted(*given):
+        begun.append(start(*given))
+        return begun[-1]
+
+    monkeypatch.setattr(worker, "start", noted)
+    with once_begun(tmp_path / "hover-ppo-0", lambda: begun[0].kill()):
+        found = quadrl.study(STUDY, out=tmp_path, jobs=1, on_line=lines.append)
+    assert len(begun) == 3 and any("attempt 2 of 3" in line for line in lines)
+    assert [digest(tmp_path / f"hover-ppo-{seed}") for seed in (0, 1)] == alone
+    assert not found.failed and found.rows[0]["seeds"] == 2
+    assert (tmp_path / "learning_curves_hover.png").exists()
+    row = next(csv.DictReader((tmp_path / "table.csv").open()))
+    errors = [run["metrics"]["position_error_m"] for run in found.runs]
+    assert float(row["position_error_m"]) == pytest.approx(sum(errors) / 2)
+    assert float(row["position_error_m_low"]) <= min(errors)  # t is 12.7 for two seeds
+    assert json.loads((tmp_path / "study.json").read_text())["rows"][0]["task"] == "hover"
+    lines.clear()
+    again = quadrl.study(STUDY, out=tmp_path, on_line=lines.append)
+    assert len(begun) == 3 and lines == ["2 of 2 trainings are done already"]
+    assert again.rows == found.rows
+
+
+def test_ctrl_c_leaves_a_study_that_the_same_command_ends(alone, tmp_path):
+    file = tmp_path / "two.json"
+    file.write_text(json.dumps(STUDY))
+    command = [sys.executable, "-m", "quadrl", "study", str(file), "--jobs", "1"]
+    given = {"cwd": tmp_path, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    first = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": search()}, **given)
+    with once_begun(tmp_path / "runs/two/hover-ppo-0", lambda: first.send_signal(signal.SIGINT)):
+        said, _ = first.communicate(timeout=PATIENCE)
+    assert first.returncode == 130 and "the same command goes on" in said
+    cli.main(["study", str(file), "--jobs", "1", "--out", str(tmp_path / "runs/two")])
+    assert [digest(tmp_path / f"runs/two/hover-ppo-{seed}") for seed in (0, 1)] == alone
+
+
+def search() -> str:
+    return os.pathsep.join(path or os.getcwd() for path in sys.path)
+
+
+def test_a_failed_training_is_told_at_the_end_and_stops_no_other(tmp_path, monkeypatch):
+    order = worker.order
+
+    def broken(run, *rest):
+        what = order(run, *rest)
+        if run.config.seed == 0:
+            what["versions"] = what["versions"] | {"torch": "0.1"}
+        return what
+
+    monkeypatch.setattr(worker, "order", broken)
+    found = quadrl.study(STUDY | {"settings": SHORT}, out=tmp_path, jobs=2, on_line=str)
+    assert list(found.failed) == ["hover-ppo-0"] and "0.1, as where" in found.failed["hover-ppo-0"]
+    assert found.rows[0]["seeds"] == 1 and found.rows[0]["success_rate_low"] is None
+
+
+def test_a_worker_that_always_dies_is_given_up(tmp_path, monkeypatch):
+    def dead(*given):
+        process = worker.start(*given)
+        process.kill()
+        return process
+
+    class Dying(crew.Local):
+        def begin(self, run, log):
+            return crew.LocalWorker(dead(worker.order(run, 2), log), log)
+
+    monkeypatch.setattr("quadrl.studies.Local", Dying)
+    lines = []
+    with pytest.raises(QuadrlError, match="killed by signal 9"):
+        quadrl.study(STUDY | {"seeds": [0]}, out=tmp_path, on_line=lines.append)
+    assert sum(": begun" in line for line in lines) == crew.ATTEMPTS
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    """Two nodes with a CPU each beside a head with none, all on this machine."""
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("PYTHONPATH", search())
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_worker_register_timeout_seconds", str(int(PATIENCE)))
+    small = {"object_store_memory": 80 << 20, "include_dashboard": False}
+    head = {"num_cpus": 0, **small}
+    made = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
+    try:
+        yield made, [patiently(lambda: made.add_node(num_cpus=1, **small)) for _ in range(2)]
+    finally:
+        ray.shutdown()
+        made.shutdown()
+
+
+def patiently(start):
+    """What a start returns: Ray gives a node 30 s, which a machine with much to do may not have."""
+    for _ in range(4):
+        try:
+            return start()
+        except Exception as error:
+            if "timed out" not in str(error):
+                raise
+    return start()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_node_that_dies_changes_no_policy(alone, tmp_path, cluster):
+    made, nodes = cluster
+    lines = []
+    with once_begun(tmp_path / "hover-ppo-0", lambda: made.remove_node(nodes[0])):
+        found = quadrl.study(STUDY, out=tmp_path, ray=made.address, on_line=lines.append)
+    assert any("was lost" in line for line in lines), lines
+    assert [digest(tmp_path / f"hover-ppo-{seed}") for seed in (0, 1)] == alone
+    assert not found.failed and (tmp_path / "hover-ppo-1" / "learning_curve.png").exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_ray_on_this_machine(tmp_path):
+    pytest.importorskip("ray")
+    here = quadrl.study(STUDY | {"settings": SHORT}, out=tmp_path / "here", on_line=str)
+    there = quadrl.study(
+        STUDY | {"settings": SHORT}, out=tmp_path / "ray", ray="local", jobs=1, on_line=str
+    )
+    names = [run["name"] for run in here.runs]
+    assert [run["name"] for run in there.runs] == names
+    for name in names:
+        assert digest(tmp_path / "here" / name) == digest(tmp_path / "ray" / name)
+
+
+def test_a_cluster_that_is_not_there(tmp_path):
+    pytest.importorskip("ray")
+    for address, said in (("127.0.0.1:1", "there is no Ray cluster at"), ("there", "HOST:PORT")):
+        with pytest.raises(QuadrlError, match=said) as caught:
+            quadrl.study(STUDY, out=tmp_path, ray=address)
+        assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_ray(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(QuadrlError, match=r"pip install 'quadrl\[ray\]'"):
+        quadrl.study(STUDY, out=tmp_path, ray="local")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_example_with_collectors_on_two_nodes_repeats_itself(tmp_path, cluster):
+    made, _ = cluster
+    script = Path(quadrl.__file__).parents[1] / "docs" / "examples" / "ray_collector.py"
+    options = ["--num-envs", "8", "--steps", "1024", "--episodes", "2", "--address", made.address]
+    runs = []
+    for seed in (0, 0, 1):
+        command = [sys.executable, str(script), *options, "--seed", str(seed)]
+        said = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+        assert said.returncode == 0, said.stderr
+        runs.append(json.loads(said.stdout.splitlines()[-1]) | {"seconds": 0})
+    assert runs[0] == runs[1] and runs[0]["steps"] == 1024
+    assert runs[0]["sum_of_weights"] != runs[2]["sum_of_weights"]

@@ -1,0 +1,140 @@
+"""Study files: what they expand to, and the one line with which a wrong one is refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import quadrl
+from quadrl.errors import QuadrlError
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.folder import write_json
+from quadrl.studies.plan import parse_seeds, read_plan
+from quadrl.studies.table import interval
+
+STUDY = """
+tasks = ["hover", "landing"]
+algorithms = ["ppo", "gae"]
+seeds = "3:5"
+episodes = 7
+
+[settings]
+steps = 4096
+ppo = {epochs = 2}
+
+[[variants]]
+name = "narrow"
+
+[[variants]]
+name = "wide"
+hidden = [256]
+ppo = {minibatch = 64}
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def written(text, name="study.toml"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return written
+
+
+def test_every_combination_is_planned(write, tmp_path):
+    plan = read_plan(write(STUDY), tmp_path / "out")
+    assert len(plan.runs) == 2 * 2 * 2 * 2 and plan.episodes == 7
+    names = [run.name for run in plan.runs]
+    assert names[:2] == ["hover-ppo-narrow-3", "hover-ppo-wide-3"] and len(set(names)) == 16
+    wide = next(run for run in plan.runs if run.name == "landing-ppo-wide-4")
+    ppo = {"epochs": 2, "minibatch": 64}
+    alone = TrainConfig("landing", seed=4, steps=4096, hidden=(256,), ppo=ppo, num_threads=1)
+    assert wide.config == alone and wide.folder == tmp_path / "out" / "landing-ppo-wide-4"
+
+
+def test_json_and_a_dict_are_the_same(write):
+    content = {"tasks": ["hover"], "settings": {"hidden": [8]}}
+    file = read_plan(write(json.dumps(content), "one.json"), None)
+    assert [str(run.folder) for run in file.runs] == ["runs/one/hover-ppo-0"]
+    assert [run.config for run in file.runs] == [
+        run.config for run in read_plan(content, None).runs
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("tasks =", "task ="), "did you mean tasks"),
+        (('tasks = ["hover", "landing"]', ""), "tasks is missing"),
+        (('"hover", "landing"', '"hower"'), "did you mean hover"),
+        (('"hover", "landing"', ""), "tasks = .*a list of names"),
+        (('"hover", "landing"', '"hover", "hover"'), "different names"),
+        (('"ppo", "gae"', '"gae", "vpg"'), "hover-gae-narrow-3 and hover-vpg-narrow-3"),
+        (("3:5", "5:5"), "seeds = '5:5'"),
+        (("episodes = 7", "episodes = 0"), "episodes = 0"),
+        (("steps = 4096", "step = 4096"), "setting in settings = 'step'"),
+        (("steps = 4096", "seed = 4"), r"settings.seed = 4: must be the key seeds"),
+        (("steps = 4096", "num_threads = 4"), "settings.num_threads"),
+        (("hidden = [256]", "hiden = [256]"), "setting in variants.wide = 'hiden'"),
+        (("hidden = [256]", "hidden = [0]"), "hover-ppo-wide-3: width of a hidden layer = 0"),
+        (("epochs = 2", "epoch = 2"), "hover-ppo-narrow-3: .*epoch"),
+        (('"wide"', '"narrow"'), "variants.name = 'narrow': must be a name of its own"),
+        (('"wide"', '"../up"'), "variants.name"),
+        (("hidden = [256]\nppo = {minibatch = 64}", ""), "have the same settings"),
+        (("[settings]", "[settings"), "is not TOML"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_its_name_and_the_key(write, change, said):
+    assert change[0] in STUDY
+    file = write(STUDY.replace(*change))
+    with pytest.raises(QuadrlError, match=said) as caught:
+        quadrl.study(file)
+    assert str(caught.value).startswith(str(file)) and "\n" not in str(caught.value)
+
+
+def test_other_files_are_refused(tmp_path, write):
+    for path, said in (
+        (tmp_path / "none.toml", "No such file"),
+        (write("", "study.yaml"), ".toml or a .json"),
+        (write("[1]", "list.json"), "must hold a table"),
+        (write("{", "half.json"), "is not JSON"),
+    ):
+        with pytest.raises(QuadrlError, match=said):
+            read_plan(path, None)
+
+
+def test_a_run_with_other_settings_stops_the_study_before_it_begins(tmp_path):
+    folder = tmp_path / "hover-ppo-1"
+    folder.mkdir()
+    write_json(folder / "config.json", TrainConfig("hover", seed=1, steps=64).resolved())
+    with pytest.raises(QuadrlError, match="hover-ppo-1 holds a run with other settings"):
+        quadrl.study({"tasks": ["hover"], "seeds": [0, 1]}, out=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["hover-ppo-1"]
+
+
+@pytest.mark.parametrize(
+    "given", ["", "a", "1,1", "2:2", "5:1", "-1:2", [], [0.5], [True], 3, "4294967296"]
+)
+def test_wrong_seeds(given):
+    with pytest.raises(QuadrlError, match="seeds"):
+        parse_seeds(given)
+
+
+def test_seeds():
+    assert parse_seeds("3,5,8") == parse_seeds([3, 5, 8]) == [3, 5, 8]
+    assert parse_seeds("2:4") == [2, 3]
+
+
+def test_intervals_by_hand():
+    # Three seeds: t is 4.303, the deviation 1, so half of the interval is 4.303 / sqrt(3) = 2.484.
+    mean, low, high = interval([1.0, 2.0, 3.0], low=0.0)
+    assert (mean, low) == (2.0, 0.0) and high == pytest.approx(2 + 2.484, abs=1e-3)
+    assert interval([0.5]) == (0.5, None, None)
+    assert interval([None, float("nan")]) == (None, None, None)
+
+
+def test_the_file_on_the_page(write):
+    page = (Path(__file__).parents[2] / "docs" / "study.md").read_text()
+    plan = read_plan(write(page.partition("```toml\n")[2].partition("```")[0]), None)
+    assert len(plan.runs) == 40 and {run.config.seed for run in plan.runs[:8]} == {0}
