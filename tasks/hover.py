@@ -27,6 +27,7 @@ class Hover(Task):
         Target("heading_error_deg", "off east", 15.0, unit="deg"),
     )
     training = {"gamma": 0.9, "steps": 204_800, "ppo": {"learning_rate": 8e-3}}
+    training_with = {"apg": {"steps": 51_200}}
     variants = {"robust": {"steps": 4_096_000}}
     heading_matters = True
 

@@ -45,6 +45,7 @@ class StaticWaypoint(Task):
         Target("heading_error_deg", "off east", 15.0, unit="deg"),
     )
     training = {"gamma": 0.9, "ppo": {"learning_rate": 8e-3}}
+    training_with = {"apg": {"steps": 153_600}}
     heading_matters = True
 
     waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)
