@@ -171,6 +171,11 @@ class Environment(saving.Copied):
             self._snapshot, self._episode = self.compiled.snapshot()
         return self._snapshot
 
+    @property
+    def episode(self) -> Episode:
+        """How far the episodes are: as live as the snapshot."""
+        return self.snapshot and self._episode  # type: ignore[return-value]
+
     def _take(self, now: Snapshot, episode: Episode) -> None:
         """Take a snapshot of all rows as the present one."""
         # What a task remembers must not be a view of buffers that the next steps write.

@@ -111,6 +111,8 @@ class Task(abc.ABC):
     """What a trained policy has to reach over many episodes."""
     training: ClassVar[dict[str, Any]] = {}
     """Training settings that differ from the defaults of `quadrl.learning.config.TrainConfig`."""
+    training_with: ClassVar[dict[str, dict[str, Any]]] = {}
+    """What is different again with an algorithm, by its name."""
     gains: ClassVar[dict[str, float]] = {}
     """Gains of the geometric controller that differ from its defaults."""
     observation: ClassVar[dict[str, ObservationTerm]] = OBSERVATION

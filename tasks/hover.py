@@ -36,6 +36,9 @@ class Hover(Task):
         "holds_goal": True,
         "ppo": {"learning_rate": 1e-2},
     }
+    training_with = {
+        "apg": {"steps": 51_200, "gamma": 0.9, "gae_lambda": 0.95, "holds_goal": False}
+    }
     variants = {"robust": {"steps": 4_096_000}}
     heading_matters = True
 

@@ -26,6 +26,7 @@ class RandomWaypoint(Task):
         Target("position_error_m", "error over the last 2 s", 0.06, unit="cm"),
     )
     training = {"steps": 2_621_440, "holds_goal": True}
+    training_with = {"apg": {"steps": 102_400, "holds_goal": False}}
     variants = {"robust": {"steps": 4_096_000}}
 
     nearest: float = 1.0

@@ -49,6 +49,7 @@ class StaticWaypoint(Task):
         Target("heading_error_deg", "off east", 5.0, unit="deg"),
     )
     training = {"gamma": 0.9, "holds_goal": True, "ppo": {"learning_rate": 8e-3}}
+    training_with = {"apg": {"steps": 153_600, "holds_goal": False}}
     heading_matters = True
 
     waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)

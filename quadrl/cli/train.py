@@ -63,8 +63,8 @@ Settings: Any = optional(TrainConfig)
 class Train:
     """Train a policy from scratch, evaluate it, and write results and pictures to a run folder.
 
-    The defaults shown are for ppo and the aircraft paper. A task, vpg or another aircraft may have
-    others: quadrl tasks TASK lists those of a task.
+    The defaults shown are for ppo and the aircraft paper. A task, vpg, apg or another aircraft may
+    have others: quadrl tasks TASK lists those of a task.
     """
 
     settings: Annotated[Settings, arg(name="")]  # pyright: ignore[reportInvalidTypeForm]

@@ -105,6 +105,12 @@ class Rotor(ControlMode):
         """Within what the rotors can do: `Vehicle.rotor_command`."""
         return self.vehicle.rotor_command(action)
 
+    def slope(self, action: Array) -> Array:
+        """The derivative of each number of `setpoint` by its own of the action, (N, k)."""
+        wanted = self.centre + self.scale * action
+        within = (abs(action) < 1) & (wanted > 0) & (wanted < self.vehicle.max_speed)
+        return np.where(within, self.scale, 0.0)
+
     def rotor_command(self, state: State, setpoint: Array) -> Array:
         """The setpoint itself."""
         return setpoint

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from quadrl import native, parameters
+from quadrl.engines.adjoint import Leg
 from quadrl.engines.free_flight import FreeFlight
 from quadrl.errors import QuadrlError
 from quadrl.rotation import norm
@@ -120,6 +121,20 @@ class Engine(abc.ABC):
     @abc.abstractmethod
     def advance(self, steps: int) -> None:
         """Some physics steps with the commands in `ctrl`."""
+
+    def leg(self, steps: int) -> Leg:
+        """What the next physics steps start from and fly in, copied, for their derivatives.
+
+        Raises:
+            QuadrlError: The engine is not free flight.
+        """
+        if (flies := self._free_flight) is None:
+            reason = "MuJoCo's steps have no derivatives here"
+            raise QuadrlError(reason, name="engine", value=self.name, allowed="'free_flight'")
+        start = np.concatenate([self.qpos, self.qvel, self.act], axis=1)
+        own = len(self.parameters) > 1  # which a reset may change
+        table = flies.parameters.copy() if own else flies.parameters
+        return Leg(start, self.ctrl.copy(), self.air.copy(), table, flies.world, steps)
 
     @abc.abstractmethod
     def clear(self, rows: np.ndarray) -> None:

@@ -48,7 +48,7 @@ class FreeFlight:
         self._fields = fields  # kept alive: the kernel knows their addresses
         self._addresses = [fields[name].ctypes.data for name in FIELDS]
         self._stride = stride
-        self._world = world(model)
+        self.world = world(model)
         self._near = np.zeros(count, dtype=np.int8)
         parts = max(1, min(threads, count // ROWS_PER_THREAD))
         # Whole groups of lanes to each, so that no group is flown twice.
@@ -58,14 +58,15 @@ class FreeFlight:
 
     def use(self, table: np.ndarray) -> None:
         """Take rows of parameters (N,), or one (1,) for all; that one is live."""
-        self._parameters, block = table, 0
+        # As the kernels read them: the row, or blocks of LANES rows side by side.
+        self.parameters, block = table, 0
         if len(table) > 1:
             rotors = MAX_ROTORS - int(table["rotor_count"][0])
             block = LANES * (ROW_SIZE - rotors * ROTOR.itemsize // 8)
-            self._parameters = np.empty((-(-len(table) // LANES), block // LANES, LANES))
-            self._parameters[:] = numbers(table[:1])[0, : block // LANES, None]
+            self.parameters = np.empty((-(-len(table) // LANES), block // LANES, LANES))
+            self.parameters[:] = numbers(table[:1])[0, : block // LANES, None]
             self.write(np.arange(len(table)), table)
-        last = (self._parameters, self._world, self._near)
+        last = (self.parameters, self.world, self._near)
         # As `Rows` in native/free_flight.c.
         self._rows = np.array(
             [*self._addresses, *(array.ctypes.data for array in last), self._stride, block]
@@ -74,7 +75,7 @@ class FreeFlight:
 
     def write(self, rows: np.ndarray, table: np.ndarray) -> None:
         """Take parameters (n,) of some aircraft (n,)."""
-        if (blocks := self._parameters).ndim > 1:
+        if (blocks := self.parameters).ndim > 1:
             blocks[rows // LANES, :, rows % LANES] = numbers(table)[:, : blocks.shape[1]]
 
     def advance(self, steps: int) -> np.ndarray | None:

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from quadrl.envs.common import PICTURE, Pictures, make
 from quadrl.task import Task
+from quadrl.transition import Transition
 
 DONE = ("done", "terminated", "truncated")
 
@@ -121,7 +122,7 @@ class QuadrotorEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._restored = False
-        now = self.environment.step(tensordict["action"].detach().cpu())
+        now = self._fly(tensordict["action"].detach().cpu())
         self._observation = self.environment.flatten(now.observation)
         columns = {
             "reward": now.reward.astype(np.float32),
@@ -136,6 +137,9 @@ class QuadrotorEnv(EnvBase):
             {name: torch.from_numpy(column[:, None]) for name, column in columns.items()},
             {name: torch.from_numpy(column[:, None]) for name, column in terms.items()},
         )
+
+    def _fly(self, action: torch.Tensor) -> Transition:
+        return self.environment.step(action)
 
     def _pack(
         self, columns: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]

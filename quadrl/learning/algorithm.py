@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -15,6 +15,9 @@ from torchrl.modules import set_recurrent_mode
 
 class Algorithm(abc.ABC):
     """An update of the networks from batches; learning rates fall linearly to zero."""
+
+    whole: ClassVar[bool] = False
+    """Whether it learns from batches (aircraft, time), with the networks that flew them."""
 
     def __init__(self, config: Any) -> None:
         """Start without optimisers, with the settings of the algorithm."""

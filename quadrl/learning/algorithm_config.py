@@ -88,4 +88,29 @@ class VPGConfig(AlgorithmConfig):
     """Norm to which gradients are clipped."""
 
 
-ALGORITHM_CONFIGS = {"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig}
+@dataclasses.dataclass(frozen=True)
+class APGConfig(AlgorithmConfig):
+    """Settings of the analytic policy gradient."""
+
+    # Many windows, each of which is one step up the gradient.
+    training = {"num_envs": 64, "rollout": 32, "initial_deviation": 0.5, "steps": 204_800}
+
+    step: float = 0.2
+    """How far the actions of a window are moved up their gradient, where it has its median
+    length; twice as far at most."""
+    learning_rate: float = 5e-3
+    """Initial rate of Adam, with which the policy is fitted to the moved actions; it falls linearly
+    to zero."""
+    epochs: int = 4
+    """Passes of the policy over each window."""
+    critic_rate: float = 5e-3
+    """Initial learning rate of the critic; it falls linearly to zero."""
+    critic_epochs: int = 4
+    """Passes of the critic over each window."""
+    minibatch: int = 1024
+    """Transitions in a gradient step."""
+    max_gradient: float = 1.0
+    """Norm to which gradients are clipped."""
+
+
+ALGORITHM_CONFIGS = {"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig, "apg": APGConfig}

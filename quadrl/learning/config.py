@@ -17,12 +17,14 @@ from quadrl.engines.mujoco import ENGINES, MAX_ENVS, MAX_THREADS
 from quadrl.errors import QuadrlError
 from quadrl.learning.algorithm_config import (
     ALGORITHM_CONFIGS,
+    APGConfig,
     PPOConfig,
     TRPOConfig,
     VPGConfig,
 )
 from quadrl.learning.defaults import PAIRS, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, free_folder, read_config
+from quadrl.learning.smooth import check_smooth
 from quadrl.observing import Observing
 from quadrl.observing import resolve as resolve_observing
 from quadrl.randomization import Randomization, resolve
@@ -33,7 +35,7 @@ from quadrl.vehicle import Vehicle
 from quadrl.vehicle import resolve as resolve_vehicle
 from quadrl.weather import Weather
 
-ALGORITHMS = ("ppo", "trpo", "vpg")
+ALGORITHMS = ("ppo", "trpo", "vpg", "apg")
 ALIASES = {"gae": "vpg"}
 """The paper names the plain policy gradient after its advantages."""
 MAX_BATCH = 1 << 24
@@ -52,7 +54,8 @@ class TrainConfig:
     task: str = "hover"
     """Name of the task."""
     algo: str = "ppo"
-    """Algorithm: ppo, trpo, or vpg (the plain policy gradient; the paper's name gae works too)."""
+    """Algorithm: ppo, trpo, vpg (the plain policy gradient; the paper's name gae works too), or apg
+    (the gradient goes through the physics, which the paper's algorithms do not know)."""
     seed: int = 0
     """Seed of the networks, the exploration and the episodes, between 0 and 2^32 - 1."""
     variant: str = "ideal"
@@ -112,6 +115,8 @@ class TrainConfig:
     """Settings of TRPO."""
     vpg: VPGConfig = dataclasses.field(default_factory=VPGConfig)
     """Settings of the plain policy gradient."""
+    apg: APGConfig = dataclasses.field(default_factory=APGConfig)
+    """Settings of the analytic policy gradient."""
     device: str = "cpu"
     """Device of the networks, such as cuda; the simulation stays on the CPU."""
     num_threads: int = 0
@@ -205,6 +210,8 @@ class TrainConfig:
         Draw(self.randomization, self.make_vehicle())
         Weather.of(self.weather)
         resolve_observing(self.observe)
+        if self.algo == "apg":
+            check_smooth(self)
 
     def conditions(self) -> dict[str, Any]:
         """What its aircraft meet that others do not, for whoever flies the policy."""

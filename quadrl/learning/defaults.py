@@ -58,12 +58,13 @@ def training_defaults(
         variant: A name of `VARIANTS`.
 
     Raises:
-        QuadrlError: The task, the vehicle, the variant or a setting in `Task.training` or
-            `Task.variants` is unknown.
+        QuadrlError: The task, the vehicle, the variant or a setting in `Task.training`,
+            `Task.training_with` or `Task.variants` is unknown.
     """
     kind = tasks.TASKS[choice("task", task, tasks.TASKS)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
-    own = merged(kind.training, shared, kind.variants.get(variant, {}))
+    with_algo = kind.training_with.get(algo, {})
+    own = merged(kind.training, with_algo, shared, kind.variants.get(variant, {}))
     keys(f"training default of {task}", own, [name for name in base if name not in CHOSEN])
     values = merged(base, ALGORITHM_CONFIGS[algo].training, own)
     values |= {"task": task, "algo": algo}

@@ -13,6 +13,8 @@ from torchrl.data import Unbounded
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import STATE
+from quadrl.learning.window import Moment, fly
+from quadrl.transition import Transition
 
 with warnings.catch_warnings():
     # TorchRL 0.14 warns about its own classes at this import.
@@ -47,6 +49,25 @@ class RememberingEnv(QuadrotorEnv):
         return fresh
 
 
+class RecordingEnv(QuadrotorEnv):
+    """Aircraft whose steps are kept, for their derivatives."""
+
+    def __init__(self, *given: Any, **settings: Any) -> None:
+        """Make the environments."""
+        super().__init__(*given, **settings)
+        self._moments: list[Moment] = []
+
+    def taken(self) -> list[Moment]:
+        """The steps since this was last asked for."""
+        moments, self._moments = self._moments, []
+        return moments
+
+    def _fly(self, action: torch.Tensor) -> Transition:
+        moment, done = fly(self.environment, action.numpy())
+        self._moments.append(moment)
+        return done
+
+
 def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
     """The aircraft of a training."""
     settings: dict[str, Any] = dict(
@@ -62,6 +83,8 @@ def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
         randomization=config.randomization,
         observe=config.observe,
     )
+    if config.algo == "apg":
+        return RecordingEnv(**settings)
     if config.memory == "none":
         return QuadrotorEnv(**settings)
     return RememberingEnv(config.memory_width, **settings)

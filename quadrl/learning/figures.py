@@ -37,7 +37,7 @@ PANELS = {
     "error": ("error [m]", "orange"),
 }
 """Of a learning curve: column of metrics.csv, label and colour."""
-COLOURS = {"ppo": "blue", "trpo": "orange", "vpg": "green"}
+COLOURS = {"ppo": "blue", "trpo": "orange", "vpg": "green", "apg": "violet"}
 """Of the algorithms; others get the remaining ones."""
 CLOCKS = {
     "steps": ("control steps [thousands]", 1e-3),

@@ -20,10 +20,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.errors import QuadrlError
 from quadrl.learning import checkpoint
+from quadrl.learning.algorithm import Algorithm
+from quadrl.learning.apg import APG
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.environments import make_collector, make_env
+from quadrl.learning.environments import RecordingEnv, make_collector, make_env
 from quadrl.learning.folder import CONFIG, EVALUATION, Log, lock_folder, new_folder, write_json
 from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE, export, make_actor_critic
 from quadrl.learning.ppo import PPO
@@ -42,6 +45,14 @@ with warnings.catch_warnings():
 LEARNED_FROM = ("action", "action_log_prob", "loc", "scale", "advantage", "value_target")
 """Of a batch, beside what actor and critic read."""
 ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "vpg": VPG}
+
+
+def make_algorithm(config: TrainConfig, env: QuadrotorEnv, actor: Any, critic: Any) -> Algorithm:
+    """The algorithm of a training."""
+    own = getattr(config, config.algo)
+    if isinstance(env, RecordingEnv):
+        return APG(actor, critic, own, env, config.gamma, config.reward_scale)
+    return ALGORITHMS[config.algo](actor, critic, own)
 
 
 def make_device(name: str) -> torch.device:
@@ -93,9 +104,7 @@ class Training:
         )
         for network in (self.actor, self.critic):
             network.to(device)
-        self.algorithm = ALGORITHMS[config.algo](
-            self.actor, self.critic, getattr(config, config.algo)
-        )
+        self.algorithm = make_algorithm(config, self.env, self.actor, self.critic)
         self.advantages = GAE(
             gamma=config.gamma, lmbda=config.gae_lambda, value_network=self.critic, average_gae=True
         )
@@ -196,7 +205,8 @@ class Training:
                 batch[BEGINS] = torch.roll(done, 1, dims=1)
                 batch[BEGINS][:, 0] = False  # the state before it says so
                 self._remembered = {STATE: state[:, -1].masked_fill(done[:, -1], 0.0).cpu().numpy()}
-            if self.iteration == 0:  # the first batch was collected without a normaliser
+            first = self.iteration == 0 and not self.algorithm.whole
+            if first:  # the first batch was collected without a normaliser
                 self._normalise(batch)
                 with set_recurrent_mode():
                     present = self.actor.get_dist(batch)
@@ -204,10 +214,10 @@ class Training:
             batch["next", "reward"] *= self.config.reward_scale
             self.advantages(batch)
         flat = batch.select(*self.actor.in_keys, *self.critic.in_keys, *LEARNED_FROM)
-        if self.config.memory == "none":
+        if self.config.memory == "none" and not self.algorithm.whole:
             flat = flat.reshape(-1)
         metrics |= self.algorithm.update(flat, 1 - self.iteration / self.config.iterations)
-        if self.iteration > 0:
+        if not first:
             self._normalise(batch)
         return metrics | {"deviation": float(batch["scale"].mean())}
 

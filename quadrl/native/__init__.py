@@ -1,4 +1,4 @@
-"""The compiled part: MuJoCo callbacks of the rotors, free flight, state, weather, random numbers.
+"""The compiled part: callbacks of the rotors, free flight and back, state, weather, random numbers.
 
 The C sources beside this file are compiled at first use with the machine's own compiler against
 the headers of the installed mujoco, because they read the structs of exactly that version. The
@@ -33,9 +33,9 @@ from quadrl.errors import NativeError
 from quadrl.parameters import c_structs
 from quadrl.state import c_rows
 
-SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
+SOURCES = ("callbacks.c", "free_flight.c", "adjoint.c", "state.c", "random.c", "weather.c",
            "disturbances.c")  # fmt: skip
-HEADERS = ("aero.h", "philox.h", "runge_kutta.h")
+HEADERS = ("adjoint.h", "aero.h", "philox.h", "runge_kutta.h")
 MARK_SLOT = 9
 """Entry of an actuator's `dynprm` that holds MARK."""
 # No contraction: a fused multiply-add would round otherwise than NumPy does.
@@ -181,6 +181,8 @@ def load(path: Path) -> ctypes.CDLL:
     opened.quadrl_state.argtypes = [_POINTER, integer, _POINTER, _POINTER]
     opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
     opened.quadrl_uniform.restype = opened.quadrl_weather.restype = None
+    opened.quadrl_adjoint.restype = None
+    opened.quadrl_adjoint.argtypes = [_POINTER, integer, integer]
     opened.quadrl_weather.argtypes = [_POINTER, integer, _POINTER, integer]
     real, stride = ctypes.c_double, integer
     opened.quadrl_estimate.restype = opened.quadrl_push.restype = None

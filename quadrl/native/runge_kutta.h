@@ -131,9 +131,8 @@ INLINE void do_stage(const Aircraft* a, const Setting* s, int effects, int rotor
   if (number < 3) move(rows, m, ahead[number], rate, t->at);
 }
 
-INLINE void runge_kutta(const Aircraft* a, int effects, int rotors, const World* world,
-                        Setting* s, Lanes* m, int64_t steps) {
-  Stages t;
+// What is the same in all steps.
+INLINE void prepare(const Aircraft* a, int effects, int rotors, Setting* s) {
   for (int k = 0; k < rotors; ++k) {
     for (int i = 0; i < LANES; ++i) {
       double column[6];
@@ -142,6 +141,12 @@ INLINE void runge_kutta(const Aircraft* a, int effects, int rotors, const World*
     }
     if (effects != STILL_AIR) aero_disc(a, a->rotor + k, s->disc + k);
   }
+}
+
+INLINE void runge_kutta(const Aircraft* a, int effects, int rotors, const World* world,
+                        Setting* s, Lanes* m, int64_t steps) {
+  Stages t;
+  prepare(a, effects, rotors, s);
   for (int64_t step = 0; step < steps; ++step) {
     if (effects == STILL_AIR && rotors == 4) {  // written out it is a little faster
       do_stage(a, s, effects, rotors, world, 0, m, &t);

@@ -150,7 +150,7 @@ def test_help_says_what_each_setting_means(capsys):
     text = " ".join(capsys.readouterr().out.split())
     for words in (
         "--num-envs INT", "(default: 256)", "--ppo.clip FLOAT", "quadrl tasks TASK",
-        "{hover,", "--algo {ppo,trpo,vpg,gae}", "--vehicle {paper,", "--import FILE",
+        "{hover,", "--algo {ppo,trpo,vpg,apg,gae}", "--vehicle {paper,", "--import FILE",
         "--memory {none,gru}",
     ):  # fmt: skip
         assert words in text, words

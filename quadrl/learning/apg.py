@@ -1,0 +1,102 @@
+"""Analytic policy gradients: through the physics, over short windows with a critic at their end.
+
+The windows and their critic are those of SHAC (Xu et al. 2022). What is done with the gradient is
+that of PODS (Mora et al. 2021): each action of the window is moved a little up it, and the policy
+is fitted to the moved actions, which does not depend on how its weights are scaled. Unlike the
+other algorithms this one knows the model: the derivatives of the flight and of the rewards.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.modules import ProbabilisticActor
+
+from quadrl.learning.algorithm import Algorithm
+from quadrl.learning.algorithm_config import APGConfig
+from quadrl.learning.environments import RecordingEnv
+from quadrl.learning.window import Window
+
+FARTHEST = 2.0  # times the usual move of an action
+
+
+class APG(Algorithm):
+    """The policy's epochs towards better actions, then the critic's."""
+
+    whole = True
+
+    def __init__(
+        self,
+        actor: ProbabilisticActor,
+        critic: TensorDictModule,
+        config: APGConfig,
+        env: RecordingEnv,
+        gamma: float,
+        reward_scale: float,
+    ) -> None:
+        """Make the optimisers.
+
+        Args:
+            actor: The policy.
+            critic: Of the windows' ends.
+            config: Settings.
+            env: Flies the windows.
+            gamma: Discount per control step.
+            reward_scale: Factor on the rewards.
+        """
+        super().__init__(config)
+        self.actor, self.critic, self._env = actor, critic, env
+        self._gamma, self._reward_scale = gamma, reward_scale
+        self.add_optimiser("policy", actor.parameters(), config.learning_rate)
+        self.add_optimiser("critic", critic.parameters(), config.critic_rate)
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """One window (aircraft, time): the policy's epochs, then the critic's."""
+        window = Window(self._env.environment, self._env.taken())
+        seen = TensorDict({"observation": window.observation.float()}, len(window.observation))
+        mean, deviation = self._distribution(seen)
+        flown = batch["action"].transpose(0, 1).reshape(mean.shape)
+        # The random numbers stay as they were drawn, whatever the policy.
+        action = mean + deviation * ((flown - mean) / deviation).detach()
+        pulled = torch.from_numpy(window.pull(self._earned(window), action, self._gamma)).float()
+        better = (mean + self._moves(pulled.reshape(mean.shape))).detach()
+        aims = seen.detach().update({"better": better, "usual": deviation.log().detach()})
+        for _ in range(self.config.epochs):
+            for rows in torch.randperm(len(aims)).split(self.config.minibatch):
+                self.step("policy", self._distance(aims[rows]))
+        return self.fit_critic(self._critic_loss, batch.reshape(-1))
+
+    def _earned(self, window: Window) -> Tensor:
+        """The rewards of a window and what the critic expects after it, ()."""
+        goes_on = torch.from_numpy(window.goes_on)
+        after = TensorDict({"observation": window.next_observation[goes_on].float()})
+        value = self._gamma * self.critic(after)["state_value"].sum()
+        return self._reward_scale * window.reward.sum() + value
+
+    def _moves(self, pulled: Tensor) -> Tensor:
+        """How far actions are moved, (n, k): as `config.step` says, where the pull is the median.
+
+        The pull at some moments is a thousand times as strong as at others.
+        """
+        strength = pulled.norm(dim=-1, keepdim=True)
+        moves = self.config.step * pulled / strength.median().clamp(min=1e-9)
+        farthest = FARTHEST * self.config.step
+        return moves * (farthest / moves.norm(dim=-1, keepdim=True).clamp(min=farthest))
+
+    def _distance(self, aims: TensorDictBase) -> Tensor:
+        """How far the policy is from the moved actions and from its usual deviation, ()."""
+        mean, deviation = self._distribution(aims)
+        off, wide = mean - aims["better"], deviation.log() - aims["usual"]
+        return off.square().mean() + wide.square().mean()
+
+    def _distribution(self, seen: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of the actions (n, k)."""
+        found: Any = self.actor.get_dist_params(seen.select("observation"))
+        return found["loc"], found["scale"]
+
+    def _critic_loss(self, batch: TensorDictBase) -> Tensor:
+        return (self.critic(batch)["state_value"] - batch["value_target"]).square().mean()

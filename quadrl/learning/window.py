@@ -1,0 +1,168 @@
+"""A window of flight, and how what it earned follows from its actions.
+
+The task's own functions give rewards and observations once more, with tensors, for all steps of the
+window at once; the derivatives of the flight between are those of `quadrl.engines.adjoint`. They
+are joined backwards in time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from quadrl import records
+from quadrl.control.modes import Rotor
+from quadrl.engines.adjoint import Leg
+from quadrl.engines.engine import Engine
+from quadrl.environment import Environment
+from quadrl.errors import QuadrlError
+from quadrl.snapshot import Snapshot
+from quadrl.state import State
+from quadrl.transition import Clock, Episode, Transition, finish
+
+FLAGS = ("terminated", "truncated")
+
+
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """One control step of N aircraft."""
+
+    was: np.ndarray  # (N, 13 + R), the motion before it: qpos, qvel and rotor speeds
+    before: Snapshot
+    episode: Episode  # before it
+    leg: Leg
+    action: np.ndarray  # (N, k)
+    end: np.ndarray  # (N, 13 + R), the motion after it
+    terminated: np.ndarray  # (N,) bool
+    truncated: np.ndarray  # (N,) bool
+    diverged: np.ndarray  # (N,) bool
+
+
+def fly(environment: Environment, action: np.ndarray) -> tuple[Moment, Transition]:
+    """`Environment.step`, and what has to be known of it for its derivatives."""
+    was, engine = coordinates(environment.engine), environment.engine
+    begun = records.copied(environment.snapshot), records.copied(environment.episode)
+    environment.begin(action)
+    leg = engine.leg(environment.vehicle.substeps)
+    engine.advance(leg.steps)
+    done = environment.finish()
+    flags = (np.array(getattr(done, name)) for name in (*FLAGS, "diverged"))
+    return Moment(was, *begun, leg, action, coordinates(engine), *flags), done
+
+
+def coordinates(engine: Engine) -> np.ndarray:
+    """qpos, qvel and rotor speeds side by side, (N, 13 + R), a copy."""
+    return np.concatenate([engine.qpos, engine.qvel, engine.act], axis=1)
+
+
+class Window:
+    """T control steps of N aircraft; tensors (T * N, ...), a step after the other."""
+
+    def __init__(self, environment: Environment, moments: list[Moment]) -> None:
+        """Run the task's functions once more.
+
+        Raises:
+            QuadrlError: They cannot be run with tensors.
+        """
+        self.moments, task = moments, environment.task
+        self.shape = len(moments), environment.num_envs  # (T, N)
+        parts = ("was", "end", "action")
+        self.was, self.end, self.action = (_leaf([getattr(m, n) for m in moments]) for n in parts)
+        self.command = _leaf([m.leg.command for m in moments])
+        self.last_command = _leaf([m.before.rotor_command for m in moments])
+        clock = environment.vehicle.control_timestep
+        assert isinstance(environment.control_mode, Rotor)
+        self._control = environment.control_mode
+        parameters = moments[0].before.parameters.map(_tensor)
+        origin = environment.origin
+        diverged = torch.from_numpy(np.concatenate([m.diverged for m in moments]))
+        time = torch.from_numpy(np.concatenate([m.before.time for m in moments]))
+        state = _joined([m.before.task for m in moments])
+        moment = state, parameters, torch.zeros_like(self.action), self.last_command, time
+        before = Snapshot(_state(self.was, origin), *moment)
+        steps = _joined([m.episode for m in moments])
+        flown = _state(self.end, origin), self.action, self.command, diverged
+        try:
+            before.potentials = task.measure(before)
+            done = finish(task, Clock.of(task, clock), steps, before, *flown)[2]
+            self.observation = torch.cat(list(task.observe(before).values()), -1)
+            """What was seen before each step, (T * N, size)."""
+        except (AttributeError, RuntimeError, TypeError, ValueError) as error:
+            reason = f"its functions cannot be run with tensors: {error}"
+            allowed = "a task of functions in the array API"
+            raise QuadrlError(reason, name="task", value=task.name, allowed=allowed) from error
+        self.next_observation = torch.cat(list(done.observation.values()), -1)
+        """What was seen after each step."""
+        self.reward = torch.where(diverged, 0.0, done.reward)
+        """Of each step, (T * N,); none where the simulation broke down."""
+
+    @property
+    def goes_on(self) -> np.ndarray:
+        """Where something comes after the step that the window does not hold, (T * N,) bool."""
+        terminated, truncated = (np.array([getattr(m, n) for m in self.moments]) for n in FLAGS)
+        truncated[-1] = ~terminated[-1]
+        return truncated.ravel()
+
+    def pull(self, earned: Tensor, action: Tensor, gamma: float) -> np.ndarray:
+        """How what is earned from each step on follows from its action, (T, N, k).
+
+        Args:
+            earned: A sum over the steps, (): of their rewards, and of what comes after the window.
+            action: The actions as they follow from `observation`, (T * N, k).
+            gamma: Discount per control step.
+        """
+        leaves = self.was, self.end, self.command, self.last_command, self.action
+        by = torch.autograd.grad(earned, leaves, retain_graph=True, allow_unused=True)
+        was, end, command, last, own = (self._steps(*pair) for pair in zip(by, leaves, strict=True))
+        jacobian = [
+            self._steps(torch.autograd.grad(one.sum(), self.was, retain_graph=True)[0], self.was)
+            for one in action.unbind(-1)
+        ]  # k of (T, N, 13 + R)
+        pulled = np.zeros_like(own)
+        later, later_command = np.zeros_like(was[0]), np.zeros_like(last[0])
+        for t, moment in reversed(list(enumerate(self.moments))):
+            same = ~(moment.terminated | moment.truncated)[:, None]  # the episode goes on
+            from_start, from_command = moment.leg.pull(
+                np.where(moment.diverged[:, None], 0.0, end[t] + gamma * same * later)
+            )
+            from_command += command[t] + gamma * same * later_command
+            pulled[t] = own[t] + self._control.slope(moment.action) * from_command
+            later = from_start + was[t]
+            for k, row in enumerate(jacobian):
+                later += row[t] * pulled[t, :, k, None]
+            later_command = last[t]
+            lost = ~(np.isfinite(later).all(1) & np.isfinite(pulled[t]).all(1))
+            later[lost], pulled[t, lost] = 0.0, 0.0
+        return pulled
+
+    def _steps(self, gradient: Tensor | None, leaf: Tensor) -> np.ndarray:
+        """A gradient by a leaf as (T, N, ...)."""
+        whole = torch.zeros_like(leaf) if gradient is None else gradient
+        return whole.numpy().reshape(*self.shape, -1)
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    return torch.tensor(np.ascontiguousarray(array))
+
+
+def _leaf(arrays: list[np.ndarray]) -> Tensor:
+    return torch.from_numpy(np.concatenate(arrays).astype(np.float64)).requires_grad_()
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Records of arrays (N, ...) as one of tensors (T * N, ...)."""
+    kind = type(parts[0])
+    names = [field.name for field in dataclasses.fields(kind)]
+    columns = ([getattr(part, name) for part in parts] for name in names)
+    return kind(*(torch.from_numpy(np.concatenate(column)) for column in columns))
+
+
+def _state(motion: Tensor, origin: np.ndarray) -> State:
+    """The state of motions (n, 13 + R)."""
+    position = motion[:, :3] - torch.from_numpy(origin)
+    parts = motion[:, 3:7], motion[:, 7:10], motion[:, 10:13], motion[:, 13:]
+    return State.of_coordinates(position, *parts, float(origin[2]))

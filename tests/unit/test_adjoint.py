@@ -1,0 +1,132 @@
+"""The reverse of free flight, beside differences of its steps and beside torch.
+
+The one is the C step itself, the other the same equations in `quadrl/dynamics.py`.
+"""
+
+import dataclasses
+
+import helpers
+import numpy as np
+import pytest
+
+from quadrl.engines.mujoco import BatchEngine
+from quadrl.errors import QuadrlError
+from quadrl.vehicle import GRAVITY
+
+COUNT = 19  # more than the kernel takes at a time, and no whole lanes
+STEPS = 5
+EVERY = helpers.LAYOUTS | helpers.IN_AIR
+every_layout = pytest.mark.parametrize("name", EVERY)
+
+
+def flying(name, *, per_row=True, count=COUNT):
+    """Aircraft that differ, in motions that differ, some near the ground where it has an effect."""
+    vehicle, rng = EVERY[name], np.random.default_rng(5)
+    batch = BatchEngine(vehicle, count, altitude=3.0, engine="free_flight", per_row=per_row)
+    if per_row:
+        batch.write_parameters(np.arange(count), helpers.parameter_rows(vehicle, count))
+    motion = helpers.random_motion(vehicle, count, speed=6.0, turn=6.0, wind=5.0, rotor=0.4)
+    motion.velocity[::4] *= 3.0  # out of the range of the inflow
+    motion.velocity[1::4] *= 0.1
+    radius = max(rotor.disc for rotor in vehicle.rotors)
+    motion.position[:, 2] = np.linspace(0.2, 12.0, count) * radius
+    helpers.put(batch, motion, origin=helpers.UP * (name not in helpers.IN_AIR))
+    batch.ctrl[:] = helpers.random_commands(vehicle, count, 1, rotor=0.8)[0]
+    batch.air[:, 3:] = rng.normal(size=batch.air[:, 3:].shape)
+    return batch
+
+
+def differences(leg, name, given):
+    """Derivatives (N, k) of the sum of `given` times where a leg leads, by four points each."""
+    argument, columns = getattr(leg, name), []
+    for column in range(argument.shape[1]):
+        step = 1e-4 * max(1.0, np.abs(argument[:, column]).max())
+        ends = []
+        for many in (-2, -1, 1, 2):
+            moved = argument.copy()
+            moved[:, column] += many * step
+            ends.append((dataclasses.replace(leg, **{name: moved}).fly() * given).sum(1))
+        columns.append((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step))
+    return np.stack(columns, axis=1)
+
+
+def off(got, expected):
+    """Largest difference of each row, over the row's largest number."""
+    return np.abs(got - expected).max(1) / np.abs(expected).max(1)
+
+
+@pytest.mark.parametrize("per_row", [False, True])
+@every_layout
+def test_a_leg_leads_where_the_engine_flies(name, per_row):
+    batch = flying(name, per_row=per_row)
+    leg = batch.leg(STEPS)
+    batch.advance(STEPS)
+    np.testing.assert_array_equal(leg.fly(), helpers.coordinates(batch))
+
+
+@pytest.mark.parametrize("per_row", [False, True])
+@every_layout
+def test_the_derivatives_are_those_of_the_step(name, per_row):
+    leg = flying(name, per_row=per_row).leg(STEPS)
+    given = np.random.default_rng(1).normal(size=leg.start.shape)
+    for argument, got in zip(("start", "command"), leg.pull(given), strict=True):
+        wrong = off(got, differences(leg, argument, given))
+        # Differences across an edge between two pieces, which a row or two is near, are none.
+        assert np.sort(wrong)[-3] < 1e-8, (argument, wrong)
+
+
+@every_layout
+def test_the_derivatives_are_those_of_the_equations_in_tensors(name):
+    import torch
+
+    from quadrl import dynamics
+    from quadrl.parameters import Parameters
+
+    batch = flying(name)
+    leg = batch.leg(2)
+    given = np.random.default_rng(1).normal(size=leg.start.shape)
+    p = Parameters.of(batch.parameters).map(lambda array: torch.tensor(array.copy()))
+    start, command, air = (torch.tensor(x) for x in (leg.start, leg.command, leg.air))
+    leaves = start.requires_grad_(), command.requires_grad_()
+    time = batch.vehicle.physics_timestep
+
+    def rate(now):
+        parts = now[:, :3], now[:, 3:7], now[:, 7:10], now[:, 10:13], now[:, 13:]
+        change = dynamics.derivative(p, dynamics.Motion(*parts), command, air, -GRAVITY)
+        return torch.cat(list(vars(change).values()), -1)
+
+    now = start
+    for _ in range(leg.steps):
+        one = rate(now)
+        two = rate(now + time / 2 * one)
+        three = rate(now + time / 2 * two)
+        now = now + time / 6 * (one + 2 * two + 2 * three + rate(now + time * three))
+        length = now[:, 3:7].square().sum(-1, keepdim=True).sqrt()
+        now = torch.cat([now[:, :3], now[:, 3:7] / length, now[:, 7:]], -1)
+    expected = torch.autograd.grad((now * torch.tensor(given)).sum(), leaves)
+    for got, other in zip(leg.pull(given), expected, strict=True):
+        assert off(got, other.numpy()).max() < 1e-12
+
+
+def test_what_stands_still_in_still_air_has_derivatives():
+    # The roots of drag, of the inflow and of the moment have none at zero: they are left out.
+    for name in ("paper", "paper in air"):
+        batch = flying(name)
+        batch.qvel[:], batch.act[:], batch.air[:] = 0.0, 0.0, 0.0
+        leg = batch.leg(STEPS)
+        assert all(np.isfinite(part).all() for part in leg.pull(np.ones_like(leg.start)))
+
+
+def test_a_command_above_the_largest_speed_changes_nothing():
+    batch = flying("paper", per_row=False)
+    batch.ctrl[:] = EVERY["paper"].hover_speed
+    batch.ctrl[:, 0] = EVERY["paper"].max_speed[0] + 1.0
+    leg = batch.leg(STEPS)
+    _, command = leg.pull(np.ones_like(leg.start))
+    assert not command[:, 0].any() and (command[:, 1:] != 0).all()
+
+
+def test_mujocos_steps_are_refused():
+    batch = BatchEngine(EVERY["paper"], 2, altitude=3.0, engine="mujoco")
+    with pytest.raises(QuadrlError, match="'free_flight'"):
+        batch.leg(STEPS)

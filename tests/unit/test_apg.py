@@ -1,0 +1,74 @@
+"""Training through the physics: it learns, it goes on where it was stopped, what it refuses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from runs import assert_same_run, metrics, refused, stopped, train
+
+from quadrl import tasks
+from quadrl.learning.config import TrainConfig
+from quadrl.rotation import norm
+from quadrl.tasks.hover import Hover
+
+TINY = TrainConfig(
+    "hover",
+    algo="apg",
+    num_envs=8,
+    rollout=8,
+    steps=8 * 8 * 6,
+    hidden=(16,),
+    critic_hidden=(16,),
+    task_options={"time_limit": 0.5},  # 10 steps: episodes end within windows
+    randomization={"mass": (0.9, 1.1)},
+    weather="light",
+    checkpoint_seconds=0.0,
+)
+
+
+def test_a_stopped_run_goes_on_bit_for_bit(tmp_path):
+    whole = train(TINY, tmp_path / "whole")
+    train(TINY, stopped(TINY, tmp_path / "stopped", 3), resume=True)
+    assert_same_run(whole, tmp_path / "stopped")
+    rows = metrics(whole)
+    assert all(float(row["deviation"]) == pytest.approx(0.5, rel=0.1) for row in rows)
+
+
+def test_hover_is_learned_within_a_few_windows(tmp_path):
+    config = TrainConfig("hover", algo="apg", seed=300, num_envs=32, steps=32 * 32 * 20)
+    error = [float(row["error"]) for row in metrics(train(config, tmp_path / "run"))]
+    assert max(error) > 1.0 and error[-1] < 0.4, error  # [m]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("control_mode", "velocity"),
+        ("engine", "mujoco"),
+        ("memory", "gru"),
+        ("observe", {"action_history": 2}),
+        ("randomization", "full"),
+    ],
+)
+def test_what_has_no_derivatives_is_refused(name, value):
+    with refused(name):
+        TrainConfig("hover", algo="apg", **{name: value})
+    TrainConfig("hover", **{name: value})
+
+
+def test_a_task_with_contact_is_refused():
+    with refused("task", "landing"):
+        TrainConfig("landing", algo="apg")
+
+
+def test_a_task_that_tensors_cannot_run_is_refused(tmp_path, monkeypatch):
+    @dataclasses.dataclass(frozen=True)
+    class Numpys(Hover):
+        name = "numpys"
+
+        def error(self, now):
+            return np.asarray(norm(now.potentials.to_goal))
+
+    monkeypatch.setitem(tasks.TASKS, "numpys", Numpys)
+    with refused("task", "numpys"):
+        train(dataclasses.replace(TINY, task="numpys"), tmp_path / "run")

@@ -1,0 +1,66 @@
+"""Derivatives of windows of flight, beside differences of the flights themselves."""
+
+import numpy as np
+import pytest
+import torch
+
+from quadrl import tasks
+from quadrl.environment import Environment
+from quadrl.learning.window import Window, fly
+
+STEPS, COUNT, GAMMA = 12, 5, 0.9
+CASES = {
+    "hover": {},
+    "random_waypoint": {"randomization": {"mass": (0.8, 1.2), "pushes": {"rate": 3.0}}},
+    "static_waypoint": {"weather": {"gust_speed": 8.0, "gust_time": 0.5}},
+    "straight_and_level": {"vehicle": "crazyflie"},
+    "target_following": {"vehicle": "hexa"},
+    "a short hover": {"time_limit": 0.3},
+    "smooth": {"smoothness_weight": 10.0},
+}
+
+
+def flown(name, weights, shifts):
+    """Fly a linear policy with some random numbers on top: the window and what was earned."""
+    settings = dict(CASES[name])
+    options = {k: settings.pop(k) for k in ("time_limit", "smoothness_weight") if k in settings}
+    task = tasks.make(name if name in tasks.TASKS else "hover", **options)
+    environment = Environment(task, num_envs=COUNT, seed=3, engine="free_flight", **settings)
+    environment.reset()
+    moments, total, share = [], 0.0, np.ones(COUNT)
+    for shift in shifts:
+        terms = environment.task.observe(environment.snapshot).values()
+        action = np.concatenate(list(terms), axis=-1) @ weights + shift
+        moment, done = fly(environment, action)
+        moments.append(moment)
+        total += (share * done.reward).sum()
+        share = share * GAMMA
+        over = np.array(done.terminated | done.truncated)
+        if over.any():
+            environment.reset(over)
+            share[over] = 1.0
+    return Window(environment, moments), total
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_derivatives_by_a_policy_are_those_of_its_flights(name):
+    rng = np.random.default_rng(0)
+    known = name if name in tasks.TASKS else "hover"
+    environment = Environment(known, vehicle=CASES[name].get("vehicle"))
+    size, actions = environment.size, environment.action_size
+    weights = 0.02 * rng.normal(size=(size, actions))
+    shifts = 0.2 * rng.normal(size=(STEPS, COUNT, actions))
+    direction = rng.normal(size=weights.shape)
+    window, _ = flown(name, weights, shifts)
+    action = window.observation @ torch.from_numpy(weights)
+    pulled = window.pull(window.reward.sum(), action, GAMMA)
+    # The first action of an episode counts whole, each later one less by gamma.
+    over = np.array([m.terminated | m.truncated for m in window.moments])
+    share = np.ones((STEPS, COUNT))
+    for t in range(1, STEPS):
+        share[t] = np.where(over[t - 1], 1.0, GAMMA * share[t - 1])
+    seen = window.observation.detach().numpy().reshape(STEPS, COUNT, -1)
+    got = (share[..., None] * pulled * (seen @ direction)).sum()
+    step = 1e-6
+    ends = [flown(name, weights + sign * step * direction, shifts)[1] for sign in (1, -1)]
+    assert got == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5)
