@@ -67,7 +67,7 @@ class APG(Algorithm):
         aims = seen.detach().update({"better": better, "usual": deviation.log().detach()})
         for _ in range(self.config.epochs):
             for rows in torch.randperm(len(aims)).split(self.config.minibatch):
-                self.step("policy", self._distance(aims[rows]))
+                self.step(self._distance(aims[rows]), "policy")
         return self.fit_critic(self._critic_loss, batch.reshape(-1))
 
     def _earned(self, window: Window) -> Tensor:
