@@ -55,7 +55,7 @@ class Landing(Task):
         Target("crash_rate", "crashes", 0.0),
         Target("touchdown_speed_median_m_s", "touchdown, median", 0.3, unit="m/s"),
     )
-    training = {"gamma": 0.97, "steps": 2_621_440}
+    training = {"gamma": 0.98, "steps": 2_621_440}
     # With the wide action scale of that variant, actions as random as usual end in a crash before
     # anything is learned.
     variants = {
