@@ -56,7 +56,6 @@ class StraightAndLevel(Task):
         Target("speed_error_share", "speed error", 0.05),
     )
     training = {"gamma": 0.94, "steps": 1_966_080}
-    training_with = {"apg": {"steps": 307_200}}
     observation = OBSERVATION | TARGET_VELOCITY
 
     time_limit: float = 20.0
