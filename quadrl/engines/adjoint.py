@@ -59,5 +59,5 @@ class Leg:
             [*(array.ctypes.data for array in taken), 0 if given is None else given.ctypes.data,
              *(array.ctypes.data for array in own), block]
         )  # fmt: skip
-        native.library().quadrl_adjoint(legs.ctypes.data, len(end), self.steps)
+        native.adjoint().quadrl_adjoint(legs.ctypes.data, len(end), self.steps)
         return end, from_start, from_command

@@ -1,4 +1,4 @@
-"""The compiled part: callbacks of the rotors, free flight and back, state, weather, random numbers.
+"""The compiled part: callbacks of the rotors, free flight, state, weather, random numbers.
 
 The C sources beside this file are compiled at first use with the machine's own compiler against
 the headers of the installed mujoco, because they read the structs of exactly that version. The
@@ -23,6 +23,7 @@ import sys
 import tempfile
 import threading
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -33,7 +34,7 @@ from quadrl.errors import NativeError
 from quadrl.parameters import c_structs
 from quadrl.state import c_rows
 
-SOURCES = ("callbacks.c", "free_flight.c", "adjoint.c", "state.c", "random.c", "weather.c",
+SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
            "disturbances.c")  # fmt: skip
 HEADERS = ("adjoint.h", "aero.h", "philox.h", "runge_kutta.h")
 MARK_SLOT = 9
@@ -91,11 +92,15 @@ def compiler() -> str:
     )
 
 
-def build(include: Path | None = None) -> Path:
-    """Compile the library unless the cache holds it.
+def build(
+    include: Path | None = None, sources: Sequence[str] = SOURCES, name: str = "mujoco"
+) -> Path:
+    """Compile a library unless the cache holds it.
 
     Args:
         include: Folder with mujoco's headers; None for those of the installed package.
+        sources: Files beside this one.
+        name: Of the library, with the version of mujoco behind it.
 
     Returns:
         The path of the shared library.
@@ -107,12 +112,12 @@ def build(include: Path | None = None) -> Path:
     digest = hashlib.sha256(" ".join((*flags(), platform.machine(), str(include))).encode())
     layout = c_structs() + c_rows() + c_weather()
     digest.update(layout.encode())
-    for name in HEADERS + SOURCES:
-        digest.update((_FOLDER / name).read_bytes())
+    for file in (*HEADERS, *sources):
+        digest.update((_FOLDER / file).read_bytes())
     digest.update((include / "mujoco" / "mujoco.h").read_bytes())
-    name = f"quadrl-mujoco-{mujoco.__version__}-{digest.hexdigest()[:16]}.so"
-    sources = [str(_FOLDER / source) for source in SOURCES]
-    return _cached(name, [f"-I{include}", *sources], {"layout.h": layout})
+    file = f"quadrl-{name}-{mujoco.__version__}-{digest.hexdigest()[:16]}.so"
+    paths = [str(_FOLDER / source) for source in sources]
+    return _cached(file, [f"-I{include}", *paths], {"layout.h": layout})
 
 
 @functools.cache
@@ -181,8 +186,6 @@ def load(path: Path) -> ctypes.CDLL:
     opened.quadrl_state.argtypes = [_POINTER, integer, _POINTER, _POINTER]
     opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
     opened.quadrl_uniform.restype = opened.quadrl_weather.restype = None
-    opened.quadrl_adjoint.restype = None
-    opened.quadrl_adjoint.argtypes = [_POINTER, integer, integer]
     opened.quadrl_weather.argtypes = [_POINTER, integer, _POINTER, integer]
     real, stride = ctypes.c_double, integer
     opened.quadrl_estimate.restype = opened.quadrl_push.restype = None
@@ -216,6 +219,19 @@ def library() -> ctypes.CDLL:
 @functools.cache
 def _library() -> ctypes.CDLL:
     return load(build())
+
+
+@functools.cache
+def adjoint() -> ctypes.CDLL:
+    """The reverse of free flight; apart, since it compiles twice as long as all the rest.
+
+    Raises:
+        NativeError: There is no compiler, or it refused the sources.
+    """
+    opened = ctypes.CDLL(str(build(sources=("adjoint.c",), name="adjoint")))
+    opened.quadrl_adjoint.restype = None
+    opened.quadrl_adjoint.argtypes = [_POINTER, ctypes.c_int64, ctypes.c_int64]
+    return opened
 
 
 @functools.cache
