@@ -101,7 +101,7 @@ def test_a_killed_worker_goes_on_and_ends_as_if_alone(alone, tmp_path, monkeypat
     assert [digest(tmp_path / f"hover-ppo-{seed}") for seed in (0, 1)] == alone
     assert not found.failed and found.rows[0]["seeds"] == 2
     assert (tmp_path / "learning_curves_hover.png").exists()
-    row = next(csv.DictReader((tmp_path / "table.csv").open()))
+    row = next(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
     errors = [run["metrics"]["position_error_m"] for run in found.runs]
     assert float(row["position_error_m"]) == pytest.approx(sum(errors) / 2)
     assert float(row["position_error_m_low"]) <= min(errors)  # t is 12.7 for two seeds
