@@ -77,7 +77,7 @@ def claim() -> str:
         "`quadrl train hover`",
         f"{statistics.median(took):.0f} s ({min(took):.1f} to {max(took):.1f} s)",
         f"100 % of {result['episodes']} fresh episodes with {solved} of {len(took)} seeds",
-        f"{min(error):.1f} to {max(error):.1f} cm",
+        f"{min(error):.1g} to {max(error):.1g} mm",
     )
     head = ("command", "from nothing to the policy", "success", "error over the last 2 s")
     note = f" Measured {result['note']}." if "note" in result else ""
@@ -87,7 +87,7 @@ def claim() -> str:
 
 
 def hover() -> tuple[list[float], int, list[float]]:
-    """Of the trainings of hover: times [s], how many never fail, errors [cm]."""
+    """Of the trainings of hover: times [s], how many never fail, errors [mm]."""
     runs = [
         run
         for run in report.load("training")["runs"]
@@ -95,7 +95,7 @@ def hover() -> tuple[list[float], int, list[float]]:
     ]
     took = [run["training_s"] for run in runs]
     solved = sum(run["metrics"]["success_rate"] == 1 for run in runs)
-    return took, solved, [100 * run["metrics"]["position_error_m"] for run in runs]
+    return took, solved, [1000 * run["metrics"]["position_error_m"] for run in runs]
 
 
 if __name__ == "__main__":

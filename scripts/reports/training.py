@@ -79,15 +79,15 @@ def hover() -> str:
         row = [run["vehicle"], run["engine"], run["seed"], f"{run['steps']:,}"]
         row += [f"{run['training_s']:.1f} s"]
         row += [f"{100 * metrics[name]:.0f} %" for name in ("survival_rate", "success_rate")]
-        row += [f"{100 * metrics['position_error_m']:.1f} cm"]
+        row += [f"{1000 * metrics['position_error_m']:.2f} mm"]
         rows.append([*row, f"{metrics['heading_error_deg']:.1f} deg"])
     head = ["aircraft", "engine", "seed", "control steps", "training", "flown to the end"]
     head += ["successful", "error", "heading off east"]
     known = [row for row in result["yardstick"] if row["task"] == "hover"]
-    error = max(100 * row["metrics"]["position_error_m"] for row in known)
+    error = max(1000 * row["metrics"]["position_error_m"] for row in known)
     success = min(100 * row["metrics"]["success_rate"] for row in known)
     note = f"The geometric controller, in the same episodes and with every aircraft: {success:.0f} "
-    note += f"% successful, largest error {number(error)} cm."
+    note += f"% successful, largest error {number(error)} mm."
     return f"{table(head, rows)}\n\n{note}  \n{report.source(result)}"
 
 
