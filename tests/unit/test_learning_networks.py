@@ -205,7 +205,7 @@ def test_kl_of_two_normals_in_closed_form():
     np.testing.assert_allclose(kl.item(), expected.sum(-1).mean().item(), rtol=1e-5)
     losses = algorithm.loss(batch)
     assert losses["kl"] == kl
-    assert losses["loss_critic"] == algorithm.loss.critic_loss(batch)
+    assert losses["loss_critic"] == algorithm.critic_loss(batch)
 
 
 def test_conjugate_gradients_solve():
