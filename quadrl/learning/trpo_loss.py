@@ -1,4 +1,7 @@
-"""The loss of TRPO (Schulman et al. 2015), in the manner of TorchRL's losses, which have none."""
+"""The loss of TRPO (Schulman et al. 2015) in the manner of TorchRL's losses, which have none.
+
+It uses nothing of quadrl: `scripts/reports/upstream.py` makes the patch for TorchRL from it.
+"""
 
 from __future__ import annotations
 
@@ -67,6 +70,7 @@ class TRPOLoss(PPOLoss):
         >>> from torch import nn
         >>> from torchrl.modules import IndependentNormal, NormalParamExtractor
         >>> from torchrl.modules import ProbabilisticActor, ValueOperator
+        >>> from quadrl.learning.trpo_loss import TRPOLoss
         >>> net = nn.Sequential(nn.Linear(3, 4), NormalParamExtractor())
         >>> actor = ProbabilisticActor(
         ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
