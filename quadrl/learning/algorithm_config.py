@@ -61,7 +61,7 @@ class TRPOConfig(AlgorithmConfig):
     backtracks: int = 10
     """Steps tried in the line search."""
     shrink: float = 0.7
-    """Factor from one tried step to the next."""
+    """Factor from a tried step within the bound, but of no gain, to the next one."""
     critic_rate: float = 3e-3
     """Initial learning rate of the critic; it falls linearly to zero."""
     critic_epochs: int = 8

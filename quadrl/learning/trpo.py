@@ -1,58 +1,22 @@
-"""TRPO (Schulman et al. 2015) as a TorchRL loss module and an update; TorchRL has none."""
+"""The update of TRPO (Schulman et al. 2015): natural gradient and line search."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torch.distributions import kl_divergence
 from torchrl.modules import ProbabilisticActor
-from torchrl.objectives.common import LossModule
 
 from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.algorithm_config import TRPOConfig
+from quadrl.learning.trpo_loss import TRPOLoss
 
-
-class TRPOLoss(LossModule):
-    """The surrogate of TRPO, the KL divergence from the policy that acted, and the critic's loss.
-
-    The forward reads what actor and critic read, `action`, `action_log_prob`, `advantage`,
-    `value_target` and the parameters of the acting policy (`loc`, `scale`), each (n, ...), and
-    gives `loss_objective` (the negative surrogate, equation 14 of the paper), `kl` (mean KL
-    divergence of the acting policy from the present one, in closed form) and `loss_critic`.
-    """
-
-    def __init__(self, actor_network: ProbabilisticActor, critic_network: TensorDictModule) -> None:
-        """Keep references to the networks."""
-        super().__init__()
-        self.actor_network = actor_network
-        self.critic_network = critic_network
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The three losses as scalars."""
-        surrogate, kl = self.surrogate_and_kl(tensordict)
-        critic = self.critic_loss(tensordict)
-        return TensorDict({"loss_objective": -surrogate, "kl": kl, "loss_critic": critic})
-
-    def critic_loss(self, batch: TensorDictBase) -> Tensor:
-        """Mean squared error of the critic, a scalar."""
-        value = self.critic_network(batch.select(*self.critic_network.in_keys)).get("state_value")
-        return (value - batch.get("value_target")).square().mean()
-
-    def surrogate_and_kl(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Mean of ratio times advantage, and mean KL divergence; scalars."""
-        present: Any = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
-        acting = type(present)(batch.get("loc"), batch.get("scale"))
-        ratio = (present.log_prob(batch.get("action")) - batch.get("action_log_prob")).exp()
-        surrogate = (ratio * batch.get("advantage").squeeze(-1)).mean()
-        # The base of an Independent(Normal): its closed form, summed over the actions.
-        kl = kl_divergence(acting.base_dist, present.base_dist).sum(-1).mean()
-        return surrogate, kl
+SAFETY = 0.95
+"""Share of the step that would meet the bound if the divergence were quadratic in its length."""
 
 
 def conjugate_gradients(
@@ -121,20 +85,27 @@ class TRPO(Algorithm):
     ) -> None:
         """Make the loss and the critic's optimiser."""
         super().__init__(config)
-        self.loss = TRPOLoss(actor, critic)
+        self.loss = TRPOLoss(
+            actor, critic, loss_critic_type="l2", log_explained_variance=False, functional=False
+        )
         self.policy = list(actor.parameters())
         self.add_optimiser("critic", critic.parameters(), config.critic_rate)
         self.parameters += self.policy
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """The policy's step, then the critic's epochs."""
-        return self.natural_step(batch) | self.fit_critic(self.loss.critic_loss, batch)
+        return self.natural_step(batch) | self.fit_critic(self.critic_loss, batch)
+
+    def critic_loss(self, batch: TensorDictBase) -> Tensor:
+        """Mean squared error of the critic, a scalar."""
+        return self.loss.loss_critic(batch)[0].mean()
 
     def natural_step(self, batch: TensorDictBase) -> dict[str, float]:
         """The policy's step: natural gradient, then a line search under the KL bound.
 
-        Takes the longest of the tried steps with which the surrogate rises and the mean KL
-        divergence stays within the bound; without any, the policy stays as it is.
+        Takes the first of the tried steps, each shorter than the last, with which the surrogate
+        rises and the mean KL divergence stays within the bound; without any, the policy stays as
+        it is, bit for bit.
         """
         config = self.config
         surrogate, kl = self.loss.surrogate_and_kl(batch)
@@ -154,9 +125,19 @@ class TRPO(Algorithm):
                 after, divergence = (x.item() for x in self.loss.surrogate_and_kl(batch))
             if after > before and divergence <= config.max_kl:
                 return {"kl": divergence, "step": share, "surrogate_gain": after - before}
-            share *= config.shrink
+            share *= self.shorter(divergence)
         self._set(start)
         return {"kl": 0.0, "step": 0.0, "surrogate_gain": 0.0}
+
+    def shorter(self, divergence: float) -> float:
+        """Factor from a refused step to the next, by the divergence of the refused one.
+
+        The divergence of a short step grows with the square of its length. After a step beyond
+        the bound the next one goes to where that meets the bound, or a little less.
+        """
+        if self.config.max_kl < divergence < math.inf:
+            return SAFETY * math.sqrt(self.config.max_kl / divergence)
+        return self.config.shrink
 
     @torch.no_grad()
     def _set(self, vector: Tensor) -> None:

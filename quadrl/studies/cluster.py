@@ -88,6 +88,7 @@ class RayWorker:
     def poll(self) -> End | None:
         """How it ended; None while it works."""
         import ray
+        import ray.exceptions
 
         ready, _ = ray.wait([self._news], timeout=0)
         if not ready:
@@ -96,7 +97,7 @@ class RayWorker:
             files, code, text = ray.get(self._news)
         except ray.exceptions.RayError as error:
             self.stop()
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
             return End(f"its node or its process there was lost ({reason})", lost=True)
         write_files(self._run.folder, files)
         if code is None:

@@ -1,4 +1,4 @@
-"""The networks, and TRPO against its definition."""
+"""The networks, and what every algorithm does with them."""
 
 import copy
 
@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.func import functional_call, jacrev
 
 import quadrl
 from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import Normaliser, export, make_actor_critic
 from quadrl.learning.ppo import PPO
-from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
+from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
 
 SIZE, ACTIONS, ROWS = 5, 2, 24
@@ -173,112 +172,3 @@ def test_a_critic_without_weight_stays_as_it_is():
     after = [flat(list(network.parameters())) for network in (actor, critic)]
     moved = [not torch.equal(a, b) for a, b in zip(before, after, strict=True)]
     assert moved == [True, False] and metrics["critic_loss"] == 0.0
-
-
-# ---------------------------------------------------------------------------- TRPO
-
-
-def explicit_fisher(actor, observation):
-    """Mean over states of J^T diag(1 / sigma^2, 2) J, of mean and log-deviation (normal)."""
-    network = actor.module[0].module
-    parameters = dict(network.named_parameters())
-
-    def outputs(values, row):
-        mean, deviation = functional_call(network, values, (row,))
-        return torch.cat([mean, deviation.log()])
-
-    total = 0
-    for row in observation:
-        jacobian = jacrev(outputs)(parameters, row)
-        matrix = torch.cat(
-            [jacobian[name].reshape(2 * ACTIONS, -1) for name in parameters], dim=1
-        ).double()
-        deviation = network(row)[1].detach().double()
-        weight = torch.cat([deviation**-2, torch.full((ACTIONS,), 2.0, dtype=torch.float64)])
-        total = total + matrix.T @ (weight[:, None] * matrix)
-    return total / len(observation)
-
-
-def trpo(seed=0, **settings):
-    actor, critic, _ = actor_critic(seed)
-    return disturbed(actor), TRPO(actor, critic, TRPOConfig(**settings))
-
-
-def test_fisher_product_is_the_explicit_fisher_matrix():
-    actor, algorithm = trpo()
-    batch = batch_of(actor)
-    _, kl = algorithm.loss.surrogate_and_kl(batch)
-    product = fisher_product(kl, algorithm.policy, damping=0.0)
-    fisher = explicit_fisher(actor, batch["observation"])
-    torch.manual_seed(1)
-    vector = torch.randn(len(fisher), dtype=torch.float64)
-    expected = fisher @ vector
-    torch.testing.assert_close(product(vector), expected, rtol=1e-4, atol=1e-4)
-    damped = fisher_product(kl, algorithm.policy, damping=0.5)
-    torch.testing.assert_close(damped(vector), expected + 0.5 * vector, rtol=1e-4, atol=1e-4)
-
-
-def test_kl_of_two_normals_in_closed_form():
-    """Per state and action: log(s2/s1) + (s1^2 + (m1 - m2)^2) / (2 s2^2) - 1/2."""
-    actor, algorithm = trpo()
-    batch = batch_of(actor)
-    mean, deviation = batch["loc"].double(), batch["scale"].double()
-    batch["loc"], batch["scale"] = batch["loc"] + 0.1, batch["scale"] * 1.5
-    first, spread = batch["loc"].double(), batch["scale"].double()
-    _, kl = algorithm.loss.surrogate_and_kl(batch)
-    expected = (deviation / spread).log() - 0.5
-    expected = expected + (spread**2 + (first - mean) ** 2) / (2 * deviation**2)
-    np.testing.assert_allclose(kl.item(), expected.sum(-1).mean().item(), rtol=1e-5)
-    losses = algorithm.loss(batch)
-    assert losses["kl"] == kl
-    assert losses["loss_critic"] == algorithm.loss.critic_loss(batch)
-
-
-def test_conjugate_gradients_solve():
-    generator = np.random.default_rng(0)
-    root = generator.normal(size=(30, 30))
-    matrix = torch.from_numpy(root @ root.T + np.eye(30))
-    target = torch.from_numpy(generator.normal(size=30))
-    solution = conjugate_gradients(lambda x: matrix @ x, target, 60, tolerance=1e-24)
-    torch.testing.assert_close(solution, torch.linalg.solve(matrix, target), rtol=1e-9, atol=1e-9)
-    few = conjugate_gradients(lambda x: matrix @ x, target, 3)
-    assert torch.linalg.norm(matrix @ few - target) > 1e-3  # the limit on iterations holds
-
-
-def test_the_step_is_the_exact_natural_gradient():
-    """sqrt(2 delta / g^T F^-1 g) F^-1 g, with F the explicit matrix and all iterations."""
-    actor, algorithm = trpo(max_kl=1e-4, damping=0.1, iterations=400)
-    batch = batch_of(actor)
-    surrogate, _ = algorithm.loss.surrogate_and_kl(batch)
-    gradient = flat(torch.autograd.grad(surrogate, algorithm.policy)).double()
-    fisher = explicit_fisher(actor, batch["observation"]) + 0.1 * torch.eye(len(gradient))
-    direction = torch.linalg.solve(fisher, gradient)
-    expected = direction * torch.sqrt(2 * 1e-4 / (gradient @ direction))
-    before = flat([p.detach() for p in algorithm.policy]).double()
-    metrics = algorithm.natural_step(batch)
-    moved = flat([p.detach() for p in algorithm.policy]).double() - before
-    assert metrics["step"] > 0
-    torch.testing.assert_close(moved, metrics["step"] * expected, rtol=1e-2, atol=1e-5)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_no_step_breaks_the_bound_or_loses(seed):
-    actor, algorithm = trpo(seed, max_kl=0.01)
-    for k in range(6):
-        batch = batch_of(actor, seed=100 * seed + k, rows=256)
-        with torch.no_grad():
-            before, _ = algorithm.loss.surrogate_and_kl(batch)
-        metrics = algorithm.natural_step(batch)
-        with torch.no_grad():
-            after, kl = algorithm.loss.surrogate_and_kl(batch)
-        assert kl.item() <= 0.01
-        assert after.item() >= before.item()
-        assert metrics["kl"] == pytest.approx(kl.item(), abs=1e-6)
-        assert metrics["step"] > 0 and metrics["surrogate_gain"] > 0
-
-
-def test_a_search_that_finds_nothing_leaves_the_policy():
-    actor, algorithm = trpo(max_kl=1e4, backtracks=1)
-    before = flat([p.detach() for p in algorithm.policy]).clone()
-    assert algorithm.natural_step(batch_of(actor))["step"] == 0.0
-    assert torch.equal(flat([p.detach() for p in algorithm.policy]), before)

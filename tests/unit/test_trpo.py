@@ -1,0 +1,250 @@
+"""The update of TRPO against its definition, and its line search."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.func import functional_call, jacrev
+from torchrl.modules import set_recurrent_mode
+
+from quadrl.learning.algorithm_config import TRPOConfig
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.networks import BEGINS, STATE, make_actor_critic
+from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
+
+SIZE, ACTIONS, ROWS = 5, 2, 24
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """As in a training: on a busy machine a second one costs more than it gives."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def trpo(seed=0, memory="none", **settings):
+    """A policy away from the start, where the mean hardly depends on the weights."""
+    torch.manual_seed(seed)
+    config = TrainConfig(
+        hidden=(6,), critic_hidden=(6,), initial_deviation=0.5, memory=memory, memory_width=4
+    )
+    actor, critic, _ = make_actor_critic(SIZE, ACTIONS, config)
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter += 0.3 * torch.randn_like(parameter)
+    return actor, TRPO(actor, critic, TRPOConfig(**settings))
+
+
+def batch_of(actor, seed=0, rows=ROWS):
+    torch.manual_seed(seed)
+    batch = TensorDict({"observation": torch.randn(rows, SIZE)}, [rows])
+    with torch.no_grad():
+        batch = actor(batch)
+    # Better the nearer the first action is to 0.5: an advantage that a policy can climb.
+    advantage = -(batch["action"][:, :1] - 0.5).square()
+    batch["advantage"] = (advantage - advantage.mean()) / advantage.std()
+    batch["value_target"] = batch["observation"][:, :1].clone()
+    return batch
+
+
+def explicit_fisher(actor, observation):
+    """Mean over states of J^T diag(1 / sigma^2, 2) J, of mean and log-deviation (normal)."""
+    network = actor.module[0].module
+    parameters = dict(network.named_parameters())
+
+    def outputs(values, row):
+        mean, deviation = functional_call(network, values, (row,))
+        return torch.cat([mean, deviation.log()])
+
+    total = 0
+    for row in observation:
+        jacobian = jacrev(outputs)(parameters, row)
+        matrix = torch.cat(
+            [jacobian[name].reshape(2 * ACTIONS, -1) for name in parameters], dim=1
+        ).double()
+        deviation = network(row)[1].detach().double()
+        weight = torch.cat([deviation**-2, torch.full((ACTIONS,), 2.0, dtype=torch.float64)])
+        total = total + matrix.T @ (weight[:, None] * matrix)
+    return total / len(observation)
+
+
+def test_fisher_product_is_the_explicit_fisher_matrix():
+    actor, algorithm = trpo()
+    batch = batch_of(actor)
+    _, kl = algorithm.loss.surrogate_and_kl(batch)
+    product = fisher_product(kl, algorithm.policy, damping=0.0)
+    fisher = explicit_fisher(actor, batch["observation"])
+    torch.manual_seed(1)
+    vector = torch.randn(len(fisher), dtype=torch.float64)
+    expected = fisher @ vector
+    torch.testing.assert_close(product(vector), expected, rtol=1e-4, atol=1e-4)
+    damped = fisher_product(kl, algorithm.policy, damping=0.5)
+    torch.testing.assert_close(damped(vector), expected + 0.5 * vector, rtol=1e-4, atol=1e-4)
+
+
+def test_kl_of_two_normals_in_closed_form():
+    """Per state and action: log(s2/s1) + (s1^2 + (m1 - m2)^2) / (2 s2^2) - 1/2."""
+    actor, algorithm = trpo()
+    batch = batch_of(actor)
+    mean, deviation = batch["loc"].double(), batch["scale"].double()
+    batch["loc"], batch["scale"] = batch["loc"] + 0.1, batch["scale"] * 1.5
+    first, spread = batch["loc"].double(), batch["scale"].double()
+    _, kl = algorithm.loss.surrogate_and_kl(batch)
+    expected = (deviation / spread).log() - 0.5
+    expected = expected + (spread**2 + (first - mean) ** 2) / (2 * deviation**2)
+    np.testing.assert_allclose(kl.item(), expected.sum(-1).mean().item(), rtol=1e-5)
+    losses = algorithm.loss(batch)
+    assert losses["kl"] == kl
+    assert losses["loss_critic"] == algorithm.critic_loss(batch)
+
+
+def test_conjugate_gradients_solve():
+    generator = np.random.default_rng(0)
+    root = generator.normal(size=(30, 30))
+    matrix = torch.from_numpy(root @ root.T + np.eye(30))
+    target = torch.from_numpy(generator.normal(size=30))
+    solution = conjugate_gradients(lambda x: matrix @ x, target, 60, tolerance=1e-24)
+    torch.testing.assert_close(solution, torch.linalg.solve(matrix, target), rtol=1e-9, atol=1e-9)
+    few = conjugate_gradients(lambda x: matrix @ x, target, 3)
+    assert torch.linalg.norm(matrix @ few - target) > 1e-3  # the limit on iterations holds
+
+
+def test_the_step_is_the_exact_natural_gradient():
+    """sqrt(2 delta / g^T F^-1 g) F^-1 g, with F the explicit matrix and all iterations."""
+    actor, algorithm = trpo(max_kl=1e-4, damping=0.1, iterations=400)
+    batch = batch_of(actor)
+    surrogate, _ = algorithm.loss.surrogate_and_kl(batch)
+    gradient = flat(torch.autograd.grad(surrogate, algorithm.policy)).double()
+    fisher = explicit_fisher(actor, batch["observation"]) + 0.1 * torch.eye(len(gradient))
+    direction = torch.linalg.solve(fisher, gradient)
+    expected = direction * torch.sqrt(2 * 1e-4 / (gradient @ direction))
+    before = flat([p.detach() for p in algorithm.policy]).double()
+    metrics = algorithm.natural_step(batch)
+    moved = flat([p.detach() for p in algorithm.policy]).double() - before
+    assert metrics["step"] > 0
+    torch.testing.assert_close(moved, metrics["step"] * expected, rtol=1e-2, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_step_breaks_the_bound_or_loses(seed):
+    actor, algorithm = trpo(seed, max_kl=0.01)
+    for k in range(6):
+        batch = batch_of(actor, seed=100 * seed + k, rows=256)
+        with torch.no_grad():
+            before, _ = algorithm.loss.surrogate_and_kl(batch)
+        metrics = algorithm.natural_step(batch)
+        with torch.no_grad():
+            after, kl = algorithm.loss.surrogate_and_kl(batch)
+        assert kl.item() <= 0.01
+        assert after.item() >= before.item()
+        assert metrics["kl"] == pytest.approx(kl.item(), abs=1e-6)
+        assert metrics["step"] > 0 and metrics["surrogate_gain"] > 0
+
+
+def test_a_search_that_finds_nothing_leaves_the_policy():
+    actor, algorithm = trpo(max_kl=1e4, backtracks=1)
+    before = flat([p.detach() for p in algorithm.policy]).clone()
+    assert algorithm.natural_step(batch_of(actor))["step"] == 0.0
+    assert torch.equal(flat([p.detach() for p in algorithm.policy]), before)
+
+
+def counted(algorithm):
+    """The list of the vectors that the line search tries, and the last one that it goes back to."""
+    tried, put = [], algorithm._set
+    algorithm._set = lambda vector: (tried.append(vector.clone()), put(vector))
+    return tried
+
+
+@pytest.mark.parametrize("beyond", [1.02, 1.5, 4.0, 1e3, 1e6])
+def test_a_step_beyond_the_bound_is_followed_by_one_at_it(beyond):
+    """sqrt(bound / divergence) and a little less; a fixed factor would need many steps, or lose."""
+    _, algorithm = trpo(max_kl=0.02, shrink=0.7)
+    factor = algorithm.shorter(0.02 * beyond)
+    assert 0.9 < factor * beyond**0.5 < 1
+    assert algorithm.shorter(0.02) == algorithm.shorter(0.01) == 0.7  # a loss within the bound
+    assert algorithm.shorter(float("inf")) == algorithm.shorter(float("nan")) == 0.7
+
+
+def test_the_search_goes_straight_to_the_bound(monkeypatch):
+    """With a bound so wide that no divergence is quadratic up to it, few trials still suffice."""
+    trials = {}
+    for straight in (True, False):
+        total = 0
+        for seed in range(6):
+            actor, algorithm = trpo(seed, max_kl=3.0, backtracks=40)
+            if not straight:
+                monkeypatch.setattr(algorithm, "shorter", lambda _: 0.7)
+            tried = counted(algorithm)
+            metrics = algorithm.natural_step(batch_of(actor, rows=256))
+            assert metrics["step"] > 0 and metrics["kl"] <= 3.0
+            total += len(tried)
+        trials[straight] = total
+    assert trials[True] <= trials[False]
+
+
+@pytest.mark.parametrize("cause", ["no iteration", "no gain", "not a number"])
+def test_without_a_step_the_policy_stays_bit_for_bit(cause):
+    actor, algorithm = trpo(max_kl=0.02, backtracks=3)
+    batch = batch_of(actor)
+    if cause == "no gain":
+        batch["advantage"] = torch.zeros(ROWS, 1)
+    if cause == "not a number":
+        batch["advantage"][0] = float("nan")
+    before = flat([p.detach() for p in algorithm.policy]).clone()
+    if cause == "no iteration":
+        algorithm.shorter = lambda _: 1.0
+        algorithm.loss.surrogate_and_kl = refusing(algorithm.loss.surrogate_and_kl)
+    metrics = algorithm.natural_step(batch)
+    assert metrics == {"kl": 0.0, "step": 0.0, "surrogate_gain": 0.0}
+    assert torch.equal(flat([p.detach() for p in algorithm.policy]), before)
+
+
+def refusing(evaluate):
+    """Of a tried step, the surrogate is lower whatever it is."""
+
+    def lower(batch):
+        surrogate, kl = evaluate(batch)
+        return (surrogate, kl) if surrogate.requires_grad else (surrogate - 1e3, kl)
+
+    return lower
+
+
+def test_fisher_products_are_those_of_the_dense_hessian():
+    actor, algorithm = trpo()
+    actor.double()
+    torch.manual_seed(1)
+    batch = TensorDict({"observation": torch.randn(ROWS, SIZE, dtype=torch.float64)}, [ROWS])
+    with torch.no_grad():
+        batch = actor(batch)
+    batch["advantage"] = torch.zeros(ROWS, 1, dtype=torch.float64)
+    _, kl = algorithm.loss.surrogate_and_kl(batch)
+    gradient = flat(torch.autograd.grad(kl, algorithm.policy, create_graph=True))
+    rows = [torch.autograd.grad(g, algorithm.policy, retain_graph=True) for g in gradient]
+    hessian = torch.stack([flat(row) for row in rows])
+    assert hessian.abs().max() > 1e-2
+    product = fisher_product(kl, algorithm.policy, damping=0.0)
+    for _ in range(3):
+        vector = torch.randn(len(gradient), dtype=torch.float64)
+        torch.testing.assert_close(product(vector), hessian @ vector, rtol=0, atol=1e-10)
+
+
+def test_a_policy_with_a_memory_keeps_the_bound():
+    """Its batch is (aircraft, time), and each divergence is that of the unrolled memory."""
+    actor, algorithm = trpo(memory="gru", max_kl=0.01)
+    torch.manual_seed(2)
+    rows, steps = 16, 6
+    begins = torch.rand(rows, steps, 1) < 0.2
+    batch = TensorDict({"observation": torch.randn(rows, steps, SIZE)}, [rows, steps])
+    batch[STATE], batch[BEGINS] = torch.zeros(rows, steps, 4), begins
+    with torch.no_grad(), set_recurrent_mode():
+        batch = actor(batch)
+        batch["advantage"] = torch.randn(rows, steps, 1)
+        batch["value_target"] = torch.randn(rows, steps, 1)
+        before, _ = algorithm.loss.surrogate_and_kl(batch)
+    metrics = algorithm.update(batch, remaining=1.0)
+    assert metrics["step"] > 0
+    losses = algorithm.loss(batch)  # it unrolls the memory by itself
+    assert losses["kl"].item() == pytest.approx(metrics["kl"], rel=1e-3) and metrics["kl"] <= 0.01
+    assert -losses["loss_objective"].item() > before.item()
