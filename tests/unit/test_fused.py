@@ -45,7 +45,9 @@ def one_thread():
 
 def networks(privileged=0, **settings):
     """Actor and critic in double precision, away from the start, and their normalisers."""
-    config = TrainConfig(**({"hidden": (16,), "critic_hidden": (8, 8)} | settings))
+    config = TrainConfig(
+        **({"hidden": (16,), "critic_hidden": (8, 8), "holds_goal": False} | settings)
+    )
     size, actions = 22, 4  # of hover, whose goal one of the policies holds
     torch.manual_seed(0)
     actor, critic, normalisers = make_actor_critic(size, actions, config, privileged)

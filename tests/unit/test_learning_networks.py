@@ -12,7 +12,7 @@ from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import Normaliser, export, make_actor_critic
 from quadrl.learning.ppo import PPO
-from quadrl.learning.trpo import TRPO
+from quadrl.learning.trpo import TRPO, flat
 from quadrl.learning.vpg import VPG
 
 SIZE, ACTIONS, ROWS = 5, 2, 24
@@ -30,7 +30,7 @@ def one_thread():
 
 def actor_critic(seed=0, size=SIZE, actions=ACTIONS, hidden=(6,)):
     torch.manual_seed(seed)
-    config = TrainConfig(hidden=hidden, critic_hidden=(6,), initial_deviation=0.5)
+    config = TrainConfig(hidden=hidden, critic_hidden=(6,), initial_deviation=0.5, holds_goal=False)
     actor, critic, normalisers = make_actor_critic(size, actions, config)
     return actor, critic, normalisers["observation"]
 

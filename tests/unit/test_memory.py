@@ -47,7 +47,12 @@ def actor_critic(seed=0, privileged=0):
     """Networks away from the start, where the mean hardly depends on the weights."""
     torch.manual_seed(seed)
     config = TrainConfig(
-        memory="gru", memory_width=WIDTH, hidden=(6,), critic_hidden=(6,), initial_deviation=0.5
+        holds_goal=False,
+        memory="gru",
+        memory_width=WIDTH,
+        hidden=(6,),
+        critic_hidden=(6,),
+        initial_deviation=0.5,
     )
     actor, critic, normalisers = make_actor_critic(SIZE, ACTIONS, config, privileged)
     with torch.no_grad():

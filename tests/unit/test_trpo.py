@@ -28,7 +28,12 @@ def trpo(seed=0, memory="none", **settings):
     """A policy away from the start, where the mean hardly depends on the weights."""
     torch.manual_seed(seed)
     config = TrainConfig(
-        hidden=(6,), critic_hidden=(6,), initial_deviation=0.5, memory=memory, memory_width=4
+        holds_goal=False,
+        hidden=(6,),
+        critic_hidden=(6,),
+        initial_deviation=0.5,
+        memory=memory,
+        memory_width=4,
     )
     actor, critic, _ = make_actor_critic(SIZE, ACTIONS, config)
     with torch.no_grad():
