@@ -285,7 +285,7 @@ class Task(abc.ABC):
 
 def heads_east(now: Snapshot, tolerance: float) -> Array:
     """Whether the heading is at most `tolerance` [rad] off east, (N,) bool."""
-    return now.state.cos_attitude[..., 2] >= math.cos(tolerance)
+    return now.state.cos_attitude[..., 2] >= math.cos(min(tolerance, math.pi))
 
 
 def reward_share(parameters: Parameters) -> float:

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 import pickle
 
 import gymnasium as gym
@@ -157,7 +158,8 @@ def test_an_impossible_mask_is_refused(mask):
 def test_vehicle_task_options_randomization_and_the_time_limit_arrive(make):
     drawn = {"mass": (0.92, 0.96)}
     settings = {"time_limit": 0.06} if make is gym.make else {"max_episode_steps": 3, "num_envs": 2}
-    made = make(HOVER, vehicle=HEAVY, tolerance=9.0, num_threads=1, randomization=drawn, **settings)
+    settings |= {"tolerance": 9.0, "heading_tolerance": math.pi}
+    made = make(HOVER, vehicle=HEAVY, num_threads=1, randomization=drawn, **settings)
     core = made.unwrapped.environment
     assert core.vehicle.mass == 1.3
     assert core.task.tolerance == 9.0
