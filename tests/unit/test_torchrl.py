@@ -1,5 +1,7 @@
 """TorchRL's batched environment, and TorchRL's wrappers of the other APIs."""
 
+import math
+
 import gymnasium as gym
 import pytest
 import torch
@@ -37,7 +39,8 @@ def test_set_seed_gives_the_episodes():
 
 
 def test_shapes_types_and_flags_are_those_of_torchrl():
-    environment = QuadrotorEnv("hover", COUNT, seed=0, time_limit=0.5, tolerance=9.0)
+    anywhere = {"tolerance": 9.0, "heading_tolerance": math.pi}
+    environment = QuadrotorEnv("hover", COUNT, seed=0, time_limit=0.5, **anywhere)
     flown = rollout(environment)
     assert environment.num_envs == COUNT
     assert environment.batch_size == torch.Size([COUNT])
