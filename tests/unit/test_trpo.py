@@ -156,7 +156,7 @@ def test_a_search_that_finds_nothing_leaves_the_policy():
 
 
 def counted(algorithm):
-    """The list of the vectors that the line search tries, and the last one that it goes back to."""
+    """The list to which each vector that the line search sets is added."""
     tried, put = [], algorithm._set
     algorithm._set = lambda vector: (tried.append(vector.clone()), put(vector))
     return tried
@@ -173,20 +173,20 @@ def test_a_step_beyond_the_bound_is_followed_by_one_at_it(beyond):
 
 
 def test_the_search_goes_straight_to_the_bound(monkeypatch):
-    """With a bound so wide that no divergence is quadratic up to it, few trials still suffice."""
+    """Even to a bound so wide that the divergence is not quadratic; 0.9 each time takes longer."""
     trials = {}
     for straight in (True, False):
         total = 0
         for seed in range(6):
             actor, algorithm = trpo(seed, max_kl=3.0, backtracks=40)
             if not straight:
-                monkeypatch.setattr(algorithm, "shorter", lambda _: 0.7)
+                monkeypatch.setattr(algorithm, "shorter", lambda _: 0.9)
             tried = counted(algorithm)
             metrics = algorithm.natural_step(batch_of(actor, rows=256))
             assert metrics["step"] > 0 and metrics["kl"] <= 3.0
             total += len(tried)
         trials[straight] = total
-    assert trials[True] <= trials[False]
+    assert trials[True] <= 15 and trials[False] >= 20  # of 6 searches
 
 
 @pytest.mark.parametrize("cause", ["no iteration", "no gain", "not a number"])
