@@ -71,7 +71,7 @@ def scaling() -> str:
     result = report.load("scaling")
     one = result["rows"][0]["seconds"]
     rows = [
-        (f"{row['count']} {row['way']}", f"{row['seconds']:.0f} s", f"{one / row['seconds']:.2f}")
+        (f"{row['way']}: {row['count']}", f"{row['seconds']:.0f} s", f"{one / row['seconds']:.2f}")
         for row in result["rows"]
     ]
     words = (
