@@ -139,6 +139,16 @@ def test_landings_in_flight():
     assert last[0] + 1 == 5 and last[-1] + 1 == 200
 
 
+def test_who_rests_with_another_heading_has_not_crashed():
+    # One stands on the pad and faces north; the other falls on it at 0.7 m/s.
+    start = placed([(0, 0, 0), (0, 0, 0.2)], [(0, 0, 0), (0, 0, -0.7)])
+    start.quaternion[0] = math.sqrt(0.5), 0, 0, math.sqrt(0.5)
+    task = helpers.starting(tasks.make("landing"), start)
+    flight = rollout.fly(lambda seen: np.full((len(seen), 4), -1.0), task, episodes=2)
+    assert flight.terminated.all() and not flight.is_success.any()
+    assert task.metrics(flight)["crash_rate"] == 0.5
+
+
 @pytest.mark.parametrize("name", VEHICLES)
 def test_every_aircraft_lands_on_its_feet(name):
     # The feet of the paper's aircraft are 7 cm below its centre, those of a Crazyflie 1.4 cm.
