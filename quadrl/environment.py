@@ -175,6 +175,7 @@ class Environment(saving.Copied):
     def episode(self) -> Episode:
         """How far the episodes are: as live as the snapshot."""
         _ = self.snapshot  # a compiled step hands out both at once
+        assert self._episode is not None
         return self._episode
 
     def _take(self, now: Snapshot, episode: Episode) -> None:
