@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 from scipy.signal import welch
 
+from quadrl import tasks
 from quadrl.learning.figures import read_metrics
 from quadrl.learning.folder import EVALUATION, METRICS
 from quadrl.policy import Policy
-from quadrl.rollout import EVALUATION_SEED, FINAL_STRETCH, Rollout, fly, summarize
+from quadrl.rollout import FINAL_STRETCH, Rollout, fly, summarize
 from quadrl.studies.plan import PlannedRun
 from scripts.reports.report import Result
 
 SMOOTHING = 0.05  # share of a training over which its curve is averaged for best and final
+FRESH = 200_000  # first of the episodes that policies are measured in
 NOISE_SEED = 0  # of sampled actions and of noise on the weights
 WEIGHT_NOISE, WEIGHT_DRAWS = 0.2, 5  # of each neuron's weights, over their own length
 SEGMENT = 40  # control steps in a segment of a spectrum
@@ -39,11 +41,12 @@ def measure(run: PlannedRun, *, episodes: int, weathers: Iterable[str]) -> Resul
 
     Args:
         run: The run.
-        episodes: Episodes of each evaluation; the same ones for every run.
+        episodes: Episodes of each evaluation; the same ones for every run, and none of those that
+            settings are chosen by.
         weathers: Names of the weathers to fly in as well.
 
     Returns:
-        What `trained` says, and: `curve`: first, best and final return of the training; `mean` and
+        What `trained` says, and: `curve`: best and final success of the training; `mean` and
         `sampled`: summary and smoothness with the mean action and with actions drawn from the
         policy; `windy`: a summary of both for each weather; `return_noisy_weights`: the return of
         the mean action with noise on the weights.
@@ -52,7 +55,7 @@ def measure(run: PlannedRun, *, episodes: int, weathers: Iterable[str]) -> Resul
     ways = {"mean": policy, "sampled": policy.flying(episodes, NOISE_SEED)}
     measured: Result = trained(run) | {"curve": curve_figures(read_metrics(run.folder / METRICS))}
     for way, controller in ways.items():
-        rollout = fly(controller, task, episodes=episodes)
+        rollout = flown(controller, task, episodes)
         measured[way] = summarize(rollout) | {"smoothness": smoothness(rollout)}
     measured["windy"] = [
         {way: blown(controller, task, episodes, weather) for way, controller in ways.items()}
@@ -62,26 +65,35 @@ def measure(run: PlannedRun, *, episodes: int, weathers: Iterable[str]) -> Resul
     for draw in range(WEIGHT_DRAWS):
         noisy = with_noisy_weights(policy, WEIGHT_NOISE, NOISE_SEED + draw)
         # Each draw flies other episodes; together they are as many as in one evaluation.
-        seed, share = EVALUATION_SEED + draw * episodes, max(1, episodes // WEIGHT_DRAWS)
-        returns.append(summarize(fly(noisy, task, episodes=share, seed=seed))["return_mean"])
+        share = max(1, episodes // WEIGHT_DRAWS)
+        flight = flown(noisy, task, share, first=FRESH + draw * episodes)
+        returns.append(summarize(flight)["return_mean"])
     return measured | {"return_noisy_weights": float(np.mean(returns))}
+
+
+def flown(
+    controller: Any, task: str, episodes: int, weather: str = "calm", first: int = FRESH
+) -> Rollout:
+    """Flights in a weather: in free flight, but for tasks that touch the ground."""
+    engine: Any = "mujoco" if tasks.make(task).contact else "free_flight"
+    return fly(controller, task, episodes=episodes, seed=first, weather=weather, engine=engine)
 
 
 def blown(controller: Any, task: str, episodes: int, weather: str) -> Result:
     """The main figures of flights in a weather."""
-    summary = summarize(fly(controller, task, episodes=episodes, weather=weather))
+    summary = summarize(flown(controller, task, episodes, weather))
     names = ("success_rate", "survival_rate", "position_error_m", "return_mean")
     return {name: summary[name] for name in names}
 
 
 def curve_figures(metrics: dict[str, np.ndarray]) -> dict[str, float | None]:
-    """First, best and final return of a training, of the running mean over `SMOOTHING` of it."""
-    returns = metrics["return"][np.isfinite(metrics["return"])]
-    if not len(returns):  # too short for an episode to end
-        return dict.fromkeys(("first", "best", "final"))
-    width = max(1, round(SMOOTHING * len(returns)))
-    smooth = np.convolve(returns, np.full(width, 1 / width), mode="valid")
-    return {"first": smooth[0].item(), "best": smooth.max().item(), "final": smooth[-1].item()}
+    """Best and final success of a training, of the running mean over `SMOOTHING` of it."""
+    shares = metrics["success"][np.isfinite(metrics["success"])]
+    if not len(shares):  # too short for an episode to end
+        return dict.fromkeys(("best", "final"))
+    width = max(1, round(SMOOTHING * len(shares)))
+    smooth = np.convolve(shares, np.full(width, 1 / width), mode="valid")
+    return {"best": smooth.max().item(), "final": smooth[-1].item()}
 
 
 def with_noisy_weights(policy: Policy, share: float, seed: int) -> Policy:

@@ -20,6 +20,7 @@ from scripts.reports import (
     robust,
     robustness,
     scaling,
+    search,
     speed,
     step_size,
     task_pages,
@@ -29,7 +30,7 @@ from scripts.reports.report import table
 
 MODULES = (
     describe, examples, ground, noise, paper, peers, reference, robust, robustness, scaling,
-    speed, step_size, task_pages, training,
+    search, speed, step_size, task_pages, training,
 )  # fmt: skip
 
 

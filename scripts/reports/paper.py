@@ -1,11 +1,16 @@
 """The paper's experiments: trains three tasks with three algorithms, draws figures 3 to 7.
 
-It takes an hour on two cores. Interrupted at any moment, it continues at the next start.
+`scripts/report search` chooses the settings, `scripts/report tuning` the gains of the controller,
+and `scripts/report noise` asks what training with noise is worth in wind. Interrupted at any
+moment, it continues at the next start.
 """
 
 from __future__ import annotations
 
-import time
+import concurrent.futures
+import functools
+import math
+import multiprocessing
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,8 +18,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from quadrl.control import make as make_controller
-from quadrl.learning.config import TrainConfig
+from quadrl.card import wilson
 from quadrl.learning.figures import COLOURS, STYLE, learning_curves, read_metrics, save, trajectory
 from quadrl.learning.folder import METRICS
 from quadrl.policy import Policy
@@ -23,61 +27,76 @@ from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
 from quadrl.weather import WEATHERS
 from scripts.reports import evaluation, report
-from scripts.reports.claims import judged
-from scripts.reports.report import Result, factor, say, spread, table
-from scripts.reports.trial import LABELS, LEVEL, SOLVED, WAYS, Trial, column, trials
+from scripts.reports.claims import CLAIMS, judged
+from scripts.reports.report import Result, factor, number, say, spread, table
+from scripts.reports.search import LABELS, SOLVED, TASKS, planned
+from scripts.reports.significance import (
+    EFFECTS,
+    LEVEL,
+    improvement,
+    improvement_interval,
+    level_of,
+    middle,
+    middle_interval,
+    mostly,
+    power,
+)
+from scripts.reports.trial import WAYS, Trial, column, trials
+from scripts.reports.tuning import tuned
 
-TASKS = ("hover", "static_waypoint", "landing")
+SEEDS = tuple(range(285, 295))  # not used for tuning
 WINDY = tuple(name for name, weather in WEATHERS.items() if not weather.calm)
+PAIRS = (("ppo", "vpg"), ("trpo", "vpg"), ("trpo", "ppo"))
 Line = tuple[Sequence[float], np.ndarray]
 """Where (n,), and values (seeds, n)."""
 
 
 def main(
     jobs: int = 2,
-    seeds: int = 5,
+    names: tuple[str, ...] = tuple(TASKS),
+    seeds: tuple[int, ...] = SEEDS,
     episodes: int = 100,
     steps: int | None = None,
-    name: str = "paper",
 ) -> None:
     """Train what is missing, measure, draw.
 
     Args:
         jobs: Trainings at the same time.
-        seeds: Trainings of each task and algorithm.
+        names: The tasks.
+        seeds: Of the trainings of each task and algorithm.
         episodes: Episodes of each evaluation.
-        steps: Control steps of each training; by default the task's own.
-        name: Name of the result and of the folder of the runs.
+        steps: Control steps of each training; by default those of the search.
     """
-    began = time.perf_counter()
-    # The paper's network; quadrl's own default for two of the tasks holds the goal.
-    settings = {"steps": steps, "num_threads": 1 if jobs > 1 else 0, "holds_goal": False}
+    chosen = report.load("search")["tasks"]
+    given = {} if steps is None else {"steps": steps}
     runs = [
-        PlannedRun(
-            TrainConfig(task, algo=algo, seed=seed, **settings),
-            report.RUNS / name / f"{task}-{algo}-{seed}",
-        )
-        for seed in range(seeds)  # seed by seed: one that is stopped has whole seeds
-        for task in TASKS
+        planned("paper", task, algo, seed, chosen[task][algo]["settings"] | given)
+        for seed in seeds  # seed by seed: one that is stopped has whole seeds
+        for task in names
         for algo in LABELS
     ]
     train_here(runs, jobs, episodes, say)
     result: Result = {"command": f"scripts/report paper --jobs {jobs}", "episodes": episodes}
     result["weathers"] = WINDY
-    result["geometric"] = {task: yardstick(task, episodes) for task in TASKS}
-    result["runs"] = []
-    for run in runs:
-        result["runs"].append(evaluation.measure(run, episodes=episodes, weathers=WINDY))
-        say(f"{run.folder.name}: measured")
-    draw(runs, report.rounded(result), report.IMAGES / name)
-    report.save(name, result | {"wall_clock_s": time.perf_counter() - began})
+    result["geometric"] = {task: yardstick(task, episodes) for task in names}
+    measured = functools.partial(evaluation.measure, episodes=episodes, weathers=WINDY)
+    with concurrent.futures.ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        result["runs"] = list(pool.map(measured, runs))
+    level = level_of(len(CLAIMS), len(names))
+    result["power"] = {
+        test.__name__: power(test, len(seeds) * (len(LABELS) if test is mostly else 1), level)
+        for test in EFFECTS
+    }
+    draw(runs, report.rounded(result), report.IMAGES / "paper")
+    report.save("paper", result)
 
 
 def yardstick(task: str, episodes: int) -> Result:
-    """The geometric controller, in calm air and in wind."""
-    controller = make_controller("geometric", task)
-    rollout = fly(controller, task, episodes=episodes)
-    windy = [{"mean": evaluation.blown(controller, task, episodes, name)} for name in WINDY]
+    """The geometric controller, in calm air and in wind, with the gains tuned for each."""
+    rollout = evaluation.flown(tuned(task, "nothing"), task, episodes)
+    windy = [
+        {"mean": evaluation.blown(tuned(task, f"weather {w}"), task, episodes, w)} for w in WINDY
+    ]
     mean = summarize(rollout) | {"smoothness": evaluation.smoothness(rollout)}
     return {"mean": mean, "windy": windy}
 
@@ -87,13 +106,16 @@ def draw(runs: list[PlannedRun], result: Result, folder: Path) -> None:
     groups: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in runs:
         groups.setdefault((run.config.task, run.config.algo), []).append(run)
-    for number, task in enumerate(TASKS, 3):
-        metrics = {a: [read_metrics(r.folder / METRICS) for r in groups[task, a]] for a in LABELS}
-        learning_curves(metrics, task, folder / f"figure_{number}_{task}.png", clocks=("steps",))
-    for number, task, algo in ((6, "static_waypoint", "ppo"), (7, "landing", "trpo")):
-        rollout = fly(Policy.load(groups[task, algo][0].folder), task, episodes=8)
-        title = f"{task}, {LABELS[algo]}, first seed: 8 flights, mean action"
-        trajectory(rollout, title, folder / f"figure_{number}_{task}_{algo}.png")
+    for figure, task in enumerate(TASKS, 3):
+        if runs_of := {a: groups[task, a] for a in LABELS if (task, a) in groups}:
+            metrics = {a: [read_metrics(r.folder / METRICS) for r in runs_of[a]] for a in runs_of}
+            path = folder / f"figure_{figure}_{task}.png"
+            learning_curves(metrics, task, path, clocks=("steps",))
+    for figure, task, algo in ((6, "static_waypoint", "ppo"), (7, "landing", "trpo")):
+        if (task, algo) in groups:
+            rollout = fly(Policy.load(groups[task, algo][0].folder), task, episodes=8)
+            title = f"{task}, {LABELS[algo]}, first seed: 8 flights, mean action"
+            trajectory(rollout, title, folder / f"figure_{figure}_{task}_{algo}.png")
     both = trials(result)
     axes = ("frequency [Hz]", "power of the body rate [rad²/s²/Hz]")
     lines({t.task: spectra(t) for t in both}, axes, folder / "smoothness.png", logarithmic=True)
@@ -144,7 +166,8 @@ def lines(
     figure = Figure(figsize=(3.6 * len(panels), 3.3), layout="constrained")
     colours = {LABELS[algo]: STYLE[name] for algo, name in COLOURS.items() if algo in LABELS}
     drawn = {}
-    for axis, (task, panel) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+    axes_of = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (task, panel) in zip(axes_of, panels.items(), strict=True):
         for label, (x, values) in panel.items():
             known = values[np.isfinite(values).all(axis=1)]
             if len(known):
@@ -168,13 +191,11 @@ def made() -> str:
     seeds = sorted({run["seed"] for run in result["runs"]})
     training = sum(run["training_s"] for run in result["runs"]) / 60
     return (
-        f"Made by `{result['command']}`: {len(result['runs'])} trainings, seeds {seeds[0]} to "
-        f"{seeds[-1]}, {training:.0f} minutes of training, {result['wall_clock_s'] / 60:.0f} "
-        "minutes of wall clock in all. The trainings flew in free flight. Every policy then flew "
-        f"the same {result['episodes']} fresh episodes in MuJoCo. Figures are medians over the "
-        "seeds, with the lowest and the highest in brackets. A seed is solved when at least "
-        f"{100 * SOLVED:g} % of the episodes succeed with the mean action.  \n"
-        f"{report.source(result)}"
+        f"Made by `{result['command']}`: {len(result['runs'])} trainings, test seeds {seeds[0]} to "
+        f"{seeds[-1]}, {training:.0f} minutes of training, a process each. The trainings flew in "
+        f"free flight. Every policy then flew the same {result['episodes']} fresh episodes. A seed "
+        f"is solved when at least {100 * SOLVED:g} % of the episodes succeed with the mean "
+        f"action.  \n{report.source(result)}"
     )
 
 
@@ -185,17 +206,52 @@ def well() -> str:
         target = trial.precision
         for algo in (*LABELS, ""):
             runs = trial.runs[algo] if algo else [trial.geometric]
-            solved = f"{trial.solved(algo)} of {len(runs)}" if algo else ""
-            row = [trial.task, LABELS.get(algo, "geometric controller"), solved]
-            row += [spread(column(runs, f"{way}.success_rate"), "%", 100) for way in WAYS]
-            figures = [column(runs, f"{way}.{target.metric}") for way in WAYS]
-            row += [spread(x, target.unit, factor(target), 2) for x in figures]
-            row.append(spread(column(runs, "mean.return_mean"), digits=4))
-            row.append(spread(trial.lost(algo), "%", 100, 2) if algo else "")
+            row = [f"`{trial.task}`", LABELS.get(algo, "geometric controller")]
+            if algo:
+                count, seeds = sum(trial.solved(algo)), len(runs)
+                low, high = wilson(count, seeds)
+                row.append(f"{count} of {seeds} ({100 * low:.0f} to {100 * high:.0f} %)")
+            else:
+                row.append("")
+            row += [centre(column(runs, f"{way}.success_rate"), "%", 100) for way in WAYS]
+            figures = (column(runs, f"{way}.{target.metric}") for way in WAYS)
+            row += [centre(worst(x), target.unit, factor(target), 2) for x in figures]
+            heading = column(runs, "mean.heading_error_deg")
+            row.append(centre(worst(heading), "°", 1, 2))
+            row.append(spread(trial.lost(algo), "points", 100, 2) if algo else "")
             rows.append(row)
     head = ["task", "policy", "seeds solved", "successful, mean action", "successful, sampled"]
-    head += ["precision, mean action", "precision, sampled", "return, mean action"]
-    return table([*head, "lost from best to final"], rows)
+    head += ["precision, mean action", "precision, sampled", "heading error, mean action"]
+    return table([*head, "success lost from best to final"], rows)
+
+
+def worst(values: Sequence[float]) -> list[float]:
+    """What no flight of a seed has reached counts as infinitely imprecise."""
+    return [math.inf if math.isnan(x) and len(values) > 1 else x for x in values]
+
+
+def centre(values: Sequence[float], unit: str, factor: float, digits: int = 3) -> str:
+    """The interquartile mean of the seeds, and its 95 % interval."""
+    scaled = [factor * x for x in values]
+    if len(scaled) == 1 or len({*scaled}) == 1:
+        return spread(scaled, unit, digits=digits)
+    between = (number(x, digits) for x in middle_interval(scaled))
+    return f"{number(middle(scaled), digits)} ({' to '.join(between)}) {unit}".replace(" °", "°")
+
+
+def better() -> str:
+    """How often a seed of one algorithm is better than a seed of another."""
+    rows = []
+    for trial in trials(report.load("paper")):
+        for one, other in PAIRS:
+            row = [f"`{trial.task}`", f"{LABELS[one]} over {LABELS[other]}"]
+            success = [trial.column(algo, "mean.success_rate") for algo in (one, other)]
+            errors = [[-x for x in trial.errors(algo, "mean")] for algo in (one, other)]
+            for pair in (success, errors):
+                low, high = improvement_interval(*pair)
+                row.append(f"{improvement(*pair):.2f} ({low:.2f} to {high:.2f})")
+            rows.append(row)
+    return table(("task", "compared", "success", "precision"), rows)
 
 
 def smooth() -> str:
@@ -228,22 +284,38 @@ def sturdy() -> str:
 
 def claims() -> str:
     """Section 5, sentence by sentence."""
+    result = report.load("paper")
+    level = level_of(len(CLAIMS), len(result["geometric"]))
     return (
         "Each task says yes, no (the contrary) or neither, by the rule in the row. The measurement "
         "agrees when more than half of the tasks say yes, disagrees when more than half say no, "
         'and is mixed when both occur; otherwise the sentence is not shown. "Clearly" means a '
-        f"one-sided test at the level {LEVEL:g}: Mann and Whitney's between two algorithms, the "
-        "sign test seed by seed, the F test of two spreads, Fisher's test of solved seeds. With "
-        f"five seeds only large differences pass.\n\n{judged(report.load('paper'))}"
+        f"one-sided test of a task at the level {level:.3f}, so that any of the {len(CLAIMS)} "
+        f"sentences gets a false verdict with a chance of {100 * LEVEL:g} % at most (Bonferroni; "
+        "the trainings of the tasks are independent).\n\n"
+        f"{judged(result)}"
     )
+
+
+def powers() -> str:
+    """What each test would see."""
+    result = report.load("paper")
+    tests = {"solved_more": "Fisher: seeds solved", "smaller": "Mann and Whitney: which is smaller"}
+    tests |= {"steadier": "Brown and Forsythe: spread", "mostly": "sign test, seed by seed"}
+    rows = []
+    for test, (_, words) in EFFECTS.items():
+        rows.append((tests[test.__name__], words, f"{result['power'][test.__name__]:.2f}"))
+    return table(("test", "difference", "power in one task"), rows)
 
 
 PARTS: report.Parts = {
     "paper-made": made,
     "paper-well": well,
+    "paper-better": better,
     "paper-smooth": smooth,
     "paper-sturdy": sturdy,
     "paper-claims": claims,
+    "paper-powers": powers,
 }
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from quadrl.randomization import Randomization
 from quadrl.rollout import fly, summarize
 from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
+from quadrl.vehicle import Vehicle
 from scripts.reports import (
     claims,
     evaluation,
@@ -26,11 +27,14 @@ from scripts.reports import (
     peers,
     report,
     robust,
+    search,
     ship,
+    significance,
     step_size,
     trial,
     tuning,
 )
+from scripts.reports.search import LABELS
 
 
 @pytest.fixture(autouse=True)
@@ -99,7 +103,7 @@ def test_policies_for_uncertain_aircraft_fly_beside_the_controller(monkeypatch, 
     monkeypatch.setattr(robust, "EPISODES", 3)
     monkeypatch.setattr(report, "RUNS", tmp_path)
     best = {"best": {"bandwidth": 1.6, "integral": 1.0}}
-    report.save("tuning", {"tasks": {"hover": best}})
+    report.save("tuning", {"tasks": {"hover": {"uncertain": best}}})
     robust.main(("hover",), ("robust",))
     found = report.load("robust")["tasks"]["hover"]
     assert [run["seed"] for run in found["robust"]] == [1, 2]
@@ -149,14 +153,30 @@ def test_what_lands_in_ground_effect_is_shown_beside_what_does_not(monkeypatch, 
 def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass(monkeypatch):
     monkeypatch.setattr(tuning, "BANDWIDTHS", (1.3,))
     monkeypatch.setattr(tuning, "INTEGRALS", (0.0, 1.0))
-    monkeypatch.setattr(tuning, "UNCERTAIN", Randomization(mass=(1.1, 1.2)))
-    tuning.main(("hover",), weather="calm", episodes=4, fresh=4)
-    found = report.load("tuning")["tasks"]["hover"]
+    heavy = tuning.Condition(randomization=Randomization(mass=(1.1, 1.2)))
+    found = tuning.searched("hover", 4, heavy)
     without, with_one = (row["position_error_m"] for row in found["tried"])
     # k_z k_v e = g (mass - 1), of the factor: the aircraft hangs e below the goal.
     assert without > 0.1 > 5 * with_one
     assert found["best"]["integral"] == 1.0
     assert found["best"]["fresh"]["success_rate"] == 1.0
+
+
+def test_gains_are_kept_for_each_task_and_disturbance(monkeypatch):
+    every = tuning.conditions("hover")
+    windy = tuning.Condition(weather="light", aerodynamics="full")
+    few = {"nothing": every["nothing"], "windy": windy}
+    report.save("tuning", {"tasks": {"landing": "as it was"}})
+    with monkeypatch.context() as patch:
+        patch.setattr(tuning, "conditions", lambda task: few)
+        tuning.main(("hover",), jobs=2, episodes=2)
+        controller = tuning.tuned("hover", "windy")
+    found = report.load("tuning")["tasks"]
+    assert found["landing"] == "as it was" and [*found["hover"]] == [*few]
+    assert len(found["hover"]["windy"]["tried"]) == search.SETTINGS  # as many as the algorithms get
+    assert controller.vehicle.aerodynamics != Vehicle().aerodynamics
+    assert {"uncertain", "all together", "weather severe"} < set(every)
+    assert "uncertain" not in tuning.conditions("landing")
 
 
 def test_examples_get_the_same_wall_clock():
@@ -211,17 +231,18 @@ def test_a_run_is_measured_by_flying_its_policy(tmp_path):
     train_here([run], 1, 2, said.append)  # there is nothing left to do
     measured = evaluation.measure(run, episodes=3, weathers=("light",))
     policy = Policy.load(run.folder)
-    assert summarize(fly(policy, "hover", episodes=3)).items() <= measured["mean"].items()
-    blown = summarize(fly(policy, "hover", episodes=3, weather="light"))
+    fresh = {"episodes": 3, "seed": evaluation.FRESH, "engine": "free_flight"}
+    assert summarize(fly(policy, "hover", **fresh)).items() <= measured["mean"].items()
+    blown = summarize(fly(policy, "hover", **fresh, weather="light"))
     assert measured["windy"][0]["mean"].items() <= blown.items()
     assert measured["sampled"] != measured["mean"] and measured["steps"] == 4096
 
 
 def test_curve_and_noisy_weights_by_hand():
-    # 40 batches: means over 2, so the lucky 100 counts for half.
-    returns = [0.0, 2.0, *[50.0] * 17, 100.0, *[50.0] * 18, 30.0, 20.0]
-    found = evaluation.curve_figures({"return": np.array(returns)})
-    assert found == {"first": 1.0, "best": 75.0, "final": 25.0}
+    # 40 batches: means over 2, so the lucky 1 counts for half. In the first no episode ends.
+    shares = [math.nan, 0.0, 0.2, *[0.5] * 17, 1.0, *[0.5] * 18, 0.3, 0.2]
+    found = evaluation.curve_figures({"success": np.array(shares)})
+    assert found == {"best": 0.75, "final": 0.25}
     policy = Policy.pretrained("hover")
     noisy = evaluation.with_noisy_weights(policy, 0.1, seed=3)
     for before, after in zip(policy.weights, noisy.weights, strict=True):
@@ -229,20 +250,92 @@ def test_curve_and_noisy_weights_by_hand():
         np.testing.assert_allclose(share, 0.1, rtol=1e-4)
 
 
-def test_statistics_by_hand():
+def test_significance_by_hand():
     # Five against five, all smaller: one of C(10, 5) = 252 orders, p = 0.004; two against two 0.17.
-    assert trial.smaller([1, 2, 3, 4, 5], [6, 7, 8, 9, 10]) == 1
-    assert trial.smaller([6, 7, 8, 9, 10], [1, 2, 3, 4, 5]) == -1
-    assert trial.smaller([1, 2], [3, 4]) == trial.smaller([], [1]) == trial.smaller([1], [1]) == 0
+    low, high = [1, 2, 3, 4, 5], [6, 7, 8, 9, 10]
+    assert significance.smaller(low, high, 0.05) == 1 == -significance.smaller(high, low, 0.05)
+    assert significance.smaller(low, high, 0.0039) == 0
+    for a, b in (([1, 2], [3, 4]), ([], [1]), ([1], [1]), ([math.nan], [1])):
+        assert significance.smaller(a, b, 0.05) == 0
     # Five of five: p = 1/32; four of five: 6/32. Zeros and NaN do not count.
-    assert trial.mostly([1, 2, 1, 1, 3]) == 1 and trial.mostly([1, 2, 1, 1, -3]) == 0
-    assert trial.mostly([-1, -2, -1, -1, -3, 0.0, math.nan]) == -1
-    # F(4, 4) exceeds 6.39 in a twentieth of the cases: deviations of a ratio of 2.53.
-    values = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    assert trial.steadier(values, 2.6 * values) == 1 and trial.steadier(values, 2.4 * values) == 0
+    assert significance.mostly([1, 2, 1, 1, 3], 0.05) == 1
+    assert significance.mostly([1, 2, 1, 1, -3], 0.05) == 0
+    assert significance.mostly([-1, -2, -1, -1, -3, 0.0, math.nan], 0.05) == -1
+    # Ten of ten against five of ten: p = 0.016; against six of ten 0.043.
+    ten, five, six = [1] * 10, [1, 0] * 5, [1] * 6 + [0] * 4
+    assert (
+        significance.solved_more(ten, five, 0.02) == 1 == -significance.solved_more(five, ten, 0.02)
+    )
+    assert significance.solved_more(ten, six, 0.02) == 0
+    assert significance.middle([9, 1, 2, 3, 4, -7, 0, math.inf]) == 2.5  # of 1, 2, 3 and 4
+    assert significance.improvement([2, 3], [1, 2]) == 0.875
+    assert significance.improvement_interval([2, 3], [0, 1]) == (1.0, 1.0)
     words = ["agrees", "disagrees", "mixed", "not shown"]
     votes = ([1, 1, -1], [-1, 0, -1], [1, -1, 0], [1, 0, 0])
     assert [trial.verdict(each) for each in votes] == words
+
+
+def test_verdicts_are_false_no_more_often_than_said():
+    """Of thirteen sentences on three tasks, and of spreads with heavy tails (F: 30 %, not 5)."""
+    level = significance.level_of(13, 3)
+    assert 2 * (3 * level**2 - 2 * level**3) == pytest.approx(0.05 / 13)
+    assert significance.level_of(13, 1) == pytest.approx(0.05 / 13 / 2)
+    draw, alike = np.random.default_rng(0), 0
+    for _ in range(400):
+        alike += significance.steadier(*draw.standard_t(2, (2, 10)), 0.025) != 0
+    assert alike <= 29  # 0.05 of 400, and two deviations
+    assert significance.steadier([1.0] * 5, [1.0] * 5, 0.05) == 0
+    assert significance.steadier(0.1 * np.arange(10.0), np.arange(10.0), 0.01) == 1
+
+
+def test_a_power_grows_with_the_seeds(monkeypatch):
+    monkeypatch.setattr(significance, "DRAWS", 60)
+    for test in significance.EFFECTS:
+        few, many = (significance.power.__wrapped__(test, n, 0.03) for n in (5, 40))
+        assert few < 0.8 < many
+
+
+def test_each_algorithm_searches_as_many_settings(monkeypatch, tmp_path):
+    every = {algo: [search.settings(algo, n) for n in range(search.SETTINGS)] for algo in LABELS}
+    assert all(len({json.dumps(x) for x in each}) == 16 for each in every.values())
+    for rows in zip(*every.values(), strict=True):  # the same batch and the same share of a range
+        assert len({(row["num_envs"], row["gae_lambda"]) for row in rows}) == 1
+        low, high = search.RATES[0], search.BOUNDS[0]
+        rate, bound = rows[0]["vpg"]["learning_rate"], rows[2]["trpo"]["max_kl"]
+        assert rate / low == pytest.approx(bound / high, rel=0.1)
+    assert search.worth([(1.0, 0.1), (0.9, math.inf)]) < search.worth([(0.96, 0.3), (0.95, 0.3)])
+    assert search.worth([(1.0, 0.1)]) > search.worth([(1.0, 0.2)])
+    monkeypatch.setitem(search.TASKS, "hover", 2048)
+    monkeypatch.setattr(search, "SETTINGS", 2)
+    monkeypatch.setattr(search, "FINALISTS", 1)
+    monkeypatch.setattr(search, "LABELS", {"vpg": "GAE"})
+    monkeypatch.setattr(search, "EPISODES", 2)
+    monkeypatch.setattr(report, "RUNS", tmp_path)
+    search.main(names=("hover",))
+    found = report.load("search")["tasks"]["hover"]["vpg"]
+    assert len(found["tried"]) == 2 and len(found["finalists"]) == 1
+    assert found["settings"] == search.settings("vpg", found["chosen"])
+    assert len([*(tmp_path / "search").glob("hover-vpg-*")]) == 3
+    assert "| `hover` | GAE |" in search.chosen()
+
+
+def test_the_experiments_are_flown_judged_and_drawn(monkeypatch, tmp_path):
+    monkeypatch.setattr(significance, "DRAWS", 20)
+    monkeypatch.setattr(report, "RUNS", tmp_path)
+    chosen = {algo: {"settings": search.settings(algo, 2)} for algo in LABELS}
+    report.save("search", {"tasks": {"hover": chosen}})
+    best = {"best": {"bandwidth": 1.3, "integral": 0.5}}
+    report.save("tuning", {"tasks": {"hover": dict.fromkeys(tuning.conditions("hover"), best)}})
+    means = {f"{name}, mean": [0.5] * 10 for name in ("noise", "neither")}
+    report.save("noise", {"success": means})
+    paper.main(names=("hover",), seeds=(1, 2), episodes=5, steps=8192)
+    result = report.load("paper")
+    assert len(result["runs"]) == 6 and result["geometric"]["hover"]["mean"]["success_rate"] == 1.0
+    assert paper.well().count("0 of 2 (0 to 66 %)") == 3  # Wilson
+    assert paper.better().count("0.50 (0.50 to 0.50)") >= 3
+    assert "power" in paper.claims() and paper.powers().count("\n") == 5
+    names = {path.name for path in (tmp_path / "images" / "paper").iterdir()}
+    assert {"figure_3_hover.png", "smoothness.png", "wind.png"} == names
 
 
 def test_verdicts_follow_what_was_measured(monkeypatch):
@@ -252,7 +345,7 @@ def test_verdicts_follow_what_was_measured(monkeypatch):
     for run in result["runs"]:
         if run["algo"] == "vpg":
             run["mean"] |= {"success_rate": 0.1, "return_mean": 100.0 * run["seed"]}
-            run["curve"] = {"first": 0.0, "best": 1900.0, "final": 1000.0 - run["seed"]}
+            run["curve"] = {"best": 0.9, "final": 0.1}
     page = claims.judged(result)
     for sentence in (
         "GAE may be less suited to flight control.",
@@ -260,7 +353,7 @@ def test_verdicts_follow_what_was_measured(monkeypatch):
     ):
         assert f"{sentence}" in page
         assert "| **agrees** |" in page.partition(sentence)[2].splitlines()[0]
-    assert "5/5 collapsed" in page and "| hover | GAE | 1 of 5 |" in paper.well()
+    assert "10/10 collapsed" in page
 
 
 def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch):
