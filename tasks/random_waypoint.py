@@ -25,9 +25,11 @@ class RandomWaypoint(Task):
         Target("success_rate", "successful", 0.99, True),
         Target("position_error_m", "error over the last 2 s", 0.06, unit="cm"),
     )
-    training = {"steps": 2_621_440, "holds_goal": True}
+    # Some of those that practise up to 2.5 m fail at its edge: 13, 44 and 9 of 10,000 flights with
+    # seeds 280 to 282, and none of those that practise up to 3 m.
+    training = {"steps": 2_621_440, "holds_goal": True, "practice": {"farthest": 3.0}}
     training_with = {"apg": {"steps": 102_400, "holds_goal": False}}
-    variants = {"robust": {"steps": 4_096_000}}
+    variants = {"robust": {"steps": 4_096_000, "practice": {"farthest": 2.5}}}
 
     nearest: float = 1.0
     """Smallest distance of the waypoint from the start [m]."""

@@ -72,6 +72,9 @@ class TrainConfig:
     always fly in mujoco."""
     task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the task that differ from its defaults, such as time_limit=5."""
+    practice: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Options of the task in the training alone, such as farthest=3: who practises more than is
+    asked does not meet the edge of what was practised."""
     aerodynamics: str = ""
     """Effects of the air on the rotors: none, full, or names of single ones with commas between
     them; by default those of the aircraft."""
@@ -207,6 +210,7 @@ class TrainConfig:
         if not isinstance(self.device, str) or not self.device:
             raise QuadrlError(name="device", value=self.device, allowed="a device of torch")
         self.make_task()
+        self.make_practice()
         Draw(self.randomization, self.make_vehicle())
         Weather.of(self.weather)
         resolve_observing(self.observe)
@@ -235,6 +239,10 @@ class TrainConfig:
         """The task with its options."""
         return tasks.make(self.task, **self.task_options)
 
+    def make_practice(self) -> Task:
+        """The task as it is trained."""
+        return tasks.make(self.task, **self.task_options | self.practice)
+
     @property
     def iterations(self) -> int:
         """Batches in the training."""
@@ -244,7 +252,7 @@ class TrainConfig:
         """The settings and everything that their names stand for, as JSON gives them back."""
         packages = ("mujoco", "torch", "torchrl", "numpy")
         whole = dataclasses.asdict(self) | {
-            "resolved_task": dataclasses.asdict(self.make_task()),
+            "resolved_task": dataclasses.asdict(self.make_practice()),
             "resolved_vehicle": dataclasses.asdict(self.make_vehicle()),
             "resolved_weather": dataclasses.asdict(Weather.of(self.weather)),
             "resolved_randomization": dataclasses.asdict(resolve(self.randomization)),

@@ -13,7 +13,7 @@ from quadrl.vehicle import VEHICLES
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
 """Settings that the defaults follow from, or that have no better default than another."""
-PAIRS = ("task_options", "vehicle_options", "observe")
+PAIRS = ("task_options", "practice", "vehicle_options", "observe")
 """Settings that are dicts; what is given is added to the defaults."""
 WIDE = 90.0
 """Action scale of the paper's aircraft in the variant robust [rad/s]: with its own, 35, the rotors

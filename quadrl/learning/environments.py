@@ -71,7 +71,7 @@ class RecordingEnv(QuadrotorEnv):
 def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
     """The aircraft of a training."""
     settings: dict[str, Any] = dict(
-        task=config.make_task(),
+        task=config.make_practice(),
         num_envs=config.num_envs,
         seed=config.seed * SEED_STRIDE,
         device=device,

@@ -36,7 +36,7 @@ from quadrl.state import c_rows
 
 SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
            "disturbances.c")  # fmt: skip
-HEADERS = ("adjoint.h", "aero.h", "philox.h", "runge_kutta.h")
+HEADERS = ("adjoint.h", "aero.h", "export.h", "philox.h", "runge_kutta.h")
 MARK_SLOT = 9
 """Entry of an actuator's `dynprm` that holds MARK."""
 # No contraction: a fused multiply-add would round otherwise than NumPy does.

@@ -9,15 +9,7 @@
 
 #define LANES 8
 #include "adjoint.h"
-
-#define QUADRL_EXPORT __attribute__((visibility("default")))
-
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__) && \
-    !defined(__SANITIZE_ADDRESS__)
-#define VECTORISED __attribute__((target_clones("default", "avx2", "avx512f")))
-#else
-#define VECTORISED
-#endif
+#include "export.h"
 
 // Of one Runge-Kutta step from m: m_, the derivatives by where it leads, become those by m.
 INLINE void back_step(const Aircraft* a, int effects, int rotors, const World* world,

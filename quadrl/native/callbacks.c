@@ -12,8 +12,8 @@
 
 #define LANES 1
 #include "aero.h"
+#include "export.h"
 
-#define QUADRL_EXPORT __attribute__((visibility("default")))
 enum { MARK_SLOT = 9 };
 
 // The struct layouts of mjModel and mjData are compiled in: the loader compares these.

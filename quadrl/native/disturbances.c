@@ -5,9 +5,8 @@
 #include <math.h>
 #include <stdint.h>
 
+#include "export.h"
 #include "philox.h"
-
-#define QUADRL_EXPORT __attribute__((visibility("default")))
 
 enum { ERRORS = 12, NOISE_BLOCKS = 6, PUSH_BLOCKS = 2 };
 

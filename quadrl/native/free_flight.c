@@ -11,17 +11,8 @@
 // same operations, each rounded as IEEE 754 says, so that no bit depends on the machine's vectors.
 #define LANES 8
 #include "aero.h"
+#include "export.h"
 #include "runge_kutta.h"
-
-#define QUADRL_EXPORT __attribute__((visibility("default")))
-
-// The clones are chosen while the library is loaded, before a sanitizer is ready for its own calls.
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__) && \
-    !defined(__SANITIZE_ADDRESS__)
-#define VECTORISED __attribute__((target_clones("default", "avx2", "avx512f")))
-#else
-#define VECTORISED
-#endif
 
 // With the number of rotors known, the compiler unrolls their loop.
 VECTORISED static void fly(const Aircraft* a, int rotors, const World* world, Setting* s, Lanes* m,

@@ -1,9 +1,8 @@
 // Keyed random numbers. The definition in the array API stands in quadrl/rng.py.
 #include <stdint.h>
 
+#include "export.h"
 #include "philox.h"
-
-#define QUADRL_EXPORT __attribute__((visibility("default")))
 
 // Numbers first..first+count-1 of n streams, uniform in [0, 1): out is (n, count). Number j of
 // stream (key, episode, stream) is word j % 4 of the block at counter (j / 4, stream, episode).

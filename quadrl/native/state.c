@@ -9,8 +9,7 @@
 
 #define LANES 1
 #include "aero.h"
-
-#define QUADRL_EXPORT __attribute__((visibility("default")))
+#include "export.h"
 
 static int is_sound(double x) { return fabs(x) < 1e10; }  // mjMAXVAL; false for NaN
 

@@ -12,17 +12,8 @@
 
 #define LANES 8
 #include "aero.h"
+#include "export.h"
 #include "philox.h"
-
-#define QUADRL_EXPORT __attribute__((visibility("default")))
-
-// As in free_flight.c.
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__) && \
-    !defined(__SANITIZE_ADDRESS__)
-#define VECTORISED __attribute__((target_clones("default", "avx2", "avx512f")))
-#else
-#define VECTORISED
-#endif
 
 typedef double Lanes[LANES];
 

@@ -11,6 +11,7 @@ from quadrl.benchmark import ALL_CORES, ONE_CORE
 from scripts.reports import (
     describe,
     examples,
+    goals,
     ground,
     noise,
     paper,
@@ -28,7 +29,7 @@ from scripts.reports import (
 from scripts.reports.report import table
 
 MODULES = (
-    describe, examples, ground, noise, paper, peers, reference, robust, robustness, scaling,
+    describe, examples, goals, ground, noise, paper, peers, reference, robust, robustness, scaling,
     speed, step_size, task_pages, training,
 )  # fmt: skip
 

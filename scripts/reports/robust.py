@@ -26,13 +26,12 @@ from quadrl.vehicle import resolve
 from scripts.reports import report
 from scripts.reports.evaluation import trained
 from scripts.reports.report import Result, say, table
-from scripts.reports.tuning import FRESH, UNCERTAIN, controller_of
+from scripts.reports.tuning import BOTH, FRESH, UNCERTAIN, tuned
 
 SEEDS = (242, 243, 244, 245, 246)  # not used for tuning
 # The steps of hover were raised after its policies of SEEDS had been flown.
 FRESH_SEEDS = {("hover", "robust"): (263, 264, 265, 266, 267)}
 EPISODES = 1000
-BOTH = ("hover", "random_waypoint")  # those that the controller is tuned for
 FEWER: dict[str, Any] = {"steps": 1_638_400}
 BLIND: dict[str, Any] = {"observe": {"action_history": 0, "disturbance": False}}
 WAYS: dict[str, dict[str, Any]] = {
@@ -109,13 +108,11 @@ def all_flown(policy: Policy | None, task: str) -> dict[str, Result]:
     """What a policy, or the tuned controller for None, reaches in each condition."""
     reached = {}
     for name, air, disturbed in conditions():
-        options = {"action_scale": WIDE}
-        vehicle = resolve(None, options) if policy is None else None
-        flown, made = "geometric" if policy is None else policy, task
+        vehicle = resolve(None, {"action_scale": WIDE}) if policy is None else None
+        flown = policy or "geometric"
         _, controller, made, vehicle = setting(flown, task, vehicle, aerodynamics=air)
         if policy is None:
-            best = report.load("tuning")["tasks"][task]["best"]
-            controller = controller_of(made, vehicle, best["bandwidth"], best["integral"])
+            controller = tuned(task, "uncertain", vehicle)
         given: Any = {"episodes": EPISODES, "vehicle": vehicle, "seed": FRESH, **disturbed}
         each = flights(fly(controller, made, engine=engine(made), **given))
         errors = np.quantile(each["position_error_m"], (0.5, 0.98))

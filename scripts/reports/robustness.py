@@ -1,48 +1,23 @@
 """Flies every policy that comes with quadrl, and the geometric controller, through disturbances.
 
 Each disturbance alone, at graded levels and at the strength of the presets, and all together.
+`scripts/report tuning` tunes the controller for each of these conditions.
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from typing import Any
 
 import tyro
 
 import quadrl
 from quadrl import tasks
-from quadrl.aerodynamics import EFFECTS
 from quadrl.card import Card
 from quadrl.evaluation import setting
-from quadrl.randomization import RANDOMIZATIONS, Randomization
-from quadrl.rollout import fly, summarize
-from quadrl.weather import Weather
-from scripts.reports import report
+from scripts.reports import report, tuning
 from scripts.reports.report import Result, say, table
 
 CONTROLLER = "geometric"
-NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
-SHOWN = ("success_rate", "position_error_m")
+TUNED = "tuned controller"
 PICTURES = report.IMAGES / "robustness"
-
-
-def conditions() -> Iterator[tuple[str, str | None, dict[str, Any]]]:
-    """A name, effects of the air, and what disturbs the flights."""
-    calm = {"weather": Weather(), "randomization": Randomization()}
-    yield "nothing", "none", calm
-    for effect in (*EFFECTS, "full"):
-        yield f"aerodynamics {effect}", effect, calm
-    for weather in ("light", "moderate"):
-        yield f"weather {weather}", "none", calm | {"weather": weather}
-    full = RANDOMIZATIONS["full"]
-    for name in full.given():
-        if name not in NEEDS_AIR:
-            given: Any = {name: getattr(full, name)}
-            yield f"{name} as in `full`", "none", calm | {"randomization": Randomization(**given)}
-    for name in ("light", "full"):
-        yield f"randomization {name}", "none", calm | {"randomization": RANDOMIZATIONS[name]}
-    yield "all together", "full", {"weather": "light", "randomization": full}
 
 
 def main(only: tuple[str, ...] = (), episodes: int = 100) -> None:
@@ -59,8 +34,9 @@ def main(only: tuple[str, ...] = (), episodes: int = 100) -> None:
     for task in only or tasks.TASKS:
         say(task)
         found["conditions"][task] = {
-            name: [one(known, task, air, disturbed, episodes) for known in flyers(task).values()]
-            for name, air, disturbed in conditions()
+            name: [one(known, task, name, episodes) for known in (*flyers(task).values(), TUNED)]
+            for name in tuning.conditions(task)
+            if name != "uncertain"
         }
         card = quadrl.robustness(flyers(task), task, episodes=episodes, aerodynamics="none")
         PICTURES.mkdir(parents=True, exist_ok=True)
@@ -75,13 +51,13 @@ def flyers(task: str) -> dict[str, str]:
     return {"policy": task, "robust policy": f"{task}_robust", "controller": CONTROLLER}
 
 
-def one(flown: str, task: str, air: str | None, disturbed: dict[str, Any], episodes: int) -> Result:
-    """What the policy or the controller reaches in one condition."""
-    _, controller, made, vehicle = setting(flown, task, aerodynamics=air)
-    engine: Any = "mujoco" if made.contact else "free_flight"
-    given = {"episodes": episodes, "vehicle": vehicle, "engine": engine, **disturbed}
-    reached = summarize(fly(controller, made, **given))
-    return {name: reached[name] for name in SHOWN}
+def one(known: str, task: str, name: str, episodes: int) -> Result:
+    """What a policy or a controller reaches in one condition; a policy with its own aircraft."""
+    condition = tuning.conditions(task)[name]
+    if known == TUNED:
+        return tuning.flown(tuning.tuned(task, name), task, condition, episodes, tuning.FRESH)
+    _, controller, _, vehicle = setting(known, task, aerodynamics=condition.aerodynamics)
+    return tuning.flown(controller, task, condition, episodes, tuning.FRESH, vehicle)
 
 
 def half() -> str:
@@ -103,7 +79,7 @@ def alone() -> str:
     for name in next(iter(known.values())):
         shares = ([f"{100 * one['success_rate']:.0f}" for one in of[name]] for of in known.values())
         rows.append((name, *(" / ".join(pair) for pair in shares)))
-    flown = " / ".join(flyers(""))
+    flown = " / ".join((*flyers(""), TUNED))
     note = f"Successful flights [%], {flown}; {result['episodes']} flights each."
     return f"{table(('disturbed by', *known), rows)}\n\n{note} {report.source(result)}"
 

@@ -16,6 +16,7 @@ from quadrl.randomization import Randomization
 from quadrl.rollout import fly, summarize
 from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
+from quadrl.vehicle import Vehicle
 from scripts.reports import (
     claims,
     evaluation,
@@ -99,7 +100,7 @@ def test_policies_for_uncertain_aircraft_fly_beside_the_controller(monkeypatch, 
     monkeypatch.setattr(robust, "EPISODES", 3)
     monkeypatch.setattr(report, "RUNS", tmp_path)
     best = {"best": {"bandwidth": 1.6, "integral": 1.0}}
-    report.save("tuning", {"tasks": {"hover": best}})
+    report.save("tuning", {"tasks": {"hover": {"uncertain": best}}})
     robust.main(("hover",), ("robust",))
     found = report.load("robust")["tasks"]["hover"]
     assert [run["seed"] for run in found["robust"]] == [1, 2]
@@ -149,14 +150,30 @@ def test_what_lands_in_ground_effect_is_shown_beside_what_does_not(monkeypatch, 
 def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass(monkeypatch):
     monkeypatch.setattr(tuning, "BANDWIDTHS", (1.3,))
     monkeypatch.setattr(tuning, "INTEGRALS", (0.0, 1.0))
-    monkeypatch.setattr(tuning, "UNCERTAIN", Randomization(mass=(1.1, 1.2)))
-    tuning.main(("hover",), weather="calm", episodes=4, fresh=4)
-    found = report.load("tuning")["tasks"]["hover"]
+    heavy = tuning.Condition(randomization=Randomization(mass=(1.1, 1.2)))
+    found = tuning.searched("hover", 4, heavy)
     without, with_one = (row["position_error_m"] for row in found["tried"])
     # k_z k_v e = g (mass - 1), of the factor: the aircraft hangs e below the goal.
     assert without > 0.1 > 5 * with_one
     assert found["best"]["integral"] == 1.0
     assert found["best"]["fresh"]["success_rate"] == 1.0
+
+
+def test_gains_are_kept_for_each_task_and_disturbance(monkeypatch):
+    every = tuning.conditions("hover")
+    windy = tuning.Condition(weather="light", aerodynamics="full")
+    few = {"nothing": every["nothing"], "windy": windy}
+    report.save("tuning", {"tasks": {"landing": "as it was"}})
+    with monkeypatch.context() as patch:
+        patch.setattr(tuning, "conditions", lambda task: few)
+        tuning.main(("hover",), jobs=2, episodes=2)
+        controller = tuning.tuned("hover", "windy")
+    found = report.load("tuning")["tasks"]
+    assert found["landing"] == "as it was" and [*found["hover"]] == [*few]
+    assert len(found["hover"]["windy"]["tried"]) == 16
+    assert controller.vehicle.aerodynamics != Vehicle().aerodynamics
+    assert {"uncertain", "all together", "weather severe"} < set(every)
+    assert "uncertain" not in tuning.conditions("landing")
 
 
 def test_examples_get_the_same_wall_clock():

@@ -4,7 +4,9 @@ import dataclasses
 import json
 import math
 
+import numpy as np
 import pytest
+import torch
 from runs import TINY, refused
 from test_policy import linear
 
@@ -13,8 +15,10 @@ from quadrl import evaluation, tasks
 from quadrl.errors import QuadrlError
 from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.environments import make_env
 from quadrl.learning.folder import read_config, write_json
 from quadrl.tasks.hover import Hover
+from quadrl.tasks.random_waypoint import RandomWaypoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +103,9 @@ def test_any_32_bit_seed_is_good(seed):
         ({"task_options": {"time_limit": "long"}}, "hover time_limit", "long"),
         ({"task_options": {"time_limit": -1}}, "hover time_limit", -1),
         ({"task_options": "time_limit=5"}, "task_options", "time_limit=5"),
+        ({"practice": {"farthst": 3}}, "hover option", "farthst"),
+        ({"practice": {"time_limit": -1}}, "hover time_limit", -1),
+        ({"practice": 3}, "practice", 3),
     ],
 )
 def test_settings_that_cannot_be_trained_are_refused(change, name, value):
@@ -159,6 +166,23 @@ def test_a_run_of_a_task_or_an_aircraft_that_has_changed_is_not_continued(tmp_pa
     (tmp_path / "config.json").write_text(json.dumps(config))
     with refused():
         TrainConfig.of_folder(tmp_path)
+
+
+def test_what_is_practised_may_be_wider_than_what_is_asked():
+    config = TrainConfig("random_waypoint", task_options={"time_limit": 5}, num_envs=512, rollout=1)
+    asked, practised = config.make_task(), config.make_practice()
+    assert asked.time_limit == practised.time_limit == 5
+    assert practised.farthest > asked.farthest == RandomWaypoint().farthest
+    env = make_env(config, torch.device("cpu"))
+    env.reset()
+    way = np.linalg.norm(env.environment.goals() - env.environment.origin, axis=1)
+    assert asked.farthest < way.max() <= practised.farthest
+    assert config.resolved()["resolved_task"]["farthest"] == practised.farthest
+    own = TrainConfig("random_waypoint", practice={"farthest": 2})
+    assert own.make_practice().farthest == 2
+    assert TrainConfig("random_waypoint", variant="robust").make_practice() == RandomWaypoint(
+        smoothness_weight=10.0
+    )
 
 
 def test_a_variant_is_settings_that_go_together():

@@ -1,0 +1,99 @@
+"""What PPO and APG reach with fresh seeds: success in many flights, precision, and wall clock.
+
+Run it on a machine that does nothing else: the trainings are made one after the other, on all
+cores. Interrupted at any moment, it continues at the next start.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import tyro
+
+from quadrl.learning.config import TrainConfig
+from quadrl.policy import Policy
+from quadrl.rollout import EVALUATION_SEED, flights, fly
+from quadrl.studies.crew import train_here
+from quadrl.studies.plan import PlannedRun
+from scripts.reports import report
+from scripts.reports.evaluation import trained
+from scripts.reports.report import Result, number, say, table
+
+SEEDS = (305, 306, 307, 308, 309)  # not used for tuning
+TASKS = {
+    "ppo": ("hover", "static_waypoint", "random_waypoint"),
+    "apg": ("hover", "static_waypoint", "random_waypoint", "target_following"),
+}
+FLIGHTS = 1000
+MANY = {("random_waypoint", "ppo"): 10_000}
+TOGETHER = 1000  # flights in a batch
+
+
+def main(seeds: tuple[int, ...] = SEEDS) -> None:
+    """Train what is missing, fly it, write it down.
+
+    Args:
+        seeds: Of the trainings.
+    """
+    runs = [
+        PlannedRun(
+            TrainConfig(task, algo=algo, seed=seed), report.RUNS / "goals" / f"{task}-{algo}-{seed}"
+        )
+        for algo, names in TASKS.items()
+        for task in names
+        for seed in seeds
+    ]
+    train_here(runs, 1, 20, say)
+    found = [trained(run) | flown(run) for run in runs]
+    report.save("goals", {"command": "scripts/report goals", "runs": found})
+
+
+def flown(run: PlannedRun) -> Result:
+    """What the mean action of a finished training reaches in free flight."""
+    policy, config = Policy.load(run.folder), run.config
+    total = MANY.get((config.task, config.algo), FLIGHTS)
+    each = [
+        flights(
+            fly(
+                policy,
+                config.task,
+                episodes=min(TOGETHER, total - first),
+                seed=EVALUATION_SEED + first,
+                engine="free_flight",
+            )
+        )
+        for first in range(0, total, TOGETHER)
+    ]
+    reached: Result = {"flights": total, "failed": sum(int((~x["success"]).sum()) for x in each)}
+    for name in ("position_error_m", "heading_error_deg"):
+        if name in each[0]:
+            reached[name] = float(np.concatenate([x[name] for x in each]).mean())
+    say(f"{run.name}: {reached}")
+    return reached
+
+
+def goals() -> str:
+    """Each task and algorithm, its seeds beside each other."""
+    result = report.load("goals")
+    groups: dict[tuple[str, str], list[Result]] = {}
+    for run in result["runs"]:
+        groups.setdefault((run["task"], run["algo"]), []).append(run)
+    rows = []
+    for (task, algo), runs in groups.items():
+        error = (number(1000 * run["position_error_m"], 2) for run in runs)
+        off = [number(run["heading_error_deg"], 2) for run in runs if "heading_error_deg" in run]
+        took = [run["training_s"] for run in runs]
+        failed = ", ".join(str(run["failed"]) for run in runs)
+        cells = (f"{runs[0]['steps']:,}", f"{min(took):.1f} to {max(took):.1f} s")
+        cells += (f"{failed} of {runs[0]['flights']:,}", ", ".join(error), ", ".join(off))
+        rows.append((f"`{task}`", algo, *cells))
+    seeds = sorted({run["seed"] for run in result["runs"]})
+    head = ("task", "algorithm", "control steps", "training", "failed flights, seed by seed")
+    head += ("error [mm]", "heading error [deg]")
+    note = f"Seeds {seeds[0]} to {seeds[-1]}; errors are means over all flights, also failed ones."
+    return f"{table(head, rows)}\n\n{note} {report.source(result)}"
+
+
+PARTS: report.Parts = {"goals": goals}
+
+if __name__ == "__main__":
+    tyro.cli(main)
