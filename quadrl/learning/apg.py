@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
-from quadrl.learning.algorithm import Algorithm
+from quadrl.learning.algorithm import Algorithm, shuffled
 from quadrl.learning.algorithm_config import APGConfig
 from quadrl.learning.environments import RecordingEnv
 from quadrl.learning.window import Window
@@ -66,9 +66,10 @@ class APG(Algorithm):
         better = (mean + self._moves(pulled.reshape(mean.shape))).detach()
         aims = seen.detach().update({"better": better, "usual": deviation.log().detach()})
         for _ in range(self.config.epochs):
-            for rows in torch.randperm(len(aims)).split(self.config.minibatch):
-                self.step(self._distance(aims[rows]), "policy")
-        return self.fit_critic(self._critic_loss, batch.reshape(-1))
+            for part in shuffled(aims).split(self.config.minibatch):
+                self.step(self._distance(part), "policy")
+        entries = batch.select(*self.critic.in_keys, "value_target")
+        return self.fit_critic(self._critic_loss, entries.reshape(-1))
 
     def _earned(self, window: Window) -> Tensor:
         """The rewards of a window and what the critic expects after it, ()."""

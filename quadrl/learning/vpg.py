@@ -36,4 +36,4 @@ class VPG(Algorithm):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """The policy's step, then the critic's epochs."""
         self.step(self.loss(batch)["loss_objective"], "policy")
-        return self.fit_critic(lambda part: self.loss(part)["loss_critic"], batch)
+        return self.fit_critic(lambda part: self.loss.loss_critic(part)[0].mean(), batch)
