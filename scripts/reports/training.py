@@ -44,13 +44,17 @@ def plan(jobs: int) -> dict[int, list[PlannedRun]]:
     }
 
 
-def main(jobs: int = 2) -> None:
+def main(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
     """Train what is missing, evaluate it, write it down.
 
     Args:
         jobs: Trainings at the same time, of those whose wall clock is not compared.
+        only: Names of tasks, beside what was measured of the others; by default all.
     """
-    planned = plan(jobs)
+    planned = {
+        k: [run for run in runs if not only or run.config.task in only]
+        for k, runs in plan(jobs).items()
+    }
     for jobs, runs in planned.items():
         train_here(runs, jobs, EPISODES, say)
     found = []
@@ -61,7 +65,12 @@ def main(jobs: int = 2) -> None:
         flown(make_controller("geometric", *pair), *pair)
         for pair in dict.fromkeys((run["task"], run["vehicle"]) for run in found)
     ]
-    report.save("training", {"episodes": EPISODES, "yardstick": yardstick, "runs": found})
+    whole: Result = {"episodes": EPISODES, "yardstick": yardstick, "runs": found}
+    if only:
+        before = report.load("training")
+        for part in ("yardstick", "runs"):
+            whole[part] += [row for row in before[part] if row["task"] not in only]
+    report.save("training", whole)
 
 
 def flown(controller: Controller, task: str, vehicle: str) -> Result:
