@@ -21,6 +21,7 @@ from scripts.reports import (
     claims,
     evaluation,
     examples,
+    goals,
     ground,
     noise,
     paper,
@@ -112,6 +113,28 @@ def test_policies_for_uncertain_aircraft_fly_beside_the_controller(monkeypatch, 
     assert found["robust"][0]["flown"]["nothing"]["success"] == 0.0  # two batches teach nothing
     text = robust.results()
     assert "100.0 (43.9 to 100.0)" in text and "0.0 (0.0 to 39.0) [0.0, 0.0]" in text  # Wilson
+
+
+def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
+    monkeypatch.setattr(goals, "TASKS", {"ppo": ("hover", "random_waypoint")})
+    monkeypatch.setattr(goals, "FLIGHTS", 5)
+    monkeypatch.setattr(goals, "MANY", {})
+    monkeypatch.setattr(goals, "TOGETHER", 2)
+    monkeypatch.setattr(goals, "TrainConfig", functools.partial(TrainConfig, steps=4096))
+    monkeypatch.setattr(report, "RUNS", tmp_path)
+    goals.main(seeds=(1,))
+    hover, waypoint = report.load("goals")["runs"]
+    assert (hover["flights"], hover["failed"]) == (5, 5)  # one batch teaches nothing
+    whole = fly(
+        Policy.load(tmp_path / "goals" / "hover-ppo-1"),
+        "hover",
+        episodes=5,
+        seed=goals.EVALUATION_SEED,
+        engine="free_flight",
+    )
+    assert hover["position_error_m"] == pytest.approx(summarize(whole)["position_error_m"], 1e-4)
+    assert "heading_error_deg" in hover and "heading_error_deg" not in waypoint
+    assert "| 5 of 5 |" in goals.goals()
 
 
 def test_noise_in_training_is_judged_by_pairs(monkeypatch, tmp_path):
