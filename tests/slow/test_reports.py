@@ -122,7 +122,8 @@ def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
     monkeypatch.setattr(goals, "TOGETHER", 2)
     monkeypatch.setattr(goals, "TrainConfig", functools.partial(TrainConfig, steps=4096))
     monkeypatch.setattr(report, "RUNS", tmp_path)
-    goals.main(seeds=(1,))
+    monkeypatch.setattr(goals, "SEEDS", (1,))
+    goals.main()
     hover, waypoint = report.load("goals")["runs"]
     assert (hover["flights"], hover["failed"]) == (5, 5)  # one batch teaches nothing
     whole = fly(
