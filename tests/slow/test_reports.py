@@ -30,6 +30,7 @@ from scripts.reports import (
     robust,
     ship,
     step_size,
+    training,
     trial,
     tuning,
 )
@@ -113,6 +114,28 @@ def test_policies_for_uncertain_aircraft_fly_beside_the_controller(monkeypatch, 
     assert found["robust"][0]["flown"]["nothing"]["success"] == 0.0  # two batches teach nothing
     text = robust.results()
     assert "100.0 (43.9 to 100.0)" in text and "0.0 (0.0 to 39.0) [0.0, 0.0]" in text  # Wilson
+
+
+def test_trainings_of_other_tasks_are_kept_with_their_commit(monkeypatch, tmp_path):
+    monkeypatch.setattr(training, "HOVER_SEEDS", (1,))
+    monkeypatch.setattr(training, "VEHICLES", {"paper": None})
+    monkeypatch.setattr(training, "EPISODES", 2)
+    monkeypatch.setattr(training, "TrainConfig", functools.partial(TrainConfig, steps=4096))
+    monkeypatch.setattr(report, "RUNS", tmp_path)
+    old = [{"task": task, "vehicle": "paper", "seed": 9} for task in ("landing", "hover")]
+    report.save("training", {"yardstick": old, "runs": old})
+    file = tmp_path / "results" / "training.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"commit": "before"}))
+    training.main(only=("hover",))
+    result = report.load("training")
+    assert [(run["task"], run["seed"]) for run in result["runs"]] == [
+        ("hover", 1),
+        ("hover", 1),
+        ("landing", 9),
+    ]
+    assert result["runs"][-1]["commit"] == "before"
+    assert training.measured_at(result)["commit"] == report.commit()
+    assert [row["task"] for row in result["yardstick"]] == ["hover", "landing"]
 
 
 def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
