@@ -197,12 +197,13 @@ def test_what_lands_in_ground_effect_is_shown_beside_what_does_not(monkeypatch, 
 def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass(monkeypatch):
     monkeypatch.setattr(tuning, "BANDWIDTHS", (1.3,))
     monkeypatch.setattr(tuning, "INTEGRALS", (0.0, 1.0))
+    monkeypatch.setattr(tuning, "AROUND", ((1.0, 1.4),))
     heavy = tuning.Condition(randomization=Randomization(mass=(1.1, 1.2)))
     found = tuning.searched("hover", 4, heavy)
-    without, with_one = (row["position_error_m"] for row in found["tried"])
+    without, with_one, _ = (row["position_error_m"] for row in found["tried"])
     # k_z k_v e = g (mass - 1), of the factor: the aircraft hangs e below the goal.
     assert without > 0.1 > 5 * with_one
-    assert found["best"]["integral"] == 1.0
+    assert found["best"]["integral"] in (1.0, 1.4)
     assert found["best"]["fresh"]["success_rate"] == 1.0
 
 
