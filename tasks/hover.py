@@ -37,7 +37,14 @@ class Hover(Task):
         "ppo": {"learning_rate": 1e-2},
     }
     training_with = {
-        "apg": {"steps": 51_200, "gamma": 0.9, "gae_lambda": 0.95, "holds_goal": False}
+        "apg": {
+            "steps": 46_080,
+            "num_envs": 80,
+            "gamma": 0.9,
+            "gae_lambda": 0.95,
+            "holds_goal": False,
+            "apg": {"step": 0.4},
+        }
     }
     variants = {"robust": {"steps": 4_096_000}}
     heading_matters = True

@@ -13,6 +13,7 @@ from quadrl import tasks
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
 from quadrl.description import describe
+from quadrl.learning.defaults import PAIRS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +61,12 @@ def settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
     """Nested settings as `quadrl train` takes them."""
     for name, value in values.items():
         word = prefix + name.replace("_", "-")
-        if isinstance(value, dict):
+        if name in PAIRS:
+            yield " ".join((word, *(f"{option}={given}" for option, given in value.items())))
+        elif isinstance(value, dict):
             yield from settings(value, f"{word}.")
+        elif isinstance(value, bool):
+            yield prefix + "no-" * (not value) + word.removeprefix(prefix)
         else:
             yield f"{word} {value}"
 

@@ -19,6 +19,8 @@ from scripts.reports.evaluation import trained
 from scripts.reports.report import Result, number, say, table
 
 SEEDS = (305, 306, 307, 308, 309)  # not used for tuning
+# The settings of this one were changed after the policies of SEEDS had been flown.
+FRESH_SEEDS = {("hover", "apg"): (310, 311, 312, 313, 314)}
 TASKS = {
     "ppo": ("hover", "static_waypoint", "random_waypoint"),
     "apg": ("hover", "static_waypoint", "random_waypoint", "target_following"),
@@ -28,19 +30,15 @@ MANY = {("random_waypoint", "ppo"): 10_000}
 TOGETHER = 1000  # flights in a batch
 
 
-def main(seeds: tuple[int, ...] = SEEDS) -> None:
-    """Train what is missing, fly it, write it down.
-
-    Args:
-        seeds: Of the trainings.
-    """
+def main() -> None:
+    """Train what is missing, fly it, write it down."""
     runs = [
         PlannedRun(
             TrainConfig(task, algo=algo, seed=seed), report.RUNS / "goals" / f"{task}-{algo}-{seed}"
         )
         for algo, names in TASKS.items()
         for task in names
-        for seed in seeds
+        for seed in FRESH_SEEDS.get((task, algo), SEEDS)
     ]
     train_here(runs, 1, 20, say)
     found = [trained(run) | flown(run) for run in runs]
@@ -83,13 +81,20 @@ def goals() -> str:
         off = [number(run["heading_error_deg"], 2) for run in runs if "heading_error_deg" in run]
         took = [run["training_s"] for run in runs]
         failed = ", ".join(str(run["failed"]) for run in runs)
-        cells = (f"{runs[0]['steps']:,}", f"{min(took):.1f} to {max(took):.1f} s")
+        seeds = f"{runs[0]['seed']} to {runs[-1]['seed']}"
+        cells = (seeds, f"{runs[0]['steps']:,}", f"{min(took):.1f} to {max(took):.1f} s")
         cells += (f"{failed} of {runs[0]['flights']:,}", ", ".join(error), ", ".join(off))
         rows.append((f"`{task}`", algo, *cells))
-    seeds = sorted({run["seed"] for run in result["runs"]})
-    head = ("task", "algorithm", "control steps", "training", "failed flights, seed by seed")
+    head = (
+        "task",
+        "algorithm",
+        "seeds",
+        "control steps",
+        "training",
+        "failed flights, seed by seed",
+    )
     head += ("error [mm]", "heading error [deg]")
-    note = f"Seeds {seeds[0]} to {seeds[-1]}; errors are means over all flights, also failed ones."
+    note = "Errors are means over all flights, also failed ones."
     return f"{table(head, rows)}\n\n{note} {report.source(result)}"
 
 

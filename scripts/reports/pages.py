@@ -11,6 +11,7 @@ from quadrl.benchmark import ALL_CORES, ONE_CORE
 from scripts.reports import (
     describe,
     examples,
+    goals,
     ground,
     noise,
     paper,
@@ -27,9 +28,10 @@ from scripts.reports import (
     training,
 )
 from scripts.reports.report import table
+from scripts.reports.training import measured_at
 
 MODULES = (
-    describe, examples, ground, noise, paper, peers, reference, robust, robustness, scaling,
+    describe, examples, goals, ground, noise, paper, peers, reference, robust, robustness, scaling,
     search, speed, step_size, task_pages, training,
 )  # fmt: skip
 
@@ -66,7 +68,8 @@ def figures() -> str:
             share = f"{row['share']:.2f} times bare `mj_step` on {row['of']}"
             rows.append((f"{row['what']}", f"{row['rate']:,.0f} control steps/s; {share}",
                          "`quadrl benchmark`"))  # fmt: skip
-    sources = f"{report.source(measured)} The row of hover at commit {result['commit']}."
+    at = measured_at(result)["commit"]
+    sources = f"{report.source(measured)} The row of hover at commit {at}."
     return f"{table(('what', 'figure', 'command'), rows)}\n\n{sources}"
 
 

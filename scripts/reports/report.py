@@ -43,13 +43,17 @@ def load(name: str) -> Result:
     return json.loads((RESULTS / f"{name}.json").read_text())
 
 
-def save(name: str, result: Result) -> None:
-    """Keep a result, with the machine and the commit that it was measured on."""
+def commit() -> str:
+    """The commit that is checked out; "-dirty" if what results depend on differs from it."""
     git = ("git", "-C", str(REPOSITORY))
     known = subprocess.run((*git, "describe", "--always"), capture_output=True, text=True).stdout
     changed = subprocess.run((*git, "diff", "--quiet", "HEAD", "--", *CODE)).returncode == 1
-    commit = (known.strip() or "unknown") + "-dirty" * changed
-    whole = {"machine": benchmark.machine(), "commit": commit, **rounded(result)}
+    return (known.strip() or "unknown") + "-dirty" * changed
+
+
+def save(name: str, result: Result) -> None:
+    """Keep a result, with the machine and the commit that it was measured on."""
+    whole = {"machine": benchmark.machine(), "commit": commit(), **rounded(result)}
     text = json.dumps(whole, indent=1)
     # A list of numbers takes one line, not one per number.
     text = re.sub(r"\[\s+([^\[\]{}\"]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text)

@@ -20,15 +20,16 @@ TUNED = "tuned controller"
 PICTURES = report.IMAGES / "robustness"
 
 
-def main(only: tuple[str, ...] = (), episodes: int = 100) -> None:
+def main(only: tuple[str, ...] = (), episodes: int = 100, cards: bool = True) -> None:
     """Fly, draw, and write down after each task.
 
     Args:
         only: Names of tasks, beside what was measured of the others; by default all.
         episodes: Flights of each level and of each condition.
+        cards: Whether the cards and maps are measured, too; else they stay as they are.
     """
     found: Result = {"episodes": episodes, "cards": {}, "conditions": {}}
-    if only:
+    if only or not cards:
         before = report.load("robustness")
         found |= {name: before[name] for name in ("cards", "conditions")}
     for task in only or tasks.TASKS:
@@ -38,11 +39,12 @@ def main(only: tuple[str, ...] = (), episodes: int = 100) -> None:
             for name in tuning.conditions(task)
             if name != "uncertain"
         }
-        card = quadrl.robustness(flyers(task), task, episodes=episodes, aerodynamics="none")
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        card.figure.save(PICTURES / f"{task}.png")
-        card.maps.save(PICTURES / f"{task}_recovery.png")
-        found["cards"][task] = card.found
+        if cards:
+            card = quadrl.robustness(flyers(task), task, episodes=episodes, aerodynamics="none")
+            PICTURES.mkdir(parents=True, exist_ok=True)
+            card.figure.save(PICTURES / f"{task}.png")
+            card.maps.save(PICTURES / f"{task}_recovery.png")
+            found["cards"][task] = card.found
         report.save("robustness", found)
 
 

@@ -44,24 +44,36 @@ def plan(jobs: int) -> dict[int, list[PlannedRun]]:
     }
 
 
-def main(jobs: int = 2) -> None:
+def main(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
     """Train what is missing, evaluate it, write it down.
 
     Args:
         jobs: Trainings at the same time, of those whose wall clock is not compared.
+        only: Names of tasks, beside what was measured of the others; by default all.
     """
-    planned = plan(jobs)
+    planned = {
+        k: [run for run in runs if not only or run.config.task in only]
+        for k, runs in plan(jobs).items()
+    }
     for jobs, runs in planned.items():
         train_here(runs, jobs, EPISODES, say)
     found = []
     for run in (run for runs in planned.values() for run in runs):
         known = evaluation.trained(run)
-        found.append(known | flown(Policy.load(run.folder), known["task"], known["vehicle"]))
+        known |= flown(Policy.load(run.folder), known["task"], known["vehicle"])
+        found.append(known | {"commit": report.commit()})
     yardstick = [
         flown(make_controller("geometric", *pair), *pair)
         for pair in dict.fromkeys((run["task"], run["vehicle"]) for run in found)
     ]
-    report.save("training", {"episodes": EPISODES, "yardstick": yardstick, "runs": found})
+    whole: Result = {"episodes": EPISODES, "yardstick": yardstick, "runs": found}
+    if only:
+        before = report.load("training")
+        for row in before["runs"]:
+            row.setdefault("commit", before["commit"])
+        for part in ("yardstick", "runs"):
+            whole[part] += [row for row in before[part] if row["task"] not in only]
+    report.save("training", whole)
 
 
 def flown(controller: Controller, task: str, vehicle: str) -> Result:
@@ -88,7 +100,13 @@ def hover() -> str:
     success = min(100 * row["metrics"]["success_rate"] for row in known)
     note = f"The geometric controller, in the same episodes and with every aircraft: {success:.0f} "
     note += f"% successful, largest error {number(error)} mm."
-    return f"{table(head, rows)}\n\n{note}  \n{report.source(result)}"
+    return f"{table(head, rows)}\n\n{note}  \n{report.source(result | measured_at(result))}"
+
+
+def measured_at(result: Result) -> Result:
+    """The commits at which the trainings of hover were measured."""
+    commits = {run["commit"] for run in result["runs"] if run["task"] == "hover"}
+    return {"commit": " and ".join(sorted(commits))}
 
 
 def suite() -> str:

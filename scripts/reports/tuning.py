@@ -1,8 +1,7 @@
 """The geometric controller with its gains tuned for each task and each disturbance.
 
-It is the yardstick of policies: it gets as many settings as the algorithms do in their search. A
-proportional controller leaves a lasting error in a lasting wind or with a mass that it does not
-know, so an integral of the position error is among the gains.
+It is the yardstick of policies. A proportional controller leaves a lasting error in a lasting wind
+or with a mass that it does not know, so an integral of the position error is among the gains.
 """
 
 from __future__ import annotations
@@ -36,8 +35,10 @@ UNCERTAIN = Randomization(
     mass=(0.8, 1.2), command_delay=(0.02, 0.02), noise=Errors(1e-3, 1e-3, 2e-3, 2e-3)
 )
 """Unknown mass, late commands, and an estimate with the noise of the preset "light"."""
-BANDWIDTHS = (0.6, 0.9, 1.3, 1.9)  # `level` and `height` of the gains
-INTEGRALS = (0.0, 0.5, 1.0, 1.5)  # [1/s]
+BANDWIDTHS = (0.9, 1.3, 1.9)  # `level` and `height` of the gains
+INTEGRALS = (0.0, 0.5, 1.2)  # [1/s]
+AROUND = ((0.8, 1.0), (1.2, 1.0), (1.0, 0.6), (1.0, 1.4), (0.8, 0.6), (1.2, 1.4), (1.2, 0.6))
+"""Factors of the best of these; for an integral of none, of half the smallest one."""
 NEAR = 0.5  # [m], distance within which errors are summed up: a long way is no lasting error
 MOST = 1.0  # [m], of the sum along each axis
 BOTH = ("hover", "random_waypoint")  # tasks that are flown in all of `UNCERTAIN` and wind as well
@@ -116,17 +117,22 @@ def main(names: tuple[str, ...] = tuple(tasks.TASKS), jobs: int = 2, episodes: i
 
 def searched(name: str, episodes: int, condition: Condition) -> Result:
     """All settings of a task in a condition, and the best of them in fresh episodes."""
-    tried, vehicle = [], condition.make_vehicle()
-    for bandwidth, integral in itertools.product(BANDWIDTHS, INTEGRALS):
+    vehicle = condition.make_vehicle()
+
+    def measured(bandwidth: float, integral: float, first: int = SEARCH) -> Result:
         controller = controller_of(name, vehicle, bandwidth, integral)
-        reached = flown(controller, name, condition, episodes, SEARCH)
-        tried.append({"bandwidth": bandwidth, "integral": integral, **reached})
-    best = max(tried, key=lambda x: (x["success_rate"], -x["position_error_m"]))
-    controller = controller_of(name, vehicle, best["bandwidth"], best["integral"])
-    return {
-        "tried": tried,
-        "best": {**best, "fresh": flown(controller, name, condition, episodes, FRESH)},
-    }
+        known = {"bandwidth": bandwidth, "integral": integral}
+        return known | flown(controller, name, condition, episodes, first)
+
+    def best(tried: list[Result]) -> Result:
+        return max(tried, key=lambda x: (x["success_rate"], -x["position_error_m"]))
+
+    tried = [measured(*pair) for pair in itertools.product(BANDWIDTHS, INTEGRALS)]
+    bandwidth, integral = best(tried)["bandwidth"], best(tried)["integral"] or INTEGRALS[1] / 2
+    tried += [measured(bandwidth * one, integral * other) for one, other in AROUND]
+    chosen = best(tried)
+    fresh = measured(chosen["bandwidth"], chosen["integral"], FRESH)
+    return {"tried": tried, "best": {**chosen, "fresh": fresh}}
 
 
 def tuned(name: str, condition: str, vehicle: Vehicle | None = None) -> Integrating:

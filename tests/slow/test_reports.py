@@ -21,6 +21,7 @@ from scripts.reports import (
     claims,
     evaluation,
     examples,
+    goals,
     ground,
     noise,
     paper,
@@ -31,6 +32,7 @@ from scripts.reports import (
     ship,
     significance,
     step_size,
+    training,
     trial,
     tuning,
 )
@@ -117,6 +119,51 @@ def test_policies_for_uncertain_aircraft_fly_beside_the_controller(monkeypatch, 
     assert "100.0 (43.9 to 100.0)" in text and "0.0 (0.0 to 39.0) [0.0, 0.0]" in text  # Wilson
 
 
+def test_trainings_of_other_tasks_are_kept_with_their_commit(monkeypatch, tmp_path):
+    monkeypatch.setattr(training, "HOVER_SEEDS", (1,))
+    monkeypatch.setattr(training, "VEHICLES", {"paper": None})
+    monkeypatch.setattr(training, "EPISODES", 2)
+    monkeypatch.setattr(training, "TrainConfig", functools.partial(TrainConfig, steps=4096))
+    monkeypatch.setattr(report, "RUNS", tmp_path)
+    old = [{"task": task, "vehicle": "paper", "seed": 9} for task in ("landing", "hover")]
+    report.save("training", {"yardstick": old, "runs": old})
+    file = tmp_path / "results" / "training.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"commit": "before"}))
+    training.main(only=("hover",))
+    result = report.load("training")
+    assert [(run["task"], run["seed"]) for run in result["runs"]] == [
+        ("hover", 1),
+        ("hover", 1),
+        ("landing", 9),
+    ]
+    assert result["runs"][-1]["commit"] == "before"
+    assert training.measured_at(result)["commit"] == report.commit()
+    assert [row["task"] for row in result["yardstick"]] == ["hover", "landing"]
+
+
+def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
+    monkeypatch.setattr(goals, "TASKS", {"ppo": ("hover", "random_waypoint")})
+    monkeypatch.setattr(goals, "FLIGHTS", 5)
+    monkeypatch.setattr(goals, "MANY", {})
+    monkeypatch.setattr(goals, "TOGETHER", 2)
+    monkeypatch.setattr(goals, "TrainConfig", functools.partial(TrainConfig, steps=4096))
+    monkeypatch.setattr(report, "RUNS", tmp_path)
+    monkeypatch.setattr(goals, "SEEDS", (1,))
+    goals.main()
+    hover, waypoint = report.load("goals")["runs"]
+    assert (hover["flights"], hover["failed"]) == (5, 5)  # one batch teaches nothing
+    whole = fly(
+        Policy.load(tmp_path / "goals" / "hover-ppo-1"),
+        "hover",
+        episodes=5,
+        seed=goals.EVALUATION_SEED,
+        engine="free_flight",
+    )
+    assert hover["position_error_m"] == pytest.approx(summarize(whole)["position_error_m"], 1e-4)
+    assert "heading_error_deg" in hover and "heading_error_deg" not in waypoint
+    assert "| 5 of 5 |" in goals.goals()
+
+
 def test_noise_in_training_is_judged_by_pairs(monkeypatch, tmp_path):
     assert noise.chance(np.array([1.0, 2.0, 3.0, 4.0])) == 2 / 16
     assert noise.chance(np.array([1.0, -1.0, 2.0, -2.0])) == 1.0
@@ -153,12 +200,13 @@ def test_what_lands_in_ground_effect_is_shown_beside_what_does_not(monkeypatch, 
 def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass(monkeypatch):
     monkeypatch.setattr(tuning, "BANDWIDTHS", (1.3,))
     monkeypatch.setattr(tuning, "INTEGRALS", (0.0, 1.0))
+    monkeypatch.setattr(tuning, "AROUND", ((1.0, 1.4),))
     heavy = tuning.Condition(randomization=Randomization(mass=(1.1, 1.2)))
     found = tuning.searched("hover", 4, heavy)
-    without, with_one = (row["position_error_m"] for row in found["tried"])
+    without, with_one, _ = (row["position_error_m"] for row in found["tried"])
     # k_z k_v e = g (mass - 1), of the factor: the aircraft hangs e below the goal.
     assert without > 0.1 > 5 * with_one
-    assert found["best"]["integral"] == 1.0
+    assert found["best"]["integral"] in (1.0, 1.4)
     assert found["best"]["fresh"]["success_rate"] == 1.0
 
 

@@ -298,6 +298,22 @@ def test_resume_takes_the_settings_of_the_run(run, copy, undrawn):
     assert (copy / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
 
 
+@pytest.mark.parametrize("name", sorted(tasks.TASKS))
+def test_the_settings_that_are_shown_are_those_of_the_command(refusal, monkeypatch, name):
+    """What `quadrl tasks` says that a task is trained with."""
+    seen = {}
+
+    def prepared(task, out, resume, settings):
+        seen.update(settings)
+        raise QuadrlError("enough")
+
+    monkeypatch.setattr(cli.train, "prepare", prepared)
+    own = tasks.TASKS[name].training
+    refusal("train", name, *" ".join(cli.tasks.settings(own)).split())
+    assert set(seen) == set(own)
+    assert TrainConfig(name, **seen) == TrainConfig(name)
+
+
 @pytest.mark.parametrize(
     ("words", "name"),
     [
