@@ -42,6 +42,7 @@ class Hover(Task):
             "num_envs": 80,
             "gamma": 0.9,
             "gae_lambda": 0.95,
+            "critic_hidden": (64,),
             "holds_goal": False,
             "apg": {"step": 0.4},
         }

@@ -28,7 +28,6 @@ from scripts.reports import (
     training,
 )
 from scripts.reports.report import table
-from scripts.reports.training import measured_at
 
 MODULES = (
     describe, examples, goals, ground, noise, paper, peers, reference, robust, robustness, scaling,
@@ -68,7 +67,7 @@ def figures() -> str:
             share = f"{row['share']:.2f} times bare `mj_step` on {row['of']}"
             rows.append((f"{row['what']}", f"{row['rate']:,.0f} control steps/s; {share}",
                          "`quadrl benchmark`"))  # fmt: skip
-    at = measured_at(result)["commit"]
+    at = report.commits(row for row in result["runs"] if row["task"] == "hover")["commit"]
     sources = f"{report.source(measured)} The row of hover at commit {at}."
     return f"{table(('what', 'figure', 'command'), rows)}\n\n{sources}"
 

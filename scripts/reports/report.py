@@ -9,7 +9,7 @@ import re
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,17 @@ def save(name: str, result: Result) -> None:
     text = re.sub(r"\[\s+([^\[\]{}\"]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text)
     RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / f"{name}.json").write_text(text + "\n")
+
+
+def others(name: str, part: str, tasks: Collection[str]) -> list[Result]:
+    """Kept rows of other tasks than these, each with the commit at which it was measured."""
+    before = load(name)
+    return [{"commit": before["commit"]} | row for row in before[part] if row["task"] not in tasks]
+
+
+def commits(rows: Iterable[Result]) -> Result:
+    """The commits of rows, as `source` names them."""
+    return {"commit": " and ".join(sorted({row["commit"] for row in rows}))}
 
 
 def rounded(value: Any) -> Any:

@@ -68,11 +68,8 @@ def main(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
     ]
     whole: Result = {"episodes": EPISODES, "yardstick": yardstick, "runs": found}
     if only:
-        before = report.load("training")
-        for row in before["runs"]:
-            row.setdefault("commit", before["commit"])
         for part in ("yardstick", "runs"):
-            whole[part] += [row for row in before[part] if row["task"] not in only]
+            whole[part] += report.others("training", part, only)
     report.save("training", whole)
 
 
@@ -85,8 +82,9 @@ def flown(controller: Controller, task: str, vehicle: str) -> Result:
 def hover() -> str:
     """Hover, in both engines and on every aircraft."""
     result = report.load("training")
+    runs = [run for run in result["runs"] if run["task"] == "hover"]
     rows = []
-    for run in (run for run in result["runs"] if run["task"] == "hover"):
+    for run in runs:
         metrics = run["metrics"]
         row = [run["vehicle"], run["engine"], run["seed"], f"{run['steps']:,}"]
         row += [f"{run['training_s']:.1f} s"]
@@ -100,13 +98,7 @@ def hover() -> str:
     success = min(100 * row["metrics"]["success_rate"] for row in known)
     note = f"The geometric controller, in the same episodes and with every aircraft: {success:.0f} "
     note += f"% successful, largest error {number(error)} mm."
-    return f"{table(head, rows)}\n\n{note}  \n{report.source(result | measured_at(result))}"
-
-
-def measured_at(result: Result) -> Result:
-    """The commits at which the trainings of hover were measured."""
-    commits = {run["commit"] for run in result["runs"] if run["task"] == "hover"}
-    return {"commit": " and ".join(sorted(commits))}
+    return f"{table(head, rows)}\n\n{note}  \n{report.source(result | report.commits(runs))}"
 
 
 def suite() -> str:

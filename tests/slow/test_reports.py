@@ -137,7 +137,7 @@ def test_trainings_of_other_tasks_are_kept_with_their_commit(monkeypatch, tmp_pa
         ("landing", 9),
     ]
     assert result["runs"][-1]["commit"] == "before"
-    assert training.measured_at(result)["commit"] == report.commit()
+    assert report.commits(result["runs"][:2]) == {"commit": report.commit()}
     assert [row["task"] for row in result["yardstick"]] == ["hover", "landing"]
 
 
@@ -161,6 +161,10 @@ def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
     )
     assert hover["position_error_m"] == pytest.approx(summarize(whole)["position_error_m"], 1e-4)
     assert "heading_error_deg" in hover and "heading_error_deg" not in waypoint
+    monkeypatch.setattr(report, "commit", lambda: "later")
+    goals.main(only=("hover",))
+    again = report.load("goals")["runs"]
+    assert again == [hover | {"commit": "later"}, waypoint]
     assert "| 5 of 5 |" in goals.goals()
 
 
