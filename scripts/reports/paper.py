@@ -67,14 +67,7 @@ def main(
         episodes: Episodes of each evaluation.
         steps: Control steps of each training; by default those of the search.
     """
-    chosen = report.load("search")["tasks"]
-    given = {} if steps is None else {"steps": steps}
-    runs = [
-        planned("paper", task, algo, seed, chosen[task][algo]["settings"] | given)
-        for seed in seeds  # seed by seed: one that is stopped has whole seeds
-        for task in names
-        for algo in LABELS
-    ]
+    runs = plan(names, seeds, {} if steps is None else {"steps": steps})
     train_here(runs, jobs, episodes, say)
     result: Result = {"command": f"scripts/report paper --jobs {jobs}", "episodes": episodes}
     result["weathers"] = WINDY
@@ -89,6 +82,17 @@ def main(
     }
     draw(runs, report.rounded(result), report.IMAGES / "paper")
     report.save("paper", result)
+
+
+def plan(names: Sequence[str], seeds: Sequence[int], given: dict[str, int]) -> list[PlannedRun]:
+    """The trainings, seed by seed: an experiment that is stopped has whole seeds."""
+    chosen = report.load("search")["tasks"]
+    return [
+        planned("paper", task, algo, seed, chosen[task][algo]["settings"] | given)
+        for seed in seeds
+        for task in names
+        for algo in LABELS
+    ]
 
 
 def yardstick(task: str, episodes: int) -> Result:
