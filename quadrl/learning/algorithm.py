@@ -59,18 +59,22 @@ class Algorithm(abc.ABC):
     def step(self, loss: Tensor | Sequence[Tensor], *names: str) -> None:
         """One gradient step of each of the named optimisers, all on one loss.
 
-        Each clips the norm of its own gradient: a critic that is far off, as at the begin of a
-        training, does not hold the policy back.
-
         Args:
             loss: A scalar, or several whose sum it is.
             *names: Of the optimisers.
         """
-        named = [self._optimisers[name] for name in names]
-        for adam, _, _ in named:
-            adam.zero_grad()
+        for name in names:
+            self._optimisers[name][0].zero_grad()
         torch.autograd.backward(loss)
-        for adam, parameters, _ in named:
+        self.move(*names)
+
+    def move(self, *names: str) -> None:
+        """One step of each of the named optimisers along the gradients that there are.
+
+        Each clips the norm of its own gradient: a critic that is far off, as at the begin of a
+        training, does not hold the policy back.
+        """
+        for adam, parameters, _ in (self._optimisers[name] for name in names):
             if hasattr(self.config, "max_gradient"):
                 torch.nn.utils.clip_grad_norm_(parameters, self.config.max_gradient)
             adam.step()

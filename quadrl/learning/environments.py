@@ -97,6 +97,7 @@ def make_collector(env: QuadrotorEnv, actor: torch.nn.Module, frames: int) -> Co
         actor,
         frames_per_batch=frames,
         total_frames=-1,
+        device=env.device,
         track_traj_ids=False,
         auto_register_policy_transforms=False,
         use_buffers=False,

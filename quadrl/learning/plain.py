@@ -31,12 +31,11 @@ class Plain:
         seen = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
         return seen if self.held is None else self.held.looks * seen
 
-    def and_goal(self, seen: Tensor) -> Tensor:
-        """What is seen (n, inputs), and below it, if it holds the goal, what is seen there."""
+    def goal(self) -> Tensor | None:
+        """What the first layer reads at the goal (1, inputs), if the network holds one."""
         if self.held is None:
-            return seen
-        goal = self.held.looks * self.held.normaliser(self.held.at_goal)
-        return torch.cat([seen, goal[None]])
+            return None
+        return (self.held.looks * self.held.normaliser(self.held.at_goal))[None]
 
     def weights(self) -> list[Tensor]:
         """Weights and biases of the layers in turn."""

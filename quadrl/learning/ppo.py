@@ -34,15 +34,22 @@ class PPO(Algorithm):
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Epochs over minibatches."""
-        batch, losses = batch.exclude("loc", "scale"), self.loss
-        if isinstance(self.loss, FusedPPOLoss):
-            batch, losses = self.loss.prepare(batch), self.loss.losses
+        batch, loss = batch.exclude("loc", "scale"), self.loss
+        fused = loss if isinstance(loss, FusedPPOLoss) else None
+        if fused is not None:
+            batch = fused.prepare(batch)
         found: Any = None
         for _ in range(self.config.epochs):
             for part in shuffled(batch).split(self.rows(batch)):
-                found = losses(part)
-                weighted = [loss for name, loss in found.items() if name.startswith("loss_")]
-                self.step(weighted, "policy", "critic")
+                if fused is not None:
+                    found = fused.gradients(part)
+                    self.move("policy", "critic")
+                else:
+                    found = loss(part)
+                    weighted = [value for name, value in found.items() if name.startswith("loss_")]
+                    self.step(weighted, "policy", "critic")
+        if fused is not None:
+            found = fused.summary(found)
         logged = {"critic_loss": "loss_critic", "kl": "kl_approx", "clip_fraction": "clip_fraction"}
         # Where the critic weighs nothing it has no loss.
         had = {name: key for name, key in logged.items() if key in found.keys()}

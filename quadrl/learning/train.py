@@ -106,7 +106,7 @@ class Training:
             network.to(device)
         self.algorithm = make_algorithm(config, self.env, self.actor, self.critic)
         self.advantages = GAE(
-            gamma=config.gamma, lmbda=config.gae_lambda, value_network=self.critic, average_gae=True
+            gamma=config.gamma, lmbda=config.gae_lambda, value_network=None, average_gae=True
         )
         self.iteration = 0
         self.seconds = 0.0  # of training, in all processes that worked on it
@@ -212,6 +212,7 @@ class Training:
                     present = self.actor.get_dist(batch)
                 batch["action_log_prob"] = present.log_prob(batch["action"])
             batch["next", "reward"] *= self.config.reward_scale
+            self._evaluate(batch)
             self.advantages(batch)
         flat = batch.select(*self.actor.in_keys, *self.critic.in_keys, *LEARNED_FROM)
         if self.config.memory == "none" and not self.algorithm.whole:
@@ -220,6 +221,18 @@ class Training:
         if not first:
             self._normalise(batch)
         return metrics | {"deviation": float(batch["scale"].mean())}
+
+    def _evaluate(self, batch: Any) -> None:
+        """Add the critic's values of all states and of those after them.
+
+        Within an episode the state after one is the next one, whose value is there already.
+        """
+        value = self.critic(batch)["state_value"]
+        ends = batch["next", "done"][..., 0].clone()
+        ends[:, -1] = True
+        after = torch.roll(value, -1, dims=1)
+        after[ends] = self.critic(batch["next"].select(*self.critic.in_keys)[ends])["state_value"]
+        batch["next", "state_value"] = after
 
     def _normalise(self, batch: Any) -> None:
         """Include a batch in the normalisers."""

@@ -297,6 +297,7 @@ def test_values_continue_at_truncation_and_not_at_termination(tmp_path):
         batch = TensorDict({"observation": observation}, [1, 2], names=[None, "time"])
         batch["next"] = TensorDict(after, [1, 2])
         with torch.no_grad():
+            training._evaluate(batch)
             training.advantages(batch)
         return batch["value_target"].flatten().tolist()
 
@@ -325,6 +326,9 @@ def test_the_critic_sees_the_last_observation_of_an_episode_not_the_next_first(t
     observation = environment.flatten(environment.reset())
     ends = 0
     for batch in seen:
+        training._evaluate(batch)
+        expected = training.critic(batch["next"].select("observation"))["state_value"]
+        torch.testing.assert_close(batch["next", "state_value"], expected)
         for t in range(TINY.rollout):
             row = batch[:, t]
             np.testing.assert_array_equal(row["observation"], observation)

@@ -146,11 +146,14 @@ def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
     monkeypatch.setattr(goals, "FLIGHTS", 5)
     monkeypatch.setattr(goals, "MANY", {})
     monkeypatch.setattr(goals, "TOGETHER", 2)
+    monkeypatch.setattr(goals, "PAIRS", 1)
     monkeypatch.setattr(goals, "TrainConfig", functools.partial(TrainConfig, steps=4096))
     monkeypatch.setattr(report, "RUNS", tmp_path)
     monkeypatch.setattr(goals, "SEEDS", (1,))
     goals.main()
     hover, waypoint = report.load("goals")["runs"]
+    updates = report.load("goals")["updates"]
+    assert set(updates) == set(goals.LOSSES) and all(took > 0 for took in updates.values())
     assert (hover["flights"], hover["failed"]) == (5, 5)  # one batch teaches nothing
     whole = fly(
         Policy.load(tmp_path / "goals" / "hover-ppo-1"),

@@ -168,15 +168,29 @@ def test_a_batch_of_two_dimensions_is_that_of_torchrl():
 def test_the_gradients_are_those_of_finite_differences(case):
     actor, critic, normalisers = networks(**CASES[case] | {"hidden": (3,), "critic_hidden": (3,)})
     loss = FusedPPOLoss(actor, critic)
-    part = dict(loss.prepare(batch_of(actor, normalisers, rows=7)).items())
-    part["policy"] = loss._policy.and_goal(part["policy"])
-    own, value = loss._policy.weights(), loss._value.weights()
+    part, count, weights = loss._given(loss.prepare(batch_of(actor, normalisers, rows=7)))
     bounds = torch.tensor([-0.1, 0.1]).double().unbind()
 
     def terms(*weights):
-        return Terms.apply(part, bounds, len(own), *weights)[:3]
+        return Terms.apply(part, bounds, count, *weights)[:3]
 
-    assert torch.autograd.gradcheck(terms, [w.detach().requires_grad_() for w in own + value])
+    assert torch.autograd.gradcheck(terms, [w.detach().requires_grad_() for w in weights])
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+@pytest.mark.parametrize("case", CASES)
+def test_the_gradients_without_a_graph_are_those_of_the_losses(case, settings):
+    actor, critic, normalisers = networks(**CASES[case])
+    loss, batch = FusedPPOLoss(actor, critic, **settings), batch_of(actor, normalisers)
+    found, expected = gradients(loss, batch.clone())
+    for parameter in loss.parameters():
+        parameter.grad = torch.full_like(parameter, 9.0)  # of an earlier step: replaced
+    said = loss.summary(loss.gradients(loss.prepare(batch)))
+    for name in found.keys() & said.keys():
+        assert_same(said[name].reshape(found[name].shape), found[name].detach())
+    for parameter, gradient in zip(loss.parameters(), expected, strict=True):
+        wanted = torch.zeros_like(parameter) if gradient is None else gradient
+        assert_same(parameter.grad, wanted)
 
 
 def test_its_graph_is_one_node_that_gives_no_second_derivative():
