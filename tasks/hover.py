@@ -34,7 +34,8 @@ class Hover(Task):
         "gae_lambda": 0.97,
         "steps": 204_800,
         "holds_goal": True,
-        "ppo": {"learning_rate": 1e-2},
+        # A training of 1000 gradient steps is too short for a memory of as many.
+        "ppo": {"learning_rate": 1e-2, "beta2": 0.99},
     }
     training_with = {
         "apg": {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, ClassVar
 
 from quadrl.validation import number
@@ -15,6 +16,7 @@ class AlgorithmConfig:
     training: ClassVar[dict[str, Any]] = {}
     """Settings of `TrainConfig` that have other defaults with this algorithm."""
     may_be_zero: ClassVar[tuple[str, ...]] = ("entropy", "critic", "damping")
+    largest: ClassVar[dict[str, float]] = {"beta2": 0.99999}
 
     def __post_init__(self) -> None:
         """Validate the numbers."""
@@ -24,7 +26,9 @@ class AlgorithmConfig:
             if isinstance(field.default, int):
                 checked = number(name, value, 1, whole=True)
             else:
-                checked = number(name, value, 0, positive=field.name not in self.may_be_zero)
+                high = self.largest.get(field.name, math.inf)
+                positive = field.name not in self.may_be_zero
+                checked = number(name, value, 0, high, positive=positive)
             object.__setattr__(self, field.name, checked)
 
 
@@ -34,6 +38,8 @@ class PPOConfig(AlgorithmConfig):
 
     learning_rate: float = 4e-3
     """Initial rate of Adam; it falls linearly to zero over the training."""
+    beta2: float = 0.999
+    """Share of Adam's mean of the squared gradients that a step leaves; below 1."""
     epochs: int = 5
     """Passes over each batch."""
     minibatch: int = 1024

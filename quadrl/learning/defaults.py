@@ -34,7 +34,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "holds_goal": False,  # in wind the goal is held with a tilt that the wind gives
         "gae_lambda": 0.95,
         "gamma": 0.95,  # with a shorter sight heavy aircraft begin to swing, and fall
-        "ppo": {"learning_rate": 4e-3},
+        "ppo": {"learning_rate": 4e-3, "beta2": 0.999},
         # Without it actions alternate between their ends on aircraft with quick rotors.
         "task_options": {"smoothness_weight": 10.0},
     },

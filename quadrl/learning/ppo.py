@@ -29,8 +29,14 @@ class PPO(Algorithm):
             entropy_coeff=config.entropy,
             critic_coeff=config.critic,
         )
-        self.add_optimiser("policy", actor.parameters(), config.learning_rate, fused=True)
-        self.add_optimiser("critic", critic.parameters(), config.learning_rate, fused=True)
+        for name, network in (("policy", actor), ("critic", critic)):
+            self.add_optimiser(
+                name,
+                network.parameters(),
+                config.learning_rate,
+                betas=(0.9, config.beta2),
+                fused=True,
+            )
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Epochs over minibatches."""

@@ -18,6 +18,7 @@ from scipy.stats import qmc
 
 from quadrl import tasks
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.defaults import merged
 from quadrl.learning.folder import EVALUATION
 from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
@@ -89,7 +90,8 @@ def planned(
         name: Of the settings.
     """
     fixed: dict[str, Any] = {"seed": seed, "num_threads": 1, "holds_goal": False}
-    config = TrainConfig(task, algo=algo, **{"steps": TASKS[task], **fixed, **chosen})
+    fixed["ppo"] = {"beta2": 0.999}  # as all of Adam is in the other two
+    config = TrainConfig(task, algo=algo, **merged({"steps": TASKS[task]}, fixed, chosen))
     words = (task, algo, *filter(None, [name]), str(seed))
     return PlannedRun(config, report.RUNS / where / "-".join(words), name)
 
