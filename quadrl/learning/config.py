@@ -160,6 +160,9 @@ class TrainConfig:
             settings["weather"] = dataclasses.asdict(given)
         if isinstance(given := settings.get("observe"), Observing):
             settings["observe"] = given.given()
+        if isinstance(given := settings.get("task_options"), dict):
+            usual = values["practice"]  # not in place of what is asked for
+            values["practice"] = {name: usual[name] for name in usual if name not in given}
         for name in PAIRS:
             if isinstance(settings.get(name), dict):
                 settings[name] = values[name] | settings[name]

@@ -30,7 +30,7 @@ from scripts.reports.report import Result, number, say, table
 SEEDS = (305, 306, 307, 308, 309)  # not used for tuning
 # The settings of these were changed after the policies of SEEDS had been flown.
 FRESH_SEEDS = {
-    ("hover", "ppo"): (345, 346, 347, 348, 349),
+    ("hover", "ppo"): (350, 351, 352, 353, 354),
     ("hover", "apg"): (340, 341, 342, 343, 344),
 }
 TASKS = {

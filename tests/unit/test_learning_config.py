@@ -178,6 +178,11 @@ def test_what_is_practised_may_be_wider_than_what_is_asked():
     way = np.linalg.norm(env.environment.goals() - env.environment.origin, axis=1)
     assert asked.farthest < way.max() <= practised.farthest
     assert config.resolved()["resolved_task"]["farthest"] == practised.farthest
+    asked = TrainConfig("random_waypoint", task_options={"farthest": 4})
+    assert asked.make_practice() == asked.make_task() == RandomWaypoint(farthest=4)
+    assert dataclasses.replace(asked, seed=3).make_practice() == asked.make_practice()
+    both = TrainConfig("random_waypoint", task_options={"farthest": 4}, practice={"farthest": 5})
+    assert both.make_practice().farthest == 5 and both.make_task().farthest == 4
     own = TrainConfig("random_waypoint", practice={"farthest": 2})
     assert own.make_practice().farthest == 2
     assert TrainConfig("random_waypoint", variant="robust").make_practice() == RandomWaypoint(
