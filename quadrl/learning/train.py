@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import os
 import time
 import warnings
@@ -159,6 +160,9 @@ class Training:
             torch.set_num_threads(1)
             log = Log(self.folder, self.iteration)
             stack.callback(log.close)
+            # All that the imports made is no garbage, and to look through it takes 5 % of the time.
+            gc.freeze()
+            stack.callback(gc.unfreeze)
             started = saved = time.perf_counter()
             before, batches = self.seconds, iter(collector)
             while self.iteration < config.iterations:
