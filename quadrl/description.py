@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.environment import Environment
+from quadrl.learning.defaults import own_settings
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
 
@@ -25,9 +26,9 @@ def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]
 
     Returns:
         name, asks, starts, ends, solved (texts); time_limit [s]; training: settings that have other
-        defaults with this task; observation: name, first, last, unit and meaning of each term of
-        the flat vector; action (text); reward: name, weight (None without an option of that name)
-        and meaning of each term; options: name, value and meaning of the others.
+        defaults with this task and PPO; observation: name, first, last, unit and meaning of each
+        term of the flat vector; action (text); reward: name, weight (None without an option of that
+        name) and meaning of each term; options: name, value and meaning of the others.
     """
     vehicle, texts = resolve(vehicle), docstrings(type(task))
     environment = Environment(task, vehicle=vehicle, seed=0)
@@ -36,7 +37,7 @@ def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]
     return {
         **{name: getattr(task, name) for name in ("name", "asks", "starts", "ends", "solved")},
         "time_limit": task.time_limit,
-        "training": task.training,
+        "training": own_settings(task),
         "observation": [
             {"name": name, "first": where.start, "last": where.stop - 1, "unit": term.unit,
              "meaning": term.meaning}

@@ -8,6 +8,7 @@ from typing import Any
 from quadrl import tasks
 from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
 from quadrl.randomization import RANDOMIZATIONS
+from quadrl.task import Task
 from quadrl.validation import choice, keys
 from quadrl.vehicle import VEHICLES
 
@@ -63,8 +64,7 @@ def training_defaults(
     """
     kind = tasks.TASKS[choice("task", task, tasks.TASKS)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
-    with_algo = kind.training_with.get(algo, {})
-    own = merged(kind.training, with_algo, shared, kind.variants.get(variant, {}))
+    own = merged(own_settings(kind, algo), shared, kind.variants.get(variant, {}))
     keys(f"training default of {task}", own, [name for name in base if name not in CHOSEN])
     values = merged(base, ALGORITHM_CONFIGS[algo].training, own)
     values |= {"task": task, "algo": algo}
@@ -79,6 +79,11 @@ def training_defaults(
         values["rollout"] = max(1, round(values["rollout"] * often))
         values["steps"] = round(values["steps"] * often)
     return values
+
+
+def own_settings(task: Task | type[Task], algo: str = "ppo") -> dict[str, Any]:
+    """Settings that have other defaults with a task and an algorithm."""
+    return merged(task.training, task.training_with.get(algo, {}))
 
 
 def merged(*settings: dict[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from quadrl import VEHICLES, cli, tasks
 from quadrl.cli.tasks import observation_rows, reward_rows, settings
 from quadrl.control import CONTROL_MODES
 from quadrl.description import describe, describe_action
+from quadrl.learning.defaults import own_settings
 from quadrl.vehicle import GRAVITY, Vehicle
 from scripts.reports.report import Parts, asked, table
 
@@ -33,7 +34,7 @@ def training_table() -> str:
     """What each task is trained with and what a policy must reach."""
     rows = []
     for name, task in tasks.TASKS.items():
-        words = " ".join(f"`{setting}`" for setting in settings(task.training))
+        words = " ".join(f"`{setting}`" for setting in settings(own_settings(task)))
         targets = "; ".join(f"{target.words}: {asked(target)}" for target in task.targets)
         rows.append((f"`{name}`", words, targets))
     return table(("task", "settings other than the defaults", "counts as trained"), rows)

@@ -12,6 +12,7 @@ import numpy as np
 from quadrl import tasks
 from quadrl.cli.tasks import settings
 from quadrl.description import describe
+from quadrl.learning.defaults import own_settings
 from quadrl.policy import SHIPPED
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle
@@ -151,7 +152,7 @@ def options(told: dict[str, Any]) -> str:
 
 def trained(name: str, task: Task) -> str:
     """Settings, what a policy must reach and what trainings reach, and their curves."""
-    own = " ".join(f"`{setting}`" for setting in settings(task.training))
+    own = " ".join(f"`{setting}`" for setting in settings(own_settings(task)))
     text = (
         f"`quadrl train {name}` trains with "
         + (f"{own} and otherwise " if own else "")
