@@ -28,7 +28,8 @@ TINY = TrainConfig(
 
 
 def changed(**settings) -> TrainConfig:
-    return dataclasses.replace(TINY, **settings)
+    other = {"practice": {}} if "task" in settings else {}  # hover's is no other task's
+    return dataclasses.replace(TINY, **other | settings)
 
 
 def train(config: TrainConfig, folder: Path, *, resume: bool = False) -> Path:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
+from PIL import Image
 
 from quadrl.card import wilson
 from quadrl.learning.figures import COLOURS, STYLE, learning_curves, read_metrics, save, trajectory
@@ -119,7 +120,8 @@ def draw(runs: list[PlannedRun], result: Result, folder: Path) -> None:
         if (task, algo) in groups:
             rollout = fly(Policy.load(groups[task, algo][0].folder), task, episodes=8)
             title = f"{task}, {LABELS[algo]}, first seed: 8 flights, mean action"
-            trajectory(rollout, title, folder / f"figure_{figure}_{task}_{algo}.png")
+            path = trajectory(rollout, title, folder / f"figure_{figure}_{task}_{algo}.png")
+            Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
     both = trials(result)
     axes = ("frequency [Hz]", "power of the body rate [rad²/s²/Hz]")
     lines({t.task: spectra(t) for t in both}, axes, folder / "smoothness.png", logarithmic=True)

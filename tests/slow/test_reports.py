@@ -147,6 +147,7 @@ def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
     monkeypatch.setattr(goals, "MANY", {})
     monkeypatch.setattr(goals, "TOGETHER", 2)
     monkeypatch.setattr(goals, "PAIRS", 1)
+    monkeypatch.setattr(goals, "FRESH_SEEDS", {})
     monkeypatch.setattr(goals, "TrainConfig", functools.partial(TrainConfig, steps=4096))
     monkeypatch.setattr(report, "RUNS", tmp_path)
     monkeypatch.setattr(goals, "SEEDS", (1,))

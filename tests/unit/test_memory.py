@@ -218,7 +218,7 @@ def test_a_minibatch_holds_as_many_transitions(memory):
 
 @pytest.mark.parametrize("algo", sorted(set(ALGORITHMS) - {"apg"}))
 def test_it_continues_bit_for_bit(tmp_path, algo):
-    config = dataclasses.replace(RECURRENT, algo=algo, task="target_following")
+    config = dataclasses.replace(RECURRENT, algo=algo, task="target_following", practice={})
     alone = train(config, tmp_path / "alone")
     # Checkpoints are those of the iteration before: at step 4 of an episode, and where all begin.
     stopped(config, tmp_path / "run", 2)
