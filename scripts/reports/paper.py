@@ -121,7 +121,7 @@ def draw(runs: list[PlannedRun], result: Result, folder: Path) -> None:
             rollout = fly(Policy.load(groups[task, algo][0].folder), task, episodes=8)
             title = f"{task}, {LABELS[algo]}, first seed: 8 flights, mean action"
             path = trajectory(rollout, title, folder / f"figure_{figure}_{task}_{algo}.png")
-            Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
+            Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
     both = trials(result)
     axes = ("frequency [Hz]", "power of the body rate [rad²/s²/Hz]")
     lines({t.task: spectra(t) for t in both}, axes, folder / "smoothness.png", logarithmic=True)
