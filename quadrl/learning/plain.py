@@ -10,7 +10,14 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from quadrl.learning.networks import Entries, HoldsGoal, Informed, MeanAndDeviation, Normaliser
+from quadrl.learning.networks import (
+    Entries,
+    HoldsGoal,
+    Informed,
+    MeanAndDeviation,
+    Normaliser,
+    Tanh,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +84,7 @@ def _plain(
     entries: Entries, normalisers: Any, layers: Any, held: HoldsGoal | None = None
 ) -> Plain | None:
     kinds = [type(module) for module in layers]
-    if kinds != [nn.Linear, nn.Tanh] * (len(kinds) // 2) + [nn.Linear]:
+    if kinds != [nn.Linear, Tanh] * (len(kinds) // 2) + [nn.Linear]:
         return None
     if any(type(module) is not Normaliser for module in normalisers):
         return None

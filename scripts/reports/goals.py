@@ -138,7 +138,7 @@ def goals() -> str:
         "algorithm",
         "seeds",
         "control steps",
-        "training",
+        "training, median and range",
         "failed flights, seed by seed",
     )
     head += ("error [mm]", "heading error [deg]")
