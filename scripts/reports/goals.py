@@ -30,7 +30,7 @@ from scripts.reports.report import Result, number, say, table
 SEEDS = (305, 306, 307, 308, 309)  # not used for tuning
 # The settings of these were changed after the policies of SEEDS had been flown.
 FRESH_SEEDS = {
-    ("hover", "ppo"): (350, 351, 352, 353, 354),
+    ("hover", "ppo"): (355, 356, 357, 358, 359),
     ("hover", "apg"): (340, 341, 342, 343, 344),
 }
 TASKS = {
@@ -130,7 +130,8 @@ def goals() -> str:
         took = [run["training_s"] for run in runs]
         failed = ", ".join(str(run["failed"]) for run in runs)
         seeds = f"{runs[0]['seed']} to {runs[-1]['seed']}"
-        cells = (seeds, f"{runs[0]['steps']:,}", f"{min(took):.1f} to {max(took):.1f} s")
+        time = f"{statistics.median(took):.1f} s ({min(took):.1f} to {max(took):.1f})"
+        cells = (seeds, f"{runs[0]['steps']:,}", time)
         cells += (f"{failed} of {runs[0]['flights']:,}", ", ".join(error), ", ".join(off))
         rows.append((f"`{task}`", algo, *cells))
     head = (
