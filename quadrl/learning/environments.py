@@ -13,6 +13,7 @@ from torchrl.data import Unbounded
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import STATE
+from quadrl.learning.plain import BehaviourPolicy, plain_policy
 from quadrl.learning.window import Moment, fly
 from quadrl.transition import Transition
 
@@ -92,9 +93,10 @@ def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
 
 def make_collector(env: QuadrotorEnv, actor: torch.nn.Module, frames: int) -> Collector:
     """TorchRL's collector of batches of `frames` steps, without what a training does not use."""
+    plain = plain_policy(actor)
     return Collector(
         env,
-        actor,
+        actor if plain is None else BehaviourPolicy(plain),
         frames_per_batch=frames,
         total_frames=-1,
         device=env.device,

@@ -7,7 +7,6 @@ loss with one node in its graph for both networks and all that lies between them
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,11 +18,17 @@ from torch.autograd.function import once_differentiable
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
-from quadrl.learning.networks import tanh_
-from quadrl.learning.plain import plain_policy, plain_value, rows
+from quadrl.learning.plain import (
+    LOG_2_PI,
+    backward,
+    forward,
+    mean_and_log_variance,
+    plain_policy,
+    plain_value,
+    rows,
+)
 from quadrl.policy import LOG_VARIANCE
 
-LOG_2_PI = math.log(2 * math.pi)
 USUAL: dict[str, Any] = {
     "loss_critic_type": "l2",
     # Without what costs time: a figure for the log, and the parameters as arguments.
@@ -49,37 +54,6 @@ def make_loss(actor: ProbabilisticActor, critic: TensorDictModule, **settings: A
 # ------------------------------------------------------------------- gradients by hand
 
 
-def forward(seen: Tensor, weights: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
-    """What each layer reads, and the output, all (n, ...).
-
-    Args:
-        seen: What the first layer reads, (n, inputs).
-        weights: Weights and biases of the layers in turn, with tanh between the layers.
-    """
-    values, output = [], seen
-    for weight, bias in zip(weights[::2], weights[1::2], strict=True):
-        if values:
-            tanh_(output)
-        values.append(output)
-        # The narrower of two factors first: that is quicker, here and in the backward.
-        if len(weight) < weight.shape[1]:
-            output = torch.addmm(bias[:, None], weight, output.t()).t()
-        else:
-            output = torch.addmm(bias, output, weight.t())
-    return values, output
-
-
-def backward(error: Tensor, values: Sequence[Tensor], weights: Sequence[Tensor]) -> list[Tensor]:
-    """Gradients of weights and biases in turn, from that of the output (n, outputs)."""
-    found: list[Tensor] = []
-    for value, weight in zip(reversed(values), reversed(weights[::2]), strict=True):
-        narrow = error.shape[1] <= value.shape[1]
-        found += [error.sum(0), error.t() @ value if narrow else (value.t() @ error).t()]
-        if value is not values[0]:
-            error = torch.ops.aten.tanh_backward(error @ weight, value)
-    return found[::-1]
-
-
 def terms(
     part: Mapping[str, Tensor], bounds: Sequence[Tensor], count: int, weights: Sequence[Tensor]
 ) -> tuple[tuple[Tensor, ...], tuple[Any, ...]]:
@@ -98,10 +72,7 @@ def terms(
     seen, action, advantage = (part[name] for name in ("policy", "action", "advantage"))
     size = action.shape[1]
     values, output = forward(seen, weights[:count])
-    mean, free = output[: len(action)].chunk(2, -1)
-    holds = len(output) > len(action)
-    if holds:
-        mean = mean - output[-1, :size]
+    mean, free = mean_and_log_variance(output, len(action))
     log_variance = free.clamp(*LOG_VARIANCE)
     off = action - mean
     by_mean = off * (-log_variance).exp()
@@ -114,6 +85,7 @@ def terms(
     entropy = 0.5 * (log_variance.sum(-1) + size * (1 + LOG_2_PI))
     critic_values, value = forward(part["value"], weights[count:])
     error = value[:, 0] - part["target"]
+    holds = len(output) > len(action)
     kept = values, critic_values, holds, slope, by_mean, square, free == log_variance, error
     return (torch.minimum(gain, clipped), entropy, error.square(), log_ratio), kept
 

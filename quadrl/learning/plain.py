@@ -1,12 +1,19 @@
-"""Networks that are plain layers: which of actor and critic are, and what they consist of."""
+"""Networks that are plain layers: which of actor and critic are, and quick passes through them.
+
+TorchRL's modules and autograd work for any network; for layers this small, what they do beside the
+arithmetic takes most of the time.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
@@ -17,7 +24,11 @@ from quadrl.learning.networks import (
     MeanAndDeviation,
     Normaliser,
     Tanh,
+    tanh_,
 )
+from quadrl.policy import LOG_VARIANCE
+
+LOG_2_PI = math.log(2 * math.pi)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,3 +108,81 @@ def _plain(
 def rows(tensor: Tensor) -> Tensor:
     """A tensor (..., k) as (n, k)."""
     return tensor.reshape(-1, tensor.shape[-1])
+
+
+# ------------------------------------------------------------------- passes
+
+
+def forward(seen: Tensor, weights: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
+    """What each layer reads, and the output, all (n, ...).
+
+    Args:
+        seen: What the first layer reads, (n, inputs).
+        weights: Weights and biases of the layers in turn, with tanh between the layers.
+    """
+    values, output = [], seen
+    for weight, bias in zip(weights[::2], weights[1::2], strict=True):
+        if values:
+            tanh_(output)
+        values.append(output)
+        # The narrower of two factors first: that is quicker, here and in the backward.
+        if len(weight) < weight.shape[1]:
+            output = torch.addmm(bias[:, None], weight, output.t()).t()
+        else:
+            output = torch.addmm(bias, output, weight.t())
+    return values, output
+
+
+def backward(error: Tensor, values: Sequence[Tensor], weights: Sequence[Tensor]) -> list[Tensor]:
+    """Gradients of weights and biases in turn, from that of the output (n, outputs)."""
+    found: list[Tensor] = []
+    for value, weight in zip(reversed(values), reversed(weights[::2]), strict=True):
+        narrow = error.shape[1] <= value.shape[1]
+        found += [error.sum(0), error.t() @ value if narrow else (value.t() @ error).t()]
+        if value is not values[0]:
+            error = torch.ops.aten.tanh_backward(error @ weight, value)
+    return found[::-1]
+
+
+def mean_and_log_variance(output: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Of the actions, (count, k), from a policy's output; the variance is not yet bounded.
+
+    Args:
+        output: (count, 2 * k), or with one row more: that of the goal, whose mean is taken away.
+        count: Of observations.
+    """
+    mean, free = output.chunk(2, -1)
+    if len(output) > count:
+        return mean[:count] - mean[-1], free[:count]
+    return mean, free
+
+
+class BehaviourPolicy(TensorDictModuleBase):
+    """Draws the actions of a plain policy, for a collector.
+
+    It gives the entries that the actor gives, without gradients and in two thirds of the time.
+    """
+
+    def __init__(self, plain: Plain) -> None:
+        """Fly with the weights of a network, as they are at each step."""
+        super().__init__()
+        self._plain = plain
+        self.in_keys = plain.entries
+        self.out_keys = ["loc", "scale", "action", "action_log_prob"]
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add mean, deviation and action (N, k), and the action's log-probability (N,)."""
+        seen, goal = self._plain.seen(tensordict), self._plain.goal()
+        count = len(seen)
+        _, output = forward(
+            seen if goal is None else torch.cat([seen, goal]), self._plain.weights()
+        )
+        mean, free = mean_and_log_variance(output, count)
+        log_variance = free.clamp(*LOG_VARIANCE)
+        deviation, noise = (0.5 * log_variance).exp(), torch.randn_like(mean)
+        log_probability = -0.5 * (noise.square() + log_variance + LOG_2_PI).sum(-1)
+        entries = mean, deviation, mean + deviation * noise, log_probability
+        for name, entry in zip(self.out_keys, entries, strict=True):
+            tensordict.set(name, entry)
+        return tensordict

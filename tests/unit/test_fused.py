@@ -1,4 +1,4 @@
-"""The fused loss of PPO against TorchRL's ClipPPOLoss."""
+"""The fused loss of PPO against TorchRL's, and the behaviour policy against its actor."""
 
 import copy
 import math
@@ -15,6 +15,7 @@ from quadrl.learning.algorithm_config import PPOConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import USUAL, FusedPPOLoss, Terms, make_loss
 from quadrl.learning.networks import make_actor_critic
+from quadrl.learning.plain import BehaviourPolicy, plain_policy
 from quadrl.learning.ppo import PPO
 from quadrl.policy import CLIP, LOG_VARIANCE
 
@@ -315,3 +316,41 @@ def test_a_memory_is_trained_through_the_loss_of_torchrl():
     assert metrics["critic_loss"] > 0 and metrics["kl"] != 0
     for parameter, old in zip(algorithm.parameters, before, strict=True):
         assert (parameter != old).any()
+
+
+# ------------------------------------------------------------------- what a collector flies with
+
+
+@pytest.mark.parametrize("case", [name for name in CASES if "privileged" not in CASES[name]])
+def test_the_behaviour_policy_gives_what_its_actor_gives(case):
+    actor, _, normalisers = networks(**CASES[case])
+    plain = plain_policy(actor)
+    assert plain is not None
+    behaviour, batch = BehaviourPolicy(plain), batch_of(actor, normalisers)
+    flown = behaviour(batch.select(*behaviour.in_keys))
+    assert set(flown.keys()) - set(behaviour.in_keys) == set(actor.out_keys)
+    expected = actor.get_dist(flown)
+    assert_same(flown["loc"], expected.base_dist.loc)
+    assert_same(flown["scale"], expected.base_dist.scale)
+    assert_same(flown["action_log_prob"], expected.log_prob(flown["action"]))
+    assert not flown["action"].requires_grad
+    with torch.no_grad():
+        for weight in plain.weights():
+            weight *= 1.1
+    again = behaviour(batch.select(*behaviour.in_keys))
+    assert_same(again["loc"], actor.get_dist(batch).base_dist.loc)  # its weights are the actor's
+
+
+def test_the_behaviour_policy_draws_from_the_normal_distribution():
+    actor, _, normalisers = networks()
+    plain = plain_policy(actor)
+    assert plain is not None
+    behaviour = BehaviourPolicy(plain)
+    rows = TensorDict({"observation": torch.ones(20_000, 22, dtype=torch.float64)}, [20_000])
+    flown = behaviour(rows)
+    drawn = (flown["action"] - flown["loc"]) / flown["scale"]
+    deviation = drawn.numel() ** -0.5
+    assert drawn.mean().abs() < 5 * deviation
+    assert (drawn.std() - 1).abs() < 5 * deviation
+    correlation = (drawn.T @ drawn / len(drawn)).fill_diagonal_(0)
+    assert correlation.abs().max() < 5 * len(drawn) ** -0.5
