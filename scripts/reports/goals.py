@@ -41,8 +41,6 @@ FLIGHTS = 1000
 MANY = {("random_waypoint", "ppo"): 10_000}
 TOGETHER = 1000  # flights in a batch
 PAIRS = 5  # trainings with each loss, in turn
-REPEATED = ("hover", "ppo"), ("hover", "apg")  # made again, for their wall clock
-REPEATS = 5
 LOSSES = ("fused_s", "usual_s")
 
 
@@ -70,21 +68,7 @@ def main(only: tuple[str, ...] = ()) -> None:
         {name: update_seconds(fused=name == "fused_s") for name in LOSSES} for _ in range(PAIRS)
     ]
     updates = {name: statistics.median(pair[name] for pair in took) for name in LOSSES}
-    repeated = {}
-    for task, algo in REPEATED:
-        configs = [TrainConfig(task, algo=algo, seed=seed) for seed in FRESH_SEEDS[task, algo]]
-        rounds = [[training_seconds(config) for config in configs] for _ in range(REPEATS)]
-        repeated[f"{task}-{algo}"] = [list(times) for times in zip(*rounds, strict=True)]
-    measured: Result = {"runs": found, "updates": updates, "repeated": repeated}
-    report.save("goals", {"command": "scripts/report goals"} | measured)
-
-
-def training_seconds(config: TrainConfig) -> float:
-    """Wall clock of a training that is made again: the same to the last bit."""
-    with tempfile.TemporaryDirectory() as folder:
-        training = Training(config, Path(folder) / "run")
-        training.run()
-    return training.seconds
+    report.save("goals", {"command": "scripts/report goals", "runs": found, "updates": updates})
 
 
 def update_seconds(*, fused: bool) -> float:
@@ -144,8 +128,6 @@ def goals() -> str:
         error = (number(1000 * run["position_error_m"], 2) for run in runs)
         off = [number(run["heading_error_deg"], 2) for run in runs if "heading_error_deg" in run]
         took = [run["training_s"] for run in runs]
-        if (task, algo) in REPEATED:
-            took = [statistics.median(times) for times in result["repeated"][f"{task}-{algo}"]]
         failed = ", ".join(str(run["failed"]) for run in runs)
         seeds = f"{runs[0]['seed']} to {runs[-1]['seed']}"
         time = f"{statistics.median(took):.1f} s ({min(took):.1f} to {max(took):.1f})"
@@ -163,12 +145,8 @@ def goals() -> str:
     head += ("error [mm]", "heading error [deg]")
     source = report.source(result | report.commits(result["runs"]))
     updates = result["updates"]
-    every = [seconds for times in result["repeated"]["hover-ppo"] for seconds in times]
     note = (
-        "Errors are means over all flights, also failed ones. Each training of hover was made "
-        f"{REPEATS} times more, in turn with the other seeds; its time is the median of these. "
-        f"Other work on the machine makes a training longer: the {len(every)} with PPO took "
-        f"{min(every):.1f} to {max(every):.1f} s. All updates of such a training "
+        "Errors are means over all flights, also failed ones. All updates of a training of hover "
         f"take PPO {updates['fused_s']:.1f} s of one processor, and {updates['usual_s']:.1f} s "
         "with TorchRL's own loss in place of the [fused one](training.md#a-trained-policy)."
     )
