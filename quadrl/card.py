@@ -1,4 +1,4 @@
-"""The robustness card: what policies stand, as numbers, tables and pictures."""
+"""The robustness card: what policies withstand, as numbers, tables and pictures."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def half_level(levels: Sequence[float], shares: Sequence[float | None]) -> float
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Card:
-    """What policies stand, beside each other; a table and pictures in a notebook."""
+    """What policies withstand, beside each other; a table and pictures in a notebook."""
 
     found: dict[str, Any]
     """As the JSON file has it: task, vehicle, seed, episodes, engine; `flown`, the names; by axis

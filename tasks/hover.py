@@ -40,6 +40,14 @@ class Hover(Task):
     training_with = {
         # Flights from the edge of what was practised fail more often.
         "ppo": {"practice": {"tilt": 0.3, "spin": 0.6}},
+        # Chosen by `scripts/report search`.
+        "vpg": {
+            "num_envs": 32,
+            "rollout": 8,
+            "gae_lambda": 0.95,
+            "holds_goal": False,
+            "vpg": {"learning_rate": 3.5e-3, "critic_rate": 1.4e-3},
+        },
         "apg": {
             "steps": 46_080,
             "num_envs": 80,

@@ -94,8 +94,7 @@ class QuadrotorEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None and not mask.all():
-            rows = mask.reshape(-1).cpu().numpy()
-            self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
+            self._begin(mask)
         elif not self._restored:
             self._observation = self.environment.flatten(self.environment.reset())
         flags = {name: torch.zeros(self.num_envs, 1, dtype=torch.bool) for name in DONE}
@@ -113,12 +112,13 @@ class QuadrotorEnv(EnvBase):
         some = bool(over.any() and not over.all())
         if not some or not all(isinstance(x, torch.Tensor) for x in values.values()):
             return super().maybe_reset(tensordict)
-        fresh = self._reset(TensorDict({"_reset": over}, batch_size=self.batch_size))
-        kept = values.keys() - set(fresh.keys()) | {"error"}
-        for name in kept:  # what a policy remembers (a recurrent state) ends with its episode
-            rows = over.reshape(-1, *[1] * (values[name].ndim - 1))
-            fresh.set(name, values[name].masked_fill(rows, 0))
-        return tensordict.update(fresh)
+        self._begin(over)
+        seen = self._seen()
+        for name, value in values.items():  # what a policy remembers ends with its episode, too
+            rows = over.reshape(-1, *[1] * (value.ndim - 1))
+            fresh = seen[name].to(value.device) if name in seen else value.masked_fill(rows, 0)
+            tensordict.set(name, fresh)
+        return tensordict
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._restored = False
@@ -141,15 +141,24 @@ class QuadrotorEnv(EnvBase):
     def _fly(self, action: torch.Tensor) -> Transition:
         return self.environment.step(action)
 
+    def _begin(self, over: torch.Tensor) -> None:
+        """Begin an episode of the aircraft of a mask (N, 1)."""
+        rows = over.reshape(-1).cpu().numpy()
+        self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
+
+    def _seen(self) -> dict[str, torch.Tensor]:
+        """What is observed now."""
+        seen = {"observation": torch.from_numpy(self._observation.copy())}
+        if (privileged := self.environment.privileged) is not None:
+            seen["privileged"] = torch.from_numpy(privileged.astype(np.float32))
+        if self._from_pixels:
+            seen["pixels"] = torch.from_numpy(self.render())
+        return seen
+
     def _pack(
         self, columns: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]
     ) -> TensorDictBase:
-        content: dict[str, Any] = {"observation": torch.from_numpy(self._observation.copy())}
-        content |= columns
-        if (privileged := self.environment.privileged) is not None:
-            content["privileged"] = torch.from_numpy(privileged.astype(np.float32))
-        if self._from_pixels:
-            content["pixels"] = torch.from_numpy(self.render())
+        content: dict[str, Any] = self._seen() | columns
         if terms:
             content["reward_terms"] = TensorDict(terms, batch_size=self.batch_size)
         packed = TensorDict(content, batch_size=self.batch_size)

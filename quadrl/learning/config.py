@@ -73,8 +73,8 @@ class TrainConfig:
     task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the task that differ from its defaults, such as time_limit=5."""
     practice: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the task in the training alone, such as farthest=3: who practises more than is
-    asked does not meet the edge of what was practised."""
+    """Options of the task in the training alone, such as farthest=3: a policy is weakest at the
+    edge of what it practised."""
     aerodynamics: str = ""
     """Effects of the air on the rotors: none, full, or names of single ones with commas between
     them; by default those of the aircraft."""

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Unbounded
 
+from quadrl import native
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import STATE
@@ -54,8 +55,9 @@ class RecordingEnv(QuadrotorEnv):
     """Aircraft whose steps are kept, for their derivatives."""
 
     def __init__(self, *given: Any, **settings: Any) -> None:
-        """Make the environments."""
+        """Make the environments, and compile the reverse of their flight where it is missing."""
         super().__init__(*given, **settings)
+        native.adjoint()
         self._moments: list[Moment] = []
 
     def taken(self) -> list[Moment]:

@@ -37,8 +37,8 @@ PANELS = {
     "error": ("error [m]", "orange"),
 }
 """Of a learning curve: column of metrics.csv, label and colour."""
-COLOURS = {"ppo": "blue", "trpo": "orange", "vpg": "green", "apg": "violet"}
-"""Of the algorithms; others get the remaining ones."""
+COLOURS = {"ppo": "blue", "trpo": "orange", "vpg": "green", "gae": "green", "apg": "violet"}
+"""Of the algorithms, of vpg also by the paper's word; others get the remaining ones."""
 CLOCKS = {
     "steps": ("control steps [thousands]", 1e-3),
     "seconds": ("wall clock of the training [s]", 1.0),

@@ -11,21 +11,14 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from quadrl.learning.networks import (
-    Entries,
-    HoldsGoal,
-    Informed,
-    MeanAndDeviation,
-    Normaliser,
-    Tanh,
-    tanh_,
-)
+from quadrl.learning.networks import Entries, HoldsGoal, Informed, MeanAndDeviation, Normaliser
 from quadrl.policy import LOG_VARIANCE
 
 LOG_2_PI = math.log(2 * math.pi)
@@ -95,7 +88,7 @@ def _plain(
     entries: Entries, normalisers: Any, layers: Any, held: HoldsGoal | None = None
 ) -> Plain | None:
     kinds = [type(module) for module in layers]
-    if kinds != [nn.Linear, Tanh] * (len(kinds) // 2) + [nn.Linear]:
+    if kinds != [nn.Linear, nn.Tanh] * (len(kinds) // 2) + [nn.Linear]:
         return None
     if any(type(module) is not Normaliser for module in normalisers):
         return None
@@ -131,6 +124,18 @@ def forward(seen: Tensor, weights: Sequence[Tensor]) -> tuple[list[Tensor], Tens
         else:
             output = torch.addmm(bias, output, weight.t())
     return values, output
+
+
+def tanh_(x: Tensor) -> Tensor:
+    """Hyperbolic tangent in place, without a gradient.
+
+    On a CPU it is NumPy's, which takes a sixth of the time of torch's.
+    """
+    if x.device.type != "cpu":
+        return x.tanh_()
+    array = x.numpy()
+    np.tanh(array, out=array)
+    return x
 
 
 def backward(error: Tensor, values: Sequence[Tensor], weights: Sequence[Tensor]) -> list[Tensor]:

@@ -33,9 +33,10 @@ FRESH_SEEDS = {
     ("hover", "ppo"): (355, 356, 357, 358, 359),
     ("hover", "apg"): (340, 341, 342, 343, 344),
 }
+PRECISE = ("hover", "static_waypoint", "random_waypoint")
 TASKS = {
-    "ppo": ("hover", "static_waypoint", "random_waypoint"),
-    "apg": ("hover", "static_waypoint", "random_waypoint", "target_following"),
+    "ppo": (*PRECISE, "straight_and_level", "target_following"),
+    "apg": (*PRECISE, "straight_and_level", "target_following"),
 }
 FLIGHTS = 1000
 MANY = {("random_waypoint", "ppo"): 10_000}

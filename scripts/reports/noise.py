@@ -1,4 +1,4 @@
-"""Whether noise in training makes policies stand wind, as the paper expects of stochastic ones.
+"""Whether noise in training makes policies withstand wind, as the paper expects.
 
 Hover is trained with and without noise of the state estimate, in calm air and in wind, and each
 policy flies in wind with its mean action and with actions that it draws.

@@ -10,6 +10,7 @@ import tyro
 from quadrl.benchmark import ALL_CORES, ONE_CORE
 from scripts.reports import (
     describe,
+    discount,
     examples,
     goals,
     ground,
@@ -30,8 +31,8 @@ from scripts.reports import (
 from scripts.reports.report import table
 
 MODULES = (
-    describe, examples, goals, ground, noise, paper, peers, reference, robust, robustness, scaling,
-    search, speed, step_size, task_pages, training,
+    describe, discount, examples, goals, ground, noise, paper, peers, reference, robust, robustness,
+    scaling, search, speed, step_size, task_pages, training,
 )  # fmt: skip
 
 

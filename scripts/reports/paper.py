@@ -113,7 +113,10 @@ def draw(runs: list[PlannedRun], result: Result, folder: Path) -> None:
         groups.setdefault((run.config.task, run.config.algo), []).append(run)
     for figure, task in enumerate(TASKS, 3):
         if runs_of := {a: groups[task, a] for a in LABELS if (task, a) in groups}:
-            metrics = {a: [read_metrics(r.folder / METRICS) for r in runs_of[a]] for a in runs_of}
+            metrics = {
+                LABELS[a].lower(): [read_metrics(run.folder / METRICS) for run in each]
+                for a, each in runs_of.items()
+            }
             path = folder / f"figure_{figure}_{task}.png"
             learning_curves(metrics, task, path, clocks=("steps",))
     for figure, task, algo in ((6, "static_waypoint", "ppo"), (7, "landing", "trpo")):
@@ -170,7 +173,7 @@ def lines(
 ) -> None:
     """Figures over something, a panel each, with the range of the seeds; dashed if sampled."""
     figure = Figure(figsize=(3.6 * len(panels), 3.3), layout="constrained")
-    colours = {LABELS[algo]: STYLE[name] for algo, name in COLOURS.items() if algo in LABELS}
+    colours = {label: STYLE[COLOURS[algo]] for algo, label in LABELS.items()}
     drawn = {}
     axes_of = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, (task, panel) in zip(axes_of, panels.items(), strict=True):

@@ -46,8 +46,9 @@ def test_defaults_are_the_tasks_own(tuned):
 
 def test_an_algorithm_has_its_own_defaults(tuned):
     # One step of the policy per batch: batches are smaller.
-    assert (TrainConfig(algo="vpg").num_envs, TrainConfig(algo="vpg").rollout) == (128, 8)
-    assert (TrainConfig().num_envs, TrainConfig().rollout) == (256, 16)
+    usual, plain = (TrainConfig("static_waypoint", algo=algo) for algo in ("ppo", "vpg"))
+    assert (plain.num_envs, plain.rollout) == (128, 8)
+    assert (usual.num_envs, usual.rollout) == (256, 16)
     assert TrainConfig("tuned", algo="vpg").num_envs == 32  # the task's goes first
     assert TrainConfig(algo="gae") == TrainConfig(algo="vpg")
 
