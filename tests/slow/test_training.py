@@ -161,8 +161,7 @@ def test_hover_is_learned_by_default(tmp_path, algo):
 def test_the_plain_policy_gradient_gets_better_at_hover(tmp_path):
     """It ends well or not, as the seed and the last bit of a sum have it, but it always learns.
 
-    Of seeds 0 to 23, 22 end with 1560 to 2050, and in the air in all of the episodes; one with
-    1300, one with 230. All of them begin with 4 to 28, of which the noise is a third.
+    Of 26 seeds, 22 succeed in at least 95 % of the episodes, three in 89 to 93 %, one in 48 %.
     """
     folder = train(TrainConfig("hover", algo="vpg"), tmp_path / "run")
     returns = [float(row["return"] or "nan") for row in metrics(folder)]
