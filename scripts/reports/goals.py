@@ -65,7 +65,8 @@ def main(only: tuple[str, ...] = ()) -> None:
     found = [trained(run) | flown(run) | {"commit": report.commit()} for run in runs]
     if only:
         found += report.others("goals", "runs", only)
-        found.sort(key=lambda run: list(TASKS).index(run["algo"]))
+        places = [(algo, task) for algo, names in TASKS.items() for task in names]
+        found.sort(key=lambda run: places.index((run["algo"], run["task"])))
     took = [
         {name: update_seconds(fused=name == "fused_s") for name in LOSSES} for _ in range(PAIRS)
     ]

@@ -79,7 +79,7 @@ def claim() -> str:
     took, solved, error = hover()
     cells = (
         "`quadrl train hover`",
-        f"{statistics.median(took):.0f} s ({min(took):.1f} to {max(took):.1f} s)",
+        f"{statistics.median(took):.1f} s ({min(took):.1f} to {max(took):.1f} s)",
         f"100 % of {result['episodes']} fresh episodes with {solved} of {len(took)} seeds",
         f"{min(error):.1g} to {max(error):.1g} mm",
     )
