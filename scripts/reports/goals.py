@@ -34,11 +34,8 @@ FRESH_SEEDS = {
     ("hover", "apg"): (340, 341, 342, 343, 344),
     ("random_waypoint", "ppo"): (375, 376, 377, 378, 379),
 }
-PRECISE = ("hover", "static_waypoint", "random_waypoint")
-TASKS = {
-    "ppo": (*PRECISE, "straight_and_level", "target_following"),
-    "apg": (*PRECISE, "straight_and_level", "target_following"),
-}
+AIRBORNE = ("hover", "static_waypoint", "random_waypoint", "straight_and_level", "target_following")
+TASKS = {"ppo": AIRBORNE, "apg": AIRBORNE}
 FLIGHTS = 1000
 MANY = {("random_waypoint", "ppo"): 10_000}
 TOGETHER = 1000  # flights in a batch
