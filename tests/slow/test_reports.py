@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 
 from quadrl import benchmark
+from quadrl.environment import Environment
 from quadrl.learning.config import TrainConfig
 from quadrl.policy import Policy
 from quadrl.randomization import Randomization
 from quadrl.rollout import fly, summarize
 from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
+from quadrl.tasks.hover import Hover
 from quadrl.vehicle import Vehicle
 from scripts.reports import (
     claims,
+    discount,
     evaluation,
     examples,
     goals,
@@ -170,6 +173,36 @@ def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
     again = report.load("goals")["runs"]
     assert again == [hover | {"commit": "later"}, waypoint]
     assert "| 5 of 5 |" in goals.goals()
+
+
+def test_both_rewards_of_hover_have_the_same_discounted_sum():
+    """The differences give w (phi_0 - gamma^T phi_T) more, whatever is done on the way."""
+    sums, ends = {}, {}
+    for task in (Hover(), discount.HoverIntegral()):
+        environment = Environment(task, num_envs=3, seed=4)
+        environment.reset()
+        ends[task.name] = [environment.snapshot.potentials.distance.copy()]
+        sums[task.name] = np.zeros(3)
+        for t in range(12):
+            given = environment.step(0.1 * np.ones((3, 4)))
+            assert not given.terminated.any()
+            sums[task.name] += discount.OWN**t * given.reward_terms["progress"]
+        ends[task.name].append(environment.snapshot.potentials.distance.copy())
+    first, last = ends["hover"]
+    assert ends["hover_integral"][1] == pytest.approx(last)
+    more = Hover.progress_weight * (first - discount.OWN**12 * last)
+    assert sums["hover"] - sums["hover_integral"] == pytest.approx(more, rel=1e-9)
+
+
+def test_rewards_of_hover_are_compared_over_the_seeds(monkeypatch):
+    monkeypatch.setattr(discount, "SEEDS", (1, 2))
+    monkeypatch.setattr(discount, "DISCOUNTS", (0.9,))
+    monkeypatch.setattr(discount, "BUDGETS", ({"steps": 4096},))
+    discount.main()
+    rows = report.load("discount")["rows"]
+    assert [row["reward"] for row in rows] == ["differences"] * 2 + ["integral"] * 2
+    assert len({row["position_error_m"] for row in rows}) == 4
+    assert discount.discount().count("| 4,096 | 0.01 | 0.9 | 1000, 1000 |") == 2
 
 
 def test_noise_in_training_is_judged_by_pairs(monkeypatch, tmp_path):
