@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import functools
 import hashlib
 import json
 import os
@@ -117,6 +118,8 @@ def test_ctrl_c_leaves_a_study_that_the_same_command_ends(alone, tmp_path):
     file.write_text(json.dumps(STUDY))
     command = [sys.executable, "-m", "quadrl", "study", str(file), "--jobs", "1"]
     given = {"cwd": tmp_path, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    # A shell that runs the tests in the background lets all that they start ignore Ctrl-C.
+    given["preexec_fn"] = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     first = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": search()}, **given)
     with once_begun(tmp_path / "runs/two/hover-ppo-0", lambda: first.send_signal(signal.SIGINT)):
         said, _ = first.communicate(timeout=PATIENCE)
