@@ -6,10 +6,16 @@ import dataclasses
 
 from quadrl.contact import touches_ground
 from quadrl.parameters import Parameters
-from quadrl.rng import Rng
+from quadrl.rng import Rng, hovering
 from quadrl.rotation import Array, namespace
 from quadrl.state import Start
 from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState
+
+# Practised from rest alone, some policies begin to swing on the way to a far waypoint, with the
+# rotors at their ends, and sink to the ground: in 0 to 28 of 30,000 flights, by the seed.
+IN_MOTION = {"tilt": 0.5, "speed": 1.0, "spin": 1.0, "smoothness_weight": 1.0}
+# Of the robust variant, which has a weight of its own.
+AT_REST = {"tilt": 0.0, "speed": 0.0, "spin": 0.0, "smoothness_weight": 10.0}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,26 +31,41 @@ class RandomWaypoint(Task):
         Target("success_rate", "successful", 0.99, True),
         Target("position_error_m", "error over the last 2 s", 0.06, unit="cm"),
     )
-    # Some of those that practise up to 2.5 m fail at its edge: 13, 44 and 9 of 10,000 flights with
-    # seeds 280 to 282. With practice up to 3 m fewer do: 0, 0, 0, 4 and 8 with seeds 375 to 379.
     training = {"steps": 3_276_800, "holds_goal": True, "practice": {"farthest": 3.0}}
-    training_with = {"apg": {"steps": 102_400, "holds_goal": False}}
-    variants = {"robust": {"steps": 4_096_000, "practice": {"farthest": 2.5}}}
+    training_with = {
+        "ppo": {"practice": IN_MOTION, "ppo": {"beta2": 0.99}},
+        "trpo": {"practice": IN_MOTION},
+        "apg": {"steps": 102_400, "holds_goal": False},
+    }
+    variants = {"robust": {"steps": 4_096_000, "practice": {"farthest": 2.5, **AT_REST}}}
 
     nearest: float = 1.0
     """Smallest distance of the waypoint from the start [m]."""
     farthest: float = 2.5
     """Largest distance of the waypoint from the start [m]."""
+    tilt: float = 0.0
+    """Largest tilt at the start [rad]."""
+    speed: float = 0.0
+    """Largest speed at the start [m/s]."""
+    spin: float = 0.0
+    """Largest body rate at the start [rad/s]."""
     max_distance: float = 5.0
     """Distance from the waypoint that ends the episode [m]."""
     tolerance: float = 0.1
     """Largest final error that counts as success [m]."""
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
-        """At rest at the origin, level, any heading."""
+        """At the origin, any heading; at rest and level, unless the options say otherwise."""
         goal = rng.vector(self.farthest, shortest=self.nearest)
         origin = namespace(goal).zeros_like(goal)
-        return rng.level_start(origin, parameters), TaskState(goal=goal)
+        start = Start(
+            position=origin,
+            quaternion=rng.attitude(self.tilt),
+            velocity=rng.vector(self.speed),
+            body_rate=rng.vector(self.spin),
+            rotor_speed=hovering(origin, parameters),
+        )
+        return start, TaskState(goal=goal)
 
     def terminated(self, now: Snapshot) -> Array:
         """Far away or on the ground."""

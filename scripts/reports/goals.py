@@ -32,7 +32,7 @@ SEEDS = (305, 306, 307, 308, 309)  # not used for tuning
 FRESH_SEEDS = {
     ("hover", "ppo"): (355, 356, 357, 358, 359),
     ("hover", "apg"): (340, 341, 342, 343, 344),
-    ("random_waypoint", "ppo"): (375, 376, 377, 378, 379),
+    ("random_waypoint", "ppo"): (380, 381, 382, 383, 384),
 }
 AIRBORNE = ("hover", "static_waypoint", "random_waypoint", "straight_and_level", "target_following")
 TASKS = {"ppo": AIRBORNE, "apg": AIRBORNE}

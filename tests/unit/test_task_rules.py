@@ -170,6 +170,15 @@ def test_random_waypoints_lie_in_their_shell():
     assert 2.49 < distance.max() <= 2.5
 
 
+@pytest.mark.parametrize(("tilt", "speed", "spin"), [(0.0, 0.0, 0.0), (0.5, 1.0, 2.0)])
+def test_flights_to_random_waypoints_may_begin_in_motion(tilt, speed, spin):
+    start, _, _ = drawn(tasks.make("random_waypoint", tilt=tilt, speed=speed, spin=spin), 1000)
+    leaning = 2 * np.arcsin(np.linalg.norm(start.quaternion[:, 1:3], axis=-1))
+    moving = (np.linalg.norm(part, axis=-1) for part in (start.velocity, start.body_rate))
+    for found, largest in zip((leaning, *moving), (tilt, speed, spin), strict=True):
+        assert 0.98 * largest <= found.max() <= largest + 1e-12
+
+
 def test_a_route_is_flown_in_order():
     route = ((0.0, 0.0, 0.1), (0.0, 0.0, 0.3), (0.0, 0.0, 2.0))
     task = tasks.make("static_waypoint", waypoints=route, reach=0.05)
