@@ -56,8 +56,10 @@ class Landing(Task):
         Target("touchdown_speed_median_m_s", "touchdown, median", 0.3, unit="m/s"),
     )
     training = {"gamma": 0.98, "steps": 2_621_440}
-    # Chosen by `scripts/report search`.
     training_with = {
+        # With the task's own weight, two of four policies come down before they have turned east.
+        "ppo": {"practice": {"attitude_weight": 60.0}, "ppo": {"beta2": 0.99}},
+        # Chosen by `scripts/report search`.
         "vpg": {
             "num_envs": 128,
             "rollout": 16,
