@@ -1,4 +1,4 @@
-"""The exceptions of quadrl: what the user can fix, keywords, the C part, and the renderer."""
+"""The exceptions of quadrl, for what the user can fix, keywords, C and renderer; and a warning."""
 
 from __future__ import annotations
 
@@ -37,3 +37,10 @@ class NativeError(QuadrlError, RuntimeError):
 
 class RenderingUnavailable(QuadrlError, RuntimeError):
     """Nothing can be drawn on this machine; simulation and training still work."""
+
+
+class QuadrlWarning(UserWarning):
+    """Something that the caller should know, although the work goes on; the message is one line.
+
+    The command line prints it as a line that begins with "quadrl: warning: ".
+    """

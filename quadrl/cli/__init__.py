@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Generator
 from importlib.metadata import version
 from pathlib import Path
@@ -32,7 +33,7 @@ from quadrl.cli.study import Study
 from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
 from quadrl.cli.view import View
-from quadrl.errors import QuadrlError
+from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.tasks import TASKS
 
 Command = (
@@ -69,7 +70,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"quadrl {__version__}, mujoco {version('mujoco')}, Python {sys.version.split()[0]}")
         return
     try:
-        with _terminated_in_order():
+        with _warned_in_a_line(stderr), _terminated_in_order():
             chosen = parse(words)
             console.own_files[:] = chosen.own
             for path in chosen.own:
@@ -90,6 +91,23 @@ def parse(words: list[str], *, enforced: bool = False) -> Quadrl:
     """What the words of a command line ask for; prints what is wrong with them and exits with 2."""
     rules = choices.registry(enforced)
     return tyro.cli(Quadrl, args=words, prog="quadrl", config=(DisallowNone,), registry=rules)
+
+
+@contextlib.contextmanager
+def _warned_in_a_line(stderr: Console) -> Generator[None]:
+    """Print each of quadrl's own warnings once, in one line; others are printed as Python does."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", QuadrlWarning)
+        usual = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+            if issubclass(category, QuadrlWarning):
+                stderr.print(f"quadrl: warning: {message}")
+            else:
+                usual(message, category, *where)
+
+        warnings.showwarning = show
+        yield
 
 
 @contextlib.contextmanager

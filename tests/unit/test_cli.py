@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import subprocess
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
@@ -16,7 +17,7 @@ from runs import contents, metrics
 import quadrl
 from quadrl import cli, tasks
 from quadrl.cli.flown import parse_options
-from quadrl.errors import QuadrlError
+from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.learning.config import TrainConfig
 from quadrl.vehicle import VEHICLES
 from quadrl.weather import Weather
@@ -612,3 +613,14 @@ def test_what_is_not_there(refusal, run):
         assert "nowhere" in refusal(*words, "nowhere")[1]
     assert refusal("evaluate", "--controller", "pid")[0].name == "controller"
     assert refusal("--import", "nowhere.py", "tasks")[0].name == "--import"
+
+
+def test_a_warning_of_quadrl_is_one_line(capsys, monkeypatch):
+    def warn(name):
+        warnings.warn("half of it is missing", QuadrlWarning, stacklevel=2)
+        warnings.warn("another library's", FutureWarning, stacklevel=2)
+
+    monkeypatch.setattr("quadrl.cli.evaluate.Evaluate.run", warn)
+    with pytest.warns(FutureWarning, match="another library's"):
+        assert command("evaluate", "hover") == 0
+    assert capsys.readouterr().err == "quadrl: warning: half of it is missing\n"
