@@ -52,17 +52,27 @@ class Disturbances:
         self._newest = np.zeros(1, np.int64)  # where in the queue
         self._delay = np.zeros(count, np.int64)  # [physics steps]
 
-    def begin(self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray) -> np.ndarray | None:
-        """Draw the aircraft of episodes (n,); their rows of parameters, unless all are the same."""
+    def of_episodes(self, keys: np.ndarray, episodes: np.ndarray) -> Array | None:
+        """What is drawn for episodes (n,), numbers (n, k); None where nobody looks at it."""
         if not self.active:
             return None
+        return self.draw.of(uniform(keys, episodes, PARAMETERS, 0, len(self.draw.names)))
+
+    def begin(
+        self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray, drawn: Array | None
+    ) -> None:
+        """Begin episodes (n,) with what `of_episodes` gave for them, the aircraft in their place.
+
+        Until the first command arrives, the rotors keep their speed.
+        """
+        if drawn is None:
+            return
         self.place[:, rows], self.steps[rows] = (keys, episodes), 0
-        shares = uniform(keys, episodes, PARAMETERS, 0, len(self.draw.names))
-        drawn = self.draw.of(shares)
         self.drawn = self.drawn.copy()
         self.drawn[rows] = drawn
         self._set_delay()
-        return self.draw.table(drawn) if self.draw.given.per_row else None
+        if self.late:
+            self._queue[:, rows] = self._engine.act[rows]
 
     def shown(self) -> dict[str, Array]:
         """What differs from aircraft to aircraft, (N,) by name."""
@@ -77,11 +87,6 @@ class Disturbances:
         if self.draw.given.wind == (1.0, 1.0):
             return None
         return weather.wind_speed * self.draw.columns(self.drawn[rows], "wind")[:, 0]
-
-    def started(self, rows: np.ndarray) -> None:
-        """Fill the queue: until the first command arrives the rotors keep their speed."""
-        if self.late:
-            self._queue[:, rows] = self._engine.act[rows]
 
     def passed_on(self, command: Array) -> Array:
         """What the rotors get for a physics step (N, R) [rad/s], after what is commanded."""
@@ -115,11 +120,10 @@ class Disturbances:
             QuadrlError: The message names the array.
         """
         numbers = saved["disturbances.drawn"]
-        newest, steps = (saved[f"disturbances.{name}"] for name in ("newest", "steps"))
+        newest = saved["disturbances.newest"]
         for name, value, within in (
             ("drawn", numbers, self.draw.may_give(numbers)),
             ("newest", newest, ((newest >= 0) & (newest < len(self._queue))).all()),
-            ("steps", steps, (steps >= 0).all()),
         ):
             if not within:
                 allowed = "of an environment with the same randomization"

@@ -120,38 +120,55 @@ class Environment(saving.Copied):
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         chosen = self._all if rows is None else validation.rows(rows, self.num_envs)
-        chosen, keys = seeds_of_rows(seed, chosen, self.num_envs)
-        self._keys[chosen], self._episodes[chosen] = keys, 0
+        self._keys, self._episodes = self._seeded(seed, chosen)
         return seed
 
+    def _seeded(self, seed: Seed, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Keys and numbers of the episodes of all (N,), with some rows (n,) seeded anew."""
+        chosen, own = seeds_of_rows(seed, rows, self.num_envs)
+        keys, episodes = self._keys.copy(), self._episodes.copy()
+        keys[chosen], episodes[chosen] = own, 0
+        return keys, episodes
+
     def reset(
-        self, rows: np.ndarray | None = None, start: Mapping[str, Any] | None = None
+        self,
+        rows: np.ndarray | None = None,
+        start: Mapping[str, Any] | None = None,
+        seed: Seed = None,
     ) -> Observation:
         """Begin an episode.
 
         Args:
             rows: Numbers (n,) or mask (N,) of the aircraft that begin one; None for all.
             start: Arrays (N, k) or (k,) by names of `quadrl.state.Start`, in place of the task's.
+            seed: Seeds those aircraft anew first, as `seed` does; None to go on with their seeds.
 
         Returns:
             The observation of those aircraft, terms (n, k).
 
         Raises:
             QuadrlError: A number of an aircraft that is not there, or one twice; or the task gives
-                arrays of the wrong shape, or the start is one that no aircraft can have.
+                arrays of the wrong shape, or the start is one that no aircraft can have. Nothing
+                has changed then.
         """
         rows = self._all if rows is None else validation.rows(rows, self.num_envs)
         if self._episode is None and len(rows) < self.num_envs:
             raise RuntimeError("the first reset must be of every aircraft")
-        place = self._keys[rows], self._episodes[rows]
-        seen = self._parameters
-        if (table := self.disturbances.begin(rows, *place)) is not None:
-            self.engine.write_parameters(rows, table)
+        if not len(rows):
+            return {name: np.zeros((0, at.stop - at.start)) for name, at in self.layout.items()}
+        seeds = (self._keys, self._episodes) if seed is None else self._seeded(seed, rows)
+        place = seeds[0][rows], seeds[1][rows]
+        drawn, table, seen = self.disturbances.of_episodes(*place), None, self._parameters
+        if drawn is not None and self.disturbances.draw.given.per_row:
+            table = self.disturbances.draw.table(drawn)
             if self._true:
                 seen = Parameters.of(table, self._clock.control_timestep)
-        drawn, task_state = self.task.begin(Rng(*place), seen)
-        state = self.engine.place(rows, drawn.replaced(start or {}, rows, self.num_envs))
-        self.disturbances.started(rows)
+        begun, task_state = self.task.begin(Rng(*place), seen)
+        # Up to here nothing is written, and `place` refuses before it writes.
+        begun = begun.replaced(start or {}, rows, self.num_envs)
+        state = self.engine.place(rows, begun, table)
+        self._keys, self._episodes = seeds
+        self.disturbances.begin(rows, *place, drawn)
         if self.blowing:
             self.blowing.begin(rows, *place, self.disturbances.wind_speed(rows, self.weather))
         now, episode = transition.begin(self.task, state, task_state, seen, self.action_size)
@@ -225,6 +242,7 @@ class Environment(saving.Copied):
         self._action[:] = validation.action(action, (self.num_envs, self.action_size))
         if self.blowing:
             self.blowing.advance()
+        self.engine.check_air()
         self._setpoint = self.control_mode.setpoint(self.engine.state, self._action)
         if self.disturbances.active:
             self.disturbances.begin_step()

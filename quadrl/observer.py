@@ -107,7 +107,8 @@ class Observer:
         if self.frame is not None:
             first = self._coordinates.ctypes.data
             places = [first, first + 7 * 8, first + 13 * 8, engine.origin.ctypes.data]
-            places += [self._limits.ctypes.data, self._coordinates.shape[1], 0]
+            places += [self._limits.ctypes.data, engine.air.ctypes.data]
+            places += [self._coordinates.shape[1], 0]
             places += [self.frame.columns, rotors]
             self._seen_rows = np.array(places)  # as `Rows` in native/state.c
         self.observation: dict[str, Array] = {}

@@ -55,10 +55,12 @@ def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray,
         count: Number of all rows.
 
     Raises:
-        QuadrlError: A seed is no whole number from 0 to `MAX_SEED`, or there are not `count` seeds.
+        QuadrlError: The seed of a row would be no whole number from 0 to `MAX_SEED`, or there are
+            not `count` seeds.
     """
     if not isinstance(seed, (list, tuple, np.ndarray)):
-        return rows, check_seed(seed) + rows
+        # The last row has a seed, too.
+        return rows, number("seed", seed, 0, MAX_SEED - (count - 1), whole=True) + rows
     if len(seed) != count:
         allowed = f"a whole number, or a sequence of {count}"
         raise QuadrlError(name="seed", value=seed, allowed=allowed)

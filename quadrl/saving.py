@@ -9,12 +9,17 @@ import numpy as np
 from quadrl import records
 from quadrl.compiled import MOMENT
 from quadrl.errors import QuadrlError
+from quadrl.rng import MAX_SEED
 from quadrl.task import Snapshot
 
 if TYPE_CHECKING:
     from typing import Self
 
     from quadrl.environment import Environment
+
+
+MOST_STEPS = 2.0**53
+"""Whole numbers up to here are exact in double precision."""
 
 
 class Copied:
@@ -75,9 +80,10 @@ def _check_sound(
     """
     table, disturbances = "engine.parameters", environment.disturbances
     for name in own:
-        begins = name.startswith(("disturbances.", "observer."))
-        if (begins or name == "engine.rows") and not np.isfinite(saved[name]).all():
+        begins = name.startswith(("disturbances.", "observer.", "episode."))
+        if (begins or name in ("engine.rows", *MOMENT)) and not np.isfinite(saved[name]).all():
             raise QuadrlError(name=name, value=saved[name], allowed="finite")
+    _check_counters(environment, saved)
     if disturbances.active:
         disturbances.check_saved(saved)
     drawn = disturbances.draw.given.per_row and disturbances.draw.holds(saved[table])
@@ -86,24 +92,51 @@ def _check_sound(
         raise QuadrlError(reason, name=table, value=saved[table], allowed="this aircraft's")
 
 
+def _check_counters(environment: Environment, saved: dict[str, np.ndarray]) -> None:
+    """Refuse seeds and numbers that no environment counts to, or that contradict each other.
+
+    Raises:
+        QuadrlError: The message names the array.
+    """
+    for name in ("keys", "episodes", "disturbances.place", "weather.streams"):
+        if name in saved and not ((saved[name] >= 0) & (saved[name] <= MAX_SEED)).all():
+            allowed = f"whole numbers from 0 to {MAX_SEED}"
+            raise QuadrlError(name=name, value=saved[name], allowed=allowed)
+    steps = saved["episode.steps"]
+    if not ((steps >= 0) & (steps <= MOST_STEPS) & (steps % 1 == 0)).all():
+        allowed = f"whole numbers from 0 to {MOST_STEPS:.0f}"
+        raise QuadrlError(name="episode.steps", value=steps, allowed=allowed)
+    counted = {"time": steps * environment.vehicle.control_timestep, "disturbances.steps": steps}
+    for name, expected in counted.items():
+        if name in saved and not np.array_equal(saved[name], expected):
+            allowed = "that of episode.steps, which was saved beside it"
+            raise QuadrlError(name=name, value=saved[name], allowed=allowed)
+
+
 def restore(environment: Environment, saved: dict[str, np.ndarray]) -> Snapshot:
     """Take up what `save` gave; returns the snapshot of that moment.
 
     Raises:
         QuadrlError: It is not of such an environment; nothing has changed then.
     """
-    if environment._episode is None:
+    if fresh := environment._episode is None:
         environment.reset()  # makes the records, which are filled below
         environment._episodes[:] = 0  # this episode does not count
-    own = save(environment)
-    records.check_alike(saved, own)
-    _check_sound(environment, saved, own)
-    if blowing := environment.blowing:
-        blowing.check(saved)
-        blowing.restore(saved)
-    elif "weather.table" in saved:
-        reason = "the state was saved in wind"
-        raise QuadrlError(reason, name="weather", value=None, allowed="the saved one's")
+    try:
+        own = save(environment)
+        records.check_alike(saved, own)
+        _check_sound(environment, saved, own)
+        if environment.blowing:
+            environment.blowing.check(saved)
+        elif "weather.table" in saved:
+            reason = "the state was saved in wind"
+            raise QuadrlError(reason, name="weather", value=None, allowed="the saved one's")
+    except QuadrlError:
+        if fresh:
+            environment._episode = None
+        raise
+    if environment.blowing:
+        environment.blowing.restore(saved)
     engine = environment.engine
     engine.restore({key.removeprefix("engine."): saved[key] for key in saved})
     environment._keys[:], environment._episodes[:] = saved["keys"], saved["episodes"]

@@ -222,6 +222,7 @@ class WeatherProcess:
         """
         table, fixed = saved["weather.table"], slice(0, len(FIXED))
         same = self._varied or np.array_equal(table[fixed], self._table[fixed])
+        same &= np.array_equal(table[ROWS.index("steps")], saved["episode.steps"])
         if not (same and np.isfinite(table).all()):
             reason = "the state was saved in another weather"
             raise QuadrlError(reason, name="weather.table", value=table, allowed="this weather's")

@@ -63,7 +63,8 @@ class Engine(abc.ABC):
         self._free_flight = FreeFlight(self.model, fields, threads) if name != "mujoco" else None
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
-        self._kernel = native.library().quadrl_state
+        library = native.library()
+        self._kernel, self._first_unsound = library.quadrl_state, library.quadrl_unsound_air
         self._use_parameters()
 
     @property
@@ -82,7 +83,7 @@ class Engine(abc.ABC):
         if self._free_flight is not None:
             self._free_flight.use(self.parameters)
         self._limits = parameters.limits(self.parameters)
-        arrays = (self.qpos, self.qvel, self.act, self.origin, self._limits)
+        arrays = (self.qpos, self.qvel, self.act, self.origin, self._limits, self.air)
         stride = self._limits.shape[1] if len(self._limits) > 1 else 0
         # As `Rows` in native/state.c.
         self._rows = np.array(
@@ -161,44 +162,71 @@ class Engine(abc.ABC):
         self.clear(rows)
         self.air[rows] = air
         self._write(rows, State.of_table(table[:, rows]))
+        self._check_parameters(rows)
         return broken
 
-    def place(self, rows: np.ndarray, start: Start) -> State:
+    def _check_parameters(self, rows: np.ndarray) -> None:
+        """Refuse parameters that are not finite, with which aircraft diverge at every step."""
+        table = self.parameters if len(self.parameters) == 1 else self.parameters[rows]
+        for name in parameters.AIRCRAFT.names or ():
+            if not np.isfinite(table[name].copy().view(np.float64)).all():
+                value = table[name].tolist()
+                raise QuadrlError(
+                    name=f"engine.parameters[{name!r}]", value=value, allowed="finite"
+                )
+
+    def check_air(self) -> None:
+        """Refuse air that is not finite: what is written to `wind` and `air` is not checked there.
+
+        Raises:
+            QuadrlError: The message names the aircraft.
+        """
+        if (row := self._first_unsound(self._address, self.num_envs)) >= 0:
+            blows = not np.isfinite(self.wind[row]).all()
+            name, array = ("wind", self.wind) if blows else ("air", self.air)
+            value = array[row].tolist()
+            raise QuadrlError(name=f"engine.{name}[{row}]", value=value, allowed="finite")
+
+    def place(self, rows: np.ndarray, start: Start, table: np.ndarray | None = None) -> State:
         """Put aircraft where an episode begins, in calm air.
 
         Args:
             rows: Which aircraft, (n,).
             start: Arrays (n, k).
+            table: Parameters (n,) that they get; None for those that they have.
 
         Returns:
             The state of those aircraft.
 
         Raises:
-            QuadrlError: The start is what `read` calls diverged.
+            QuadrlError: The start is what `read` calls diverged; nothing has changed then.
         """
+        self._check_start(rows, start, table)
+        if table is not None:
+            self.write_parameters(rows, table)
         self.clear(rows)
         self._write(rows, start)
-        if self._fill(rows):
-            self._refuse(rows, start)
+        self._fill(rows)
         if len(rows) == self.num_envs:
             return self.state
         return State.of_table(self.frames[0].table[:, rows])
 
-    def _refuse(self, rows: np.ndarray, start: Start) -> None:
-        """Say what is wrong with a start."""
-        own = self._limits if len(self._limits) == 1 else self._limits[rows]
-        names = ("velocity", "body_rate", "quaternion", "rotor_speed")
-        fastest = dict(zip(names, own.min(axis=0), strict=False))
-        for name in names:
-            part, limit = getattr(start, name), fastest.get(name, mujoco.mjMAXVAL)
-            if not ((np.abs(part) < mujoco.mjMAXVAL).all() and (norm(part) <= limit).all()):
-                break
-        else:  # with the height of the origin added
-            name, part, limit = "position", start.position, mujoco.mjMAXVAL
+    def _check_start(self, rows: np.ndarray, start: Start, table: np.ndarray | None) -> None:
+        """Refuse a start that the step does not resolve: by the rules of native/state.c."""
+        limits = self._limits if table is None else parameters.limits(table)
+        limits = limits if len(limits) in (1, len(rows)) else limits[rows]
+        most = np.array([mujoco.mjMAXVAL])
         step = f"a physics_timestep shorter than {self.vehicle.physics_timestep} s resolves more"
-        allowed = f"finite, and at most {limit:g}"
-        advice = step if name in fastest else ""
-        raise QuadrlError(advice, name=f"{name} at the start", value=part, allowed=allowed)
+        for name, part, limit, advice in (
+            ("velocity", start.velocity, limits[:, 0], step),
+            ("body_rate", start.body_rate, limits[:, 1], step),
+            ("quaternion", start.quaternion, most, ""),
+            ("rotor_speed", start.rotor_speed, most, ""),
+            ("position", start.position + self.origin, most, ""),
+        ):
+            if not ((np.abs(part) < most).all() and (norm(part) <= limit).all()):
+                value, allowed = getattr(start, name), f"finite, and at most {limit.min():g}"
+                raise QuadrlError(advice, name=f"{name} at the start", value=value, allowed=allowed)
 
     @abc.abstractmethod
     def save(self) -> dict[str, np.ndarray]:

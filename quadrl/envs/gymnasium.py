@@ -110,10 +110,9 @@ class QuadrotorEnv(_Shared, gym.Env):
 
         Options are arrays of the start, by names of `quadrl.state.Start`: {"position": (0, 0, 1)}.
         """
-        if seed is not None:
-            self.environment.seed(seed)
+        begun = self.environment.reset(start=options, seed=seed)
         super().reset(seed=seed)
-        observation = self.environment.flatten(self.environment.reset(start=options))[0]
+        observation = self.environment.flatten(begun)[0]
         return observation, {name: value[0] for name, value in told(self.environment).items()}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, Info]:
@@ -176,9 +175,7 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         if rows.dtype != bool or rows.shape != (self.num_envs,) or not rows.any():
             allowed = f"an array of {self.num_envs} bool, at least one of them True"
             raise QuadrlError(name="reset_mask", value=rows, allowed=allowed)
-        if seed is not None:
-            self.environment.seed(seed, rows)
-        self._begin(rows, start)
+        self._begin(rows, start, seed)
         return self._observation.copy(), _masked(told(self.environment), rows)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Info]:
@@ -206,9 +203,10 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
             info |= _masked(told(self.environment), np.ones(self.num_envs, dtype=bool))
         return self._observation.copy(), reward, terminated, truncated, info
 
-    def _begin(self, rows: Array, start: Info | None = None) -> None:
+    def _begin(self, rows: Array, start: Info | None = None, seed: Seed = None) -> None:
         """Begin an episode in some rows (N,) bool."""
-        self._observation[rows] = self.environment.flatten(self.environment.reset(rows, start))
+        begun = self.environment.reset(rows, start, seed)
+        self._observation[rows] = self.environment.flatten(begun)
         self._resting = self._resting & ~rows
 
     def render(self) -> tuple[Array, ...] | None:

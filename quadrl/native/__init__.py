@@ -182,8 +182,10 @@ def load(path: Path) -> ctypes.CDLL:
     for name, kind in _KINDS.items():
         setattr(opened, name, ctypes.cast(getattr(opened, f"quadrl_{name}"), kind))
     integer = ctypes.c_int64
-    opened.quadrl_state.restype = opened.quadrl_free_flight.restype = integer
+    for kernel in (opened.quadrl_state, opened.quadrl_unsound_air, opened.quadrl_free_flight):
+        kernel.restype = integer
     opened.quadrl_state.argtypes = [_POINTER, integer, _POINTER, _POINTER]
+    opened.quadrl_unsound_air.argtypes = [_POINTER, integer]
     opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
     opened.quadrl_uniform.restype = opened.quadrl_weather.restype = None
     opened.quadrl_weather.argtypes = [_POINTER, integer, _POINTER, integer]

@@ -14,10 +14,10 @@
 static int is_sound(double x) { return fabs(x) < 1e10; }  // mjMAXVAL; false for NaN
 
 // Where the rows of a simulation are. qpos (7), qvel (6) and act (one per rotor) of aircraft i stand
-// at i * stride doubles, its largest speed [m/s] and spin [rad/s] at i * limit_stride (0: all the
-// same). Filled by quadrl/engines.
+// at i * stride doubles, and so does its air (AIR numbers); its largest speed [m/s] and spin [rad/s] at
+// i * limit_stride (0: all the same). Filled by quadrl/engines.
 typedef struct {
-  const double *qpos, *qvel, *act, *origin, *limits;
+  const double *qpos, *qvel, *act, *origin, *limits, *air;
   int64_t stride, limit_stride, columns, rotors;
 } Rows;
 
@@ -78,4 +78,15 @@ QUADRL_EXPORT int64_t quadrl_state(const Rows* rows, int64_t n, const int64_t* i
     broken += !sound;
   }
   return broken;
+}
+
+// The first of n aircraft whose air holds a number that is not finite; -1 where there is none.
+QUADRL_EXPORT int64_t quadrl_unsound_air(const Rows* rows, int64_t n) {
+  for (int64_t i = 0; i < n; ++i) {
+    const double* air = rows->air + i * rows->stride;
+    int sound = 1;
+    for (int k = 0; k < AIR; ++k) sound &= isfinite(air[k]) != 0;
+    if (!sound) return i;
+  }
+  return -1;
 }
