@@ -151,6 +151,8 @@ class Environment(saving.Copied):
                 arrays of the wrong shape, or the start is one that no aircraft can have. Nothing
                 has changed then.
         """
+        if self.engine.forked:
+            self.make_anew()
         rows = self._all if rows is None else validation.rows(rows, self.num_envs)
         if self._episode is None and len(rows) < self.num_envs:
             raise RuntimeError("the first reset must be of every aircraft")
@@ -239,6 +241,8 @@ class Environment(saving.Copied):
         """First half of a step: the commands to the rotors, or the setpoint of the loops."""
         if self._episode is None:
             raise RuntimeError("call reset before the first step")
+        if self.engine.forked:
+            self.make_anew()
         self._action[:] = validation.action(action, (self.num_envs, self.action_size))
         if self.blowing:
             self.blowing.advance()

@@ -35,6 +35,10 @@ class Copied:
         """For pickle and deepcopy: how it was made, and all that the next steps depend on."""
         return self._made_with, self._keys, self._episodes, self.save() if self._episode else None
 
+    def make_anew(self) -> None:
+        """Take the place of itself: all that is live, such as `engine.wind`, is another array."""
+        self.__setstate__(self.__getstate__())
+
     def __setstate__(self: Any, state: Any) -> None:
         """Make it anew and take up where the other was."""
         (args, kwargs), keys, episodes, saved = state

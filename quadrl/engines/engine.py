@@ -35,6 +35,7 @@ class Engine(abc.ABC):
     air: np.ndarray  # (N, AIR) rows of air; saved and restored with the rest
     wind: np.ndarray  # (N, 3) [m/s], world frame: the first numbers of `air`
     parameters: np.ndarray  # (N,) rows, or (1,) where all are the same
+    forked = False  # whether it is of the process that this one was forked from, as its threads are
 
     def __init__(
         self,

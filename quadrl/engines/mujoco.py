@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
+import os
+import weakref
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +26,19 @@ __all__ = ["ENGINES", "BatchEngine", "DataEngine", "Engine", "EngineName", "make
 
 MAX_ENVS = 1 << 20
 MAX_THREADS = 1024
+_BATCHES: weakref.WeakSet[BatchEngine] = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    """In a forked process: its engines have no threads, and wait for them for ever."""
+    for engine in list(_BATCHES):
+        engine.forked = True
+        # Never freed here: that would join the threads, too.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(engine.batch))
+    _BATCHES.clear()
+
+
+os.register_at_fork(after_in_child=_after_fork)
 
 
 class BatchEngine(Engine):
@@ -57,6 +73,7 @@ class BatchEngine(Engine):
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._fresh = self.batch.state[0].copy()
         self._per_row = per_row
+        _BATCHES.add(self)
         fields = {name: self.batch.bind(name) for name in FIELDS}
         super().__init__(vehicle, fields, altitude, engine, self.batch.nthread)
 
@@ -68,7 +85,13 @@ class BatchEngine(Engine):
 
         Raises:
             NativeError: The rotor callbacks were taken away.
+            QuadrlError: It is of the process that this one was forked from.
         """
+        if self.forked:
+            raise QuadrlError(
+                "the engine was made before this process was forked, and its threads are not here: "
+                "make it in this process, or start processes by spawn"
+            )
         near = None
         if self._free_flight and (near := self._free_flight.advance(steps)) is None:
             return
