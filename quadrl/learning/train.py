@@ -14,7 +14,7 @@ import os
 import time
 import warnings
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,20 @@ def make_device(name: str) -> torch.device:
     return device
 
 
+@contextlib.contextmanager
+def one_thread() -> Generator[None]:
+    """Let torch calculate with one thread, so that no bit depends on how many cores there are.
+
+    Networks this small gain nothing from a second thread, and lose a lot when a core is busy.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 @dataclasses.dataclass
 class Progress:
     """The state of a training after an iteration."""
@@ -86,6 +100,7 @@ class Progress:
 class Training:
     """A run in its folder."""
 
+    @one_thread()  # the first weights are numbers, too
     def __init__(self, config: TrainConfig, folder: Path, *, resume: bool = False) -> None:
         """Make everything that learns; then make the folder, or load its checkpoint.
 
@@ -135,6 +150,7 @@ class Training:
         """Control steps of all aircraft so far."""
         return self.iteration * self.config.num_envs * self.config.rollout
 
+    @one_thread()
     def run(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> Policy:
         """Train to the end, and save the policy.
 
@@ -154,10 +170,6 @@ class Training:
             collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
             stack.callback(collector.shutdown, close_env=False)
             self._set_generators()
-            # Networks this small gain nothing from a second thread and lose a lot when a core is
-            # busy, and with one the results are the same on any number of cores.
-            stack.callback(torch.set_num_threads, torch.get_num_threads())
-            torch.set_num_threads(1)
             log = Log(self.folder, self.iteration)
             stack.callback(log.close)
             # All that the imports made is no garbage, and to look through it takes 5 % of the time.

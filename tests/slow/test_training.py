@@ -42,6 +42,47 @@ def test_several_seeds(tmp_path, monkeypatch, capsys):
     assert trained[0] == trained[1]  # whatever was trained before it
 
 
+# ------------------------------------------------------------------- on any number of cores
+
+ALIKE = {
+    "as it is": {},
+    "on one core": {"cores": 1},
+    "one thread of OpenMP": {"OMP_NUM_THREADS": "1"},
+    "four threads of OpenMP, another hash seed": {"OMP_NUM_THREADS": "4", "PYTHONHASHSEED": "7"},
+    "one thread of MKL": {"MKL_NUM_THREADS": "1"},
+}
+TRAIN = """
+import os, sys
+from quadrl.cli import main
+cores = int(sys.argv[1])
+if cores and hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+main(["train", "hover", "--seed", "1733", "--steps", "8192", "--episodes", "3", "--no-video",
+      "--out", sys.argv[2]])
+"""
+
+
+def test_the_same_command_gives_the_same_policy_on_any_number_of_cores(tmp_path):
+    running = []
+    for k, settings in enumerate(ALIKE.values()):
+        own = {name: value for name, value in settings.items() if name != "cores"}
+        words = [sys.executable, "-c", TRAIN, str(settings.get("cores", 0)), str(tmp_path / f"{k}")]
+        running.append(subprocess.Popen(words, env=os.environ | own, stdout=subprocess.DEVNULL))
+    assert [process.wait(300) for process in running] == [0] * len(ALIKE)
+    study = {"tasks": ["hover"], "seeds": [1733], "episodes": 3, "settings": {"steps": 8192}}
+    quadrl.study(study, out=tmp_path / "study", jobs=1, on_line=lambda line: None)
+    folders = [*(tmp_path / f"{k}" for k in range(len(ALIKE))), tmp_path / "study/hover-ppo-1733"]
+    first, *others = ((f / "policy.safetensors").read_bytes() for f in folders)
+    assert [content == first for content in others] == [True] * len(ALIKE)
+    for folder in folders[1:]:
+        assert metrics(folder) == metrics(folders[0])
+        one, other = (
+            json.loads((f / "evaluation.json").read_text()) | {"training_s": 0}
+            for f in (folder, folders[0])
+        )
+        assert one == other
+
+
 # ------------------------------------------------------------------- killed at any moment
 
 
