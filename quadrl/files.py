@@ -1,23 +1,30 @@
-"""Files that are written whole or not at all, and safetensors files that are read with care."""
+"""Files that are written whole or not at all, with a digest, and read with care."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
-from collections.abc import Sequence
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
-from quadrl.errors import QuadrlError
+from quadrl.errors import QuadrlError, QuadrlWarning
 
 UNREADABLE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError,
               RecursionError)  # fmt: skip
 """What reading a damaged safetensors file and its header can raise."""
 HEADER = "quadrl"
 """The one entry of the file's table, JSON: safetensors writes several in random order."""
+BLANK = b"0" * 64
+"""What stands in place of a digest while it is worked out: it comes first in a file."""
+DIGEST = re.compile(rb"digest\W{1,8}([0-9a-f]{64})")
+"""In JSON, or in JSON within JSON."""
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -35,28 +42,108 @@ def write_whole(path: Path, content: bytes) -> None:
         raise
 
 
+def write_sealed(path: Path, content: bytes) -> None:
+    """Write a file with the digest of all its other bytes in place of BLANK, its first digest."""
+    digest = hashlib.sha256(content).hexdigest().encode()
+    write_whole(path, content.replace(BLANK, digest, 1))
+
+
+def is_sealed(content: bytes) -> bool | None:
+    """Whether the digest of a file is that of its other bytes; None where it has no digest."""
+    if (found := DIGEST.search(content)) is None:
+        return None
+    blank = content[: found.start(1)] + BLANK + content[found.end(1) :]
+    return hashlib.sha256(blank).hexdigest().encode() == found[1]
+
+
+def check_seal(path: Path, content: bytes, *, unsealed: bool) -> None:
+    """Refuse a file that is not as it was written.
+
+    Args:
+        path: Its path.
+        content: Its bytes.
+        unsealed: Whether it is of an earlier format, which has no digest.
+
+    Raises:
+        QuadrlError: A digest is missing, or another one.
+    """
+    sound = is_sealed(content)
+    if sound is None and unsealed:
+        text = f"{path} is of an earlier quadrl and has no digest: damage to it would not be seen"
+        warnings.warn(text, QuadrlWarning, stacklevel=3)
+    elif not sound:
+        raise QuadrlError(f"{path} is damaged, or was changed after it was written: restore it")
+
+
+def write_sealed_json(path: Path, content: Mapping[str, Any], form: str) -> None:
+    """Write a table as JSON, with a format and a digest."""
+    sealed = {"digest": BLANK.decode(), "format": form, **content}
+    write_sealed(path, json.dumps(sealed, indent=2).encode())
+
+
+def read_sealed_json(path: Path, form: str) -> dict[str, Any]:
+    """Read what `write_sealed_json` wrote, or a table of an earlier quadrl, without a digest.
+
+    Raises:
+        QuadrlError: The file cannot be read, is no table, of another format, or damaged.
+    """
+    try:
+        content = path.read_bytes()
+        table = json.loads(content)
+    except (OSError, ValueError, RecursionError) as error:
+        raise QuadrlError(f"{path} cannot be read: {error}") from error
+    if not isinstance(table, dict):
+        raise QuadrlError(f"{path} must hold a table")
+    check_seal(path, content, unsealed="format" not in table)
+    if (written := table.get("format", form)) != form:
+        raise QuadrlError(name=f"format of {path}", value=written, allowed=form)
+    return {name: value for name, value in table.items() if name not in ("digest", "format")}
+
+
+def write_safetensors(
+    path: Path, arrays: dict[str, Any], header: dict[str, Any], to_bytes: Callable[..., bytes]
+) -> None:
+    """Write arrays and a header, with a digest of both.
+
+    Args:
+        path: The file.
+        arrays: Of one framework, by name.
+        header: What JSON can hold; its `format` says what the file is.
+        to_bytes: `save` of the framework's module of safetensors.
+    """
+    text = json.dumps({"digest": BLANK.decode(), **header})
+    write_sealed(path, to_bytes(arrays, metadata={HEADER: text}))
+
+
 def read_safetensors(
-    path: Path, wanted: Sequence[str], framework: str
+    path: Path,
+    wanted: Sequence[str],
+    unsealed: Sequence[str],
+    of_bytes: Callable[[bytes], dict[str, Any]],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Arrays of a safetensors file, and the header that quadrl wrote into its table.
 
     Args:
         path: The file.
         wanted: What the header's format may be.
-        framework: "numpy" or "pt".
+        unsealed: Earlier formats, of files without a digest.
+        of_bytes: `load` of a framework's module of safetensors.
 
     Raises:
-        QuadrlError: The file cannot be read, or is of another format.
+        QuadrlError: The file cannot be read, is damaged, or of another format.
     """
     try:
-        with safe_open(path, framework=framework) as opened:
-            header = json.loads((opened.metadata() or {}).get(HEADER, "{}"))
-            written = header.get("format")
-            names = opened.keys() if written in wanted else ()
-            arrays = {name: opened.get_tensor(name) for name in names}
+        content = path.read_bytes()
+        size = int.from_bytes(content[:8], "little")
+        table = json.loads(content[8 : 8 + size])
+        header = json.loads((table.get("__metadata__") or {}).get(HEADER, "{}"))
+        written = header.get("format")
+        known = written in wanted or written in unsealed
+        arrays = of_bytes(content) if known else {}
     except UNREADABLE as error:
         raise QuadrlError(f"{path} is damaged or not a safetensors file: {error}") from error
-    if written not in wanted:
+    if not known:
         allowed = " or ".join(wanted)
         raise QuadrlError(name=f"format of {path}", value=written, allowed=allowed)
+    check_seal(path, content, unsealed=written in unsealed)
     return arrays, header

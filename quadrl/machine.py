@@ -15,13 +15,31 @@ def machine() -> dict[str, str | int]:
     for name in ("mujoco", "gymnasium", "dm-control", "torch", "torchrl"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
-    cpu = platform.processor() or platform.machine()
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-        cpu = next(named, cpu)
-    known = {"cpu": cpu, "cores": cores(), "system": f"{platform.system()} {platform.machine()}"}
+    system = f"{platform.system()} {platform.machine()}"
+    known = {"cpu": processor(), "cores": cores(), "system": system}
     return known | {"python": platform.python_version()} | versions
+
+
+def _cpuinfo() -> dict[str, str]:
+    """What Linux says of the first core; empty elsewhere."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
+    except OSError:
+        return {}
+    pairs = (line.partition(":") for line in lines)
+    return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def processor() -> str:
+    """The name of the processor."""
+    return _cpuinfo().get("model name") or platform.processor() or platform.machine()
+
+
+def processor_kind() -> str:
+    """What torch chooses its instructions by, and with them the last bits of its numbers."""
+    known = _cpuinfo()
+    numbers = (f"{name} {known[name]}" for name in ("cpu family", "model") if name in known)
+    return ", ".join((processor(), *numbers))
 
 
 def cores() -> int:

@@ -9,16 +9,17 @@ a memory has a gated recurrent unit beside that: its state joins the observation
 from __future__ import annotations
 
 import dataclasses
-import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors.numpy import save
+from safetensors.numpy import load as of_bytes
+from safetensors.numpy import save as to_bytes
 
-from quadrl.errors import QuadrlError
-from quadrl.files import HEADER, read_safetensors, write_whole
+from quadrl.errors import QuadrlError, QuadrlWarning
+from quadrl.files import read_safetensors, read_sealed_json, write_safetensors
 from quadrl.memory import GRU, NAMES, PREFIX, Flyer
 from quadrl.observing import resolve
 from quadrl.validation import choice, number
@@ -28,9 +29,11 @@ if TYPE_CHECKING:
     from quadrl.environment import Environment
 
 CONDITIONS = ("weather", "randomization", "observe")
-FORMAT = "quadrl-policy-2"
-RECURRENT_FORMAT = "quadrl-policy-gru-1"
-FILE = "policy.safetensors"
+FORMAT, RECURRENT_FORMAT = "quadrl-policy-3", "quadrl-policy-gru-2"
+UNSEALED, RECURRENT_UNSEALED = "quadrl-policy-2", "quadrl-policy-gru-1"
+"""Formats of files without a digest."""
+FILE, RUN, RUN_FORMAT = "policy.safetensors", "config.json", "quadrl-run-2"
+"""In the folder of a run: its policy, and its settings."""
 CLIP = 10.0
 """Normalised observations are clipped to +-CLIP."""
 LOG_VARIANCE = (-12.0, 2.0)
@@ -224,11 +227,13 @@ class Policy:
         arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
         written = RECURRENT_FORMAT if self.memory else FORMAT
         header = {"format": written, "task": self.task, "metadata": self.metadata}
-        write_whole(Path(path), save(arrays, metadata={HEADER: json.dumps(header)}))
+        write_safetensors(Path(path), arrays, header, to_bytes)
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
         """Read a policy; nothing in the file is run.
+
+        A policy in the folder of a run that it is not of is read with a `QuadrlWarning`.
 
         Args:
             path: A .safetensors file, or a run folder that holds policy.safetensors.
@@ -239,7 +244,7 @@ class Policy:
         path = Path(path)
         file = path / FILE if path.is_dir() else path
         if not file.is_file():
-            if (path / "config.json").is_file():
+            if (path / RUN).is_file():
                 raise QuadrlError(
                     f"the run in {path} has no policy yet, since it was stopped before its first "
                     f"checkpoint; continue it: quadrl train --resume {path}"
@@ -248,12 +253,13 @@ class Policy:
                 f"there is no policy at {file}; give a run folder (quadrl train ... --out FOLDER "
                 "makes one) or a .safetensors file"
             )
-        arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), "numpy")
+        unsealed = UNSEALED, RECURRENT_UNSEALED
+        arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), unsealed, of_bytes)
         task, metadata = header.get("task"), header.get("metadata")
         options = metadata.get("task_options", {}) if isinstance(metadata, dict) else None
         if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
             raise QuadrlError(f"{file} does not say what its policy was trained for")
-        own = NAMES if header["format"] == RECURRENT_FORMAT else ()
+        own = NAMES if header["format"] in (RECURRENT_FORMAT, RECURRENT_UNSEALED) else ()
         layers = max(1, (len(arrays) - len(own)) // 2 - 1)
         names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS), *own)
         if set(arrays) != set(names):
@@ -264,7 +270,19 @@ class Policy:
         policy = cls(weights, biases, mean, deviation, task, metadata, memory)
         if not _is_network(policy):
             raise QuadrlError(f"{file} is damaged: its arrays do not make a policy network")
+        if path.is_dir() and (path / RUN).is_file():
+            policy._warn_of_another_run(path)
         return policy
+
+    def _warn_of_another_run(self, folder: Path) -> None:
+        """Say so where a policy is not of the run in whose folder it is."""
+        run, own = read_sealed_json(folder / RUN, RUN_FORMAT), self.metadata | {"task": self.task}
+        for name in ("task", "algo", "seed", "run"):
+            if name in own and name in run and own[name] != run[name]:
+                text = f"the policy in {folder} is not of the run there: its {name} is "
+                text += f"{own[name]}, that of the run {run[name]}"
+                warnings.warn(text, QuadrlWarning, stacklevel=3)
+                return
 
     @classmethod
     def pretrained(cls, task: str, algo: str = "ppo", variant: str = "ideal") -> Policy:

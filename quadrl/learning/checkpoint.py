@@ -6,18 +6,18 @@ header of JSON. It is written whole or not at all.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
+from safetensors.torch import load as of_bytes
 from safetensors.torch import save as to_bytes
 from tensordict import TensorDict
 
 from quadrl.errors import QuadrlError
-from quadrl.files import HEADER, read_safetensors, write_whole
+from quadrl.files import read_safetensors, write_safetensors
 from quadrl.learning.folder import CHANGEABLE
 
-FORMAT = "quadrl-checkpoint-5"
+FORMAT, UNSEALED = "quadrl-checkpoint-6", "quadrl-checkpoint-5"
 CHECKPOINT = "checkpoint.safetensors"
 
 
@@ -31,7 +31,7 @@ def save(path: Path, tensors: dict[str, Any], numbers: dict[str, Any]) -> None:
     """
     flat = TensorDict(tensors).flatten_keys("/").contiguous().clone()  # as safetensors demands
     header = {"format": FORMAT, "numbers": numbers}
-    write_whole(path, to_bytes(flat.to_dict(), metadata={HEADER: json.dumps(header)}))
+    write_safetensors(path, flat.to_dict(), header, to_bytes)
 
 
 def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -42,7 +42,7 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     if not path.is_file():
         raise QuadrlError(f"there is no checkpoint at {path}")
-    flat, header = read_safetensors(path, (FORMAT,), "pt")
+    flat, header = read_safetensors(path, (FORMAT,), (UNSEALED,), of_bytes)
     try:
         tensors = TensorDict(flat).unflatten_keys("/").to_dict()
     except (KeyError, RuntimeError, TypeError, ValueError) as error:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import csv
 import fcntl
+import hashlib
 import io
 import json
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from quadrl.errors import QuadrlError
-from quadrl.files import write_whole
+from quadrl.files import read_sealed_json, write_sealed_json, write_whole
+from quadrl.machine import processor_kind
+from quadrl.policy import RUN as CONFIG
+from quadrl.policy import RUN_FORMAT
 
-CONFIG = "config.json"
 METRICS = "metrics.csv"
 EVENTS = "events"
 EVALUATION = "evaluation.json"
@@ -72,6 +76,25 @@ def write_json(path: Path, content: Any) -> None:
     write_whole(path, json.dumps(content, indent=2).encode())
 
 
+def run_of(config: Mapping[str, Any]) -> str:
+    """What a run and its policies are known by: a digest of all that its result follows from."""
+    free = (*CHANGEABLE, "run", "processors")
+    fixed = {name: value for name, value in config.items() if name not in free}
+    return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def write_config(folder: Path, config: Mapping[str, Any], processors: Sequence[str] = ()) -> None:
+    """Write the resolved configuration of a run, and the processor that it is trained on.
+
+    Args:
+        folder: Of the run.
+        config: As `TrainConfig.resolved` gives it.
+        processors: Those that it was trained on before.
+    """
+    kinds = {"run": run_of(config), "processors": [*dict.fromkeys((*processors, processor_kind()))]}
+    write_sealed_json(folder / CONFIG, {**config, **kinds}, RUN_FORMAT)
+
+
 def read_config(folder: Path) -> dict[str, Any]:
     """The resolved configuration of a run, as it was saved.
 
@@ -81,11 +104,8 @@ def read_config(folder: Path) -> dict[str, Any]:
     file = folder / CONFIG
     if not file.is_file():
         raise QuadrlError(f"{folder} holds no run: it has no {CONFIG}")
-    try:
-        config = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise QuadrlError(f"{file} cannot be read: {error}") from error
-    if missing := {"task", "algo", "seed"} - set(config if isinstance(config, dict) else ()):
+    config = read_sealed_json(file, RUN_FORMAT)
+    if missing := {"task", "algo", "seed"} - set(config):
         raise QuadrlError(f"{file} is not the configuration of a run: it lacks {min(missing)}")
     return config
 

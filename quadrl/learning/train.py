@@ -22,17 +22,26 @@ import numpy as np
 import torch
 
 from quadrl.envs.torchrl import QuadrotorEnv
-from quadrl.errors import QuadrlError
+from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.learning import checkpoint
 from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.apg import APG
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import RecordingEnv, make_collector, make_env
-from quadrl.learning.folder import CONFIG, EVALUATION, Log, lock_folder, new_folder, write_json
+from quadrl.learning.folder import (
+    EVALUATION,
+    Log,
+    lock_folder,
+    new_folder,
+    read_config,
+    run_of,
+    write_config,
+)
 from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE, export, make_actor_critic
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
+from quadrl.machine import processor_kind
 from quadrl.policy import FILE as POLICY_FILE
 from quadrl.policy import Policy
 from quadrl.vehicle import VEHICLES
@@ -132,8 +141,10 @@ class Training:
         if not resume:
             new_folder(folder)
         self._unlock = weakref.finalize(self, os.close, lock_folder(folder))
+        resolved = config.resolved()
+        self._known_as = run_of(resolved)
         if not resume:
-            write_json(folder / CONFIG, config.resolved())
+            write_config(folder, resolved)
         elif any((folder / name).exists() for name in (checkpoint.CHECKPOINT, POLICY_FILE)):
             # Without either, it was stopped before the first checkpoint.
             try:
@@ -141,7 +152,12 @@ class Training:
             except QuadrlError:
                 self._unlock()
                 raise
-            write_json(folder / CONFIG, config.resolved())
+            before = read_config(folder).get("processors", ())
+            if others := set(before) - {processor_kind()}:
+                text = f"{folder} was trained on another processor ({', '.join(sorted(others))}): "
+                text += "on this one its policy can end otherwise in the last digits"
+                warnings.warn(text, QuadrlWarning, stacklevel=2)
+            write_config(folder, resolved, before)
         if self.iteration < config.iterations:
             (folder / EVALUATION).unlink(missing_ok=True)
 
@@ -202,6 +218,7 @@ class Training:
         metadata = {
             "algo": config.algo,
             "seed": config.seed,
+            "run": self._known_as,
             "variant": config.variant,
             "steps": self.steps,
             "vehicle": config.vehicle,

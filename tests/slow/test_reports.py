@@ -12,6 +12,7 @@ import pytest
 from quadrl import benchmark
 from quadrl.environment import Environment
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.folder import write_config
 from quadrl.policy import Policy
 from quadrl.randomization import Randomization
 from quadrl.rollout import fly, summarize
@@ -450,15 +451,16 @@ def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch):
     for name, number in (("a", seed + 1), ("b", seed)):
         (tmp_path / name).mkdir()
         config = TrainConfig("hover", seed=number).resolved()
-        (tmp_path / name / "config.json").write_text(json.dumps(config))
-        source.save(tmp_path / name / "policy.safetensors")
+        write_config(tmp_path / name, config)
+        own = dataclasses.replace(source, metadata=source.metadata | {"seed": number})
+        own.save(tmp_path / name / "policy.safetensors")
     monkeypatch.setattr(ship, "EPISODES", 20)
     ship.main((tmp_path / "a", tmp_path / "b", tmp_path / "none"), tmp_path / "out")
     beside = json.loads((tmp_path / "out" / "hover_ppo.json").read_text())
     assert beside["command"] == f"quadrl train hover --algo ppo --seed {seed}"
     assert beside["evaluation"] == summarize(fly(source, "hover", episodes=20))
     variant = TrainConfig("hover", seed=seed, variant="robust").resolved()
-    (tmp_path / "b" / "config.json").write_text(json.dumps(variant))
+    write_config(tmp_path / "b", variant)
     monkeypatch.setattr(ship, "WORTH_HAVING", 0.0)
     ship.main((tmp_path / "b",), tmp_path / "out")
     beside = json.loads((tmp_path / "out" / "hover_robust.json").read_text())

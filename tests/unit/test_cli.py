@@ -19,6 +19,7 @@ from quadrl import cli, tasks
 from quadrl.cli.flown import parse_options
 from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.folder import read_config, write_config
 from quadrl.vehicle import VEHICLES
 from quadrl.weather import Weather
 
@@ -256,8 +257,7 @@ def test_plot_of_several_runs(run, tmp_path, capsys, refusal):
     kinds = (("hover", "ppo"), ("hover", "vpg"), ("landing", "ppo"))
     for folder, (task, algo) in zip(folders, kinds, strict=True):
         shutil.copytree(run, folder)
-        config = json.loads((folder / "config.json").read_text()) | {"task": task, "algo": algo}
-        (folder / "config.json").write_text(json.dumps(config))
+        write_config(folder, read_config(folder) | {"task": task, "algo": algo})
     nothing = tmp_path / "no run"
     nothing.mkdir()
     assert command("plot", *folders, nothing, "--out", "curves.svg") == 0
@@ -566,7 +566,7 @@ def test_a_disk_that_fills_up(capsys, tmp_path, monkeypatch, undrawn):
 
     folder = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr("quadrl.learning.checkpoint.write_whole", full)
+        patch.setattr("quadrl.learning.checkpoint.write_safetensors", full)
         assert command("train", "hover", *TINY, "--no-video", "--out", folder) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "No space left on device" in line and f"quadrl train --resume {folder}" in line

@@ -16,7 +16,7 @@ from quadrl.errors import QuadrlError
 from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import make_env
-from quadrl.learning.folder import read_config, write_json
+from quadrl.learning.folder import read_config, write_config
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
 
@@ -141,7 +141,7 @@ def test_an_unknown_training_default_of_a_task_is_refused(tuned, monkeypatch):
 
 
 def test_the_settings_of_a_run_are_found_again(tmp_path):
-    write_json(tmp_path / "config.json", TINY.resolved())
+    write_config(tmp_path, TINY.resolved())
     assert TrainConfig.of_folder(tmp_path) == TINY
     saved = read_config(tmp_path)
     assert saved["resolved_task"]["time_limit"] == 0.5
@@ -151,6 +151,7 @@ def test_the_settings_of_a_run_are_found_again(tmp_path):
     assert set(saved["versions"]) == {"quadrl", "mujoco", "torch", "torchrl", "numpy"}
 
 
+@pytest.mark.filterwarnings("ignore:.*no digest")
 @pytest.mark.parametrize("text", [None, "", "{", "[]", "{}", '{"task": "hover"}'])
 def test_damaged_settings_are_refused(tmp_path, text):
     if text is not None:
@@ -164,7 +165,7 @@ def test_damaged_settings_are_refused(tmp_path, text):
 def test_a_run_of_a_task_or_an_aircraft_that_has_changed_is_not_continued(tmp_path, part, name):
     config = TINY.resolved()
     config[f"resolved_{part}"][name] *= 2
-    (tmp_path / "config.json").write_text(json.dumps(config))
+    write_config(tmp_path, config)
     with refused():
         TrainConfig.of_folder(tmp_path)
 

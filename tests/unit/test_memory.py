@@ -1,7 +1,6 @@
 """Policies that remember: the unit, its gradients, its training, its file, its flights."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from torchrl.modules import set_recurrent_mode
 from quadrl import tasks
 from quadrl.environment import Environment
 from quadrl.evaluation import evaluate
+from quadrl.files import write_safetensors
 from quadrl.learning import checkpoint, environments
 from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import ALGORITHMS, TrainConfig
@@ -415,7 +415,7 @@ HEADER = {"format": RECURRENT_FORMAT, "task": "hover", "metadata": {}}
 
 
 def write(path, arrays, **header):
-    path.write_bytes(save(arrays, metadata={"quadrl": json.dumps(HEADER | header)}))
+    write_safetensors(path, arrays, HEADER | header, save)
     return path
 
 

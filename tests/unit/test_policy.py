@@ -14,6 +14,7 @@ from runs import refused
 from safetensors.numpy import save
 
 import quadrl
+from quadrl.files import write_safetensors
 from quadrl.policy import FORMAT, SHIPPED, Policy, shipped
 from quadrl.rollout import fly
 
@@ -47,7 +48,7 @@ def linear(inputs: int, actions: int, **metadata) -> Policy:
 
 def write(path, arrays, header):
     """A safetensors file with any content."""
-    path.write_bytes(save(arrays, metadata={"quadrl": json.dumps(header)}))
+    write_safetensors(path, arrays, header, save)
     return path
 
 

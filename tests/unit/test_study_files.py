@@ -8,7 +8,7 @@ import pytest
 import quadrl
 from quadrl.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import write_json
+from quadrl.learning.folder import write_config
 from quadrl.studies.plan import parse_seeds, read_plan
 from quadrl.studies.table import interval
 
@@ -107,7 +107,7 @@ def test_other_files_are_refused(tmp_path, write):
 def test_a_run_with_other_settings_stops_the_study_before_it_begins(tmp_path):
     folder = tmp_path / "hover-ppo-1"
     folder.mkdir()
-    write_json(folder / "config.json", TrainConfig("hover", seed=1, steps=64).resolved())
+    write_config(folder, TrainConfig("hover", seed=1, steps=64).resolved())
     with pytest.raises(QuadrlError, match="hover-ppo-1 holds a run with other settings"):
         quadrl.study({"tasks": ["hover"], "seeds": [0, 1]}, out=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["hover-ppo-1"]

@@ -1,0 +1,116 @@
+"""What is saved is what is loaded: one bit that has changed anywhere is refused."""
+
+import json
+import shutil
+import warnings
+
+import numpy as np
+import pytest
+from runs import TINY, changed, refused, train
+from test_hostile_files import unsealed
+from test_memory import make_policy as make_recurrent
+from test_policy import make_policy
+
+from quadrl.errors import QuadrlWarning
+from quadrl.evaluation import setting
+from quadrl.learning import checkpoint
+from quadrl.learning.folder import read_config, write_config
+from quadrl.learning.train import Training
+from quadrl.machine import processor_kind
+from quadrl.policy import Policy
+
+FLIPS = 1000
+PARTS = ("config.json", "checkpoint.safetensors", "policy.safetensors")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run; not to be written to."""
+    return train(TINY, tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture
+def copy(run, tmp_path):
+    return shutil.copytree(run, tmp_path / "copy")
+
+
+def flipped(content, bit):
+    changed = bytearray(content)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def bits(content):
+    """Every bit of the first 1,000 of them, and 1,000 of all."""
+    size = 8 * len(content)
+    anywhere = np.random.default_rng(0).choice(size, min(size, FLIPS), replace=False)
+    return [*range(min(size, FLIPS)), *anywhere.tolist()]
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("config.json", read_config),
+        ("checkpoint.safetensors", lambda folder: checkpoint.load(folder / PARTS[1])),
+        ("policy.safetensors", lambda folder: Policy.load(folder / PARTS[2])),
+        ("memory", lambda folder: Policy.load(folder / "memory")),
+    ],
+)
+def test_one_bit_that_has_changed_is_refused(copy, name, read):
+    make_recurrent().save(copy / "memory")
+    path = copy / name
+    sound = path.read_bytes()
+    read(copy)
+    for bit in bits(sound):
+        path.write_bytes(flipped(sound, bit))
+        with refused() as caught:
+            read(copy)
+        assert str(path) in str(caught.value), bit
+
+
+@pytest.mark.parametrize("name", PARTS[:2])
+def test_a_run_is_not_continued_from_a_damaged_file(copy, name):
+    path = copy / name
+    path.write_bytes(flipped(path.read_bytes(), 8 * (path.stat().st_size - 100)))
+    with refused():
+        Training(changed(steps=10 * TINY.steps), copy, resume=True)
+
+
+def test_files_of_an_earlier_quadrl_are_read_with_a_note(copy, run):
+    for name in PARTS[1:]:
+        (copy / name).write_bytes(unsealed((run / name).read_bytes()))
+    config = json.loads((run / "config.json").read_text())
+    for key in ("digest", "format", "run", "processors"):
+        del config[key]
+    (copy / "config.json").write_text(json.dumps(config))
+    with pytest.warns(QuadrlWarning, match="has no digest") as said:
+        assert read_config(copy) == config
+        (weights, *_), (own, *_) = Policy.load(copy).weights, Policy.load(run).weights
+        checkpoint.load(copy / PARTS[1])
+    assert {name for name in PARTS for one in said if name in str(one.message)} == set(PARTS)
+    np.testing.assert_array_equal(weights, own)
+
+
+def test_a_policy_of_another_run_is_told(copy, run, tmp_path):
+    other = train(changed(seed=5), tmp_path / "other")
+    longer = train(changed(steps=2 * TINY.steps), tmp_path / "longer")
+    wider = train(changed(gamma=0.9), tmp_path / "wider")
+    for folder, name in ((other, "its seed is 5, that of the run 0"), (wider, "its run is")):
+        shutil.copy(folder / PARTS[2], copy / PARTS[2])
+        with pytest.warns(QuadrlWarning, match=f"policy in {copy} is not of the run.*{name}"):
+            setting(copy)
+    shutil.copy(longer / PARTS[2], copy / PARTS[2])  # the same run, further on
+    setting(copy)
+    make_policy().save(tmp_path / PARTS[2])  # in no run's folder
+    setting(tmp_path, "hover")
+
+
+def test_another_processor_is_told_at_a_resume(copy):
+    assert read_config(copy)["processors"] == [processor_kind()]
+    write_config(copy, TINY.resolved(), ["an abacus"])
+    with pytest.warns(QuadrlWarning, match="trained on another processor .an abacus.*last digits"):
+        Training(changed(steps=2 * TINY.steps), copy, resume=True).run()
+    assert read_config(copy)["processors"] == ["an abacus", processor_kind()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Policy.load(copy).metadata["run"] == read_config(copy)["run"]
