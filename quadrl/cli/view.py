@@ -25,7 +25,7 @@ class View(Flown):
     num_envs: int = 1
     """Aircraft that fly at the same time."""
     host: str = "localhost"
-    """Address that the page is served at; 0.0.0.0 lets other machines see it."""
+    """Address that the page is served at; 0.0.0.0 lets other machines see and steer it."""
     port: int = 8080
     """Port that the page is served at; 0 for any that is free."""
     native: bool = False

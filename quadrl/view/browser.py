@@ -16,12 +16,11 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
-import viser
 
 from quadrl.errors import QuadrlError
 from quadrl.rollout import Controller
 from quadrl.validation import number
-from quadrl.view import readout
+from quadrl.view import access, readout
 from quadrl.view.flight import KEYS, Flight, Keyboard
 from quadrl.view.scene import CAMERAS, Scene
 
@@ -54,15 +53,14 @@ class Page:
             port: Port to listen at; 0 for any that is free.
 
         Raises:
-            QuadrlError: Nothing can listen at that address.
+            QuadrlError: Nothing can listen at that address, or any web page could steer it.
         """
         _check_address(host, port)
         self.flight, self.keyboard = flight, Keyboard()
         self.controllers = dict(controllers) | {KEYBOARD: lambda: self.keyboard}
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
-            self.server = viser.ViserServer(host=host, port=port, verbose=False)
-        here = "localhost" if host in ("0.0.0.0", "::") else host
+        self.server = access.serve(host, port)
+        here = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         self.address = f"http://{here}:{self.server.get_port()}"
         self._flown_by, self._viewed, self._plotted = next(iter(self.controllers)), None, None
         self._history, self._clock, self._last_readout = np.zeros((3, 0)), 0.0, 0.0

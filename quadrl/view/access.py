@@ -1,0 +1,154 @@
+"""Who may steer the page: a browser that shows it, and only by what its controls send.
+
+Any web page may connect to a port of this machine. Its browser says in the header Origin where the
+page came from, and in Host by which name it reached the port. A domain of a stranger's that was
+turned to this machine (DNS rebinding) gives itself away by its name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import ipaddress
+import socket
+import urllib.parse
+from collections.abc import Callable
+from typing import Annotated, Any, cast
+
+import msgspec
+import viser
+from websockets.asyncio import server
+from websockets.datastructures import Headers
+from websockets.http11 import Request
+
+from quadrl.errors import QuadrlError
+
+LARGEST_MESSAGE = 1 << 14  # [bytes] of a client; the largest tells its camera
+Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+Vector = tuple[Number, Number, Number]
+# viser takes long strings of digits for integers too large to send on, and loses every client.
+Text = Annotated[str, msgspec.Meta(pattern=r"^.{0,18}$|[^\d\s_+-]")]
+
+
+class Update(msgspec.Struct):
+    """What a client may change of a control: nothing but its value."""
+
+    value: bool | Number | Text
+
+
+# The messages of viser's that the page needs, by their names. Others let a client open a tunnel to
+# the internet, upload files, or have things kept for ever.
+class GuiUpdateMessage(msgspec.Struct, tag=True):
+    """A control was moved."""
+
+    uuid: str
+    updates: Update
+
+
+class CommandTriggerMessage(msgspec.Struct, tag=True):
+    """A key was pressed."""
+
+    uuid: str
+
+
+class ViewerCameraMessage(msgspec.Struct, tag=True):
+    """A camera was moved; with the first one a client counts as connected."""
+
+    wxyz: tuple[Number, Number, Number, Number]
+    position: Vector
+    look_at: Vector
+    up_direction: Vector
+    fov: Number
+    near: Number
+    far: Number
+    image_height: Number
+    image_width: Number
+
+
+_DECODER = msgspec.msgpack.Decoder(GuiUpdateMessage | CommandTriggerMessage | ViewerCameraMessage)
+
+
+class Connection(server.ServerConnection):
+    """A client's connection, of which only the messages above arrive."""
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        """The next message that the page needs, and nothing in it that it does not."""
+        while True:
+            message = await super().recv(decode=False)
+            with contextlib.suppress(msgspec.MsgspecError):
+                return msgspec.msgpack.encode(_DECODER.decode(message))
+
+
+def refusal(headers: Headers, host: str) -> str | None:
+    """Why a request does not come from the page itself.
+
+    Args:
+        headers: Of the request.
+        host: Address that the page is served at.
+
+    Returns:
+        The reason in a line, or None where it does come from the page.
+    """
+    reached, origins = headers.get_all("Host"), headers.get_all("Origin")
+    names = ["localhost", socket.gethostname().lower(), host.lower()]
+    if len(reached) != 1 or not _names_this_machine(reached[0], names):
+        known = ", ".join(dict.fromkeys(names))
+        return f"Host is {reached}: must be an IP address or one of {known} (--host NAME)"
+    if "Upgrade" not in headers and not origins:  # asks for the page
+        return None
+    own = [f"{scheme}://{reached[0].lower()}" for scheme in ("http", "https")]
+    if len(origins) != 1 or origins[0].lower() not in own:
+        return f"Origin is {origins}: must be this page's own, {own[0]}"
+    return None
+
+
+def serve(host: str, port: int) -> viser.ViserServer:
+    """Start viser's server, which answers to its own page alone.
+
+    viser has no option for that. So it gets, while it starts, a server of websockets that checks.
+
+    Raises:
+        QuadrlError: It did not take that; it is stopped then.
+    """
+    unchecked, guarded = server.serve, []
+
+    def checked(handler: Any, *where: Any, process_request: Any = None, **options: Any) -> Any:
+        guarded.append(handler)
+        options |= {"max_size": LARGEST_MESSAGE, "create_connection": Connection}
+        check = _checked(process_request, host)
+        return unchecked(handler, *where, process_request=check, **options)
+
+    with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
+        try:
+            cast(Any, server).serve = checked
+            started = viser.ViserServer(host=host, port=port, verbose=False)
+        finally:
+            cast(Any, server).serve = unchecked
+        if not guarded:
+            started.stop()
+            raise QuadrlError(
+                f"viser {viser.__version__} cannot be kept from answering to any web page: "
+                "install an earlier one"
+            )
+    return started
+
+
+def _checked(answer: Callable[..., Any] | None, host: str) -> Callable[..., Any]:
+    """The answer to a request, which is 403 and a line unless it comes from the page."""
+
+    def check(connection: server.ServerConnection, request: Request) -> Any:
+        reason = refusal(request.headers, host)
+        if reason:
+            return connection.respond(403, f"{reason}\n")
+        return answer(connection, request) if answer else None
+
+    return check
+
+
+def _names_this_machine(reached: str, names: list[str]) -> bool:
+    """Whether a header Host is an IP address or one of some names, with or without a port."""
+    try:
+        name = urllib.parse.urlsplit(f"//{reached}").hostname or ""
+        return name in names or bool(ipaddress.ip_address(name))
+    except ValueError:
+        return False
