@@ -11,11 +11,12 @@ import io
 import queue
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from functools import partial
 from typing import Any, cast
 
 import numpy as np
+import viser
 
 from quadrl.errors import QuadrlError
 from quadrl.rollout import Controller
@@ -30,6 +31,35 @@ HISTORY = 200  # updates in the plot
 PUSHES = {"west": (-1, 0, 0), "east": (1, 0, 0), "south": (0, -1, 0), "north": (0, 1, 0),
           "down": (0, 0, -1), "up": (0, 0, 1)}  # fmt: skip
 KEYBOARD = "keyboard"
+MOST_ASKED = 32  # actions that wait for the next frame; what a client asks for beyond is dropped
+
+
+class Control:
+    """An input of the page, read within its bounds: a client may have sent any value."""
+
+    def __init__(self, handle: viser.GuiInputHandle[Any]) -> None:
+        """Take the bounds of a slider, a dropdown or a checkbox."""
+        self._handle, self._value = handle, handle.value
+        self._range = (handle.min, handle.max) if isinstance(handle, viser.GuiSliderHandle) else ()
+        self._choices = getattr(handle, "options", (False, True))
+
+    @property
+    def value(self) -> Any:
+        """A number of a slider's range, or one of the choices; the last one where it is neither."""
+        sent = self._handle.value
+        if not self._range:
+            self._value = sent if sent in self._choices else self._value
+        elif isinstance(sent, (int, float)) and sent == sent:  # not NaN
+            low, high = self._range
+            self._value = type(self._value)(min(max(sent, low), high))
+        if sent != self._value:
+            self.value = self._value  # so that every browser shows what counts
+        return self._value
+
+    @value.setter
+    def value(self, value: Any) -> None:
+        with contextlib.suppress(TypeError, ValueError):  # viser holds another kind of value
+            self._handle.value = value
 
 
 class Page:
@@ -58,7 +88,7 @@ class Page:
         _check_address(host, port)
         self.flight, self.keyboard = flight, Keyboard()
         self.controllers = dict(controllers) | {KEYBOARD: lambda: self.keyboard}
-        self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._asked: queue.Queue[Callable[[], None]] = queue.Queue(MOST_ASKED)
         self.server = access.serve(host, port)
         here = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         self.address = f"http://{here}:{self.server.get_port()}"
@@ -84,9 +114,8 @@ class Page:
     def frame(self, seconds: float) -> None:
         """Do what was asked for, fly on for some seconds of the wall clock, and draw."""
         flight = self.flight
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self._asked.get_nowait()()
+        for _ in range(self._asked.qsize()):
+            self._asked.get_nowait()()
         flight.wind[:] = [slider.value for slider in self.wind]
         flight.speed, flight.paused = self.speed.value, self.paused.value
         flight.endless = self.endless.value
@@ -118,7 +147,8 @@ class Page:
     @property
     def row(self) -> int:
         """The aircraft that the camera and the numbers are of."""
-        return int(self.aircraft.value) - 1
+        # A slider has two ends, even that of a single aircraft.
+        return min(self.aircraft.value, self.flight.environment.num_envs) - 1
 
     def _change_controller(self) -> None:
         chosen = self.flown_by.value
@@ -151,34 +181,54 @@ class Page:
             aspect=2.2,
         )  # fmt: skip
         with gui.add_folder("Flight"):
-            self.flown_by = gui.add_dropdown("flown by", tuple(self.controllers))
-            self.paused = gui.add_checkbox("paused", False)
-            self.speed = gui.add_slider("speed of time", 0.1, 4.0, 0.1, 1.0)
-            self.endless = gui.add_checkbox(
-                "without end", False, hint="only flying into the ground ends an episode"
+            self.flown_by = Control(gui.add_dropdown("flown by", tuple(self.controllers)))
+            self.paused = Control(gui.add_checkbox("paused", False))
+            self.speed = Control(gui.add_slider("speed of time", 0.1, 4.0, 0.1, 1.0))
+            self.endless = Control(
+                gui.add_checkbox(
+                    "without end", False, hint="only flying into the ground ends an episode"
+                )
             )
-            what = {"one step": self._step_once, "new episodes": self.flight.reset}
-            buttons = gui.add_button_group("", tuple(what))
-            buttons.on_click(lambda event: self._asked.put(what[event.target.value]))
+            self._add_buttons("", {"one step": self._step_once, "new episodes": self.flight.reset})
         with gui.add_folder("Wind [m/s]"):
             self.wind = [
-                gui.add_slider(to, -10.0, 10.0, 0.1, 0.0) for to in ("east", "north", "up")
+                Control(gui.add_slider(to, -10.0, 10.0, 0.1, 0.0)) for to in ("east", "north", "up")
             ]
-            calm = gui.add_button("calm")
-            calm.on_click(lambda event: self._asked.put(self._calm))
+            gui.add_button("calm").on_click(self._asks(lambda event: self._calm))
         with gui.add_folder("Push"):
-            self.strength = gui.add_slider("by [m/s]", 0.1, 5.0, 0.1, 1.0)
-            pushes = gui.add_button_group("to", tuple(PUSHES))
-            pushes.on_click(lambda event: self._asked.put(partial(self.push, event.target.value)))
+            self.strength = Control(gui.add_slider("by [m/s]", 0.1, 5.0, 0.1, 1.0))
+            self._add_buttons("to", {to: partial(self.push, to) for to in PUSHES})
         with gui.add_folder("Picture"):
-            self.camera = gui.add_dropdown(
-                "camera", CAMERAS, initial_value="free" if count > 1 else "follow"
+            many = count > 1
+            first = "free" if many else "follow"
+            self.camera = Control(gui.add_dropdown("camera", CAMERAS, initial_value=first))
+            self.aircraft = Control(
+                gui.add_slider("aircraft", 1, max(2, count), 1, 1, visible=many)
             )
-            self.aircraft = gui.add_slider("aircraft", 1, max(2, count), 1, 1, visible=count > 1)
-            self.apart = gui.add_slider("apart [m]", 0.0, 20.0, 0.5, 4.0, visible=count > 1)
-            self.show_markers = gui.add_checkbox("goals and markers", True)
-            self.show_trails = gui.add_checkbox("trails", True)
+            self.apart = Control(gui.add_slider("apart [m]", 0.0, 20.0, 0.5, 4.0, visible=many))
+            self.show_markers = Control(gui.add_checkbox("goals and markers", True))
+            self.show_trails = Control(gui.add_checkbox("trails", True))
         self._add_keys()
+
+    def _asks(
+        self, find: Callable[[Any], Callable[[], None] | None]
+    ) -> Callable[[Any], Coroutine[Any, Any, None]]:
+        """What viser calls on a click or key: the action found for it waits for the next frame.
+
+        A coroutine, since viser lets any number of plain functions wait for a thread.
+        """
+
+        async def ask(event: Any) -> None:
+            action = find(event)
+            if action is not None:
+                with contextlib.suppress(queue.Full):
+                    self._asked.put_nowait(action)
+
+        return ask
+
+    def _add_buttons(self, label: str, actions: Mapping[str, Callable[[], None]]) -> None:
+        buttons = self.server.gui.add_button_group(label, tuple(actions))
+        buttons.on_click(self._asks(lambda event: actions.get(event.target.value)))
 
     def _add_keys(self) -> None:
         gui = self.server.gui
@@ -192,7 +242,7 @@ class Page:
             keys[key] = f"{KEYBOARD}: {meaning}", partial(self.keyboard.press, key)
         for key, (meaning, change) in keys.items():
             command = gui.add_command(meaning, hotkey=cast(Any, key))
-            command.on_trigger(lambda event, change=change: self._asked.put(change))
+            command.on_trigger(self._asks(lambda event, change=change: change))
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown("\n".join(f"- `{key}` {what}" for key, (what, _) in keys.items()))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
@@ -68,7 +69,8 @@ class Scene:
         stand = self._home + size * np.array(VIEWS[camera])
         cameras = [client.camera for client in self._server.get_clients().values()]
         for one in (self._server.initial_camera, *cameras):
-            one.position, one.look_at, one.fov = stand, self._home, FOV
+            with contextlib.suppress(ValueError):  # a browser may have told of an impossible one
+                one.position, one.look_at, one.fov = stand, self._home, FOV
 
     def draw(self, seconds: float, row: int, camera: str, apart: float) -> None:
         """Send the poses of this moment; the camera belongs to the aircraft of a row."""

@@ -1,0 +1,329 @@
+"""Who may steer the page of `quadrl view`, and with what: real clients, wrong ones among them."""
+
+import contextlib
+import random
+import socket
+import time
+import types
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+from quadrl import tasks
+from quadrl.control import make as make_controller
+from quadrl.errors import QuadrlError
+from quadrl.vehicle import resolve
+from quadrl.view.flight import Flight
+
+viser = pytest.importorskip("viser")
+import msgspec  # noqa: E402
+import viser.infra._infra as infra  # noqa: E402
+import zstandard  # noqa: E402
+from websockets.datastructures import Headers  # noqa: E402
+from websockets.exceptions import InvalidStatus  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+
+from quadrl.view import access, browser  # noqa: E402
+
+VEHICLE = resolve(None)
+CAMERA = {
+    **{"wxyz": (1, 0, 0, 0), "position": (0, -3, 2), "look_at": (0, 0, 2)},
+    **{"up_direction": (0, 0, 1), "fov": 0.7, "near": 0.01, "far": 1000},
+    **{"image_height": 480, "image_width": 640},
+}
+WRONG = (
+    *(None, True, "", "nobody", "up2", "nan", "1e400", "9" * 400, [], [1.0, 2.0], {"a": 1}, b"\0"),
+    *(0, -1, 10**6, 2**64 - 1, -(2**63), 1e300, -1e300, np.inf, -np.inf, np.nan, 1e-320),
+)
+LABELS = (
+    *("flown by", "paused", "speed of time", "without end", "", "east", "north", "up", "calm"),
+    *("by [m/s]", "to", "camera", "aircraft", "apart [m]", "goals and markers", "trails"),
+)
+
+
+def flying(count):
+    task = tasks.make("hover")
+    choices = {"geometric": lambda: make_controller("geometric", task, VEHICLE)}
+    flight = Flight(choices["geometric"](), task, VEHICLE, num_envs=count)
+    return contextlib.closing(browser.Page(flight, choices, port=0))
+
+
+@pytest.fixture(scope="module")
+def served():
+    """A page that tests only knock at."""
+    with flying(2) as page:
+        page.frame(0.0)
+        yield page
+
+
+@pytest.fixture(params=[1, 2])
+def page(request):
+    """A page of one aircraft, or of two, which a test may leave in any state."""
+    with flying(request.param) as page:
+        page.frame(0.0)
+        yield page
+
+
+@contextlib.contextmanager
+def client(page, host="localhost:{}", origin="http://localhost:{}", **options):
+    """A connection to the page, which was reached by a name and comes from an origin."""
+    port = page.server.get_port()
+    with socket.create_connection(("localhost", port), timeout=20) as plug:
+        address, origin = f"ws://{host.format(port)}/", origin and origin.format(port)
+        settings = {"subprotocols": [f"viser-v{viser.__version__}"], "compression": None}
+        settings |= {"max_size": None, "max_queue": None, "origin": origin, "sock": plug}
+        with connect(address, **settings, **options) as connection:
+            yield connection
+
+
+def send(connection, kind, **parts):
+    connection.send(msgspec.msgpack.encode({"type": kind} | parts))
+
+
+def join(connection):
+    """Be a client as viser counts them; returns what the page can be asked by: ids by labels."""
+    send(connection, "ViewerCameraMessage", **CAMERA)
+    found = {}
+    while "Keys" not in found:
+        frame = connection.recv(timeout=20)
+        size = int.from_bytes(frame[8:16], "little")
+        content = msgspec.msgpack.decode(zstandard.decompress(frame[16 : 16 + size]))
+        for message in content["messages"]:
+            if "label" in message.get("props", {}):
+                found[message["props"]["label"]] = message["uuid"]
+    return found
+
+
+def until(fulfilled):
+    end = time.monotonic() + 20
+    while not fulfilled():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def heard(page, connection, ids):
+    """Wait until the page has heard all that was sent, by changing what is heard last."""
+    sought = page.apart.value % 20.0 + 0.5
+    send(connection, "GuiUpdateMessage", uuid=ids["apart [m]"], updates={"value": sought})
+    until(lambda: page.apart.value == sought)
+
+
+def controls(page):
+    return [part for part in vars(page).values() if isinstance(part, browser.Control)] + page.wind
+
+
+def check_sound(page):
+    """The flight goes on, finite, and what it reads of its controls is within their bounds."""
+    engine, count = page.flight.environment.engine, page.flight.environment.num_envs
+    for array in (engine.qpos, engine.qvel, engine.act, engine.wind, page.flight.pose):
+        assert np.isfinite(array).all()
+    assert (np.abs(engine.wind) <= 10.0).all()
+    assert 0.1 <= page.flight.speed <= 4.0 and 0.0 <= page.apart.value <= 20.0
+    assert 0 <= page.row < count and 0.1 <= page.strength.value <= 5.0
+    assert page.camera.value in browser.CAMERAS and page.flown_by.value in page.controllers
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("localhost:{}", "http://localhost:{}"),
+        ("LocalHost:{}", "http://localhost:{}"),
+        ("127.0.0.1:{}", "http://127.0.0.1:{}"),
+        ("[::1]:{}", "http://[::1]:{}"),
+        ("192.168.7.9:{}", "http://192.168.7.9:{}"),
+        (socket.gethostname() + ":{}", f"http://{socket.gethostname()}:{{}}".lower()),
+        ("localhost:9000", "http://localhost:9000"),  # through a tunnel
+        ("localhost:9000", "https://localhost:9000"),
+    ],
+)
+def test_the_page_itself_may_steer(served, host, origin):
+    with client(served, host, origin) as connection:
+        ids = join(connection)
+        send(connection, "GuiUpdateMessage", uuid=ids["north"], updates={"value": 3})
+        heard(served, connection, ids)
+        served.frame(VEHICLE.control_timestep)
+    engine = served.flight.environment.engine
+    np.testing.assert_array_equal(engine.wind, [[0.0, 3.0, 0.0]] * len(engine.wind))
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "wrong"),
+    [
+        ("localhost:{}", "http://stranger.example", "Origin"),
+        ("localhost:{}", "http://localhost:9", "Origin"),
+        ("localhost:{}", "http://127.0.0.1:{}", "Origin"),
+        ("localhost:{}", "http://localhost:{}.stranger.example", "Origin"),
+        ("localhost:{}", "null", "Origin"),
+        ("localhost:{}", None, "Origin"),
+        ("stranger.example:{}", "http://stranger.example:{}", "Host"),  # DNS rebinding
+        ("localhost.stranger.example", "http://localhost.stranger.example", "Host"),
+        ("127.0.0.1.stranger.example", "http://127.0.0.1.stranger.example", "Host"),
+    ],
+)
+def test_a_web_page_of_a_stranger_may_not(served, host, origin, wrong):
+    with pytest.raises(InvalidStatus) as refused, client(served, host, origin):
+        pass
+    answer = refused.value.response
+    said = answer.body.decode()
+    assert answer.status_code == 403 and said.startswith(f"{wrong} is ") and said.count("\n") == 1
+
+
+def test_headers_that_are_given_twice_are_refused(served):
+    for name, value in (("Origin", "http://localhost"), ("Host", "stranger.example")):
+        twice = {"additional_headers": {name: value}}
+        with pytest.raises(InvalidStatus, match="403"), client(served, **twice):
+            pass
+
+
+def test_the_page_is_not_shown_under_a_stranger_s_name(served):
+    def fetch(host):
+        request = urllib.request.Request(served.address, headers={"Host": host})
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            return answer.read()
+
+    assert b"<html" in fetch("localhost:9000")
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        fetch("stranger.example")
+
+
+def test_the_host_that_was_given_is_answered_to():
+    headers = Headers(Host="Lab.example:8080")
+    assert access.refusal(headers, "lab.example") is None
+    assert access.refusal(headers, "0.0.0.0") is not None
+
+
+def test_a_viser_that_starts_another_server_is_not_served(monkeypatch):
+    hidden = types.SimpleNamespace(serve=infra.websockets.asyncio.server.serve)
+    parts = {"exceptions": infra.websockets.exceptions, "datastructures": None}
+    other = types.SimpleNamespace(asyncio=types.SimpleNamespace(server=hidden), **parts)
+    monkeypatch.setattr(infra, "websockets", other)
+    started = []
+    stop = viser.ViserServer.stop
+    monkeypatch.setattr(viser.ViserServer, "stop", lambda it: (started.append(it), stop(it)))
+    with pytest.raises(QuadrlError, match="any web page") as refused:
+        flying(1)
+    assert str(refused.value).count("\n") == 0
+    with socket.socket() as probe:
+        assert probe.connect_ex(("localhost", started[0].get_port())) != 0
+
+
+def test_messages_that_no_control_sends_do_nothing(page, monkeypatch):
+    with client(page) as connection, client(page) as other:
+        ids, _ = join(connection), join(other)
+        opened = []
+        monkeypatch.setattr(page.server, "request_share_url", lambda: opened.append("tunnel"))
+        kept = len(page.server._websock_server._broadcast_buffer.message_from_id)
+        connection.send("text")
+        connection.send(b"\xc1")
+        connection.send(msgspec.msgpack.encode([1, 2]))
+        send(connection, "ShareUrlRequest")
+        for count in range(200):
+            send(connection, "GuiFormDirtyMessage", uuid=str(count))
+        for name, value in (("removed", True), ("props", "x"), ("update_cb", 7), ("uuid", "")):
+            send(connection, "GuiUpdateMessage", uuid=ids["paused"], updates={name: value})
+            both = {"value": False, name: value}
+            send(connection, "GuiUpdateMessage", uuid=ids["east"], updates=both)
+        send(connection, "GuiUpdateMessage", uuid="of nobody", updates={"value": 1})
+        heard(page, connection, ids)
+        for _ in range(3):
+            page.frame(VEHICLE.control_timestep)
+        now = len(page.server._websock_server._broadcast_buffer.message_from_id)
+        assert now < kept + 20 and not opened
+        send(connection, "GuiUpdateMessage", uuid=ids["paused"], updates={"value": True})
+        heard(page, connection, ids)
+        page.frame(0.0)
+    assert page.flight.paused
+
+
+def test_a_camera_that_cannot_be_does_not_end_the_viewer(page):
+    impossible = [{"look_at": CAMERA["position"]}, {"up_direction": (0, 0, 0)}]
+    impossible += [{"position": ("a", "b", "c")}, {"look_at": (np.nan,) * 3}, {"fov": np.inf}]
+    with client(page) as connection:
+        ids = join(connection)
+        for k, change in enumerate(impossible):
+            send(connection, "ViewerCameraMessage", **(CAMERA | change))
+            choice = browser.CAMERAS[k % len(browser.CAMERAS)]
+            send(connection, "GuiUpdateMessage", uuid=ids["camera"], updates={"value": choice})
+            heard(page, connection, ids)
+            page.frame(VEHICLE.control_timestep)
+    check_sound(page)
+
+
+def test_whatever_a_client_sends_the_flight_goes_on(page):
+    draw = random.Random(5)
+    with client(page) as connection, client(page) as other:
+        ids, _ = join(connection), join(other)
+        assert set(LABELS) <= set(ids)
+        for _ in range(60):
+            for _ in range(20):
+                label = draw.choice(LABELS)
+                wrong = {"value": draw.choice(WRONG)}
+                send(connection, "GuiUpdateMessage", uuid=ids[label], updates=wrong)
+                send(connection, "CommandTriggerMessage", uuid=draw.choice([*ids.values(), "x"]))
+            page.frame(VEHICLE.control_timestep)
+            check_sound(page)
+        heard(page, connection, ids)
+        page.frame(0.0)
+        send(other, "GuiUpdateMessage", uuid=ids["paused"], updates={"value": False})
+        heard(page, other, ids)
+        flown = page._clock
+        page.frame(1.0)
+        check_sound(page)
+    assert page._clock > flown
+
+
+def test_whatever_viser_hands_over_is_read_within_bounds(page):
+    draw = random.Random(6)
+    for _ in range(200):
+        for control in controls(page):
+            control._handle._impl.value = draw.choice(WRONG)
+        draw.choice([page._calm, page._pause, page._step_once])()
+        page.frame(VEHICLE.control_timestep)
+        check_sound(page)
+
+
+def test_numbers_beyond_a_slider_are_its_ends_and_what_is_no_choice_changes_nothing(page):
+    with client(page) as connection:
+        ids = join(connection)
+        for label, value in (("east", 1e8), ("north", -20), ("up", "nan"), ("camera", "nobody")):
+            send(connection, "GuiUpdateMessage", uuid=ids[label], updates={"value": value})
+        send(connection, "GuiUpdateMessage", uuid=ids["aircraft"], updates={"value": 10**6})
+        heard(page, connection, ids)
+        camera = page.camera.value
+        page.frame(VEHICLE.control_timestep)
+    np.testing.assert_array_equal(page.flight.wind, [10.0, -10.0, 0.0])
+    assert page.row == page.flight.environment.num_envs - 1
+    assert camera == ("follow" if page.row == 0 else "free")
+    assert page.wind[0]._handle.value == 10.0  # which every browser shows
+
+
+def test_key_presses_beyond_some_are_dropped(page):
+    with client(page) as connection:
+        ids = join(connection)
+        for label in ("keyboard: forward", "one step"):
+            press = {"type": "CommandTriggerMessage", "uuid": ids[label]}
+            press = msgspec.msgpack.encode(press)
+            for _ in range(10_000):
+                connection.send(press)
+        heard(page, connection, ids)
+        assert page._asked.qsize() == browser.MOST_ASKED
+        page.frame(VEHICLE.control_timestep)
+        assert page._asked.empty() and page.keyboard.action[0] == 1.0
+        send(connection, "CommandTriggerMessage", uuid=ids["keyboard: stop"])
+        until(lambda: page._asked.qsize())
+        page.frame(VEHICLE.control_timestep)
+    assert page.keyboard.action[0] == 0.0
+
+
+def test_pushes_without_end_leave_the_flight_finite(page):
+    page.endless.value, page.paused.value, page.strength.value = True, True, 5.0
+    for _ in range(100):
+        for _ in range(browser.MOST_ASKED):
+            page._asked.put(lambda: page.push("up"))
+        page.frame(VEHICLE.control_timestep)
+    page.paused.value = False
+    for _ in range(10):
+        page.frame(VEHICLE.control_timestep)
+        check_sound(page)
