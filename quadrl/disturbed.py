@@ -14,7 +14,7 @@ from quadrl.card import QUARTILES, Card, half_level, wilson
 from quadrl.draw import Draw
 from quadrl.engines.engine import EngineName
 from quadrl.errors import QuadrlError
-from quadrl.evaluation import setting, trained_with
+from quadrl.evaluation import setting
 from quadrl.policy import Policy
 from quadrl.progress import ProgressBar
 from quadrl.randomization import Randomization
@@ -179,7 +179,7 @@ def _flyers(
         name, k = name or own, 2
         while name in flown:
             name, k = f"{own} {k}", k + 1
-        if isinstance(flies, Policy) and (own_one := trained_with(flies)).name == flown_with.name:
+        if isinstance(flies, Policy) and (own_one := flies.make_vehicle()).name == flown_with.name:
             flown_with = resolve(flown_with, {"action_scale": own_one.action_scale})
         flown[str(name)], vehicles[str(name)] = flies, flown_with
     return flown, task, vehicles  # type: ignore[return-value]

@@ -176,10 +176,10 @@ def setting(
         own = flown.metadata
         if task is None or task == flown.task:
             task, options = flown.task, own.get("task_options", {}) | options
-        if aerodynamics is None and not isinstance(vehicle, Vehicle):
-            aerodynamics = own.get("aerodynamics")
         if vehicle is None or vehicle == own.get("vehicle"):
-            vehicle = trained_with(flown)
+            vehicle, aerodynamics = flown.make_vehicle(aerodynamics), None
+        elif aerodynamics is None and not isinstance(vehicle, Vehicle):
+            aerodynamics = own.get("aerodynamics")
     elif not callable(flown):
         allowed = "a policy, a run, a path, the name of a task or a controller, or a function"
         raise QuadrlError(name="controller", value=flown, allowed=allowed)
@@ -187,11 +187,6 @@ def setting(
         raise QuadrlError(name="task", value=None, allowed="given, for a function")
     vehicle = with_effects(resolve(vehicle), aerodynamics)
     return name, cast(Any, flown), tasks.make(task, **options), vehicle
-
-
-def trained_with(policy: Policy) -> Vehicle:
-    """The aircraft of a policy's training, without the effects of the air."""
-    return resolve(policy.metadata.get("vehicle"), policy.metadata.get("vehicle_options"))
 
 
 def comes_with_quadrl(name: str) -> bool:

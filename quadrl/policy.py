@@ -18,12 +18,14 @@ import numpy as np
 from safetensors.numpy import load as of_bytes
 from safetensors.numpy import save as to_bytes
 
+from quadrl.aerodynamics import Aerodynamics, with_effects
 from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.files import read_safetensors, read_sealed_json, write_safetensors
 from quadrl.memory import GRU, NAMES, PREFIX, Flyer
 from quadrl.observing import resolve
 from quadrl.validation import choice, number
-from quadrl.vehicle import VEHICLES
+from quadrl.vehicle import VEHICLES, Vehicle
+from quadrl.vehicle import resolve as resolve_vehicle
 
 if TYPE_CHECKING:
     from quadrl.environment import Environment
@@ -80,6 +82,31 @@ class Policy:
     def conditions(self) -> dict[str, Any]:
         """What its training flew in and saw, for `Environment`, where it is not the usual."""
         return {name: self.metadata[name] for name in CONDITIONS if name in self.metadata}
+
+    def make_vehicle(self, aerodynamics: str | Aerodynamics | None = None) -> Vehicle:
+        """The aircraft of its training.
+
+        Args:
+            aerodynamics: Effects of the air, as `quadrl.aerodynamics.with_effects` takes them; None
+                for those of the training.
+        """
+        own = self.metadata
+        vehicle = resolve_vehicle(own.get("vehicle"), own.get("vehicle_options"))
+        if aerodynamics is None:
+            aerodynamics = own.get("aerodynamics")
+        return with_effects(vehicle, aerodynamics)
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """Keywords with which each API makes an environment that it fits.
+
+        They are the aircraft, the control mode, the observation and the options of the task of its
+        training: `gymnasium.make("quadrl/Hover-v0", **policy.keywords)`. Its training's weather
+        and randomization are in `conditions`.
+        """
+        seen = self.conditions.get("observe", {})
+        needed = {"vehicle": self.make_vehicle(), "control_mode": self.control_mode}
+        return needed | {"observe": seen} | self.metadata.get("task_options", {})
 
     @property
     def size(self) -> int:
@@ -156,13 +183,19 @@ class Policy:
         return Flyer(self, n, seed)
 
     def check_fits(self, environment: Environment) -> None:
-        """Refuse a task and a vehicle with another layout than the policy was trained for.
+        """Refuse an environment in which observations or actions mean something else.
+
+        `keywords` make one that fits.
 
         Raises:
             QuadrlError: The policy observes or commands another number of values or with other
-                options, or it commands rotors, and those of the vehicle stand or turn otherwise.
+                options, or in another control mode; or it commands rotors, and those of the vehicle
+                stand or turn otherwise, or an action of 1 is another change of their speed.
         """
-        vehicle = environment.vehicle
+        vehicle, name = environment.vehicle, self.metadata.get("vehicle")
+        # One that is not known here is taken for the one that it is to fly.
+        known = name if name in VEHICLES else vehicle
+        trained = resolve_vehicle(known, self.metadata.get("vehicle_options"))
         needed, seen = (
             resolve(self.conditions.get("observe")).for_policy(),
             environment.observing.for_policy(),
@@ -179,10 +212,19 @@ class Policy:
                 name = f"{what} size of the policy for {self.task}"
                 where = f"{environment.task.name} with the vehicle {vehicle.name}"
                 raise QuadrlError(name=name, value=own, allowed=f"{needed} for {where}")
-        trained = VEHICLES.get(str(self.metadata.get("vehicle")), vehicle)
-        if self.control_mode == "rotor" and not np.array_equal(trained.layout, vehicle.layout):
+        if (mode := environment.control_mode.name) != self.control_mode:
+            allowed = f"{self.control_mode!r}, as in the training of the policy for {self.task}"
+            raise QuadrlError(name="control_mode", value=mode, allowed=allowed)
+        if self.control_mode != "rotor":
+            return
+        if not np.array_equal(trained.layout, vehicle.layout):
             allowed = f"one with the rotor layout of {trained.name}, which the policy has learned"
             raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
+        if trained.action_scale != vehicle.action_scale:
+            allowed = f"{trained.action_scale:g}, as in the training of the policy for {self.task}"
+            reason = "make the environment with **policy.keywords, or its aircraft with that scale"
+            scale = vehicle.action_scale
+            raise QuadrlError(reason, name="action_scale", value=scale, allowed=allowed)
 
     def _without_memory(self) -> np.ndarray:
         """The state of a policy that has none.
@@ -204,7 +246,10 @@ class Policy:
         observation = np.asarray(observation, dtype=np.float32)
         if observation.shape[-1:] != self.mean.shape:
             allowed = f"(..., {self.size}) for the policy for {self.task}"
-            raise QuadrlError(name="observation shape", value=observation.shape, allowed=allowed)
+            reason = "an environment that is made with **policy.keywords gives that"
+            raise QuadrlError(
+                reason, name="observation shape", value=observation.shape, allowed=allowed
+            )
         hidden = np.clip((observation - self.mean) / self.deviation, -CLIP, CLIP)
         if self.memory:
             state = self.memory.step(hidden, state)

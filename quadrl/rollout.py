@@ -51,7 +51,7 @@ def fly(
         task: A task or its name.
         episodes: N.
         seed: Aircraft i has the seed `seed + i`.
-        vehicle: The aircraft; None for the paper's.
+        vehicle: The aircraft; None for that of the controller's training, or the paper's.
         control_mode: What actions mean; None for what the controller says, or "rotor".
         weather: A `Weather` or its name; None for that of the controller's training, or calm air.
             Each aircraft flies in a wind of its own, from its seed, and does not observe it.
@@ -131,6 +131,9 @@ def prepared(
     own = getattr(controller, "control_mode", None)
     if None not in (control_mode, own) and control_mode != own:
         raise QuadrlError(name="control_mode", value=control_mode, allowed=f"{own!r}, as trained")
+    policy = controller if isinstance(controller, Policy) else getattr(controller, "policy", None)
+    if vehicle is None and isinstance(policy, Policy):
+        vehicle = policy.make_vehicle()
     given = {name: value for name, value in conditions.items() if value is not None}
     environment = Environment(
         task,

@@ -15,7 +15,7 @@ from quadrl.policy import Policy, shipped
 from quadrl.rollout import Controller
 from quadrl.task import Task
 from quadrl.tasks import TASKS
-from quadrl.vehicle import VEHICLES, Vehicle
+from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,12 +75,11 @@ class View(Flown):
 
 def others(task: Task, vehicle: Vehicle) -> dict[str, Callable[[], Controller]]:
     """What else can fly a task: the policies for it that come with quadrl, and the controllers."""
-    usual = VEHICLES.get(vehicle.name, vehicle).action_scale
     policies = {}
     for file in shipped():
         policy = Policy.load(file)
         # The aircraft stays the same, so that its commands have to mean what they did in training.
-        scale = policy.metadata.get("vehicle_options", {}).get("action_scale", usual)
+        scale = policy.make_vehicle().action_scale
         if policy.task == task.name and scale == vehicle.action_scale:
             policies[file.stem] = lambda policy=policy: policy
     return policies | {

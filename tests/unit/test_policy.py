@@ -8,15 +8,19 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from runs import refused
 from safetensors.numpy import save
 
 import quadrl
+from quadrl.environment import Environment
+from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.files import write_safetensors
 from quadrl.policy import FORMAT, SHIPPED, Policy, shipped
 from quadrl.rollout import fly
+from quadrl.vehicle import VEHICLES
 
 SIZE = 3
 HEADER = {"format": FORMAT, "task": "hover", "metadata": {}}
@@ -294,3 +298,48 @@ def test_a_policy_and_its_evaluation_stay_light(tmp_path):
     heavy = {"torch", "tensordict", "torchrl", "matplotlib", "mediapy", "PIL", "quadrl.rendering"}
     assert not heavy & modules
     assert not [name for name in modules if name.startswith("dm_control")]
+
+
+# ------------------------------------------------------------------ what it needs to fly
+
+ROBUST = ("hover_robust", "straight_and_level_robust")
+
+
+@pytest.mark.parametrize("name", ROBUST)
+def test_a_robust_policy_flies_its_own_aircraft_or_says_which(name):
+    policy = Policy.pretrained(name)
+    plain = Environment(policy.task, observe=policy.conditions["observe"])
+    with refused("action_scale", 35.0) as caught:
+        policy.check_fits(plain)
+    assert "90" in caught.value.allowed and "keywords" in str(caught.value)
+    for flown in (policy, policy.flying(4)):
+        with refused("action_scale", 35.0):
+            fly(flown, policy.task, episodes=4, vehicle="paper")
+        with refused("action_scale", 35.0):
+            quadrl.evaluate(policy, episodes=4, vehicle=VEHICLES["paper"])
+    for given in ({}, {"vehicle": "paper"}):  # the name stands for the aircraft of the training
+        found = quadrl.evaluate(policy, episodes=20, randomization="none", weather="calm", **given)
+        assert found.metrics["success_rate"] == 1.0 and found.vehicle.action_scale == 90.0
+    calm = {"randomization": "none", "weather": "calm", "episodes": 20}
+    assert fly(policy, policy.task, **calm).is_success.all()
+
+
+def test_its_keywords_make_what_it_fits_in_every_api():
+    policy = Policy.pretrained("hover", variant="robust")
+    single = gym.make("quadrl/Hover-v0", **policy.keywords)
+    many = QuadrotorEnv("hover", num_envs=3, seed=0, **policy.keywords)
+    classic = quadrl.load("hover", task_kwargs={"random": 0, **policy.keywords})
+    environments = (single.unwrapped.environment, many.environment, classic.task.environment)
+    for environment in environments:
+        policy.check_fits(environment)
+    observation, info = single.reset(seed=0)
+    for _ in range(200):
+        observation, _, terminated, truncated, info = single.step(policy(observation))
+    assert truncated and not terminated and info["is_success"]
+
+
+def test_another_control_mode_is_refused():
+    policy = Policy.pretrained("hover")
+    with refused("control_mode", "velocity") as caught:
+        policy.check_fits(Environment("hover", control_mode="velocity"))
+    assert "'rotor'" in caught.value.allowed

@@ -16,7 +16,6 @@ from quadrl import cli, mjcf, tasks
 from quadrl.cli.view import others
 from quadrl.control import make as make_controller
 from quadrl.errors import QuadrlError
-from quadrl.evaluation import trained_with
 from quadrl.markers import Marker
 from quadrl.policy import Policy
 from quadrl.vehicle import resolve
@@ -291,7 +290,7 @@ def test_what_is_offered_commands_what_it_did_in_its_training(scale):
         flight.step()
         if isinstance(controller, Policy):
             assert controller.task == "hover"
-            assert trained_with(controller).action_scale == vehicle.action_scale
+            assert controller.make_vehicle().action_scale == vehicle.action_scale
 
 
 def test_aircraft_are_drawn_apart_and_where_they_are(page):
