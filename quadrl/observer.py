@@ -116,7 +116,6 @@ class Observer:
         self.flat = np.zeros((count, self._size))
         """The same as vectors."""
         self._specified = Parameters.of(nominal, vehicle.control_timestep)
-        self._share = 1 - math.exp(-vehicle.control_timestep / SMOOTHING)
         self._disturbance = np.zeros((count, 3))  # [m/s^2], world frame
         self._motion = np.zeros((count, 6))  # velocity, and acceleration by thrust, world frame
         self._scaled = np.zeros((count, len(draw.spread)))
@@ -165,7 +164,7 @@ class Observer:
         seen = now.state if estimate is None else estimate
         terms = truth if estimate is None else observe(self._task, now, estimate)
         if self._feels:
-            self._disturbance[rows], self._motion[rows] = 0.0, self._moving(seen)
+            self._disturbance[rows], self._motion[rows] = 0.0, moving(self._specified, seen)
         self._seen[:, rows] = self._vector(terms, seen, rows)
         self._actions[rows] = 0.0
         self._tell(truth, now.state, rows, drawn=True)
@@ -178,7 +177,9 @@ class Observer:
             self._seen[1:] = self._seen[:-1].copy()
         seen = self._engine.state if self.frame is None else self.frame.state
         if self._feels:
-            self._feel(seen)
+            last, self._motion = self._motion, moving(self._specified, seen)
+            timestep = self._engine.vehicle.control_timestep
+            self._disturbance = felt(self._disturbance, last, self._motion, timestep)
         self._seen[0] = self._vector(done.observation, seen, self._rows)
         if self._options.action_history:
             size = action.shape[1]
@@ -206,20 +207,6 @@ class Observer:
             felt = to_body(state.rotation, self._disturbance[rows])
             terms = {**terms, "disturbance": felt}
         return np.concatenate([terms[name] for name in self._single], axis=-1)
-
-    def _moving(self, state: State) -> Array:
-        """Velocity [m/s] and the acceleration by the specified thrust [m/s^2], (n, 6), world."""
-        force, _ = thrust_wrench(self._specified, state.rotor_speed)
-        thrust = to_world(state.rotation, force / self._specified.mass[:, None])
-        return np.concatenate([state.velocity, thrust], axis=-1)
-
-    def _feel(self, state: State) -> None:
-        """Smooth the acceleration of the last control step that thrust does not explain."""
-        moving = self._moving(state)
-        rate = (moving[:, :3] - self._motion[:, :3]) / self._engine.vehicle.control_timestep
-        rate -= 0.5 * (moving[:, 3:] + self._motion[:, 3:]) + WEIGHT
-        self._disturbance += self._share * (rate - self._disturbance)
-        self._motion = moving
 
     def _present(self) -> Array:
         """The flat observation (N, size): as late as it is, with what is remembered."""
@@ -254,6 +241,27 @@ class Observer:
         """Take up what `save` gave."""
         for name in REMEMBERED:
             setattr(self, f"_{name}", np.array(saved[name]))
+
+
+def moving(specified: Parameters, state: State) -> Array:
+    """Velocity [m/s] and the acceleration by the specified thrust [m/s^2], (n, 6), world frame."""
+    force, _ = thrust_wrench(specified, state.rotor_speed)
+    thrust = to_world(state.rotation, force / specified.mass[:, None])
+    return np.concatenate([state.velocity, thrust], axis=-1)
+
+
+def felt(disturbance: Array, last: Array, now: Array, timestep: float) -> Array:
+    """The acceleration that weight and specified thrust do not explain, smoothed.
+
+    Args:
+        disturbance: The last one, (n, 3) [m/s^2], world frame.
+        last: What `moving` gave a control step ago, (n, 6).
+        now: What it gives now.
+        timestep: Of control [s].
+    """
+    rate = (now[:, :3] - last[:, :3]) / timestep
+    rate = rate - (0.5 * (now[:, 3:] + last[:, 3:]) + WEIGHT)
+    return disturbance + (1 - math.exp(-timestep / SMOOTHING)) * (rate - disturbance)
 
 
 REMEMBERED = ("seen", "actions", "rotor_speed", "disturbance", "motion")

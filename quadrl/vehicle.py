@@ -269,16 +269,21 @@ class Vehicle:
 
         Omega_c = clip(Omega_hover + action_scale * clip(action, -1, 1), 0, Omega_max).
         """
-        command = self.hover_speed + self.action_scale * np.minimum(np.maximum(action, -1.0), 1.0)
         if self._always_within:
-            return command
-        return np.minimum(np.maximum(command, 0.0), self.max_speed)
+            return commanded(action, self.hover_speed, self.action_scale)
+        return commanded(action, self.hover_speed, self.action_scale, self.max_speed)
 
     @functools.cached_property
     def _always_within(self) -> bool:
         """Whether no action commands a speed below zero or above the largest."""
         room = np.minimum(self.hover_speed, self.max_speed - self.hover_speed)
         return bool((self.action_scale <= room).all())
+
+
+def commanded(action: Array, hover: Array, scale: Any, most: Array | None = None) -> Array:
+    """Rotor speed commands (N, R) [rad/s] of actions, within 0 and `most` unless that is None."""
+    command = hover + scale * np.minimum(np.maximum(action, -1.0), 1.0)
+    return command if most is None else np.minimum(np.maximum(command, 0.0), most)
 
 
 def resolved_speed(mass: Array, drag_coefficient: Array, timestep: float) -> Array:

@@ -29,7 +29,7 @@ const jobs = {
   begin({ task, aircraft, seed, episode }) {
     const flight = new Flight(kernel, 0, task, aircraft);
     flight.begin(seed, episode);
-    return { coordinates: coordinates(flight), observation: [...flight.seen] };
+    return { coordinates: coordinates(flight), observation: [...Float32Array.from(flight.seen())] };
   },
 
   // Physics steps with commands to the rotors, from an episode's start.
@@ -57,7 +57,7 @@ const jobs = {
       flight.first();
     }
     while (flown.length < steps && !episode.outcome) {
-      const observation = [...flight.seen];
+      const observation = [...Float32Array.from(flight.seen())];
       do episode.tick();
       while (!episode.outcome && episode.ticks % flight.vehicle.substeps);
       const { error, terminated, truncated, succeeded, wind, goal } = flight, action = [...flight.action.subarray(0, flight.vehicle.rotors)];

@@ -11,8 +11,10 @@ const GUSTS = 0x67757374; // a stream of random numbers that no task uses
 export class Episode {
   constructor(kernel, slot, { task, aircraft, seed }, controller, events) {
     this.flight = new Flight(kernel, slot, task, aircraft);
+    if (controller?.scale) this.flight.scale[0] = controller.scale;
     this.flight.begin(seed);
     Object.assign(this, { controller, events });
+    this.past = []; // what was seen and done before, the newest first
     this.steps = 0; // control steps
     this.ticks = 0; // physics steps
     this.outcome = ""; // why it is over, in words
@@ -45,13 +47,27 @@ export class Episode {
 
   #control() {
     const { flight } = this;
-    const action = this.controller?.act(flight.seen);
+    const action = this.controller?.act(this.#see());
+    if (action) this.past[0].action = action;
     for (const { kind, values } of this.events.filter((event) => event.step === this.steps)) {
       if (kind === "push") values.forEach((value, k) => (flight.qvel[k] += value));
       else this.air = { mean: values.slice(0, 3), deviation: values[3] };
     }
     this.#blow();
     flight.command(action);
+  }
+
+  // What the controller sees now: as the options of its observation say (quadrl/observer.py).
+  #see() {
+    const { disturbance, action_history, observation_history } = this.controller.observe;
+    const seen = this.flight.seen(disturbance), { rotors } = this.flight.vehicle;
+    const rest = { seen: this.past.at(-1)?.seen ?? seen, action: new Float32Array(rotors) };
+    const before = (k) => this.past[k] ?? rest;
+    const actions = Array.from({ length: action_history }, (_, k) => [...before(k).action]);
+    const older = Array.from({ length: observation_history }, (_, k) => before(k).seen);
+    this.past.unshift({ seen });
+    this.past.length = Math.min(this.past.length, 1 + Math.max(action_history, observation_history));
+    return Float32Array.from([seen, ...actions, ...older].flat());
   }
 
   // Gusts: an Ornstein-Uhlenbeck process in each direction, a step per control step.

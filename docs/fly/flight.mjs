@@ -47,7 +47,7 @@ export class Flight {
     this.memory = kernel.functions.flight_memory(slot);
     new Float64Array(kernel.functions.memory.buffer, this.memory, book.flightSize).fill(0);
     const motion = ["qpos", "qvel", "act", "ctrl", "wind"];
-    for (const part of [...motion, "action", "observation", "given", "drawn"]) {
+    for (const part of [...motion, "action", "scale", "observation", "felt", "given", "drawn"]) {
       this[part] = kernel.view(slot, part);
     }
     this.keys = kernel.view(slot, "keys", BigInt64Array);
@@ -57,8 +57,9 @@ export class Flight {
     kernel.view(slot, "limits").set(this.vehicle.limits);
     kernel.view(slot, "world").set(this.pair.world);
     kernel.view(slot, "origin").set(this.pair.origin);
+    this.scale[0] = this.vehicle.actionScale;
     this.#point("flight_rows", "qpos qvel act ctrl warm wind parameters world near", [0, 0]);
-    this.#point("state_rows", "qpos qvel act origin limits", [0, 0, 1, this.vehicle.rotors]);
+    this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, this.vehicle.rotors]);
   }
 
   // Fills a struct of pointers, then of int64, for the kernels of C.
@@ -95,6 +96,7 @@ export class Flight {
   first() {
     this.#read();
     this.call("first");
+    this.call("rest");
   }
 
   // Commands to the rotors from an action; without one the geometric controller gives it.
@@ -114,6 +116,7 @@ export class Flight {
   finish() {
     this.#read();
     this.call("step");
+    this.call("feel");
   }
 
   #read() {
@@ -122,9 +125,9 @@ export class Flight {
     if (broken) this.diverged[0] = 1;
   }
 
-  // What the policy sees, float32.
-  get seen() {
-    return Float32Array.from(this.observation.subarray(0, this.pair.size));
+  // What the task shows, and where it is asked for the disturbance that is felt.
+  seen(feels = false) {
+    return [...this.observation.subarray(0, this.pair.size), ...(feels ? this.felt : [])];
   }
 
   get error() { return this.given[0]; } // [m]

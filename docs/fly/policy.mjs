@@ -24,6 +24,9 @@ export function readSafetensors(buffer) {
   return { arrays, texts };
 }
 
+// Options of the observation that this page knows, by their names in quadrl/observing.py.
+const KNOWN = { disturbance: false, action_history: 0, observation_history: 0 };
+
 export class Policy {
   // rules: the `policy` entry of the book.
   constructor(buffer, rules) {
@@ -34,7 +37,7 @@ export class Policy {
     } catch {
       // The format below is missing then.
     }
-    if (header.format !== rules.format) throw new Error("The file holds no policy of quadrl.");
+    if (!rules.formats.includes(header.format)) throw new Error("The file holds no policy of quadrl.");
     const length = Math.max(1, Math.floor(Object.keys(arrays).length / 2) - 1);
     const names = Array.from({ length }, (_, k) => LAYERS.map((name) => `${name}_${k}`));
     for (const name of ["mean", "deviation", ...names.flat()]) {
@@ -43,6 +46,8 @@ export class Policy {
     this.clip = rules.clip;
     this.task = header.task;
     this.metadata = header.metadata ?? {};
+    this.observe = { ...KNOWN, ...this.metadata.observe };
+    this.scale = this.metadata.vehicle_options?.action_scale; // of its actions, where it is its own
     this.mean = arrays.mean;
     this.deviation = arrays.deviation;
     this.layers = names.map(([weight, bias]) => ({ weight: arrays[weight], bias: arrays[bias] }));
@@ -61,15 +66,23 @@ export class Policy {
 
   // Why this policy cannot fly an aircraft of the book in a task; nothing if it can.
   unfit(book, taskName, vehicleName) {
-    const { rotors, layout } = book.vehicles[vehicleName], { actionSize, metadata } = this;
-    const { size } = book.pairs[`${taskName}_${vehicleName}`];
+    const { rotors, layout } = book.vehicles[vehicleName], { actionSize, metadata, observe } = this;
+    const single = book.pairs[`${taskName}_${vehicleName}`].size + 3 * observe.disturbance;
+    const size = single * (1 + observe.observation_history) + rotors * observe.action_history;
+    const foreign = Object.keys(observe).find((name) => !(name in KNOWN));
+    if (foreign) return `It observes ${foreign}, which this page does not know.`;
+    const other = Object.keys(metadata.vehicle_options ?? {}).find((name) => name !== "action_scale");
+    if (other) return `It has learned another ${other} than the aircraft here have.`;
     const mode = metadata.control_mode ?? "rotor";
     if (mode !== "rotor") return `Its control mode is ${mode}, and this page knows rotor alone.`;
     if (actionSize !== rotors) return `It commands ${actionSize} rotors; ${vehicleName} has ${rotors}.`;
     if (this.size !== size) return `It observes ${this.size} numbers; ${taskName} shows ${size}.`;
-    const trained = book.vehicles[metadata.vehicle]?.layout ?? layout;
-    const alike = JSON.stringify(trained) === JSON.stringify(layout);
-    return alike ? "" : `It has learned the rotor layout of ${metadata.vehicle}.`;
+    const trained = book.vehicles[metadata.vehicle] ?? book.vehicles[vehicleName];
+    const alike = JSON.stringify(trained.layout) === JSON.stringify(layout);
+    if (!alike) return `It has learned the rotor layout of ${metadata.vehicle}.`;
+    const own = this.scale ?? trained.actionScale;
+    if (this.scale || own === book.vehicles[vehicleName].actionScale) return "";
+    return `Its actions change the rotor speeds by ${own} rad/s, as those of ${metadata.vehicle}.`;
   }
 
   // The mean action of a flat observation (float32), within [-1, 1].

@@ -1,13 +1,15 @@
 """C of whole flights, for a page that flies them: what quadrl's own functions compute.
 
 A task, an aircraft and the geometric controller are called with symbols (`quadrl.trace`), as the
-compiled step of `quadrl.compiled` is, and become five C functions per task and aircraft:
+compiled step of `quadrl.compiled` is, and become C functions per task and aircraft:
 
     begin      the start of an episode, from numbers that were drawn
     first      its first observation
     step       the transition after the physics, with the next observation
     command    the commands to the rotors of an action
     geometric  the action of the geometric controller
+    rest       the disturbance that is felt at the start of an episode
+    feel       that after a control step
 
 Each takes the memory of one flight, an array of doubles whose parts are named in `LAYOUT`.
 """
@@ -23,16 +25,17 @@ import numpy as np
 from quadrl import records
 from quadrl.control.geometric import GeometricController
 from quadrl.environment import Environment
+from quadrl.observer import felt, moving
 from quadrl.parameters import AIR, AIRCRAFT, ROW_SIZE, Parameters
 from quadrl.reading import Reading
 from quadrl.rng import Rng
-from quadrl.rotation import Array
+from quadrl.rotation import Array, to_body
 from quadrl.snapshot import Potentials, Snapshot
 from quadrl.state import FIRST, State
 from quadrl.task import total
 from quadrl.trace import Trace
 from quadrl.transition import Clock, Episode, begin, finish
-from quadrl.vehicle import MAX_ROTORS
+from quadrl.vehicle import MAX_ROTORS, commanded
 
 PARTS = {
     "parameters": ROW_SIZE,  # the aircraft's row
@@ -51,6 +54,10 @@ PARTS = {
     "action": MAX_ROTORS,
     "diverged": 1,
     "observation": 64,
+    "scale": 1,  # of actions [rad/s]: Vehicle.action_scale, or that of a policy's training
+    "moving": 6,  # as quadrl.observer.moving gives it
+    "disturbance": 3,  # [m/s^2], world frame
+    "felt": 3,  # the same in the body frame, as policies see it
     "given": 8,  # error [m], reward, goal (3) [m, world], terminated, truncated, is_success
     "keys": 1,  # of the random numbers, an int64 each
     "episodes": 1,
@@ -61,7 +68,6 @@ PARTS = {
 """Numbers in each part of a flight's memory."""
 LAYOUT = dict(zip(PARTS, np.cumsum([0, *PARTS.values()]).tolist(), strict=False))
 """Where each part begins."""
-FUNCTIONS = ("begin", "first", "step", "command", "geometric")
 
 
 class Draws(Rng):
@@ -103,8 +109,8 @@ def write(environment: Environment) -> Written:
     draws = Draws(trace)
     start, task_state = task.begin(draws, _parameters(trace, timestep, rotors))
     placed = np.concatenate([start.position + origin, start.quaternion], axis=-1)
-    moving = np.concatenate([start.velocity, start.body_rate], axis=-1)
-    places = {"qpos": placed, "qvel": moving, "act": start.rotor_speed}
+    motion = np.concatenate([start.velocity, start.body_rate], axis=-1)
+    places = {"qpos": placed, "qvel": motion, "act": start.rotor_speed}
     bodies["begin"] = trace, _stores(places) | _stores({"kept": _row(task_state)})
 
     trace = Trace()
@@ -124,7 +130,9 @@ def write(environment: Environment) -> Written:
     bodies["step"] = trace, _outputs(environment, now, episode, total(done.reward_terms), *flags)
 
     trace = Trace()
-    command = vehicle.rotor_command(read(trace, "action")(np.arange(rotors)[None]))
+    action, scale = (read(trace, name) for name in ("action", "scale"))
+    given = action(np.arange(rotors)[None]), vehicle.hover_speed, scale(np.zeros((1, 1)))
+    command = commanded(*given, vehicle.max_speed)
     bodies["command"] = trace, _stores({"ctrl": command})
 
     trace = Trace()
@@ -137,6 +145,18 @@ def write(environment: Environment) -> Written:
         trace,
         _stores({"action": controller.action(reading, *task.guide(reading))}),
     )
+
+    for name in ("rest", "feel"):
+        trace = Trace()
+        state, numbers = _state(trace, rotors), np.arange(6)[None]
+        now = moving(_parameters(trace, timestep, rotors), state)
+        disturbance = np.zeros((1, 3))
+        if name == "feel":
+            last, before = read(trace, "moving")(numbers), read(trace, "disturbance")
+            disturbance = felt(before(numbers[:, :3]), last, now, timestep)
+        seen = to_body(state.rotation, disturbance)
+        outputs = {"moving": now, "disturbance": disturbance, "felt": seen}
+        bodies[name] = trace, _stores(outputs)
 
     functions = (function(f"{prefix}_{name}", *body) for name, body in bodies.items())
     return Written("\n".join(functions), draws.used)

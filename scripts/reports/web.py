@@ -23,7 +23,7 @@ from quadrl import mjcf, native, parameters
 from quadrl.engines.free_flight import world
 from quadrl.environment import Environment
 from quadrl.files import HEADER
-from quadrl.policy import CLIP, FORMAT, Policy, shipped
+from quadrl.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
 from quadrl.rng import START
 from quadrl.state import c_rows
 from quadrl.tasks import TASKS
@@ -96,7 +96,7 @@ def make_book() -> tuple[dict[str, Any], str]:
         "flightSize": size,
         "startStream": START,
         "gustTime": GUST_TIME,
-        "policy": {"format": FORMAT, "header": HEADER, "clip": CLIP},
+        "policy": {"formats": [FORMAT, UNSEALED], "header": HEADER, "clip": CLIP},
         "tasks": {
             name: {
                 **{word: getattr(task, word) for word in ("asks", "starts", "ends", "solved")},
@@ -106,11 +106,10 @@ def make_book() -> tuple[dict[str, Any], str]:
         },
         "vehicles": {name: describe(vehicle) for name, vehicle in VEHICLES.items()},
         "pairs": pairs,
-        # Those that see no more than the task's own entries, which is what the page computes.
         "policies": {
             file.stem: {"task": policy.task, "file": encoded(file.read_bytes())}
             for file in shipped()
-            if (policy := Policy.load(file)).task in tasks and not policy.conditions
+            if (policy := Policy.load(file)).task in tasks
         },
     }
     return book, "\n".join(sources)
@@ -131,6 +130,7 @@ def describe(vehicle: Vehicle) -> dict[str, Any]:
         "scale": vehicle.scale,
         "mass": vehicle.mass,
         "hoverSpeed": vehicle.hover_speed.tolist(),
+        "actionScale": vehicle.action_scale,
         "maxSpeed": vehicle.max_speed.tolist(),
         "spin": [rotor.spin for rotor in vehicle.rotors],
         "axis": [list(rotor.axis) for rotor in vehicle.rotors],

@@ -68,8 +68,8 @@ def node(page):
     return run
 
 
-def begun(task, vehicle, seed=0):
-    environment = Environment(task, vehicle=vehicle, engine="free_flight", seed=seed)
+def begun(task, vehicle, seed=0, **settings):
+    environment = Environment(task, vehicle=vehicle, engine="free_flight", seed=seed, **settings)
     return environment, environment.flatten(environment.reset())
 
 
@@ -119,7 +119,7 @@ def test_policies_act_as_in_python(node):
     jobs, expected = [], []
     for file in sorted(SHIPPED.glob("*.safetensors")):
         policy = Policy.load(file)
-        if policy.task in FLOWN and not policy.conditions:
+        if policy.task in FLOWN:
             scale = rng.uniform(0, 3, (200, 1))  # past where the observations are clipped
             observation = policy.mean + scale * policy.deviation * rng.normal(
                 size=(200, policy.size)
@@ -132,12 +132,14 @@ def test_policies_act_as_in_python(node):
         np.testing.assert_allclose(found, action, rtol=0, atol=1e-5)
 
 
-def fly(task, vehicle, controller, steps, events=(), seed=3):
+def fly(task, vehicle, controller, steps, events=(), seed=3, **settings):
     """The flight in Python: what each control step saw, did and gave."""
-    environment, observation = begun(task, vehicle, seed)
+    environment, observation = begun(task, vehicle, seed, **settings)
+    task_size = sum(term.width(environment.vehicle.rotor_count)
+                    for term in environment.task.observation.values())  # fmt: skip
     engine, flown = environment.engine, []
     for step in range(steps):
-        seen, action = observation[0], np.asarray(controller(observation))
+        seen, action = observation[0, :task_size], np.asarray(controller(observation))
         for event in events:
             if event["step"] == step and event["kind"] == "push":
                 engine.qvel[0] += event["values"]
@@ -194,6 +196,21 @@ def test_a_flight_of_the_hover_policy_is_pythons(node, events):
     for name, bound in {"observation": 1e-5, "action": 1e-5, "coordinates": 1e-4}.items():
         assert differences[name] < bound
     assert differences["error"] < 1e-6 and differences["reward"] < 1e-3
+
+
+@pytest.mark.parametrize("events", ([], PUSHES), ids=("calm", "pushed"))
+@pytest.mark.parametrize("name", ["hover_robust", "target_following_robust"])
+def test_a_flight_of_a_robust_policy_is_pythons(node, name, events):
+    policy = Policy.pretrained(name)
+    needed = {"vehicle": policy.make_vehicle(), "observe": policy.conditions["observe"]}
+    expected = fly(policy.task, controller=policy, steps=200, events=events, **needed)
+    settings = {"task": policy.task, "aircraft": "paper", "seed": 3}
+    job = dict(job="fly", settings=settings, controller=name, steps=200, events=events)
+    ((found, outcome),) = ((each["flown"], each["outcome"]) for each in node(job))
+    differences = worst(found, expected)
+    assert outcome == "" and found[-1]["error"] < 0.1
+    assert differences["succeeded"] == 0 and found[-1]["succeeded"] == (name == "hover_robust")
+    assert differences["action"] < 1e-5 and differences["coordinates"] < 1e-4
 
 
 @pytest.mark.parametrize("task, vehicle", PAIRS)
