@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from dm_control.rl.control import Environment as ControlEnvironment
 
     from quadrl import rendering, suite, testing
+    from quadrl.checked import check
     from quadrl.disturbed import robustness
     from quadrl.evaluation import evaluate
     from quadrl.learning.run import train
@@ -35,9 +36,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "RANDOMIZATIONS", "VEHICLES", "Observing", "Policy", "Randomization", "Task", "Vehicle", "envs",
-    "evaluate", "load", "plot", "register", "render", "rendering", "robustness", "study", "suite",
-    "tasks", "testing", "train",
+    "RANDOMIZATIONS", "VEHICLES", "Observing", "Policy", "Randomization", "Task", "Vehicle",
+    "check", "envs", "evaluate", "load", "plot", "register", "render", "rendering", "robustness",
+    "study", "suite", "tasks", "testing", "train",
 ]  # fmt: skip
 LAZY = {
     "train": "quadrl.learning.run",
@@ -46,6 +47,7 @@ LAZY = {
     "plot": "quadrl.show",
     "robustness": "quadrl.disturbed",
     "study": "quadrl.studies",
+    "check": "quadrl.checked",
 }
 """Functions that are imported on first use, and their modules."""
 

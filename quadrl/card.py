@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import html
 import io
 import json
 import math
@@ -58,7 +59,9 @@ class Card:
     """As the JSON file has it: task, vehicle, seed, episodes, engine; `flown`, the names; by axis
     its levels and, for each that flew, `success`, its 95 % interval `low` and `high`, quartiles of
     the error over the last 2 s `error_m`, and `half`, the levels under and over the usual one at
-    which half of the flights fail; by recovery map the shares of the flights that recover."""
+    which half of the flights fail, and `reach`, for each that flew those from which on no policy
+    can hover within its actions (older files have none); by recovery map the shares of the flights
+    that recover."""
 
     def __repr__(self) -> str:
         found = self.found
@@ -69,7 +72,8 @@ class Card:
 
     def _repr_html_(self) -> str:
         pictures = [self.figure, *([self.maps] if self.found["recovery"] else [])]
-        return html_table(self.table) + "".join(one._repr_html_() for one in pictures)
+        text = html_table(self.table) + f"<p>{html.escape(self.reach)}</p>"
+        return text + "".join(one._repr_html_() for one in pictures)
 
     @property
     def table(self) -> list[tuple[str, ...]]:
@@ -80,6 +84,21 @@ class Card:
             cells = (half_words(axis, axis["flown"][name]["half"]) for name in flown)
             rows.append((f"{axis['label']} [{axis['unit']}]", *cells))
         return rows
+
+    @property
+    def reach(self) -> str:
+        """From which levels on no policy can hover within its actions; empty if at none."""
+        said = []
+        for axis in self.found["axes"].values():
+            alike: dict[str, list[str]] = {}
+            for name, ends in axis.get("reach", {}).items():
+                words = zip(("under", "over"), ends, strict=True)
+                given = " or ".join(f"{word} {end:.3g}" for word, end in words if end is not None)
+                alike.setdefault(given, []).append(name)
+            limits = (f"{given} ({', '.join(names)})" for given, names in alike.items() if given)
+            if text := ", ".join(limits):
+                said.append(f"{axis['label']} [{axis['unit']}] {text}")
+        return f"no policy can hover level and still: {'; '.join(said)}" if said else ""
 
     @property
     def figure(self) -> Media:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib
@@ -12,6 +13,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #e69f00 #56b4e9 #000000".split()
 """Of those that fly (Okabe and Ito): readers who confuse red and green tell them apart."""
@@ -21,6 +23,8 @@ PANEL, GAP = (2.45, 3.1), 1.1  # [inches]
 DPI = 150
 TEXT: Any = {"font.size": 9, "axes.titlesize": 9.5, "axes.labelsize": 9, "legend.fontsize": 9.5}
 FONTS: Any = {"pdf.fonttype": 42, "svg.fonttype": "none"}  # text stays text
+GREY = "#6b7280"
+HATCHED: Any = {"fc": "none", "hatch": "////", "lw": 0.0, "alpha": 0.45}
 BANDS = 3  # as many can be told apart
 LEAST_ERROR = 1e-4  # [m], that is drawn
 SHADES = "cividis"
@@ -29,7 +33,8 @@ SHADES = "cividis"
 def card(found: Mapping[str, Any]) -> Figure:
     """Success with its interval over error with its quartiles, a column for each disturbance.
 
-    A ring marks where half of the flights fail. Levels at which no aircraft can hover are shaded.
+    A ring marks where half of the flights fail. Levels at which no aircraft can hover are shaded,
+    those at which actions do not reach as far are hatched.
     """
     axes, flown = found["axes"], found["flown"]
     columns = min(COLUMNS, len(axes))
@@ -58,7 +63,8 @@ def card(found: Mapping[str, Any]) -> Figure:
             for panel in bottom:
                 panel.set_ylim(low, high)
         words = f"{found['task']}, aircraft {found['vehicle']}, {found['episodes']} flights a level"
-        _head(figure, words, *grid[0, 0].get_legend_handles_labels())
+        hatched = any(_beyond(axis, name) for axis in axes.values() for name in flown)
+        _head(figure, words, hatched, *grid[0, 0].get_legend_handles_labels())
     return figure
 
 
@@ -89,20 +95,45 @@ def _panels(upper: Any, lower: Any, axis: Mapping[str, Any], flown: list[str]) -
         if not known.all():
             for panel in (upper, lower):
                 for start, end in _unknown(levels, known):
-                    panel.axvspan(start, end, color="#6b7280", alpha=0.18, lw=0)
-    upper.axhline(50, color="#6b7280", lw=0.7, zorder=0)
+                    panel.axvspan(start, end, color=GREY, alpha=0.18, lw=0)
+    _hatch((upper, lower), axis, flown)
+    upper.axhline(50, color=GREY, lw=0.7, zorder=0)
     upper.set(ylim=(-4, 104), yticks=(0, 25, 50, 75, 100))
     upper.set_title(axis["label"], loc="left", fontweight="bold")
     lower.set_yscale("log")
     lower.set_xlabel(f"[{axis['unit']}]" if "of" not in axis["unit"] else f"{axis['unit']}")
-    margin = 0.03 * (levels[-1] - levels[0])
     for panel in (upper, lower):
-        panel.set_xlim(levels[0] - margin, levels[-1] + margin)
+        panel.set_xlim(*_view(levels))
         panel.grid(alpha=0.22, lw=0.6)
         panel.spines[["top", "right"]].set_visible(False)
         if axis["usual"] != levels[0]:
-            panel.axvline(axis["usual"], color="#6b7280", lw=0.7, zorder=0)
+            panel.axvline(axis["usual"], color=GREY, lw=0.7, zorder=0)
     upper.tick_params(labelbottom=False)
+
+
+def _view(levels: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    """The levels and a margin on both sides."""
+    margin = 0.03 * (levels[-1] - levels[0])
+    return levels[0] - margin, levels[-1] + margin
+
+
+def _beyond(axis: Mapping[str, Any], name: str) -> list[tuple[float, float]]:
+    """Stretches of the view that the actions of one that flew do not reach."""
+    (start, end), (low, high) = _view(axis["levels"]), axis.get("reach", {}).get(name, (None, None))
+    spans = [(start, start if low is None else low), (end if high is None else high, end)]
+    return [(first, last) for first, last in spans if first < last]
+
+
+def _hatch(panels: tuple[Any, Any], axis: Mapping[str, Any], flown: list[str]) -> None:
+    """Hatch what actions do not reach, in grey where that is the same for all."""
+    alike: dict[tuple[tuple[float, float], ...], list[str]] = {}
+    for name in flown:
+        alike.setdefault(tuple(_beyond(axis, name)), []).append(name)
+    for spans, names in alike.items():
+        index = flown.index(names[0])
+        colour = GREY if len(names) == len(flown) else COLOURS[index % len(COLOURS)]
+        for panel, (start, end) in itertools.product(panels, spans):
+            panel.axvspan(start, end, **HATCHED, ec=colour, zorder=0)
 
 
 def _unknown(levels: np.ndarray, known: np.ndarray) -> list[tuple[float, float]]:
@@ -143,12 +174,19 @@ def maps(found: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _head(figure: Figure, words: str, handles: list[Any], names: list[str]) -> None:
+def _head(figure: Figure, words: str, hatched: bool, handles: list[Any], names: list[str]) -> None:
     """The title, and what each line is, above the panels."""
     figure.suptitle(words, x=0.01, ha="left", fontweight="bold", fontsize=11)
-    ring = Line2D([], [], color="#6b7280", marker="o", ms=8, mfc="none", ls="none")
-    entries = [*handles, ring], [*names, "half of the flights fail"]
-    figure.legend(*entries, loc="outside lower left", ncols=4, frameon=False)
+    ring = Line2D([], [], color=GREY, marker="o", ms=8, mfc="none", ls="none")
+    entries: list[tuple[Any, str]] = [(ring, "half of the flights fail")]
+    if hatched:
+        entries.append(
+            (Patch(**HATCHED, ec=GREY), "beyond the reach of the actions (no level hover)")
+        )
+    marks, texts = zip(*entries, strict=True)
+    figure.legend(
+        [*handles, *marks], [*names, *texts], loc="outside lower left", ncols=4, frameon=False
+    )
 
 
 def content(figure: Figure, kind: str) -> bytes:

@@ -11,6 +11,7 @@ import numpy as np
 from quadrl.aerodynamics import Aerodynamics
 from quadrl.axes import AXES, Axis
 from quadrl.card import QUARTILES, Card, half_level, wilson
+from quadrl.control.feasibility import limit
 from quadrl.draw import Draw
 from quadrl.engines.engine import EngineName
 from quadrl.errors import QuadrlError
@@ -76,6 +77,8 @@ def robustness(
     found: dict[str, Any] = {"task": task.name, "vehicle": vehicle.name, "seed": seed}
     found |= {"episodes": episodes, "engine": engine, "flown": [*flown]}
     found |= {"axes": {axis.name: _described(axis) for axis in chosen}, "recovery": {}}
+    for axis in chosen:
+        found["axes"][axis.name]["reach"] = {name: _reach(axis, vehicles[name]) for name in flown}
     done = 0
 
     with ProgressBar() as bar:
@@ -144,6 +147,12 @@ def _summary(axis: Axis, at: list[dict[str, Any] | None]) -> dict[str, Any]:
     below = half_level(axis.levels[start::-1], shares[start::-1])
     above = half_level(axis.levels[start:], shares[start:])
     return {**columns, "half": [below, above]}
+
+
+def _reach(axis: Axis, vehicle: Vehicle) -> list[float | None]:
+    """The levels under and over the usual one from which on no policy can hover."""
+    ends = (axis.levels[0], axis.levels[-1])
+    return [limit(axis.at, axis.usual, end, vehicle) for end in ends]
 
 
 def _described(axis: Axis) -> dict[str, Any]:

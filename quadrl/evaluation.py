@@ -14,6 +14,7 @@ from quadrl import tasks
 from quadrl.aerodynamics import Aerodynamics, with_effects
 from quadrl.control import CONTROLLERS
 from quadrl.control import make as make_controller
+from quadrl.control.feasibility import warn_of_unreached
 from quadrl.errors import QuadrlError
 from quadrl.files import write_whole
 from quadrl.observing import Observed
@@ -126,6 +127,8 @@ def evaluate(
         if not isinstance(flown, Policy):
             raise QuadrlError(name="sampled", value=True, allowed="False for a controller")
         flown = flown.flying(episodes, SAMPLING_SEED)
+    own = getattr(flown, "conditions", {}).get("randomization")
+    warn_of_unreached(vehicle, own if randomization is None else randomization)
     chosen: Any = {"episodes": episodes, "vehicle": vehicle, "weather": weather}
     chosen |= {"randomization": randomization, "observe": observe}
     rollout = fly(flown, task, seed=EVALUATION_SEED + seed, **chosen)

@@ -24,6 +24,7 @@ from tyro.conf import CascadeSubcommandArgs, DisallowNone, UseAppendAction, arg,
 from quadrl import __version__
 from quadrl.cli import choices, console
 from quadrl.cli.benchmark import Benchmark
+from quadrl.cli.check import Check
 from quadrl.cli.completion import Completion
 from quadrl.cli.evaluate import Evaluate
 from quadrl.cli.plot import Plot
@@ -45,6 +46,7 @@ Command = (
     | Annotated[Render, subcommand("render")]
     | Annotated[View, subcommand("view")]
     | Annotated[Plot, subcommand("plot")]
+    | Annotated[Check, subcommand("check")]
     | Annotated[Benchmark, subcommand("benchmark")]
     | Annotated[Completion, subcommand("completion")]
 )
@@ -98,11 +100,13 @@ def _warned_in_a_line(stderr: Console) -> Generator[None]:
     """Print each of quadrl's own warnings once, in one line; others are printed as Python does."""
     with warnings.catch_warnings():
         warnings.simplefilter("default", QuadrlWarning)
-        usual = warnings.showwarning
+        usual, said = warnings.showwarning, set()
 
         def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
             if issubclass(category, QuadrlWarning):
-                stderr.print(f"quadrl: warning: {message}")
+                if str(message) not in said:  # from wherever it comes
+                    stderr.print(f"quadrl: warning: {message}")
+                said.add(str(message))
             else:
                 usual(message, category, *where)
 

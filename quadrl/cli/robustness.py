@@ -76,6 +76,8 @@ class Robustness:
         )
         head, *rows = card.table
         console.print(make_table(head, rows, numbers=len(head) - 1))
+        if card.reach:
+            say(card.reach)
         for path in card.save(self.out):
             say(f"wrote {path}")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl import mjcf
+from quadrl.control.feasibility import warn_of_unreached
 from quadrl.evaluation import Evaluation, evaluate, html_table
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO, write_json
@@ -115,9 +116,11 @@ def train_in(
 ) -> Run:
     """What `train` does once settings and folder are known."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
+    vehicle = config.make_vehicle()
+    warn_of_unreached(vehicle, config.randomization)
     training = Training(config, folder, resume=resume)
     policy = training.run(show)
-    found = evaluate(policy, config.make_task(), episodes=episodes, vehicle=config.make_vehicle())
+    found = evaluate(policy, config.make_task(), episodes=episodes, vehicle=vehicle)
     seconds = round(training.seconds, 2)
     write_json(folder / EVALUATION, found.metrics | {"training_s": seconds})
     return Run(folder, config, policy, found, seconds)

@@ -1,0 +1,246 @@
+"""What the actions of an aircraft can do: carry it, turn it, and answer in time.
+
+Commands stay within hover plus and minus `Vehicle.action_scale` in every control mode
+(`Vehicle.rotor_command`), with the hover speeds of the specified aircraft. One that a randomization
+draws may need more than that to hover level and still; no policy then holds it in the air.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from quadrl import parameters
+from quadrl.control.allocation import Allocation
+from quadrl.draw import WHICH, Draw
+from quadrl.errors import QuadrlError, QuadrlWarning
+from quadrl.randomization import Randomization, Randomized
+from quadrl.rng import PARAMETERS, uniform
+from quadrl.rotation import Array
+from quadrl.rotors import GRAVITY, mixer
+from quadrl.vehicle import Vehicle
+from quadrl.weather import Weather
+
+MARGIN = 1.2
+"""Thrust over weight that an aircraft needs to be flown. With it thrust carries the weight at a
+tilt of 33 degrees, or climbs with g / 5; the aircraft that come with quadrl have at least 1.22."""
+FEW = 0.02
+"""Share of drawn aircraft that may be unable to hover without a warning: tasks ask for 98 to 100 %
+of success, which more of them rule out."""
+SAMPLES = 2048
+SURE = 1e-9
+"""Share of a bound by which rounding may exceed it."""
+BISECTIONS = 24
+PHASE_MARGIN = math.pi / 4  # [rad]
+BY_HOVER = {"mass", "thrust", "torque", "rotors", "one_rotor", "max_speed", "centre_of_mass"}
+"""Fields of a randomization that change how fast rotors turn in hover, or may turn."""
+
+
+class Reach:
+    """The thrusts without a moment that the rotors of some aircraft (n,) can give, exactly.
+
+    Rotors between a lowest and a highest speed give the wrenches of a zonotope: the mixer times a
+    box of squared speeds. A wrench lies in it if it lies between its facets, each of which is
+    parallel to the columns of three rotors. That also holds where more than four rotors can share
+    the weight in many ways.
+    """
+
+    def __init__(self, vehicle: Vehicle, table: np.ndarray | None = None) -> None:
+        """Take rows of parameters (n,); None for the vehicle as it is specified."""
+        table = parameters.rows(vehicle) if table is None else table
+        self.vehicle = vehicle
+        rotor = table["rotor"][:, : vehicle.rotor_count]
+        names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")
+        rows = mixer(*(rotor[name] for name in names))  # (n, 4, R)
+        size = np.abs(rows).max(axis=-1, keepdims=True)
+        rows = rows / size
+        triples = [*itertools.combinations(range(vehicle.rotor_count), 3)]
+        spanned = np.moveaxis(rows[:, :, np.array(triples)], 1, -1)  # (n, F, 3, 4)
+        # Their normals, as the cross product of three vectors in four dimensions.
+        normal = np.stack(
+            [(-1) ** k * np.linalg.det(np.delete(spanned, k, axis=-1)) for k in range(4)], axis=-1
+        )
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        # Three columns in a plane span no facet: a normal of zero bounds nothing.
+        normal = np.where(length > SURE, normal / np.maximum(length, SURE), 0.0)
+        normal = normal * np.where(normal[..., :1] < 0, -1.0, 1.0)
+        self._across = normal @ rows  # (n, F, R)
+        self._weight = normal[..., 0] * (table["mass"] * GRAVITY / size[:, 0, 0])[:, None]
+        self._max_speed = np.minimum(rotor["max_speed"], vehicle.max_speed)  # (n, R) [rad/s]
+        self.hover_speed = rotor["hover_speed"]
+        """(n, R) [rad/s], of the drawn aircraft."""
+        self.room = float((vehicle.max_speed - vehicle.hover_speed).max())
+        """An action scale [rad/s] above which an action of 1 commands no more."""
+        self.most = max(self.room, float(vehicle.hover_speed.max()))
+        """An action scale [rad/s] with which actions reach all that the rotors can do."""
+
+    def speeds(self, scale: Array | float) -> tuple[Array, Array]:
+        """Lowest and highest rotor speeds (n, R) [rad/s] for an action scale [rad/s], or (n, 1)."""
+        high = np.minimum(self.vehicle.hover_speed + scale, self._max_speed)
+        low = np.minimum(np.maximum(self.vehicle.hover_speed - scale, 0.0), high)
+        return low, high
+
+    def loads(self, scale: Array | float) -> tuple[Array, Array]:
+        """Smallest and largest thrust without a moment over the weight, (n,) each.
+
+        The largest is below the smallest where there is none.
+        """
+        low, high = (speed[:, None] ** 2 for speed in self.speeds(scale))
+        middle = (self._across * (high + low) / 2).sum(axis=-1)  # (n, F)
+        room = (np.abs(self._across) * (high - low) / 2).sum(axis=-1)
+        level = self._weight <= SURE * self._weight.max(axis=-1, keepdims=True)
+        weight = np.where(level, 1.0, self._weight)
+        least = np.where(level, 0.0, (middle - room) / weight)
+        most = np.where(level, np.inf, (middle + room) / weight)
+        rounding = SURE * np.abs(self._across).max() * self.most**2
+        shut = (level & (np.abs(middle) > room + rounding)).any(axis=-1)
+        return least.max(axis=-1), np.where(shut, 0.0, most.min(axis=-1))
+
+    def carries(self, scale: Array | float, margin: float = 1.0) -> Array:
+        """Whether thrusts from the weight over a margin to the margin times it exist, (n,)."""
+        least, most = self.loads(scale)
+        return (least * margin <= 1 + SURE) & (most * (1 + SURE) >= margin)
+
+    def scale(self) -> float:
+        """The smallest action scale with which each aircraft has the MARGIN [rad/s].
+
+        Rounded up to two digits. Where not even the rotors' limits give it, `room`.
+        """
+        low, high = 0.0, self.most
+        if not self.carries(high, MARGIN).all():
+            return self.room
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if self.carries(middle, MARGIN).all() else (middle, high)
+        digit = 10.0 ** (math.floor(math.log10(high)) - 1)
+        return max(high, min(math.ceil(high / digit - SURE) * digit, self.room))
+
+
+def samples(vehicle: Vehicle, draw: Draw) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of parameters of aircraft that are drawn, and of some at corners of the ranges."""
+    keys = np.arange(SAMPLES)
+    shares = uniform(keys, np.zeros_like(keys), PARAMETERS, 0, len(draw.names))
+    corners = np.where(shares < 0.5, 0.0, 1 - SURE)
+    return draw.table(draw.of(shares)), draw.table(draw.of(corners))
+
+
+def unreached(vehicle: Vehicle, draw: Draw) -> tuple[float, str, float]:
+    """How many of the drawn aircraft cannot hover level and still.
+
+    From a sample that is always the same; exact where nothing is drawn.
+
+    Returns:
+        Their share; what the worst of the sample lacks, in words; the action scale [rad/s] with
+        which each has the MARGIN, in the corners of the ranges too, or all that the rotors give.
+    """
+    if not draw.given.per_row:
+        return 0.0, "", vehicle.action_scale
+    drawn, corners = samples(vehicle, draw)
+    reach, scale = Reach(vehicle, drawn), vehicle.action_scale
+    low, high = reach.speeds(scale)
+    hover = reach.hover_speed
+    beyond = np.maximum(hover - high, low - hover)
+    worst = np.unravel_index(np.argmax(beyond), beyond.shape)
+    end, given = (1, high[worst]) if hover[worst] > high[worst] else (-1, low[worst])
+    lack = (
+        f"rotor {worst[1] + 1} of the worst one needs {hover[worst]:.1f} rad/s, and an action of "
+        f"{end} commands {given:.1f} rad/s"
+    )
+    enough = Reach(vehicle, np.concatenate([drawn, corners])).scale()
+    return 1 - float(reach.carries(scale).mean()), lack, enough
+
+
+def warn_of_unreached(vehicle: Vehicle, randomization: Randomized) -> None:
+    """Warn the caller's caller if more than a FEW of the drawn aircraft cannot hover.
+
+    Raises:
+        QuadrlError: The randomization does not fit the aircraft.
+    """
+    share, lack, enough = unreached(vehicle, Draw(randomization, vehicle))
+    if share > FEW:
+        said = (
+            f"{100 * share:.0f} % of the drawn aircraft cannot hover level and still, whatever the "
+            f"policy: {lack}; train with --vehicle-options action_scale={enough:.3g}"
+        )
+        warnings.warn(said, QuadrlWarning, stacklevel=3)
+
+
+@functools.lru_cache
+def limit(
+    at: Callable[[float], Randomization | Weather], usual: float, end: float, vehicle: Vehicle
+) -> float | None:
+    """From which level of a disturbance on no policy can hover, from the usual level outwards.
+
+    Args:
+        at: What a level is.
+        usual: The level at which nothing is disturbed.
+        end: The last level on one side; what lies up to eight times as far off is found as well.
+        vehicle: The aircraft, with the action scale that it flies with.
+
+    Returns:
+        The level; None where the actions reach as far, or where a level changes no hover.
+    """
+
+    def able(given: Any) -> bool:
+        try:
+            draw = Draw(given, vehicle)
+        except QuadrlError:  # even at their limits the rotors do not carry it
+            return False
+        drawn = np.tile(draw.low, (vehicle.rotor_count, 1))
+        draw.columns(drawn, WHICH)[:, 0] = np.arange(vehicle.rotor_count)
+        return bool(Reach(vehicle, draw.table(drawn)).carries(vehicle.action_scale).any())
+
+    if end == usual or not BY_HOVER.intersection(getattr(at(end), "given", dict)()):
+        return None
+    near = usual
+    for farther in (1, 2, 4, 8):
+        far = usual + farther * (end - usual)
+        try:
+            given = at(far)
+        except QuadrlError:  # there is no such level
+            return None
+        if not able(given):
+            for _ in range(BISECTIONS):
+                middle = (near + far) / 2
+                near, far = (middle, far) if able(at(middle)) else (near, middle)
+            return far
+        near = far
+    return None
+
+
+def angular_acceleration(vehicle: Vehicle, scale: float) -> Array:
+    """Largest about x, y and z (3,) [rad/s^2], each alone, with a thrust that suits it."""
+    low, high = Reach(vehicle).speeds(scale)
+    squares = Allocation(np.linalg.pinv(vehicle.mixer), low[0] ** 2, high[0] ** 2)
+    return squares.moment / np.array(vehicle.inertia)
+
+
+def held_wind(vehicle: Vehicle, load: float) -> float:
+    """Steady wind [m/s] against which a thrust of `load` times the weight still holds the place.
+
+    Leaned until its vertical part is the weight, sideways it has sqrt(load^2 - 1) of it; the drag
+    of the aircraft and of its rotors is k_D v^2 + k_H sum(Omega) v.
+    """
+    if load <= 1:
+        return 0.0
+    sideways = vehicle.mass * GRAVITY * math.sqrt(load**2 - 1)  # [N]
+    linear = vehicle.aerodynamics.rotor_drag * math.sqrt(load) * float(vehicle.hover_speed.sum())
+    root = math.sqrt(linear**2 + 4 * vehicle.drag_coefficient * sideways)
+    return 2 * sideways / (linear + root) if linear + root > 0 else math.inf
+
+
+def attitude_bandwidth(lag: float, late: float) -> float:
+    """Bandwidth of the attitude [rad/s] that is left by a rotor lag and by delays [s].
+
+    From moment to attitude there are two integrators, 180 degrees of phase lag, of which feedback
+    of the body rate makes up for 90 at most. At a rate w a delay T takes w T, and a lag T at most
+    as much. For a phase margin of 45 degrees, in the middle of the usual 30 to 60 (Astrom and
+    Murray, "Feedback Systems", chapter 10), both together may take pi / 4.
+    """
+    return PHASE_MARGIN / (lag + late)
