@@ -30,10 +30,10 @@ from quadrl.validation import choice
 from quadrl.vehicle import Vehicle, resolve
 
 OK = "ok"
-DRIFT = 0.5  # [m], how far a tilted aircraft may be carried before it is level
+DRIFT = 0.5  # [m], chosen: how far a tilted aircraft may go until it is level
 TILT = 0.2  # [rad], with which hover starts
 SLOWEST = math.sqrt(GRAVITY * TILT / DRIFT)
-"""Bandwidth of the attitude [rad/s] below which a tilt carries it farther: g tilt / w^2."""
+"""Bandwidth w of the attitude [rad/s] below which it goes farther: about g tilt / w^2."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,25 +108,25 @@ def _thrust(vehicle: Vehicle, draw: Draw) -> Iterator[Row]:
     yield Row("hover speed", float(vehicle.hover_speed.max()), "rad/s")
     yield Row("hover over largest speed", 100 * float(hover.max()), "%")
     commanded = 100 * float((hover + scale / vehicle.max_speed).max())
-    beyond = f"actions over {room / scale:.2g} command no more than the largest speed"
+    beyond = f"actions over {room / scale:.2g} are cut to the largest speed"
     yield Row("action 1 over largest speed", commanded, "%", OK if scale <= room else beyond)
     load, limit = (float(reach.loads(most)[1][0]) for most in (scale, reach.most))
-    short = f"under {MARGIN:g}: it can hardly climb and lean; action_scale={needed:.3g}"
-    yield Row("thrust over weight, action 1", load, "", OK if load >= MARGIN else short)
     weak = f"under {MARGIN:g}: it needs less weight or stronger rotors"
+    short = f"under {MARGIN:g}: action_scale={needed:.3g}" if scale < needed else weak
+    yield Row("thrust over weight, action 1", load, "", OK if load >= MARGIN else short)
     yield Row("thrust over weight, limits", limit, "", OK if limit >= MARGIN else weak)
     if draw.given.per_row:
         worst = float(drawn.loads(scale)[1].min())
-        low = f"under {MARGIN:g}: action_scale={needed:.3g}, or draw less"
-        yield Row("thrust over weight, worst drawn", worst, "", OK if worst >= MARGIN else low)
+        less = f"{short}, or draw less"
+        yield Row("thrust over weight, worst drawn", worst, "", OK if worst >= MARGIN else less)
         share, lack, _ = unreached(vehicle, draw)
         yield Row("drawn that cannot hover", 100 * share, "%", lack if share else OK)
     yield Row("steady wind held, action 1", held_wind(vehicle, load), "m/s")
-    keeps = needed <= scale <= room
-    wanted = scale if keeps else min(max(needed, scale), room)
+    wanted = max(needed, min(scale, room))
     carried = float(drawn.loads(wanted)[1].min())
-    reason = f"then the worst has {carried:.2f} times its weight, and no command passes a limit"
-    yield Row("suggested action_scale", wanted, "rad/s", OK if keeps else reason)
+    reason = f"then the worst has {carried:.2f} times its weight"
+    reason += ", and no command is cut" if wanted <= room else ""
+    yield Row("suggested action_scale", wanted, "rad/s", OK if wanted == scale else reason)
 
 
 def _moments(vehicle: Vehicle, task: Task) -> Iterator[Row]:
@@ -159,17 +159,11 @@ def _steps(vehicle: Vehicle, draw: Draw, control_mode: str) -> Iterator[Row]:
     slow = f"over the lag of the rotors: control_timestep={lag:.2g} or less"
     yield Row("slowest rotor lag", 1000 * lag, "ms")
     yield Row("time between two commands", 1000 * held, "ms", OK if held <= lag else slow)
-    seen = math.ceil(round(late / control, 6))
+    seen = math.ceil(round(late / control, 6))  # actions
     verdict = f"a policy must know what is under way: --observe action_history={seen}"
     yield Row("longest delay", 1000 * late, "ms", verdict if seen and not looped else OK)
     bandwidth = attitude_bandwidth(lag, late + held / 2)
     drift = GRAVITY * TILT / bandwidth**2
-    slow = (
-        f"under {SLOWEST:.2g}: a tilt of {TILT:g} rad carries it {drift:.2g} m before it is level"
-    )
-    yield Row(
-        "attitude bandwidth",
-        bandwidth,
-        "rad/s",
-        OK if bandwidth >= SLOWEST else slow,
-    )
+    slow = f"under {SLOWEST:.2g}: tilted by {TILT:g} rad it goes {drift:.2g} m until it is level"
+    verdict = OK if bandwidth >= SLOWEST else slow
+    yield Row("attitude bandwidth", bandwidth, "rad/s", verdict)

@@ -33,7 +33,7 @@ tilt of 33 degrees, or climbs with g / 5; the aircraft that come with quadrl hav
 FEW = 0.02
 """Share of drawn aircraft that may be unable to hover without a warning: tasks ask for 98 to 100 %
 of success, which more of them rule out."""
-SAMPLES = 2048
+SAMPLES, CORNERS = 1024, 256
 SURE = 1e-9
 """Share of a bound by which rounding may exceed it."""
 BISECTIONS = 24
@@ -75,9 +75,10 @@ class Reach:
         self._max_speed = np.minimum(rotor["max_speed"], vehicle.max_speed)  # (n, R) [rad/s]
         self.hover_speed = rotor["hover_speed"]
         """(n, R) [rad/s], of the drawn aircraft."""
-        self.room = float((vehicle.max_speed - vehicle.hover_speed).max())
-        """An action scale [rad/s] above which an action of 1 commands no more."""
-        self.most = max(self.room, float(vehicle.hover_speed.max()))
+        room = vehicle.max_speed - vehicle.hover_speed
+        self.room = float(room.min())
+        """Largest action scale [rad/s] with which no command is cut at a largest speed."""
+        self.most = float(max(room.max(), vehicle.hover_speed.max()))
         """An action scale [rad/s] with which actions reach all that the rotors can do."""
 
     def speeds(self, scale: Array | float) -> tuple[Array, Array]:
@@ -110,11 +111,12 @@ class Reach:
     def scale(self) -> float:
         """The smallest action scale with which each aircraft has the MARGIN [rad/s].
 
-        Rounded up to two digits. Where not even the rotors' limits give it, `room`.
+        Rounded up to two digits. Where not even the rotors' limits give it, the smallest with which
+        an action of 1 commands the largest speeds.
         """
         low, high = 0.0, self.most
         if not self.carries(high, MARGIN).all():
-            return self.room
+            return float((self.vehicle.max_speed - self.vehicle.hover_speed).max())
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
             low, high = (low, middle) if self.carries(middle, MARGIN).all() else (middle, high)
@@ -126,7 +128,7 @@ def samples(vehicle: Vehicle, draw: Draw) -> tuple[np.ndarray, np.ndarray]:
     """Rows of parameters of aircraft that are drawn, and of some at corners of the ranges."""
     keys = np.arange(SAMPLES)
     shares = uniform(keys, np.zeros_like(keys), PARAMETERS, 0, len(draw.names))
-    corners = np.where(shares < 0.5, 0.0, 1 - SURE)
+    corners = np.where(shares[:CORNERS] < 0.5, 0.0, 1 - SURE)
     return draw.table(draw.of(shares)), draw.table(draw.of(corners))
 
 
@@ -138,13 +140,16 @@ def unreached(vehicle: Vehicle, draw: Draw) -> tuple[float, str, float]:
     Returns:
         Their share; what the worst of the sample lacks, in words; the action scale [rad/s] with
         which each has the MARGIN, in the corners of the ranges too, or all that the rotors give.
+        With a share of 0 there are no words, and the action scale is the vehicle's.
     """
     if not draw.given.per_row:
         return 0.0, "", vehicle.action_scale
     drawn, corners = samples(vehicle, draw)
     reach, scale = Reach(vehicle, drawn), vehicle.action_scale
-    low, high = reach.speeds(scale)
-    hover = reach.hover_speed
+    share = 1 - float(reach.carries(scale).mean())
+    if share == 0:
+        return 0.0, "", scale
+    (low, high), hover = reach.speeds(scale), reach.hover_speed
     beyond = np.maximum(hover - high, low - hover)
     worst = np.unravel_index(np.argmax(beyond), beyond.shape)
     end, given = (1, high[worst]) if hover[worst] > high[worst] else (-1, low[worst])
@@ -153,7 +158,7 @@ def unreached(vehicle: Vehicle, draw: Draw) -> tuple[float, str, float]:
         f"{end} commands {given:.1f} rad/s"
     )
     enough = Reach(vehicle, np.concatenate([drawn, corners])).scale()
-    return 1 - float(reach.carries(scale).mean()), lack, enough
+    return share, lack, enough
 
 
 def warn_of_unreached(vehicle: Vehicle, randomization: Randomized) -> None:

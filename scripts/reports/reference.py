@@ -12,6 +12,7 @@ from typing import Any, get_args
 from quadrl import VEHICLES, snapshot, state
 from quadrl import vehicle as vehicle_module
 from quadrl.cli.benchmark import Benchmark
+from quadrl.cli.check import Check
 from quadrl.cli.completion import Completion
 from quadrl.cli.evaluate import Evaluate
 from quadrl.cli.plot import Plot
@@ -195,7 +196,7 @@ def observing() -> str:
 
 COMMANDS = {
     kind.__name__.lower(): kind
-    for kind in (Tasks, Train, Study, Evaluate, Render, View, Plot, Benchmark, Completion)
+    for kind in (Tasks, Check, Train, Study, Evaluate, Render, View, Plot, Benchmark, Completion)
 }
 PARTS: Parts = {
     **{f"command-{name}": functools.partial(command, name) for name in COMMANDS},

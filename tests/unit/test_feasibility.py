@@ -1,0 +1,380 @@
+"""What actions reach: exactly, in warnings, on the robustness card, and in `quadrl check`."""
+
+import dataclasses
+import json
+import math
+from typing import Any
+
+import helpers
+import numpy as np
+import pytest
+from runs import TINY, refused
+from scipy.optimize import linprog
+
+import quadrl
+from quadrl import card_figures, cli
+from quadrl.axes import AXES
+from quadrl.card import Card
+from quadrl.checked import OK
+from quadrl.control import feasibility
+from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
+from quadrl.draw import Draw
+from quadrl.errors import QuadrlWarning
+from quadrl.evaluation import trained_with
+from quadrl.learning.defaults import VARIANTS
+from quadrl.parameters import rows
+from quadrl.policy import Policy, shipped
+from quadrl.rotors import GRAVITY, mixer
+from quadrl.vehicle import VEHICLES, Vehicle, resolve
+
+PAPER = Vehicle()
+# Action 1 commands 225.68 + 35 = 260.68 rad/s, which carry (260.68 / 225.68)^2 times the weight;
+# action -1 commands 190.68 rad/s.
+MOST, LEAST = (260.68 / 225.68) ** 2, (190.68 / 225.68) ** 2
+WEAK = {"one_rotor": 0.7}
+SHORT = {"episodes": 1, "time_limit": 0.5}
+
+
+# ------------------------------------------------------------------------------- the arithmetic
+
+
+def test_the_loads_of_the_paper_by_worked_numbers():
+    least, most = Reach(PAPER).loads(35.0)
+    assert (least[0], most[0]) == pytest.approx((LEAST, MOST), rel=1e-4)
+    # At the limits it carries twice its weight, and falls.
+    assert Reach(PAPER).loads(1e4)[1][0] == pytest.approx(2.0)
+    assert Reach(PAPER).room == pytest.approx(319.15 - 225.68, abs=0.01)
+    # sqrt(1.2) 225.68 - 225.68 = 21.5, and up to two digits 22; downwards 19.7 do.
+    assert Reach(PAPER).scale() == pytest.approx(22.0)
+
+
+@pytest.mark.parametrize("name", ["paper", "racer", "hexa", "eight", "leaning"])
+def test_loads_are_the_least_and_the_most_of_a_linear_program(name):
+    vehicle = helpers.LAYOUTS[name]
+    count, generator = vehicle.rotor_count, np.random.default_rng(3)
+    table = np.repeat(rows(vehicle), 12)
+    rotor = table["rotor"][:, :count]
+    for field in ("thrust_coefficient", "torque_coefficient"):
+        rotor[field] *= generator.uniform(0.6, 1.2, (12, count))
+    reach, solved = Reach(vehicle, table), 0
+    found = np.array(reach.loads(vehicle.action_scale))
+    low, high = (speed**2 for speed in reach.speeds(vehicle.action_scale))
+    for k, row in enumerate(table):
+        names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")
+        matrix = mixer(*(row["rotor"][name][:count] for name in names))
+        scaled = matrix / np.abs(matrix).max(axis=1, keepdims=True)
+        weight = vehicle.mass * GRAVITY / np.abs(matrix[0]).max()
+        for end, sign in ((0, 1.0), (1, -1.0)):
+            answer = linprog(
+                sign * scaled[0],
+                A_eq=scaled[1:],
+                b_eq=np.zeros(3),
+                bounds=[*zip(low[k], high[k], strict=True)],
+            )
+            if answer.status == 2:  # no thrust without a moment
+                assert found[1, k] < found[0, k]
+                continue
+            assert found[end, k] == pytest.approx(sign * answer.fun / weight, rel=1e-6)
+            solved += 1
+    assert solved >= 6
+
+
+def test_an_action_of_1_lifts_what_is_in_reach_and_no_more():
+    masses = {"mass": (1.30, 1.37)}
+    environment = helpers.flying(count=8, engine="free_flight", randomization=masses)
+    assert MOST == pytest.approx(1.334, abs=1e-3)
+    drawn = environment.disturbances.shown()["mass"]
+    climb = before = np.zeros(8)  # [m/s]
+    for _ in range(16):  # 0.8 s, over four times the lag
+        environment.step(np.ones((8, 4)))
+        climb, before = np.array(environment.snapshot.state.velocity[:, 2]), climb
+    climbs = climb > before
+    near = abs(drawn - MOST) < 0.01
+    assert ((drawn < MOST) == climbs)[~near].all() and len(set(climbs[~near])) == 2
+
+
+@pytest.mark.parametrize(
+    ("axis", "expected"),
+    [
+        ("mass", [LEAST, MOST]),
+        ("thrust", [None, 100 * (1 - 1 / MOST)]),
+        ("one_rotor", [None, 100 * (1 - 1 / MOST)]),
+        ("inertia", [None, None]),
+        ("delay", [None, None]),
+        ("wind", [None, None]),
+    ],
+)
+def test_where_a_disturbance_goes_beyond_the_actions(axis, expected):
+    of = AXES[axis]
+    for end, level in zip((of.levels[0], of.levels[-1]), expected, strict=True):
+        found = limit(of.at, of.usual, end, PAPER)
+        assert found == (level if level is None else pytest.approx(level, rel=1e-4))
+
+
+def test_a_wider_action_scale_reaches_farther():
+    mass, wide = AXES["mass"], resolve("paper", {"action_scale": 90})
+    # (225.68 + 90)^2 / 225.68^2
+    assert limit(mass.at, 1.0, 1.3, wide) == pytest.approx((315.68 / 225.68) ** 2, rel=1e-4)
+
+
+def test_more_than_four_rotors_share_what_one_of_them_lacks():
+    of = AXES["one_rotor"]
+    alone = 100 * (1 - float(Reach(VEHICLES["hexa"]).loads(110.0)[1][0]) ** -1)
+    found = limit(of.at, of.usual, of.levels[-1], VEHICLES["hexa"])
+    assert found is not None and found > alone + 10
+
+
+# ------------------------------------------------------------------------- evaluate and train
+
+
+def test_evaluate_says_what_no_policy_can_do():
+    # 225.68 / sqrt(0.7) = 269.7
+    words = r"100 % .* rotor \d of .* 269\.7 rad/s, .* 1 commands 260\.7 rad/s.*action_scale=70$"
+    with pytest.warns(QuadrlWarning, match=words) as said:
+        quadrl.evaluate("geometric", "hover", randomization=WEAK, **SHORT)
+    assert len(said) == 1 and said[0].filename == __file__
+
+
+def test_the_scale_that_is_named_is_enough():
+    for drawn in (WEAK, {"mass": (0.5, 1.0)}, {"mass": (1.0, 1.5)}):
+        share, lack, enough = unreached(PAPER, Draw(drawn, PAPER))
+        wide = resolve("paper", {"action_scale": enough})
+        assert unreached(wide, Draw(drawn, wide))[0] == 0
+        table = np.concatenate(feasibility.samples(wide, Draw(drawn, wide)))
+        assert Reach(wide, table).loads(enough)[1].min() >= MARGIN * (1 - 1e-6)
+        if drawn == {"mass": (0.5, 1.0)}:  # too light: -1 asks for too much
+            assert "an action of -1 commands 190.7" in lack and share > feasibility.FEW
+
+
+def test_the_share_is_that_of_the_masses_out_of_reach():
+    share, _, _ = unreached(PAPER, Draw({"mass": (1.0, 1.5)}, PAPER))
+    assert share == pytest.approx((1.5 - MOST) / 0.5, abs=0.03)
+
+
+def test_a_policy_is_warned_about_in_its_own_conditions():
+    own = Policy.pretrained("hover")
+    weak = dataclasses.replace(own, metadata=own.metadata | {"randomization": WEAK})
+    with pytest.warns(QuadrlWarning, match="269.7 rad/s"):
+        quadrl.evaluate(weak, **SHORT)
+    quadrl.evaluate(weak, randomization="none", **SHORT)
+
+
+@pytest.mark.parametrize("name", sorted(file.stem for file in shipped()))
+def test_what_ships_can_hover_wherever_it_was_trained(name):
+    task, _, algo = name.rpartition("_")
+    robust = algo == "robust"
+    policy = Policy.pretrained(task, "ppo" if robust else algo, *(["robust"] if robust else []))
+    vehicle = trained_with(policy)
+    given = policy.conditions.get("randomization")
+    assert ("mass" in (given or {})) == robust
+    assert unreached(vehicle, Draw(given, vehicle))[0] == 0
+
+
+def test_the_variant_robust_and_the_preset_light_are_flown_without_a_warning():
+    drawn = VARIANTS["robust"]["randomization"]
+    wide = resolve("paper", {"action_scale": 90})
+    feasibility.warn_of_unreached(wide, drawn)
+    for vehicle in VEHICLES.values():
+        feasibility.warn_of_unreached(vehicle, "light")
+    # A corner of one in a hundred is no reason; a quarter is.
+    racer = VEHICLES["racer"]
+    assert 0 < unreached(racer, Draw("full", racer))[0] < feasibility.FEW
+    feasibility.warn_of_unreached(racer, "full")
+    with pytest.warns(QuadrlWarning, match="28 %"):
+        feasibility.warn_of_unreached(VEHICLES["crazyflie"], "full")
+
+
+def test_train_says_it_before_it_begins(tmp_path):
+    seen = []
+    settings = {"randomization": WEAK, "algo": "ppo", "on_progress": seen.append, "episodes": 1}
+    with pytest.warns(QuadrlWarning, match="269.7 rad/s") as said:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("quadrl.learning.run.Training", lambda *_, **__: refuse())
+            with pytest.raises(InterruptedError):
+                quadrl.train(TINY, out=tmp_path / "run", **settings)
+    assert len(said) == 1 and not seen
+
+
+def refuse():
+    raise InterruptedError
+
+
+def test_the_command_says_it_once_whatever_flies(capsys):
+    words = ["--randomization", '{"one_rotor": 0.7}', "--episodes", "1"]
+    cli.main(["evaluate", "hover", *words, "--task-options", "time_limit=0.5"])
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.startswith("quadrl: warning: 100 % of the drawn")
+
+
+# ---------------------------------------------------------------------------------- the card
+
+
+@pytest.fixture(scope="module")
+def card():
+    own = Policy.pretrained("hover")
+    options = {"vehicle_options": {"action_scale": 20.0}}
+    narrow = dataclasses.replace(own, metadata=own.metadata | options)
+    given = {"axes": ("mass", "delay"), "recovery": False, "progress": False}
+    return quadrl.robustness({"usual": own, "narrow": narrow}, **given, **SHORT)
+
+
+def test_a_card_knows_what_the_actions_of_each_that_flew_reach(card, tmp_path):
+    reach = card.found["axes"]["mass"]["reach"]
+    assert reach["usual"] == pytest.approx([LEAST, MOST], rel=1e-4)
+    ends = [((225.68 + sign * 20) / 225.68) ** 2 for sign in (-1, 1)]
+    assert reach["narrow"] == pytest.approx(ends, rel=1e-4)
+    assert card.found["axes"]["delay"]["reach"] == {"usual": [None] * 2, "narrow": [None] * 2}
+    assert "mass [of the specified] under 0.714 or over 1.33 (usual), under 0.831" in card.reach
+    assert "delay" not in card.reach and card.reach in card._repr_html_()
+    card.save(tmp_path / "card")
+    assert Card.load(tmp_path / "card").found == card.found
+
+
+def drawn(found):
+    figure = card_figures.card(found)
+    patches: list[Any] = [panel.patches for panel in figure.axes]
+    hatched = [[patch for patch in of if patch.get_hatch()] for of in patches]
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    return hatched, any("beyond the reach" in text for text in texts)
+
+
+def test_a_picture_is_hatched_from_there_on(card):
+    hatched, named = drawn(card.found)
+    below, above = (patch.get_bbox() for patch in hatched[0])
+    assert named and [len(patches) for patches in hatched] == [2, 0, 2, 0]
+    assert (below.x1, above.x0) == pytest.approx([0.831, 1.185], abs=1e-3)
+    usual = card.found | {"flown": ["usual"]}  # beyond the levels
+    assert drawn(usual) == ([[], [], [], []], False)
+
+
+def test_an_older_card_has_none_and_is_drawn(card, tmp_path):
+    older = json.loads(json.dumps(card.found))
+    for axis in older["axes"].values():
+        del axis["reach"]
+    card = Card(older)
+    card.save(tmp_path / "older")
+    assert Card.load(tmp_path / "older").reach == ""
+    assert drawn(older) == ([[], [], [], []], False)
+
+
+# ------------------------------------------------------------------------------------- check
+
+
+def found(**given):
+    return {row.quantity: row for row in quadrl.check(**given).rows}
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_the_aircraft_that_come_with_quadrl_are_ok(name):
+    assert {row.verdict for row in quadrl.check(name).rows} == {OK}
+    assert "every row is ok" in repr(quadrl.check(name))
+
+
+def test_the_rows_of_the_paper_by_worked_numbers():
+    seen = {name: row.value for name, row in found().items()}
+    # 4 k_Q (260.68^2 - 225.68^2 + 225.68^2 - 190.68^2) / 2 / J_z: both pairs of rotors at their
+    # ends, which change the moment from -2 k_Q to 2 k_Q of the squares.
+    yaw = 2 * 7.5e-7 * (260.68**2 - 190.68**2) / 1.3e-2
+    # Roll: the left rotor at its largest, the right one at its smallest.
+    roll = 0.23 * 3.13e-5 * (260.68**2 - 190.68**2) / 7.5e-3
+    for name, value in {
+        "hover speed": 225.68,
+        "hover over largest speed": 100 / math.sqrt(2),
+        "thrust over weight, action 1": MOST,
+        "thrust over weight, limits": 2.0,
+        # 9e-3 v^2 = 0.65 g sqrt(MOST^2 - 1)
+        "steady wind held, action 1": math.sqrt(0.65 * 9.81 * math.sqrt(MOST**2 - 1) / 9e-3),
+        "suggested action_scale": 35.0,
+        "yaw acceleration, action 1": yaw,
+        "roll acceleration, action 1": roll,
+        "fastest rotor rate times step": 0.01 / 0.18,
+        "resolved body rate": PAPER.resolved_turn,
+        "slowest rotor lag": 180.0,
+        "attitude bandwidth": math.pi / 4 / (0.18 + 0.05 / 2),
+    }.items():
+        assert seen[name] == pytest.approx(value, rel=1e-3), name
+
+
+def test_rotor_drag_takes_from_the_wind_that_is_held():
+    name = "steady wind held, action 1"
+    assert found(aerodynamics="full")[name].value < 0.9 * found()[name].value
+    still = resolve("paper", {"drag_coefficient": 0.0})
+    assert found(vehicle=still)[name].value == math.inf
+
+
+@pytest.mark.parametrize(
+    ("given", "quantity", "words"),
+    [
+        ({"vehicle_options": {"action_scale": 10}}, "thrust over weight, action 1", "scale=22"),
+        ({"vehicle_options": {"action_scale": 10}}, "suggested action_scale", "then the worst"),
+        ({"vehicle_options": {"action_scale": 150}}, "action 1 over largest speed", "0.62"),
+        ({"vehicle_options": {"mass": 1.2}}, "thrust over weight, limits", "stronger rotors"),
+        ({"vehicle_options": {"mass": 1.2}}, "thrust over weight, action 1", "stronger rotors"),
+        ({"randomization": {"mass": 1.3}}, "thrust over weight, worst drawn", "draw less"),
+        ({"randomization": WEAK}, "drawn that cannot hover", "269.7 rad/s"),
+        ({"time_limit": 3.0}, "yaw acceleration, action 1", "half a turn takes 1.9 s"),
+        ({"randomization": {"command_delay": 0.06}}, "longest delay", "action_history=2"),
+        ({"randomization": {"observation_delay": 0.1}}, "longest delay", "action_history=2"),
+        ({"randomization": {"lag": 2.5}}, "attitude bandwidth", "until it is level"),
+    ],
+)
+def test_what_is_wrong_is_said_with_what_to_do(given, quantity, words):
+    row = found(**given)[quantity]
+    assert row.verdict != OK and words in row.verdict
+
+
+def test_the_suggested_scale_is_one_that_the_check_accepts():
+    narrow, wide = ({"vehicle_options": {"action_scale": scale}} for scale in (10, 150))
+    for given in (narrow, wide, {"randomization": {"mass": 1.5}}):
+        scale = found(**given)["suggested action_scale"].value
+        again = given | {"vehicle_options": {"action_scale": scale}}
+        assert found(**again)["suggested action_scale"].verdict == OK
+
+
+def test_heading_matters_only_where_the_task_says_so():
+    name = "yaw acceleration, action 1"
+    assert found(task="random_waypoint", time_limit=3.0)[name].verdict == OK
+
+
+def test_loops_answer_at_the_physics_step():
+    looped, direct = (found(control_mode=mode) for mode in ("velocity", "rotor"))
+    assert looped["time between two commands"].value == pytest.approx(10.0)
+    assert looped["attitude bandwidth"].value > direct["attitude bandwidth"].value
+    late = {"randomization": {"observation_delay": 0.1}}  # they see the true state
+    assert found(control_mode="velocity", **late)["longest delay"].value == 0
+
+
+def test_a_control_step_that_is_longer_than_the_lag():
+    slow = dataclasses.replace(VEHICLES["hexa"], control_timestep=0.05)
+    verdict = found(vehicle=slow)["time between two commands"].verdict
+    assert "control_timestep=0.025" in verdict
+
+
+def test_the_command_prints_rows_or_json(capsys):
+    words = ["--vehicle", "crazyflie", "--randomization", "full", "--task", "landing"]
+    cli.main(["check", *words])
+    table = capsys.readouterr().out
+    assert "thrust over weight, worst drawn" in table and "…" not in table
+    cli.main(["check", *words, "--json"])
+    read = json.loads(capsys.readouterr().out)
+    assert read["vehicle"] == "crazyflie"
+    values = {row["quantity"]: row for row in read["rows"]}
+    assert values["slowest rotor lag"]["value"] == pytest.approx(2 * 87, rel=0.05)
+    assert values["drawn that cannot hover"]["unit"] == "%"
+    cli.main(["check", "--vehicle-options", "action_scale=10", "--task-options", "time_limit=3"])
+    assert "action_scale=22" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"vehicle": "papr"}, "vehicle"),
+        ({"task": "hoover"}, "task"),
+        ({"control_mode": "rotors"}, "control_mode"),
+        ({"vehicle_options": {"weight": 1}}, "vehicle option"),
+        ({"randomization": {"mass": 3.0}}, "max_speed of rotor 1"),
+    ],
+)
+def test_what_cannot_be_checked_is_refused(given, name):
+    with refused(name):
+        quadrl.check(**given)
