@@ -27,8 +27,7 @@ def make_table(head: Sequence[str], rows: Iterable[Sequence[str]] = (), numbers:
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
     for k, column in enumerate(head):
         right = k >= len(head) - numbers
-        side = "right" if right else "left"
-        table.add_column(column, no_wrap=k == 0, justify=side, overflow="fold")
+        table.add_column(column, no_wrap=k == 0, justify="right" if right else "left")
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
     return table

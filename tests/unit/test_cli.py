@@ -618,6 +618,7 @@ def test_what_is_not_there(refusal, run):
 def test_a_warning_of_quadrl_is_one_line(capsys, monkeypatch):
     def warn(name):
         warnings.warn("half of it is missing", QuadrlWarning, stacklevel=2)
+        warnings.warn("half of it is missing", QuadrlWarning, stacklevel=1)  # from another place
         warnings.warn("another library's", FutureWarning, stacklevel=2)
 
     monkeypatch.setattr("quadrl.cli.evaluate.Evaluate.run", warn)
