@@ -1,8 +1,10 @@
-"""Files that are written whole or not at all, with a digest, and read with care."""
+"""Files that are written whole or not at all, with a digest, and read with care; locks."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -19,6 +21,10 @@ from quadrl.errors import QuadrlError, QuadrlWarning
 UNREADABLE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError,
               RecursionError)  # fmt: skip
 """What reading a damaged safetensors file and its header can raise."""
+PART = ".part"
+"""Behind the name of a file that is not whole yet."""
+NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
+"""What a file system without locks says."""
 HEADER = "quadrl"
 """The one entry of the file's table, JSON: safetensors writes several in random order."""
 BLANK = b"0" * 64
@@ -29,17 +35,46 @@ DIGEST = re.compile(rb"digest\W{1,8}([0-9a-f]{64})")
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file whole or not at all: the old one stays until the new one is on the disk."""
-    scratch = path.with_name(path.name + ".part")
+    scratch = path.with_name(path.name + PART)
     try:
-        with open(scratch, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(scratch, path)
+        scratch.write_bytes(content)
+        put(scratch, path)
     except BaseException:
         with contextlib.suppress(OSError):
             scratch.unlink()
         raise
+
+
+def put(written: Path, path: Path) -> None:
+    """Move a file to its place in the same file system once it is on the disk, then the folder."""
+    _sync(written)
+    os.replace(written, path)
+    with contextlib.suppress(OSError):  # not every file system can do that with a folder
+        _sync(path.parent)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def lock(folder: Path) -> int:
+    """Lock a folder against other processes while the returned descriptor is open.
+
+    Raises:
+        BlockingIOError: Another one holds the lock.
+        OSError: The folder cannot be opened, or its file system has no such locks (NO_LOCKS).
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
 
 
 def write_sealed(path: Path, content: bytes) -> None:

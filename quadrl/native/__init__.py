@@ -4,13 +4,16 @@ The C sources beside this file are compiled at first use with the machine's own 
 the headers of the installed mujoco, because they read the structs of exactly that version. The
 library is kept in a cache folder (`$QUADRL_CACHE`, else the user's cache folder), one for each
 version of mujoco, of the sources and of the flags; `$QUADRL_CFLAGS` adds flags at the end of
-these (`scripts/sanitize` does). `layout.h`, which declares a row of parameters and the rows of the
-state and of the weather, is written from `quadrl.parameters`, `quadrl.state` and `quadrl.air` into
-the build.
+these (`scripts/sanitize` does). Its name ends with a digest of its bytes, so that one that was
+damaged is known before it is loaded, and built anew. `layout.h`, which declares a row of parameters
+and the rows of the state and of the weather, is written from `quadrl.parameters`, `quadrl.state`
+and `quadrl.air` into the build.
 """
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -23,7 +26,7 @@ import sys
 import tempfile
 import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -31,6 +34,7 @@ import numpy as np
 
 from quadrl.air import c_weather
 from quadrl.errors import NativeError
+from quadrl.files import lock, put
 from quadrl.parameters import c_structs
 from quadrl.state import c_rows
 
@@ -60,6 +64,9 @@ _KINDS = {
     "passive": ctypes.CFUNCTYPE(None, _POINTER, _POINTER),
     "time": ctypes.CFUNCTYPE(ctypes.c_double),
 }
+_SCRATCH = "quadrl-build-"
+_ALONE: dict[Path, contextlib.ExitStack] = {}
+"""Libraries of this process alone that are not loaded yet, and what removes each."""
 
 
 def cache_folder() -> Path:
@@ -115,9 +122,9 @@ def build(
     for file in (*HEADERS, *sources):
         digest.update((_FOLDER / file).read_bytes())
     digest.update((include / "mujoco" / "mujoco.h").read_bytes())
-    file = f"quadrl-{name}-{mujoco.__version__}-{digest.hexdigest()[:16]}.so"
+    whole = f"quadrl-{name}-{mujoco.__version__}-{digest.hexdigest()[:16]}"
     paths = [str(_FOLDER / source) for source in sources]
-    return _cached(file, [f"-I{include}", *paths], {"layout.h": layout})
+    return _cached(whole, [f"-I{include}", *paths], {"layout.h": layout})
 
 
 @functools.cache
@@ -129,41 +136,104 @@ def compile_generated(source: str) -> ctypes.CDLL:
     """
     digest = hashlib.sha256(" ".join((*flags(), platform.machine(), source)).encode())
     name = digest.hexdigest()[:16]
-    return ctypes.CDLL(str(_cached(f"quadrl-generated-{name}.so", [], {f"{name}.c": source})))
+    return _open(_cached(f"quadrl-generated-{name}", [], {f"{name}.c": source}))
 
 
 def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
-    """A library of the cache, compiled first where it is missing.
+    """A library of the cache, compiled first where there is no sound one.
 
     Args:
-        name: Of its file, another one for other contents.
+        name: Of its file, without digest and ending; another one for other contents.
         arguments: Further ones of the compiler.
         written: Files that are written first, by name: headers, and sources to compile.
     """
     folder = cache_folder()
-    if os.path.exists(folder / name):  # False, too, for a folder that may not be looked into
-        return folder / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        scratch = tempfile.mkdtemp(dir=folder)
-    except OSError:  # a read-only home: a library for this process alone
-        folder = Path(tempfile.mkdtemp(prefix="quadrl-"))
-        scratch = tempfile.mkdtemp(dir=folder)
-    try:
+    with contextlib.suppress(OSError):  # a folder that may not be looked into
+        for path in folder.glob(f"{name}-*.so"):
+            if path == _place(path, name):
+                return path
+    with contextlib.ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            scratch = stack.enter_context(_scratch(folder))
+        except OSError:  # a read-only home: a library for this process alone
+            scratch = stack.enter_context(_scratch(Path(tempfile.gettempdir())))
+            folder = scratch
         for file, text in written.items():
-            Path(scratch, file).write_text(text)
+            (scratch / file).write_text(text)
         sources = [f"{scratch}/{file}" for file in written if file.endswith(".c")]
-        command = [compiler(), *flags(), f"-I{scratch}", "-o", f"{scratch}/{name}"]
+        command = [compiler(), *flags(), f"-I{scratch}", "-o", f"{scratch}/built.so"]
         command += [*arguments, *sources, "-lm"]
-        outcome = subprocess.run(command, capture_output=True, text=True)
+        # What a compiler that is killed leaves behind goes with the rest.
+        environment = os.environ | {"TMPDIR": str(scratch)}
+        outcome = subprocess.run(command, capture_output=True, text=True, env=environment)
         if outcome.returncode != 0:
             raise NativeError(
                 f"the C compiler failed: {' '.join(command)}\n{outcome.stderr.strip()[-2000:]}"
             )
-        os.replace(f"{scratch}/{name}", folder / name)  # whole or not at all
+        path = folder / _place(scratch / "built.so", name).name
+        put(scratch / "built.so", path)
+        if folder == scratch:
+            _ALONE[path] = stack.pop_all()
+            atexit.register(_ALONE[path].close)  # if it is never loaded
+    return path
+
+
+def _place(library: Path, name: str) -> Path:
+    """Where a library belongs by its name and its bytes, in its folder."""
+    digest = hashlib.sha256(library.read_bytes()).hexdigest()
+    return library.with_name(f"{name}-{digest[:16]}.so")
+
+
+@contextlib.contextmanager
+def _scratch(folder: Path) -> Generator[Path]:
+    """A new folder in another one, for a build; those that killed builds left there are removed.
+
+    A build holds the lock of its folder: one that can be locked belongs to nobody any more.
+    """
+    for left in folder.glob(f"{_SCRATCH}*"):
+        with contextlib.suppress(OSError):
+            descriptor = lock(left)
+            shutil.rmtree(left, ignore_errors=True)
+            os.close(descriptor)
+    path, descriptor = _locked(folder)
+    try:
+        yield path
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-    return folder / name
+        shutil.rmtree(path, ignore_errors=True)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _locked(folder: Path) -> tuple[Path, int | None]:
+    """A new folder in another one, and the descriptor that locks it, if the file system can."""
+    while True:
+        path = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=folder))
+        try:
+            descriptor = lock(path)
+        except (BlockingIOError, FileNotFoundError):
+            continue  # another build was faster, and takes it for one that was left
+        except OSError:
+            return path, None  # nor can another build lock and remove it
+        if path.exists():
+            return path, descriptor
+        os.close(descriptor)
+
+
+def _open(path: Path) -> ctypes.CDLL:
+    """Open a compiled library; one for this process alone leaves no file behind.
+
+    Raises:
+        NativeError: The system refuses it.
+    """
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError as error:
+        reason = f"the compiled library cannot be loaded: {error}; $QUADRL_CACHE names a folder"
+        raise NativeError(f"{reason} that programs may be run from") from error
+    finally:
+        if stack := _ALONE.pop(path, None):
+            stack.close()
 
 
 def load(path: Path) -> ctypes.CDLL:
@@ -172,7 +242,7 @@ def load(path: Path) -> ctypes.CDLL:
     Raises:
         NativeError: It was compiled against another version of mujoco.
     """
-    opened = ctypes.CDLL(str(path))
+    opened = _open(path)
     built, running = opened.quadrl_mujoco_version(), mujoco.mj_version()
     if built != running:
         raise NativeError(
@@ -230,7 +300,7 @@ def adjoint() -> ctypes.CDLL:
     Raises:
         NativeError: There is no compiler, or it refused the sources.
     """
-    opened = ctypes.CDLL(str(build(sources=("adjoint.c",), name="adjoint")))
+    opened = _open(build(sources=("adjoint.c",), name="adjoint"))
     opened.quadrl_adjoint.restype = None
     opened.quadrl_adjoint.argtypes = [_POINTER, ctypes.c_int64, ctypes.c_int64]
     return opened

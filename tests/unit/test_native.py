@@ -1,4 +1,4 @@
-"""The compiled callbacks: harmless to others, never silently absent, built for this mujoco."""
+"""The compiled callbacks: harmless to others, never silently absent."""
 
 import helpers
 import mujoco
@@ -26,25 +26,6 @@ def callbacks():
     yield
     remove_callbacks()
     native.install()
-
-
-@pytest.fixture
-def copying_compiler(tmp_path, monkeypatch):
-    """A compiler that is done at once: it gives out a copy of the library that there is."""
-    program = tmp_path / "copying-cc"
-    copy = f'while [ "$1" != -o ]; do shift; done; cp "{native.build()}" "$2"'
-    program.write_text(f"#!/bin/sh\n{copy}\n")
-    program.chmod(0o755)
-    monkeypatch.setenv("CC", str(program))
-
-
-@pytest.fixture
-def cache(tmp_path, monkeypatch):
-    """An empty cache of compiled libraries; the compiler does not take its time."""
-    folder = tmp_path / "cache"
-    monkeypatch.setenv("QUADRL_CACHE", str(folder))
-    monkeypatch.setenv("QUADRL_CFLAGS", "-O0")
-    return folder
 
 
 # --------------------------------------------------------------------------- other people's models
@@ -243,57 +224,3 @@ def test_rollout_runs_the_callbacks_without_python():
         mujoco.mj_step(model, data)
     mujoco.mj_getState(model, data, initial[0], state)
     np.testing.assert_array_equal(states[2, -1], initial[0])
-
-
-# -------------------------------------------------------------------------------------- the build
-
-
-def test_without_a_compiler_the_error_says_what_to_install(cache, monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.delenv("CC", raising=False)
-    with pytest.raises(native.NativeError, match="apt-get install build-essential"):
-        native.build()
-    assert list(cache.iterdir()) == []  # nothing half-made
-
-
-def test_cc_names_the_compiler_and_what_it_says_is_quoted(cache, monkeypatch, tmp_path):
-    chosen = tmp_path / "broken-cc"
-    chosen.write_text("#!/bin/sh\necho 'no such target: toaster' >&2\nexit 1\n")
-    chosen.chmod(0o755)
-    monkeypatch.setenv("CC", str(chosen))
-    assert native.compiler() == str(chosen)
-    with pytest.raises(native.NativeError, match="no such target: toaster"):
-        native.build()
-    assert list(cache.iterdir()) == []
-
-
-def test_the_cache_is_used_and_other_flags_make_another_library(
-    copying_compiler, cache, monkeypatch, tmp_path
-):
-    path = native.build()
-    assert list(cache.iterdir()) == [path]
-    built = path.stat().st_mtime_ns
-    monkeypatch.setenv("QUADRL_CFLAGS", "-O0 -DQUADRL_SAID='a word'")
-    assert native.flags()[-2:] == ("-O0", "-DQUADRL_SAID=a word")
-    assert native.build() != path and len(list(cache.iterdir())) == 2
-    monkeypatch.setenv("QUADRL_CFLAGS", "-O0")
-    monkeypatch.setenv("PATH", str(tmp_path))  # no compiler any more
-    monkeypatch.delenv("CC", raising=False)
-    assert native.build() == path
-    assert path.stat().st_mtime_ns == built
-
-
-@pytest.mark.parametrize("kind", ["read-only", "unreadable"])
-def test_a_cache_that_cannot_be_written_is_done_without(
-    copying_compiler, cache, tmp_path, monkeypatch, kind
-):
-    # Root may write everywhere, so both stand in: a folder under a file cannot be made, and a
-    # name past the file system's limit cannot even be asked for.
-    impossible = tmp_path / "file" / "quadrl" if kind == "read-only" else tmp_path / ("x" * 300)
-    (tmp_path / "file").write_text("")
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setenv("QUADRL_CACHE", str(impossible))
-    path = native.build()
-    assert path.is_relative_to(tmp_path / "tmp")
-    assert native.load(path).quadrl_mujoco_version() == mujoco.mj_version()
