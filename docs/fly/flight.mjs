@@ -57,9 +57,10 @@ export class Flight {
     kernel.view(slot, "limits").set(this.vehicle.limits);
     kernel.view(slot, "world").set(this.pair.world);
     kernel.view(slot, "origin").set(this.pair.origin);
+    const { rotors } = this.vehicle;
     this.scale[0] = this.vehicle.actionScale;
-    this.#point("flight_rows", "qpos qvel act ctrl warm wind parameters world near", [0, 0]);
-    this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, this.vehicle.rotors]);
+    this.#point("flight_rows", "qpos qvel act ctrl warm wind parameters world near", [0, 0, rotors]);
+    this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, rotors]);
   }
 
   // Fills a struct of pointers, then of int64, for the kernels of C.

@@ -57,7 +57,7 @@ class Leg:
         # As `Legs` in native/adjoint.c.
         legs = np.array(
             [*(array.ctypes.data for array in taken), 0 if given is None else given.ctypes.data,
-             *(array.ctypes.data for array in own), block]
+             *(array.ctypes.data for array in own), block, self.command.shape[1]]
         )  # fmt: skip
         native.adjoint().quadrl_adjoint(legs.ctypes.data, len(end), self.steps)
         return end, from_start, from_command

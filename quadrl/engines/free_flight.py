@@ -59,17 +59,16 @@ class FreeFlight:
     def use(self, table: np.ndarray) -> None:
         """Take rows of parameters (N,), or one (1,) for all; that one is live."""
         # As the kernels read them: the row, or blocks of LANES rows side by side.
-        self.parameters, block = table, 0
+        self.parameters, block, rotors = table, 0, self._fields["act"].shape[1]
         if len(table) > 1:
-            rotors = MAX_ROTORS - int(table["rotor_count"][0])
-            block = LANES * (ROW_SIZE - rotors * ROTOR.itemsize // 8)
+            block = LANES * (ROW_SIZE - (MAX_ROTORS - rotors) * ROTOR.itemsize // 8)
             self.parameters = np.empty((-(-len(table) // LANES), block // LANES, LANES))
             self.parameters[:] = numbers(table[:1])[0, : block // LANES, None]
             self.write(np.arange(len(table)), table)
         last = (self.parameters, self.world, self._near)
         # As `Rows` in native/free_flight.c.
         self._rows = np.array(
-            [*self._addresses, *(array.ctypes.data for array in last), self._stride, block]
+            [*self._addresses, *(array.ctypes.data for array in last), self._stride, block, rotors]
         )
         self._address = self._rows.ctypes.data
 

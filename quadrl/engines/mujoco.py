@@ -245,6 +245,7 @@ def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:
     sizes = (model.nq, model.nv, model.na, model.nu) == (7, 6, count, count)
     row: Any = model.body_user[1] if model.nbody > 1 and model.nuser_body else [0.0]
     marked = model.nuser_body == parameters.ROW_SIZE and row[0] == parameters.MARK
+    marked = marked and row.view(parameters.AIRCRAFT)["rotor_count"][0] == count
     rotors = sizes and (model.actuator_dynprm[:, native.MARK_SLOT] == parameters.MARK).all()
     step = model.opt.timestep
     for right, what in (

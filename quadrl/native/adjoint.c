@@ -88,16 +88,16 @@ VECTORISED static void near_ground(const Aircraft* a, int rotors, const World* w
 // Where the rows are, all contiguous: motions (7 of qpos, 6 of qvel, one per rotor), commands (one
 // per rotor), air (AIR) and parameters as in free_flight.c. given: the derivatives by the motions
 // at the end, or NULL to fly alone. Filled: end, from_start and from_command. path has room for
-// ROWS * LANES numbers per step. Filled by quadrl/engines.
+// ROWS * LANES numbers per step. rotors: as in free_flight.c. Filled by quadrl/engines.
 typedef struct {
   const double *start, *command, *air, *parameters, *given;
   const World* world;
   double *end, *from_start, *from_command, *path;
-  int64_t block;
+  int64_t block, rotors;
 } Legs;
 
 // Flies `count` aircraft some steps, and goes back. It knows no ground: the derivatives are those
-// of a flight that touches nothing.
+// of a flight that touches nothing. Nothing of one whose parameters are not sound is a number.
 QUADRL_EXPORT void quadrl_adjoint(const Legs* legs, int64_t count, int64_t steps) {
   const Legs r = *legs;
   Setting s;
@@ -109,7 +109,7 @@ QUADRL_EXPORT void quadrl_adjoint(const Legs* legs, int64_t count, int64_t steps
     }
   }
   const Aircraft* a = r.block ? (const Aircraft*)r.parameters : &same;
-  const int rotors = (int)a->rotor_count[0], rows = SPEED + rotors;
+  const int rotors = (int)r.rotors, rows = SPEED + rotors;
   for (int64_t row = 0; row < count; row += LANES) {
     const int filled = count - row < LANES ? (int)(count - row) : LANES;
     if (r.block) a = (const Aircraft*)(r.parameters + row / LANES * r.block);
@@ -120,7 +120,8 @@ QUADRL_EXPORT void quadrl_adjoint(const Legs* legs, int64_t count, int64_t steps
       for (int k = 0; k < rows; ++k) m_[k][i] = r.given ? r.given[place * rows + k] : 0;
       for (int k = 0; k < rotors; ++k) s.command[k][i] = r.command[place * rotors + k];
       for (int k = 0; k < AIR; ++k) s.air[k][i] = r.air[place * AIR + k];
-      if (a->effects[i] > effects) effects = (int)a->effects[i];
+      if (aero_effects(a, i) > effects) effects = aero_effects(a, i);
+      if (!is_sound(a, rotors, i)) m[QUATERNION][i] = NAN;
     }
     memset(command_, 0, sizeof command_);
     Lanes* back = r.given ? m_ : 0;

@@ -23,6 +23,13 @@ typedef double Lanes[LANES];
 // Aerodynamics.effects: the kernels are compiled for each.
 enum { STILL_AIR = 0, ROTOR_EFFECTS = 1, GROUND_EFFECT = 2 };
 
+// Those of an aircraft, or -1 where its row names none: not every number is an int.
+AERO int aero_effects(const Aircraft* a, int i) {
+  if (a->effects[i] == STILL_AIR) return STILL_AIR;
+  if (a->effects[i] == ROTOR_EFFECTS) return ROTOR_EFFECTS;
+  return a->effects[i] == GROUND_EFFECT ? GROUND_EFFECT : -1;
+}
+
 // Equation 10: the lag of the rotor speed [rad/s^2]; it may rise and fall at different rates, and a
 // command above the rotor's largest speed asks for that.
 AERO double aero_rotor_acceleration(const Rotor* rotor, double speed, double command, int i) {

@@ -26,24 +26,65 @@ static const Aircraft* aircraft_of(const mjModel* m, int body) {
   return a->mark[0] == QUADRL_MARK && a->size[0] == ROW_SIZE ? a : 0;
 }
 
-// The rotor of an actuator, or NULL where it is not one of ours.
-static const Rotor* rotor_of(const mjModel* m, int actuator) {
+// A number of a model as an int from 0 to the one below `count`, or -1. A model can be edited: none of
+// its numbers is an index before it was looked at.
+static int index_of(mjtNum number, int count) {
+  if (!(number >= 0 && number < count)) return -1;  // nor is what is not a number
+  const int index = (int)number;
+  return index == number ? index : -1;
+}
+
+// Whether an aircraft is one that can fly: on a free joint, with as many rotors and such effects as
+// there are.
+static int can_fly(const mjModel* m, const Aircraft* a, int body) {
+  const int joint = m->body_jntadr[body], dof = m->body_dofadr[body];
+  return joint >= 0 && joint < m->njnt && m->jnt_type[joint] == mjJNT_FREE && dof >= 0 &&
+         dof + 6 <= m->nv && index_of(a->rotor_count[0], MAX_ROTORS + 1) >= 0 &&
+         aero_effects(a, 0) >= 0;
+}
+
+enum { FOREIGN = -1, UNSOUND = -2 };
+
+// What a marked actuator is that is on no aircraft: a foreign one, unless the model has an aircraft
+// that it is missing from. Out of line, since it is rare.
+static __attribute__((noinline, cold)) int lost_rotor(const mjModel* m) {
+  for (int body = 1; body < m->nbody; ++body) {
+    if (aircraft_of(m, body)) return UNSOUND;
+  }
+  return FOREIGN;
+}
+
+// Whether an address of a model is one in an array of some length.
+static int is_in(int address, mjtSize length) { return (uint64_t)(int64_t)address < (uint64_t)length; }
+
+// The number of the rotor that an actuator is, and whose. FOREIGN where it is not one of ours;
+// UNSOUND where it is, but the model does not say of which aircraft, or not which of its rotors.
+static int rotor_of(const mjModel* m, int actuator, const Aircraft** owner) {
   const mjtNum* parameters = m->actuator_dynprm + mjNDYN * actuator;
-  if (parameters[MARK_SLOT] != QUADRL_MARK) return 0;
-  const Aircraft* a = aircraft_of(m, m->site_bodyid[m->actuator_trnid[2 * actuator]]);
-  return a ? a->rotor + (int)parameters[0] : 0;
+  if (parameters[MARK_SLOT] != QUADRL_MARK) return FOREIGN;
+  const int site = m->actuator_trnid[2 * actuator];
+  if (m->actuator_trntype[actuator] != mjTRN_SITE || !is_in(site, m->nsite)) return lost_rotor(m);
+  const Aircraft* a = aircraft_of(m, m->site_bodyid[site]);
+  if (!a) return lost_rotor(m);
+  *owner = a;
+  if (!is_in(m->actuator_actadr[actuator], m->na)) return UNSOUND;
+  const int rotor = index_of(parameters[0], MAX_ROTORS);
+  return rotor >= 0 && rotor < a->rotor_count[0] ? rotor : UNSOUND;
 }
 
 QUADRL_EXPORT mjtNum quadrl_act_dyn(const mjModel* m, const mjData* d, int actuator) {
-  const Rotor* rotor = rotor_of(m, actuator);
-  if (!rotor) return 0;
-  return aero_rotor_acceleration(rotor, d->act[m->actuator_actadr[actuator]],
+  const Aircraft* a;
+  const int rotor = rotor_of(m, actuator, &a);
+  if (rotor < 0) return rotor == FOREIGN ? 0 : NAN;
+  return aero_rotor_acceleration(a->rotor + rotor, d->act[m->actuator_actadr[actuator]],
                                  d->ctrl[m->actuator_ctrladr[actuator]], 0);
 }
 
 QUADRL_EXPORT mjtNum quadrl_act_gain(const mjModel* m, const mjData* d, int actuator) {
-  const Rotor* rotor = rotor_of(m, actuator);
-  return rotor ? aero_rotor_gain(rotor, d->act[m->actuator_actadr[actuator]], 0) : 1;
+  const Aircraft* a;
+  const int rotor = rotor_of(m, actuator, &a);
+  if (rotor < 0) return rotor == FOREIGN ? 1 : NAN;
+  return aero_rotor_gain(a->rotor + rotor, d->act[m->actuator_actadr[actuator]], 0);
 }
 
 // What the air does to the rotors of a body beside equation 7, and their inertia.
@@ -53,9 +94,10 @@ static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft*
   Lanes speed[MAX_ROTORS] = {{0}}, command[MAX_ROTORS] = {{0}}, noise[MAX_ROTORS] = {{0}};
   Lanes air[3], body_rate[3], up[3], push[3] = {{0}}, twist[3] = {{0}}, height;
   Disc disc[MAX_ROTORS];
-  for (int k = 0; k < m->nu; ++k) {
-    if (!rotor_of(m, k) || m->site_bodyid[m->actuator_trnid[2 * k]] != body) continue;
-    const int rotor = (int)m->actuator_dynprm[mjNDYN * k];
+  for (int k = 0; k < m->nactuator; ++k) {
+    const Aircraft* owner;
+    const int rotor = rotor_of(m, k, &owner);
+    if (rotor < 0 || owner != a) continue;
     speed[rotor][0] = d->act[m->actuator_actadr[k]];
     command[rotor][0] = d->ctrl[m->actuator_ctrladr[k]];
     if (m->nuserdata >= AIR) noise[rotor][0] = d->userdata[WIND + rotor];
@@ -68,7 +110,7 @@ static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft*
   height[0] = d->xpos[3 * body + 2];
   const int rotors = (int)a->rotor_count[0];
   for (int k = 0; k < rotors; ++k) aero_disc(a, a->rotor + k, disc + k);
-  const int effects = a->effects[0] == GROUND_EFFECT ? GROUND_EFFECT : ROTOR_EFFECTS;
+  const int effects = aero_effects(a, 0) == GROUND_EFFECT ? GROUND_EFFECT : ROTOR_EFFECTS;
   aero_rotors(a, disc, effects, rotors, speed, command, noise, air, body_rate, up, height, push,
               twist);
   for (int k = 0; k < 3; ++k) {
@@ -81,6 +123,11 @@ QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
   for (int body = 1; body < m->nbody; ++body) {
     const Aircraft* a = aircraft_of(m, body);
     if (!a) continue;
+    if (!can_fly(m, a, body)) {
+      // It fails as a model of ours without callbacks does.
+      for (int k = 0; k < m->nv; ++k) d->qfrc_passive[k] = NAN;
+      return;
+    }
     const int dof = m->body_dofadr[body];
     // A model of ours carries a gravity compensation that is not a number, so that stepping it
     // without these callbacks fails at once (MuJoCo warns and resets). Here it is taken out again.

@@ -35,9 +35,9 @@ VECTORISED static void fly_near_ground(const Aircraft* a, int rotors, const Worl
 }
 
 // Distance of the farthest rotor from the centre of mass [m], and the largest disc.
-static void extent(const Aircraft* a, double* reach, double* radius, int i) {
+static void extent(const Aircraft* a, int rotors, double* reach, double* radius, int i) {
   *reach = *radius = 0;
-  for (int k = 0; k < (int)a->rotor_count[i]; ++k) {
+  for (int k = 0; k < rotors; ++k) {
     const Rotor* rotor = a->rotor + k;
     const double r[3] = {rotor->position[0][i], rotor->position[1][i], rotor->position[2][i]};
     const double distance = aero_length(r);
@@ -47,10 +47,10 @@ static void extent(const Aircraft* a, double* reach, double* radius, int i) {
 }
 
 // Height under which the aircraft of a lane cannot come in `time` [s], whatever it does.
-static double lowest(const Aircraft* a, const World* world, const Setting* s, const Lanes* m,
-                     double time, int i) {
+static double lowest(const Aircraft* a, int rotors, const World* world, const Setting* s,
+                     const Lanes* m, double time, int i) {
   double lift = 0, squares = 0, speeds = 0;
-  for (int k = 0; k < (int)a->rotor_count[i]; ++k) {
+  for (int k = 0; k < rotors; ++k) {
     const double speed = m[SPEED + k][i], wanted = s->command[k][i];
     const double fastest = speed > wanted ? speed : wanted;
     lift += aero_rotor_gain(a->rotor + k, fastest, i) * fastest;
@@ -64,7 +64,7 @@ static double lowest(const Aircraft* a, const World* world, const Setting* s, co
   if (a->effects[i] != STILL_AIR) {
     const double r[3] = {m[BODY_RATE][i], m[BODY_RATE + 1][i], m[BODY_RATE + 2][i]};
     double reach, radius;
-    extent(a, &reach, &radius, i);
+    extent(a, rotors, &reach, &radius, i);
     pull += (aero_largest_lift(a, i) - 1) * lift / a->mass[i];
     pull += aero_largest_push(a, speeds, sqrt(squares) + aero_length(r) * reach + pull * time, i);
   }
@@ -74,13 +74,13 @@ static double lowest(const Aircraft* a, const World* world, const Setting* s, co
 
 // The kernel of the aircraft that stay above a height each (`low`): the effects that they have, but
 // for a ground effect that is exactly nothing up there.
-static int effects_of(const Aircraft* a, const double low[LANES]) {
+static int effects_of(const Aircraft* a, int rotors, const double low[LANES]) {
   int effects = STILL_AIR;
   for (int i = 0; i < LANES; ++i) {
-    int own = (int)a->effects[i];
+    int own = aero_effects(a, i);
     if (own == GROUND_EFFECT) {
       double reach, radius;
-      extent(a, &reach, &radius, i);
+      extent(a, rotors, &reach, &radius, i);
       if (low[i] - reach > 8 * radius) own = ROTOR_EFFECTS;
     }
     if (own > effects) effects = own;
@@ -92,7 +92,8 @@ static int effects_of(const Aircraft* a, const double low[LANES]) {
 // MuJoCo's warm start, cleared) and air (AIR: wind [m/s, world], noise of the rotors' thrust) of
 // aircraft i stand at i * stride doubles. parameters: with block = 0 a row for all, an Aircraft of
 // one lane; else those of aircraft i..i+LANES-1 side by side at i / LANES * block doubles, an
-// Aircraft as far as there are rotors. Filled by quadrl/engines.
+// Aircraft as far as there are rotors. rotors: how many all have, at most MAX_ROTORS. Filled by
+// quadrl/engines.
 typedef struct {
   double *qpos, *qvel, *act;
   const double* ctrl;
@@ -100,11 +101,12 @@ typedef struct {
   const double *air, *parameters;
   const World* world;
   char* near;  // one per aircraft
-  int64_t stride, block;
+  int64_t stride, block, rotors;
 } Rows;
 
 // Advances aircraft first..last-1 by a number of steps, in place, except those that may touch
-// something meanwhile: these are left as they are and marked in near. first is a multiple of LANES.
+// something meanwhile: these are left as they are and marked in near. The position of one whose
+// parameters are not sound any more is not a number afterwards. first is a multiple of LANES.
 // Returns how many are marked.
 QUADRL_EXPORT int64_t quadrl_free_flight(const Rows* rows, int64_t first, int64_t last,
                                          int64_t steps) {
@@ -124,11 +126,14 @@ QUADRL_EXPORT int64_t quadrl_free_flight(const Rows* rows, int64_t first, int64_
     }
   }
   const Aircraft* a = r.block ? (const Aircraft*)r.parameters : &same;
-  const int rotors = (int)a->rotor_count[0];
-  const int air = a->effects[0] == STILL_AIR ? WIND : WIND + rotors;
+  const int rotors = (int)r.rotors;
   for (int64_t row = first; row < last; row += LANES) {
     const int filled = last - row < LANES ? (int)(last - row) : LANES;
     if (r.block) a = (const Aircraft*)(r.parameters + row / LANES * r.block);
+    int air = WIND;
+    for (int i = 0; i < LANES; ++i) {
+      if (a->effects[i] != STILL_AIR) air = WIND + rotors;
+    }
     for (int i = 0; i < LANES; ++i) {
       const int64_t place = (row + (i < filled ? i : 0)) * stride;  // spare lanes: twins
       for (int k = 0; k < 7; ++k) m[POSITION + k][i] = qpos[place + k];
@@ -136,17 +141,18 @@ QUADRL_EXPORT int64_t quadrl_free_flight(const Rows* rows, int64_t first, int64_
       for (int k = 0; k < rotors; ++k) m[SPEED + k][i] = act[place + k];
       for (int k = 0; k < rotors; ++k) s.command[k][i] = ctrl[place + k];
       for (int k = 0; k < air; ++k) s.air[k][i] = r.air[place + k];
+      if (!is_sound(a, rotors, i)) m[POSITION][i] = m[POSITION + 2][i] = NAN;
     }
     double low[LANES];
     int touching = 0;
-    for (int i = 0; i < LANES; ++i) low[i] = lowest(a, world, &s, m, time, i);
+    for (int i = 0; i < LANES; ++i) low[i] = lowest(a, rotors, world, &s, m, time, i);
     for (int i = 0; i < filled; ++i) {
       r.near[row + i] = low[i] < world->floor;
       touching += r.near[row + i];
     }
     marked += touching;
     if (touching == filled) continue;
-    const int effects = effects_of(a, low);
+    const int effects = effects_of(a, rotors, low);
     if (effects == GROUND_EFFECT) {
       fly_near_ground(a, rotors, world, &s, m, steps);
     } else if (effects == ROTOR_EFFECTS) {

@@ -30,6 +30,11 @@ typedef struct {
   Disc disc[MAX_ROTORS];
 } Setting;
 
+// Whether a row of parameters, which may be live, is still one that is flown with so many rotors.
+INLINE int is_sound(const Aircraft* a, int rotors, int i) {
+  return a->rotor_count[i] == rotors && aero_effects(a, i) >= 0;
+}
+
 // Body to world. Between the stages the quaternion is not quite of unit length; its direction
 // counts.
 INLINE void rotation(const Lanes* q, double turn[3][3], int i) {
