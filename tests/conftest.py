@@ -17,7 +17,7 @@ from quadrl import mjcf  # noqa: E402
 
 @pytest.fixture(autouse=True)
 def scratch_folder(tmp_path, monkeypatch):
-    """MuJoCo writes MUJOCO_LOG.TXT where it runs."""
+    """What a test writes where it runs goes with it."""
     monkeypatch.chdir(tmp_path)
 
 

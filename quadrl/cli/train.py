@@ -197,6 +197,7 @@ def _list_files(run: Run) -> None:
         names.VIDEO: "one of them on video",
         names.EVALUATION: "the metrics",
         names.METRICS: f"the training, row by row; also: tensorboard --logdir {folder}",
+        names.WARNINGS: "MuJoCo's warnings in the training",
         names.CONFIG: "the resolved configuration",
         "checkpoint.safetensors": f"to continue: {again('train --resume', folder)} --steps N",
     }

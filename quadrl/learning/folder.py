@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
-import fcntl
+import functools
 import hashlib
 import io
 import json
 import os
-from collections.abc import Mapping, Sequence
+import socket
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from quadrl.errors import QuadrlError
-from quadrl.files import read_sealed_json, write_sealed_json, write_whole
+from quadrl.errors import QuadrlError, QuadrlWarning
+from quadrl.files import NO_LOCKS, lock, read_sealed_json, write_sealed_json, write_whole
 from quadrl.machine import processor_kind
 from quadrl.policy import RUN as CONFIG
 from quadrl.policy import RUN_FORMAT
@@ -25,6 +28,10 @@ EVALUATION = "evaluation.json"
 LEARNING_CURVE = "learning_curve.png"
 TRAJECTORY = "trajectory.png"
 VIDEO = "flight.mp4"
+WARNINGS = "warnings.txt"
+"""MuJoCo's, of the training; where it had any."""
+LOCK = "training.lock"
+"""Host and process of the training that works here, where the file system has no locks."""
 FREE = ("num_threads", "checkpoint_seconds")
 """Settings that change no result."""
 CHANGEABLE = (*FREE, "steps", "device")
@@ -54,21 +61,83 @@ def new_folder(path: Path) -> None:
     path.mkdir(parents=True, exist_ok=True)
 
 
-def lock_folder(path: Path) -> int:
-    """Keep other trainings out of a folder while the returned descriptor is open.
+def lock_folder(path: Path) -> Callable[[], None]:
+    """Keep other trainings out of a folder until the returned function is called.
+
+    Where the file system has no locks, a file in the folder does it, with a warning.
 
     Raises:
         QuadrlError: Another training works in it.
     """
-    descriptor = os.open(path, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return functools.partial(os.close, lock(path))
     except BlockingIOError as error:
-        os.close(descriptor)
         raise QuadrlError(
             f"another training works in {path}: wait for its end, stop it, or choose another folder"
         ) from error
-    return descriptor
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+    file = (path / LOCK).absolute()
+    _make_lock(file)
+    text = f"the file system of {path} has no locks: {LOCK} in it keeps other trainings out"
+    warnings.warn(text, QuadrlWarning, stacklevel=2)
+    return functools.partial(_remove_lock, file)
+
+
+_HELD: set[Path] = set()
+"""Lock files of this process."""
+
+
+def _make_lock(file: Path) -> None:
+    """Write a lock file, in place of one whose process died on this host.
+
+    Raises:
+        QuadrlError: There is one whose process lives, or may live.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        if _is_dead(file):
+            file.unlink()
+    try:
+        with open(file, "x") as opened:
+            opened.write(_owner())
+    except FileExistsError as error:
+        host, _, process = file.read_text(errors="replace").strip().partition(" ")
+        who = f"process {process} on {host}, by {file}"
+        raise QuadrlError(
+            f"another training works in {file.parent} ({who}): wait for its end, stop it, or "
+            "choose another folder; if that process is gone, delete the file"
+        ) from error
+    _HELD.add(file)
+
+
+def _is_dead(file: Path) -> bool:
+    """Whether a lock file is one of a process of this host that is no more."""
+    text = file.read_text(errors="replace")
+    host, _, process = text.strip().partition(" ")
+    if host != socket.gethostname() or not process.isdecimal():
+        return False
+    if text == _owner():  # of this process, or of an earlier one with its number
+        return file not in _HELD
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):  # it lives, and belongs to somebody else
+        pass
+    return False
+
+
+def _remove_lock(file: Path) -> None:
+    """Remove a lock file, if it is this process's own: a child may hold a copy of this call."""
+    _HELD.discard(file)
+    with contextlib.suppress(OSError):
+        if file.read_text(errors="replace") == _owner():
+            file.unlink()
+
+
+def _owner() -> str:
+    return f"{socket.gethostname()} {os.getpid()}\n"
 
 
 def write_json(path: Path, content: Any) -> None:

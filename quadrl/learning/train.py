@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import gc
-import os
 import time
 import warnings
 import weakref
@@ -21,8 +20,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from quadrl import native
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.errors import QuadrlError, QuadrlWarning
+from quadrl.files import PART
 from quadrl.learning import checkpoint
 from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.apg import APG
@@ -30,6 +31,7 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import RecordingEnv, make_collector, make_env
 from quadrl.learning.folder import (
     EVALUATION,
+    WARNINGS,
     Log,
     lock_folder,
     new_folder,
@@ -140,7 +142,9 @@ class Training:
         self._remembered: dict[str, np.ndarray] = {}  # the states of a recurrent policy
         if not resume:
             new_folder(folder)
-        self._unlock = weakref.finalize(self, os.close, lock_folder(folder))
+        self._unlock = weakref.finalize(self, lock_folder(folder))
+        for left in folder.glob(f"*{PART}") if resume else ():  # by a kill
+            left.unlink(missing_ok=True)
         resolved = config.resolved()
         self._known_as = run_of(resolved)
         if not resume:
@@ -188,6 +192,7 @@ class Training:
             self._set_generators()
             log = Log(self.folder, self.iteration)
             stack.callback(log.close)
+            stack.enter_context(native.warnings_in(self.folder / WARNINGS))
             # All that the imports made is no garbage, and to look through it takes 5 % of the time.
             gc.freeze()
             stack.callback(gc.unfreeze)

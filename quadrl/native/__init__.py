@@ -39,7 +39,7 @@ from quadrl.parameters import c_structs
 from quadrl.state import c_rows
 
 SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
-           "disturbances.c")  # fmt: skip
+           "disturbances.c", "warnings.c")  # fmt: skip
 HEADERS = ("adjoint.h", "aero.h", "export.h", "philox.h", "runge_kutta.h")
 MARK_SLOT = 9
 """Entry of an actuator's `dynprm` that holds MARK."""
@@ -54,6 +54,8 @@ FLAGS = (
     "-fno-math-errno",
 )
 CALLBACKS = ("act_dyn", "act_gain", "passive")
+MAX_WARNINGS = 500
+"""Lines of a file of MuJoCo's warnings: at most 60 kB."""
 
 _FOLDER = Path(__file__).parent
 _POINTER = ctypes.c_void_p
@@ -63,6 +65,7 @@ _KINDS = {
     "act_gain": _ACTUATOR_CALLBACK,
     "passive": ctypes.CFUNCTYPE(None, _POINTER, _POINTER),
     "time": ctypes.CFUNCTYPE(ctypes.c_double),
+    "warning": ctypes.CFUNCTYPE(None, ctypes.c_char_p),
 }
 _SCRATCH = "quadrl-build-"
 _ALONE: dict[Path, contextlib.ExitStack] = {}
@@ -258,6 +261,8 @@ def load(path: Path) -> ctypes.CDLL:
     opened.quadrl_unsound_air.argtypes = [_POINTER, integer]
     opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
     opened.quadrl_uniform.restype = opened.quadrl_weather.restype = None
+    opened.quadrl_write_warnings.restype = None
+    opened.quadrl_write_warnings.argtypes = [ctypes.c_char_p, ctypes.c_int]
     opened.quadrl_weather.argtypes = [_POINTER, integer, _POINTER, integer]
     real, stride = ctypes.c_double, integer
     opened.quadrl_estimate.restype = opened.quadrl_push.restype = None
@@ -318,6 +323,32 @@ def _stop_clock() -> None:
         mujoco.set_mjcb_time(library().time)
 
 
+@functools.cache
+def _take_warnings() -> None:
+    """Write a few of MuJoCo's warnings to stderr and none to a file, unless somebody has them.
+
+    Done once per process. MuJoCo itself writes all of them, also to MUJOCO_LOG.TXT in the working
+    folder; `mujoco.set_mju_user_warning(None)` brings that back at any time.
+    """
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(library().warning)
+
+
+@contextlib.contextmanager
+def warnings_in(path: Path) -> Generator[None]:
+    """Add MuJoCo's warnings to a file, which has at most MAX_WARNINGS lines, and not to stderr.
+
+    It is made with the first one. A handler of somebody else's keeps its warnings.
+    """
+    lines = len(path.read_text(errors="replace").splitlines()) if path.exists() else 0
+    write = library().quadrl_write_warnings
+    write(os.fsencode(path.absolute()), max(MAX_WARNINGS - lines, 0))
+    try:
+        yield
+    finally:
+        write(None, 0)
+
+
 def install(replace: bool = False) -> None:
     """Install the rotor callbacks in this process (idempotent).
 
@@ -346,6 +377,7 @@ def install(replace: bool = False) -> None:
     for name in CALLBACKS:
         getattr(mujoco, f"set_mjcb_{name}")(getattr(ours, name))
     _stop_clock()
+    _take_warnings()
 
 
 def check_installed() -> None:

@@ -26,8 +26,8 @@ static const Aircraft* aircraft_of(const mjModel* m, int body) {
   return a->mark[0] == QUADRL_MARK && a->size[0] == ROW_SIZE ? a : 0;
 }
 
-// A number of a model as an int from 0 to the one below `count`, or -1. A model can be edited: none of
-// its numbers is an index before it was looked at.
+// A number of a model as an int from 0 to the one below `count`, or -1. A model can be edited: none
+// of its numbers is an index before it was looked at.
 static int index_of(mjtNum number, int count) {
   if (!(number >= 0 && number < count)) return -1;  // nor is what is not a number
   const int index = (int)number;
@@ -55,7 +55,7 @@ static __attribute__((noinline, cold)) int lost_rotor(const mjModel* m) {
 }
 
 // Whether an address of a model is one in an array of some length.
-static int is_in(int address, mjtSize length) { return (uint64_t)(int64_t)address < (uint64_t)length; }
+static int is_in(int address, mjtSize length) { return address >= 0 && address < length; }
 
 // The number of the rotor that an actuator is, and whose. FOREIGN where it is not one of ours;
 // UNSOUND where it is, but the model does not say of which aircraft, or not which of its rotors.
@@ -68,6 +68,7 @@ static int rotor_of(const mjModel* m, int actuator, const Aircraft** owner) {
   if (!a) return lost_rotor(m);
   *owner = a;
   if (!is_in(m->actuator_actadr[actuator], m->na)) return UNSOUND;
+  if (!is_in(m->actuator_ctrladr[actuator], m->nu)) return UNSOUND;
   const int rotor = index_of(parameters[0], MAX_ROTORS);
   return rotor >= 0 && rotor < a->rotor_count[0] ? rotor : UNSOUND;
 }
@@ -110,7 +111,7 @@ static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft*
   height[0] = d->xpos[3 * body + 2];
   const int rotors = (int)a->rotor_count[0];
   for (int k = 0; k < rotors; ++k) aero_disc(a, a->rotor + k, disc + k);
-  const int effects = aero_effects(a, 0) == GROUND_EFFECT ? GROUND_EFFECT : ROTOR_EFFECTS;
+  const int effects = a->effects[0] == GROUND_EFFECT ? GROUND_EFFECT : ROTOR_EFFECTS;
   aero_rotors(a, disc, effects, rotors, speed, command, noise, air, body_rate, up, height, push,
               twist);
   for (int k = 0; k < 3; ++k) {

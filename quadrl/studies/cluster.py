@@ -13,13 +13,14 @@ import shutil
 import socket
 import tempfile
 import time
+import weakref
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 from quadrl.errors import QuadrlError
-from quadrl.files import write_whole
-from quadrl.learning.folder import CONFIG, EVALUATION, METRICS, lock_folder
+from quadrl.files import PART, write_whole
+from quadrl.learning.folder import CONFIG, EVALUATION, LOCK, METRICS, lock_folder
 from quadrl.machine import cores
 from quadrl.studies import worker
 from quadrl.studies.crew import End, ended
@@ -82,7 +83,7 @@ class RayWorker:
         """Follow an actor; the folder is locked until it ends."""
         self._actor, self._run, self._log = actor, run, log
         run.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = lock_folder(run.folder)
+        self._unlock = weakref.finalize(self, lock_folder(run.folder))
         self._news = actor.news.remote()
 
     def poll(self) -> End | None:
@@ -113,9 +114,7 @@ class RayWorker:
         import ray
 
         ray.kill(self._actor)
-        if self._lock >= 0:
-            os.close(self._lock)
-            self._lock = -1
+        self._unlock()
 
 
 class RayCrew:
@@ -232,7 +231,7 @@ def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
     """Time of change [ns] and size of the files of a folder."""
     found = {}
     for path in sorted(folder.rglob("*")) if folder.exists() else ():
-        if path.suffix == ".part":  # not whole yet
+        if path.suffix == PART or path.name == LOCK:  # not whole yet, or of this machine alone
             continue
         with contextlib.suppress(FileNotFoundError):
             known = path.stat()

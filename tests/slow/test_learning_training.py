@@ -1,10 +1,12 @@
 """Training: the same seed, checkpoints that lose nothing, what the critic sees, the metrics."""
 
 import dataclasses
+import errno
 import os
 import shutil
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -13,12 +15,15 @@ from safetensors.torch import save as to_safetensors
 from tensordict import TensorDict
 
 import quadrl
+from quadrl import native
 from quadrl.environment import Environment
+from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.learning import checkpoint
 from quadrl.learning.config import ALGORITHMS
 from quadrl.learning.environments import SEED_STRIDE
 from quadrl.learning.figures import learning_curve, read_metrics
 from quadrl.learning.figures import trajectory as draw_trajectory
+from quadrl.learning.folder import LOCK, WARNINGS
 from quadrl.learning.train import Training
 from quadrl.rollout import fly
 
@@ -244,6 +249,46 @@ def test_a_full_disk_does_not_destroy_what_is_there(finished, tmp_path, monkeypa
         assert (folder / name).read_bytes() == before[name]
     assert not list(folder.glob("*.part"))
     assert_same_run(finished, train(TINY, folder, resume=True))
+
+
+def test_what_a_killed_training_left_half_written_is_removed_when_it_is_resumed(finished, tmp_path):
+    folder = stopped(TINY, tmp_path / "run", 4)
+    names = (checkpoint.CHECKPOINT, "policy.safetensors", "learning_curve.png")
+    for name in names:
+        (folder / f"{name}.part").write_bytes(b"half")
+    Training(TINY, folder, resume=True)
+    assert not list(folder.glob("*.part"))
+    assert_same_run(finished, train(TINY, folder, resume=True))
+
+
+def test_a_file_system_without_locks_trains(finished, tmp_path, monkeypatch):
+    def refuse(descriptor, operation):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with pytest.warns(QuadrlWarning, match="has no locks"):
+        training = Training(TINY, tmp_path / "run")
+    assert (tmp_path / "run" / LOCK).exists()
+    with pytest.raises(QuadrlError, match=f"another training works in .*{LOCK}"):
+        Training(TINY, tmp_path / "run", resume=True)
+    training.run()
+    assert not (tmp_path / "run" / LOCK).exists()
+    assert_same_run(finished, tmp_path / "run")
+
+
+def test_mujocos_warnings_stand_in_the_run_folder(tmp_path, capfd):
+    def diverge(progress):
+        training.env.environment.engine.qvel[:] = np.nan
+
+    training = Training(changed(engine="mujoco"), tmp_path / "run")
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(native.library().warning)  # another test's may be there
+    try:
+        training.run(diverge)
+    finally:
+        mujoco.set_mju_user_warning(before)
+    assert "huge value in Q" in (tmp_path / "run" / WARNINGS).read_text()
+    assert "MuJoCo" not in "".join(capfd.readouterr())
 
 
 def test_checkpoints_keep_every_kind_of_number(tmp_path):

@@ -1,5 +1,10 @@
 """The compiled callbacks: harmless to others, never silently absent."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import helpers
 import mujoco
 import numpy as np
@@ -183,6 +188,70 @@ def test_without_one_of_the_callbacks_nothing_steps(name):
         with pytest.raises(native.NativeError, match=f"mjcb_{name}"):
             step()
     np.testing.assert_array_equal(environment.engine.qpos, before)
+
+
+# -------------------------------------------------------------------------------- MuJoCo's warnings
+
+DIVERGE = """
+import mujoco, numpy as np
+from pathlib import Path
+from quadrl import native
+from quadrl.engines.mujoco import BatchEngine
+from quadrl.vehicle import Vehicle
+{before}
+engine = BatchEngine(Vehicle(), 64, altitude=3.0, num_threads=4)
+def diverge():
+    engine.clear(np.arange(64))
+    engine.qvel[:] = np.nan
+    engine.advance(1)
+{body}
+"""
+INTO_A_FILE = """
+path = Path("warnings.txt")
+with native.warnings_in(path):
+    engine.advance(1)
+assert not path.exists()
+with native.warnings_in(path):
+    diverge()
+with native.warnings_in(path):
+    for _ in range(10):
+        diverge()
+"""
+
+
+def diverged(body, before=""):
+    """What a process wrote to stderr, standing in this folder."""
+    command = [sys.executable, "-c", DIVERGE.format(before=before, body=body)]
+    repository = str(Path(quadrl.__file__).parents[1])
+    environment = os.environ | {"PYTHONPATH": repository}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stderr.splitlines()
+
+
+def test_a_few_warnings_of_mujoco_are_told_and_none_written_where_one_stands():
+    lines = diverged("diverge(), diverge()")
+    assert len(lines) == 10
+    assert all(line.startswith("quadrl: warning: MuJoCo: ") for line in lines)
+    assert all("huge value in Q" in line for line in lines[:-1])
+    assert "there were more warnings" in lines[-1]
+    assert os.listdir() == []
+
+
+def test_warnings_of_many_threads_go_to_a_file_that_does_not_grow_without_end():
+    assert diverged(INTO_A_FILE) == []
+    assert os.listdir() == ["warnings.txt"]
+    *lines, last = Path("warnings.txt").read_text().splitlines()
+    assert len(lines) == native.MAX_WARNINGS - 1
+    assert all("The simulation is unstable" in line for line in lines)
+    assert "there were more warnings" in last
+    assert Path("warnings.txt").stat().st_size < 64_000
+
+
+def test_somebody_elses_handler_of_warnings_is_left_alone():
+    before = "seen = []; mujoco.set_mju_user_warning(seen.append)"
+    assert diverged(INTO_A_FILE + "assert len(seen) >= 11 * 64", before) == []
+    assert os.listdir() == []
 
 
 # --------------------------------------------------------------- our models without the callbacks
