@@ -9,6 +9,8 @@
 //   actuator_gear     along and about the rotor's axis: 1, aero_reaction
 //   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/parameters.py says
 #include <mujoco/mujoco.h>
+#include <stdint.h>
+#include <string.h>
 
 #define LANES 1
 #include "aero.h"
@@ -19,11 +21,16 @@ enum { MARK_SLOT = 9 };
 // The struct layouts of mjModel and mjData are compiled in: the loader compares these.
 QUADRL_EXPORT int quadrl_mujoco_version(void) { return mjVERSION_HEADER; }
 
+// Whether a number of a model is this one, bit for bit: that is quicker than `==`.
+static int is_same(mjtNum number, mjtNum expected) {
+  return memcmp(&number, &expected, sizeof number) == 0;
+}
+
 // The row of a body, or NULL where it is not one of ours.
 static const Aircraft* aircraft_of(const mjModel* m, int body) {
   if (m->nuser_body < ROW_SIZE) return 0;
   const Aircraft* a = (const Aircraft*)(m->body_user + (size_t)m->nuser_body * body);
-  return a->mark[0] == QUADRL_MARK && a->size[0] == ROW_SIZE ? a : 0;
+  return is_same(a->mark[0], QUADRL_MARK) && is_same(a->size[0], ROW_SIZE) ? a : 0;
 }
 
 // A number of a model as an int from 0 to the one below `count`, or -1. A model can be edited: none
@@ -54,23 +61,24 @@ static __attribute__((noinline, cold)) int lost_rotor(const mjModel* m) {
   return FOREIGN;
 }
 
-// Whether an address of a model is one in an array of some length.
-static int is_in(int address, mjtSize length) { return address >= 0 && address < length; }
+// Whether an address of a model is one in an array of some length; as unsigned numbers, since then a
+// negative one is too large.
+static int is_in(int address, mjtSize length) { return (uint64_t)address < (uint64_t)length; }
 
 // The number of the rotor that an actuator is, and whose. FOREIGN where it is not one of ours;
 // UNSOUND where it is, but the model does not say of which aircraft, or not which of its rotors.
 static int rotor_of(const mjModel* m, int actuator, const Aircraft** owner) {
   const mjtNum* parameters = m->actuator_dynprm + mjNDYN * actuator;
-  if (parameters[MARK_SLOT] != QUADRL_MARK) return FOREIGN;
+  if (!is_same(parameters[MARK_SLOT], QUADRL_MARK)) return FOREIGN;
   const int site = m->actuator_trnid[2 * actuator];
   if (m->actuator_trntype[actuator] != mjTRN_SITE || !is_in(site, m->nsite)) return lost_rotor(m);
   const Aircraft* a = aircraft_of(m, m->site_bodyid[site]);
   if (!a) return lost_rotor(m);
   *owner = a;
   if (!is_in(m->actuator_actadr[actuator], m->na)) return UNSOUND;
-  if (!is_in(m->actuator_ctrladr[actuator], m->nu)) return UNSOUND;
+  if (!(parameters[0] < a->rotor_count[0])) return UNSOUND;
   const int rotor = index_of(parameters[0], MAX_ROTORS);
-  return rotor >= 0 && rotor < a->rotor_count[0] ? rotor : UNSOUND;
+  return rotor >= 0 ? rotor : UNSOUND;
 }
 
 QUADRL_EXPORT mjtNum quadrl_act_dyn(const mjModel* m, const mjData* d, int actuator) {
