@@ -9,7 +9,6 @@ import inspect
 import os
 import signal
 import sys
-import threading
 import traceback
 import warnings
 from collections.abc import Generator
@@ -35,6 +34,7 @@ from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
 from quadrl.cli.view import View
 from quadrl.errors import QuadrlError, QuadrlWarning
+from quadrl.signals import IN_ORDER, Stopped, handling
 from quadrl.tasks import TASKS
 
 Command = (
@@ -72,7 +72,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"quadrl {__version__}, mujoco {version('mujoco')}, Python {sys.version.split()[0]}")
         return
     try:
-        with _warned_in_a_line(stderr), _terminated_in_order():
+        with _warned_in_a_line(stderr), handling(IN_ORDER):
             chosen = parse(words)
             console.own_files[:] = chosen.own
             for path in chosen.own:
@@ -86,7 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(2)
     except KeyboardInterrupt as stop:
         stderr.print(f"quadrl: {stop.args[0] if stop.args else 'stopped'}")
-        sys.exit(130)
+        sys.exit(128 + (stop.number if isinstance(stop, Stopped) else signal.SIGINT))
 
 
 def parse(words: list[str], *, enforced: bool = False) -> Quadrl:
@@ -112,19 +112,6 @@ def _warned_in_a_line(stderr: Console) -> Generator[None]:
 
         warnings.showwarning = show
         yield
-
-
-@contextlib.contextmanager
-def _terminated_in_order() -> Generator[None]:
-    """Let SIGTERM end the program as an exception does: what was begun is cleaned up."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def import_own(path: Path) -> None:

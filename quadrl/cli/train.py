@@ -20,6 +20,7 @@ from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import PAIRS
 from quadrl.progress import ProgressBar
 from quadrl.rollout import MAX_EPISODES
+from quadrl.signals import heeded
 from quadrl.studies.plan import parse_seeds
 from quadrl.validation import number
 
@@ -127,9 +128,11 @@ class Train:
                     resume=self.resume is not None,
                     episodes=self.episodes,
                     show=bar.show,
+                    heed=heeded,
                 )
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"stopped; the run is kept, {go_on}") from None
+        except KeyboardInterrupt as stop:
+            stop.args = (f"stopped; the run is kept, {go_on}",)
+            raise
         except OSError as error:
             kept = (folder / names.CONFIG).exists()
             advice = f"the run is kept, {go_on}" if kept else "choose another --out"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -113,13 +115,15 @@ def train_in(
     resume: bool,
     episodes: int,
     show: Callable[[Progress], None],
+    heed: Callable[[Training], AbstractContextManager[None]] = contextlib.nullcontext,
 ) -> Run:
-    """What `train` does once settings and folder are known."""
+    """What `train` does once settings and folder are known, in the context `heed` of a training."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     vehicle = config.make_vehicle()
     warn_of_unreached(vehicle, config.randomization)
     training = Training(config, folder, resume=resume)
-    policy = training.run(show)
+    with heed(training):
+        policy = training.run(show)
     found = evaluate(policy, config.make_task(), episodes=episodes, vehicle=vehicle)
     seconds = round(training.seconds, 2)
     write_json(folder / EVALUATION, found.metrics | {"training_s": seconds})

@@ -140,6 +140,7 @@ class Training:
         self._running = {name: np.zeros(config.num_envs) for name in ("return", "length")}
         self._generators: dict[str, torch.Tensor] = {}
         self._remembered: dict[str, np.ndarray] = {}  # the states of a recurrent policy
+        self._asked = self._stopping = False
         if not resume:
             new_folder(folder)
         self._unlock = weakref.finalize(self, lock_folder(folder))
@@ -172,7 +173,7 @@ class Training:
 
     @one_thread()
     def run(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> Policy:
-        """Train to the end, and save the policy.
+        """Train to the end, or until `ask` stops it, and save the policy.
 
         Returns:
             The saved policy.
@@ -198,7 +199,7 @@ class Training:
             stack.callback(gc.unfreeze)
             started = saved = time.perf_counter()
             before, batches = self.seconds, iter(collector)
-            while self.iteration < config.iterations:
+            while True:
                 metrics = self._learn(next(batches))
                 self.iteration += 1
                 now = time.perf_counter()
@@ -211,11 +212,23 @@ class Training:
                 log.write(self.iteration, self.steps, self.seconds, metrics)
                 progress = (self.iteration, config.iterations, self.steps, self.seconds, metrics)
                 on_progress(Progress(*progress))
-                if self.iteration == config.iterations or now - saved > config.checkpoint_seconds:
+                over = self.iteration == config.iterations or self._stopping
+                if over or self._asked or now - saved > config.checkpoint_seconds:
+                    self._asked = False  # what is asked from here on, the next iteration does
                     self.save()
                     saved = time.perf_counter()
+                if over:
+                    break
             self.seconds = before + time.perf_counter() - started
         return self.policy()
+
+    def ask(self, *, stop: bool = False) -> None:
+        """Ask for a checkpoint at the end of this iteration, and maybe to stop after it.
+
+        It may be called at any moment, by the handler of a signal or another thread.
+        """
+        self._stopping |= stop
+        self._asked = True
 
     def policy(self) -> Policy:
         """The policy at this moment."""

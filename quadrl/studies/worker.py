@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -18,6 +19,7 @@ from typing import Any
 from quadrl.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import CONFIG, EVALUATION
+from quadrl.signals import Stopped, heeded, unheeded
 from quadrl.studies.plan import PlannedRun, fields
 
 FAILED = 2
@@ -101,7 +103,12 @@ def carry_out(what: dict[str, Any]) -> None:
         return
     again = (folder / CONFIG).exists()
     finished: Run = train_in(
-        folder, config, resume=again, episodes=what["episodes"], show=lambda progress: None
+        folder,
+        config,
+        resume=again,
+        episodes=what["episodes"],
+        show=lambda progress: None,
+        heed=heeded,
     )
     for _ in finished.draw(video=False):
         pass
@@ -118,11 +125,15 @@ def main() -> None:
         os._exit(FAILED)
 
     threading.Thread(target=watch, daemon=True).start()
+    signal.signal(signal.SIGUSR1, unheeded)
     try:
         carry_out(what)
     except (QuadrlError, OSError) as error:
         print(f"quadrl: {error}", flush=True)
         sys.exit(FAILED)
+    except Stopped as stop:  # its run can be continued, as that of a process that was killed
+        signal.signal(stop.number, signal.SIG_DFL)
+        signal.raise_signal(stop.number)
     # What hangs at the end of the interpreter must not turn a finished training into a lost one.
     sys.stdout.flush()
     os._exit(0 if (Path(what["folder"]) / EVALUATION).exists() else FAILED)

@@ -69,13 +69,13 @@ def alone(tmp_path_factory):
 
 
 @contextlib.contextmanager
-def once_begun(folder, act):
+def once_begun(folder, act, awaited="checkpoint.safetensors"):
     """Acts in a thread as soon as the folder holds a checkpoint of a training that goes on."""
     errors = []
 
     def work():
         try:
-            wait_for((folder / "checkpoint.safetensors").exists, f"a checkpoint in {folder}")
+            wait_for((folder / awaited).exists, f"{awaited} in {folder}")
             assert not (folder / "evaluation.json").exists()
             act()
         except BaseException as error:
@@ -111,6 +111,24 @@ def test_a_killed_worker_goes_on_and_ends_as_if_alone(alone, tmp_path, monkeypat
     again = quadrl.study(STUDY, out=tmp_path, on_line=lines.append)
     assert len(begun) == 3 and lines == ["2 of 2 trainings are done already"]
     assert again.rows == found.rows
+
+
+def test_a_terminated_worker_loses_no_iteration(alone, tmp_path, monkeypatch):
+    """It has a checkpoint before it ends, which is the only one, and goes on from that."""
+    begun, held, start, folder = [], [], worker.start, tmp_path / "hover-ppo-0"
+
+    def noted(*given):
+        held.append((folder / "checkpoint.safetensors").exists())
+        begun.append(start(*given))
+        return begun[-1]
+
+    monkeypatch.setattr(worker, "start", noted)
+    lines, settings = [], LONG | {"checkpoint_seconds": 60}
+    study = STUDY | {"seeds": [0], "settings": settings}
+    with once_begun(folder, lambda: begun[0].terminate(), "metrics.csv"):
+        found = quadrl.study(study, out=tmp_path, jobs=1, on_line=lines.append)
+    assert held == [False, True] and any("killed by signal 15" in line for line in lines)
+    assert not found.failed and digest(folder) == alone[0]
 
 
 def test_ctrl_c_leaves_a_study_that_the_same_command_ends(alone, tmp_path):

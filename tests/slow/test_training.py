@@ -18,6 +18,7 @@ from scipy import stats
 import quadrl
 from quadrl import cli
 from quadrl.evaluation import evaluate, setting
+from quadrl.learning import checkpoint
 from quadrl.learning.config import TrainConfig
 from quadrl.policy import SHIPPED_AS, Policy, shipped
 from quadrl.rollout import EVALUATION_SEED, fly, summarize
@@ -275,22 +276,47 @@ def stopped(words, folder, signal_number, awaited):
     return process.returncode, error
 
 
-def test_interrupted_it_says_how_to_go_on(tmp_path):
-    folder = tmp_path / "run"
-    code, error = stopped(LONG, folder, signal.SIGINT, "checkpoint.safetensors")
-    assert code == 130
+RARELY = [*LONG, "--checkpoint-seconds", "1e9"]
+"""Its one checkpoint is the one that a signal asks for."""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("seeds", [(), ("--seeds", "3:5")], ids=["alone", "of several seeds"])
+def test_stopped_it_has_a_checkpoint_and_says_how_to_go_on(tmp_path, number, seeds):
+    folder = tmp_path / "hover-ppo-3" if seeds else tmp_path
+    awaited = str((folder / "metrics.csv").relative_to(tmp_path))
+    code, error = stopped([*RARELY, *seeds], tmp_path, number, awaited)
+    assert code == 128 + number
     (line,) = error.splitlines()
-    assert line.startswith("quadrl: ") and line.endswith(f"quadrl train --resume {folder}")
+    assert line == f"quadrl: stopped; the run is kept, continue it: quadrl train --resume {folder}"
+    steps = 32 * len(metrics(folder))  # to the last iteration that was begun
+    assert steps and Policy.load(folder).metadata["steps"] == steps
+    assert checkpoint.load(folder / "checkpoint.safetensors")[1]["iteration"] * 32 == steps
 
 
-@pytest.mark.parametrize(
-    ("words", "awaited"),
-    [(LONG, "policy.safetensors"), (["train", "hover", *TINY], ".flight*")],
-    ids=["while it trains", "while it draws"],
-)
-def test_terminated_it_leaves_nothing_half_written(tmp_path, words, awaited):
+def test_asked_for_a_checkpoint_it_writes_one_and_goes_on(tmp_path):
+    def wait_for(file):
+        while not file.exists() and process.poll() is None:
+            time.sleep(0.01)
+
+    words, policy = [sys.executable, "-m", "quadrl", *RARELY], tmp_path / "policy.safetensors"
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    with subprocess.Popen([*words, "--out", str(tmp_path)], env=environment) as process:
+        wait_for(tmp_path / "metrics.csv")
+        steps = []
+        for _ in range(2):
+            process.send_signal(signal.SIGUSR1)
+            wait_for(policy)
+            steps.append(Policy.load(policy).metadata["steps"])
+            policy.unlink()
+        process.kill()
+    assert steps[0] < steps[1] and process.returncode == -signal.SIGKILL
+
+
+def test_terminated_while_it_draws_it_leaves_nothing_half_written(tmp_path):
     folder = tmp_path / "run"
-    code, error = stopped(words, folder, signal.SIGTERM, awaited)
+    words = ["train", "hover", *TINY]
+    code, error = stopped(words, folder, signal.SIGTERM, ".flight*")
     assert code == 128 + signal.SIGTERM and not error
     left = {file.name for file in folder.iterdir()}
     assert not {name for name in left if name.startswith(".") or name.endswith(".part")}
