@@ -10,12 +10,15 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from quadrl.errors import QuadrlError
 from quadrl.evaluation import html_table
 from quadrl.files import write_whole
 from quadrl.show import Media
+
+if TYPE_CHECKING:
+    from quadrl.kept import Kept
 
 NORMAL_95 = 1.959963984540054  # the normal distribution's quantile of 97.5 %
 QUARTILES = (0.25, 0.5, 0.75)
@@ -62,6 +65,8 @@ class Card:
     which half of the flights fail, and `reach`, for each that flew those from which on no policy
     can hover within its actions (older files have none); by recovery map the shares of the flights
     that recover."""
+    kept: Kept | None = dataclasses.field(default=None, compare=False)
+    """What was kept of the flights until the card is saved."""
 
     def __repr__(self) -> str:
         found = self.found
@@ -139,6 +144,8 @@ class Card:
                 contents[f"{name}.{kind}"] = card_figures.content(picture, kind)
         for name, content in contents.items():
             write_whole(folder / name, content)
+        if self.kept:
+            self.kept.forget()
         return [folder / name for name in contents]
 
     @classmethod

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from quadrl.draw import Draw
 from quadrl.engines.engine import EngineName
 from quadrl.errors import QuadrlError
 from quadrl.evaluation import setting
+from quadrl.kept import Kept
 from quadrl.policy import Policy
 from quadrl.progress import ProgressBar
 from quadrl.randomization import Randomization
@@ -41,6 +43,7 @@ def robustness(
     axes: Iterable[str] | None = None,
     recovery: bool = True,
     progress: bool = True,
+    keep: str | Path | None = None,
     **task_options: Any,
 ) -> Card:
     """Fly policies or controllers through graded disturbances, each alone, and map recoveries.
@@ -60,6 +63,9 @@ def robustness(
         axes: Names of the disturbances, of `quadrl.axes.AXES`; by default all.
         recovery: Whether to fly the recovery maps.
         progress: Whether to show a progress bar.
+        keep: A folder in which each level and each map is kept as soon as it is flown, until the
+            card is saved; a call with the same conditions that follows one that was stopped takes
+            them from there. What a function of your own flies is not kept.
         **task_options: Options of the task.
 
     Raises:
@@ -79,7 +85,7 @@ def robustness(
     found |= {"axes": {axis.name: _described(axis) for axis in chosen}, "recovery": {}}
     for axis in chosen:
         found["axes"][axis.name]["reach"] = {name: _reach(axis, vehicles[name]) for name in flown}
-    done = 0
+    done, kept = 0, Kept(None if keep is None else Path(keep))
 
     with ProgressBar() as bar:
 
@@ -92,13 +98,13 @@ def robustness(
         for name, one in flown.items():
             count(f"{name}, undisturbed")
             alike: Any = common | {"vehicle": vehicles[name], "episodes": episodes}
-            undisturbed = measured(one, task, Randomization(), **alike)
+            undisturbed = kept(measured, one, task, Randomization(), **alike)
             for axis in chosen:
                 at = [undisturbed] * len(axis.levels)
                 for k, level in enumerate(axis.levels):
                     if level != axis.usual:
                         count(f"{name}, {axis.label}")
-                        at[k] = measured(one, task, axis.at(level), **alike)
+                        at[k] = kept(measured, one, task, axis.at(level), **alike)
                 found["axes"][axis.name]["flown"][name] = _summary(axis, at)
         for chart in MAPS.values() if recovery else ():
             sides = {side: vars(getattr(chart, side)) for side in "xy"}
@@ -107,11 +113,10 @@ def robustness(
                 count(f"{name}, {chart.name}")
                 alike = common | {"vehicle": vehicles[name]}
                 each = max(1, episodes // CELL_SHARE)
-                shares = recovered(one, task, chart, episodes=each, **alike)
-                entry["flown"][name] = shares.tolist()
+                entry["flown"][name] = kept(recovered, one, task, chart, episodes=each, **alike)
         if progress:
             bar.update(total, total, "flown")
-    return Card(json.loads(json.dumps(found)))  # tuples as lists, as in the file
+    return Card(json.loads(json.dumps(found)), kept)  # tuples as lists, as in the file
 
 
 def measured(

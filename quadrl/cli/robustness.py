@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,7 +51,8 @@ class Robustness:
     engine: choices.EngineName = choices.EngineName("")
     """free_flight or mujoco; by default free flight, unless the task touches the ground."""
     out: Path = Path("robustness")
-    """Folder for the pictures (.png, .pdf), the numbers (.json) and the table (.csv)."""
+    """Folder for the pictures (.png, .pdf), the numbers (.json) and the table (.csv). Until they
+    are written it keeps what was flown, from which the same command goes on after a stop."""
     task_options: tuple[str, ...] = ()
     """Options of the task that differ from the training's, such as time_limit=5."""
 
@@ -65,15 +68,20 @@ class Robustness:
         # The name of a controller is no policy here: a folder may be called so.
         flown = [name if comes_with_quadrl(name) else Path(name) for name in self.policies]
         chosen: dict[str, Any] = {name: getattr(self, name) or None for name in GIVEN}
-        card = robustness(
-            [*flown, *(str(name) for name in self.controller)],
-            self.task or None,
-            episodes=self.episodes,
-            seed=self.seed,
-            recovery=self.recovery,
-            **chosen,
-            **parse_options(self.task_options),
-        )
+        try:
+            card = robustness(
+                [*flown, *(str(name) for name in self.controller)],
+                self.task or None,
+                episodes=self.episodes,
+                seed=self.seed,
+                recovery=self.recovery,
+                keep=self.out,
+                **chosen,
+                **parse_options(self.task_options),
+            )
+        except KeyboardInterrupt:
+            words = shlex.join(["quadrl", *sys.argv[1:]])
+            raise KeyboardInterrupt(f"stopped; the same command goes on: {words}") from None
         head, *rows = card.table
         console.print(make_table(head, rows, numbers=len(head) - 1))
         if card.reach:

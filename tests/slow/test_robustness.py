@@ -1,7 +1,13 @@
 """The robustness card: its statistics, what its levels and its maps fly, its files."""
 
 import dataclasses
+import functools
 import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +18,11 @@ import quadrl
 from quadrl import Randomization, disturbed
 from quadrl.axes import AXES
 from quadrl.card import Card, half_level, wilson
-from quadrl.cli import main
+from quadrl.cli import import_own, main
 from quadrl.draw import Draw
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
+from quadrl.errors import QuadrlError, QuadrlWarning
+from quadrl.kept import FILE, digest
 from quadrl.parameters import rows
 from quadrl.recovery import MAPS, begin
 from quadrl.rollout import flights
@@ -211,3 +218,180 @@ def test_nothing_to_fly_is_refused(capsys):
         with pytest.raises(SystemExit):
             main(["robustness", *words])
     assert "geometric" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------- stopped, and gone on with
+
+AXIS: Any = dict(axes=("delay",), **SHORT)
+LEVELS, FLOWN = 8, 8 + len(MAPS)  # of delay; of one that flies
+
+
+class Stop(Exception):
+    pass
+
+
+@pytest.fixture
+def flights_flown(monkeypatch):
+    """Notes what is flown; after `stop_after` of them the next one raises."""
+
+    class Noted(list):
+        stop_after = None
+
+    noted = Noted()
+
+    def noting(fly):
+        @functools.wraps(fly)
+        def flown(*given, **conditions):
+            if len(noted) == noted.stop_after:
+                raise Stop
+            noted.append(given)
+            return fly(*given, **conditions)
+
+        return flown
+
+    for name in ("measured", "recovered"):
+        monkeypatch.setattr(disturbed, name, noting(getattr(disturbed, name)))
+    return noted
+
+
+def stopped_after(count, flights_flown, **given):
+    flights_flown.stop_after = count
+    with pytest.raises(Stop):
+        quadrl.robustness(**AXIS | given)
+    flights_flown.clear()
+    flights_flown.stop_after = None
+
+
+@pytest.mark.parametrize("count", [1, FLOWN + 2, 2 * FLOWN - 1])
+def test_a_card_that_was_stopped_is_gone_on_with_and_is_the_same(tmp_path, flights_flown, count):
+    flyers = ["hover", "geometric"]
+    quadrl.robustness(flyers, **AXIS).save(tmp_path / "whole")
+    assert len(flights_flown) == 2 * FLOWN
+    flights_flown.clear()
+    folder = tmp_path / "stopped"
+    stopped_after(count, flights_flown, controller=flyers, keep=folder)
+    card = quadrl.robustness(flyers, **AXIS, keep=folder)
+    assert len(flights_flown) == 2 * FLOWN - count and (folder / FILE).exists()
+    card.save(folder)
+    whole, again = (tmp_path / name / "robustness.json" for name in ("whole", "stopped"))
+    assert whole.read_bytes() == again.read_bytes()
+    assert {p.name for p in folder.iterdir()} == {p.name for p in whole.parent.iterdir()}
+
+
+def own_task(tmp_path, radius):
+    """A task of a file of one's own, in the same place whatever is in it."""
+    (tmp_path / "own.py").write_text(
+        "import dataclasses\n\nfrom quadrl.tasks.hover import Hover\n\n\n"
+        "@dataclasses.dataclass(frozen=True)\nclass Own(Hover):\n    name = 'own'\n"
+        f"    def distance(self):\n        return {radius}\n"
+    )
+    import_own(tmp_path / "own.py")
+    return sys.modules["own"].Own(time_limit=0.5)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"seed": 1},
+        {"episodes": 5},
+        {"time_limit": 0.6},
+        {"engine": "mujoco"},
+        {"aerodynamics": "rotor_drag"},
+        {"vehicle": Vehicle(mass=0.66)},
+        {"controller": "lqr"},
+        {"controller": "hover_robust"},
+    ],
+    ids=lambda other: next(iter(other)),
+)
+def test_what_was_flown_under_other_conditions_is_not_used(tmp_path, flights_flown, other):
+    stopped_after(4, flights_flown, controller="hover", keep=tmp_path)
+    given = AXIS | {"recovery": False, "keep": tmp_path}
+    card = quadrl.robustness(**given | {"controller": "hover"} | other)
+    assert len(flights_flown) == LEVELS
+    card.save(tmp_path)
+    flights_flown.clear()
+    quadrl.robustness("hover", **given)  # nor has the other one's card removed it
+    assert len(flights_flown) == LEVELS - 4
+
+
+def test_a_policy_is_known_by_its_numbers_and_what_it_was_trained_in():
+    policy = quadrl.Policy.pretrained("hover")
+    again = quadrl.Policy.pretrained("hover")
+    assert digest(policy) == digest(again)
+    again.weights[0][3, 2] = np.nextafter(again.weights[0][3, 2], np.float32(9))
+    assert digest(policy) != digest(again)
+    metadata = policy.metadata | {"control_mode": "velocity"}
+    assert digest(policy) != digest(dataclasses.replace(policy, metadata=metadata))
+
+
+def test_a_task_of_ones_own_is_known_by_its_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("quadrl.tasks.TASKS", dict(quadrl.tasks.TASKS))
+    first, same, edited = (digest(own_task(tmp_path, radius)) for radius in (1, 1, 2))
+    assert first == same != edited
+
+
+def test_what_ones_own_functions_fly_is_flown_again(tmp_path, flights_flown):
+    memory = []
+
+    def own(observation):
+        memory.append(observation)
+        return np.full((len(observation), 4), 0.01 * len(memory))
+
+    policy = quadrl.Policy.pretrained("hover")
+    for flyer in (own, policy.sampled(0)):
+        for _ in range(2):
+            flights_flown.clear()
+            quadrl.robustness(flyer, "hover", **AXIS, recovery=False, keep=tmp_path)
+            assert len(flights_flown) == LEVELS
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("damage", ["half", "a level", "foreign", "list"])
+def test_a_damaged_file_is_not_used_and_kept_aside(tmp_path, flights_flown, damage):
+    stopped_after(4, flights_flown, controller="hover", keep=tmp_path)
+    file = tmp_path / FILE
+    text = file.read_text()
+    damaged = {
+        "half": text[: len(text) // 2],
+        "a level": text.replace('"success": 0.0', '"success": 0.5', 1),
+        "foreign": '{"mine": 1}',
+        "list": "[]",
+    }[damage]
+    assert damaged != text
+    file.write_text(damaged)
+    with pytest.warns(QuadrlWarning, match=f"{file} is damaged") as caught:
+        quadrl.robustness("hover", **AXIS, keep=tmp_path)
+    assert caught[0].filename == __file__ and len(flights_flown) == FLOWN
+    assert (tmp_path / "flown.unused").read_text() == damaged
+
+
+def test_a_killed_command_goes_on(tmp_path):
+    words = ["robustness", "hover", "--axes", "delay", "noise", "--episodes", "20", "--no-recovery"]
+    command = [sys.executable, "-m", "quadrl", *words, "--out", "card"]
+    environment = os.environ | {"PYTHONPATH": str(Path(quadrl.__file__).parents[1])}
+    given: Any = dict(cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+    with subprocess.Popen(command, **given) as process:
+        while process.poll() is None and not (tmp_path / "card" / FILE).exists():
+            time.sleep(0.005)
+        process.kill()
+    assert os.listdir(tmp_path / "card") == [FILE]
+    kept = json.loads((tmp_path / "card" / FILE).read_text())["flown"]
+    assert 0 < len(kept) < 2 * LEVELS - 1
+    subprocess.run(command, check=True, **given)
+    main([*words, "--out", "whole"])
+    one, other = ((tmp_path / name / "robustness.json").read_bytes() for name in ("card", "whole"))
+    assert one == other and not (tmp_path / "card" / FILE).exists()
+
+
+def test_ctrl_c_says_that_the_same_command_goes_on(tmp_path, monkeypatch, capsys):
+    def interrupted(*given, **conditions):
+        raise KeyboardInterrupt
+
+    words = ["robustness", "hover", "--out", str(tmp_path)]
+    monkeypatch.setattr(disturbed, "measured", interrupted)
+    monkeypatch.setattr(sys, "argv", ["quadrl", *words])
+    with pytest.raises(SystemExit) as caught:
+        main(words)
+    assert caught.value.code == 130
+    again = f"quadrl robustness hover --out {tmp_path}"
+    assert capsys.readouterr().err == f"quadrl: stopped; the same command goes on: {again}\n"
