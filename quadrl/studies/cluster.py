@@ -82,6 +82,7 @@ class RayWorker:
     def __init__(self, actor: Any, run: PlannedRun, log: Path) -> None:
         """Follow an actor; the folder is locked until it ends."""
         self._actor, self._run, self._log = actor, run, log
+        self._ran = False
         run.folder.mkdir(parents=True, exist_ok=True)
         self._unlock = weakref.finalize(self, lock_folder(run.folder))
         self._news = actor.news.remote()
@@ -99,7 +100,9 @@ class RayWorker:
         except ray.exceptions.RayError as error:
             self.stop()
             reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-            return End(f"its node or its process there was lost ({reason})", lost=True)
+            ran = self._ran or getattr(error, "actor_init_failed", False)
+            return End(f"its node or its process there was lost ({reason})", lost=True, ran=ran)
+        self._ran = True
         write_files(self._run.folder, files)
         if code is None:
             self._news = self._actor.news.remote()

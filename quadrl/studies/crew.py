@@ -18,6 +18,10 @@ from quadrl.studies.plan import PlannedRun
 
 ATTEMPTS = 3
 """Times that a training is begun or continued before it counts as failed."""
+BEGINNINGS = 10
+"""Times that its machine may be gone before it runs; these are no attempts."""
+PAUSE_SECONDS = 5.0
+"""After each of them. A cluster needs half a minute to see that a machine is gone."""
 POLL_SECONDS = 0.1
 NEWS_SECONDS = 10.0  # between two lines of progress
 Say = Callable[[str], None]
@@ -31,6 +35,8 @@ class End:
     """Why it failed; empty if it did not."""
     lost: bool = False
     """Whether its process or its machine died, and another attempt may succeed."""
+    ran: bool = True
+    """Whether it ran at all; if not, its machine was gone before."""
 
 
 class Worker(Protocol):
@@ -103,6 +109,18 @@ class Local:
         return LocalWorker(worker.start(worker.order(run, self.episodes, self.own), log), log)
 
 
+@dataclasses.dataclass(eq=False)
+class _Job:
+    """A training that waits or is at work."""
+
+    run: PlannedRun
+    attempt: int = 1
+    never_ran: int = 0
+    """Beginnings that were none."""
+    after: float = 0.0
+    """When it may be begun, on the clock `time.monotonic` [s]."""
+
+
 def train_all(runs: Iterable[PlannedRun], crew: Crew, say: Say) -> dict[str, str]:
     """Train and evaluate the runs that are not done, and continue those that are half done.
 
@@ -118,42 +136,51 @@ def train_all(runs: Iterable[PlannedRun], crew: Crew, say: Say) -> dict[str, str
         QuadrlError: A folder holds a run with other settings; nothing was begun.
     """
     given = list(runs)
-    waiting = collections.deque((run, 1) for run in given if not run.done)
+    waiting = collections.deque(_Job(run) for run in given if not run.done)
     done = len(given) - len(waiting)
     if done:
         say(f"{done} of {len(given)} trainings are done already")
-    going: list[tuple[Worker, PlannedRun, int]] = []
+    going: list[tuple[Worker, _Job]] = []
     failed: dict[str, str] = {}
     news = time.monotonic()
     try:
         while waiting or going:
-            while waiting and len(going) < crew.slots():
-                run, attempt = waiting.popleft()
-                log = log_of(run)
-                going.append((crew.begin(run, log), run, attempt))
-                again = f" (attempt {attempt} of {ATTEMPTS})" if attempt > 1 else ""
+            while (job := _next(waiting)) and len(going) < crew.slots():
+                waiting.remove(job)
+                run = job.run
+                going.append((crew.begin(run, log_of(run)), job))
+                again = f" (attempt {job.attempt} of {ATTEMPTS})" if job.attempt > 1 else ""
                 say(f"{run.name}: begun{again}, {len(waiting)} waiting")
             for each in list(going):
-                at_work, run, attempt = each
+                at_work, job = each
                 if (end := at_work.poll()) is None:
                     continue
                 going.remove(each)
+                run, why = job.run, end.message or "it left no result"
+                job.never_ran += not end.ran
                 if not end.message and run.done:
                     done += 1
                     say(f"{run.name}: done, {done} of {len(given)}")
-                elif end.lost and attempt < ATTEMPTS:
-                    say(f"{run.name}: {end.message}; it goes on from its last checkpoint")
-                    waiting.appendleft((run, attempt + 1))
+                elif not end.ran and job.never_ran < BEGINNINGS:
+                    say(f"{run.name}: {why}; it never ran, and begins again in {PAUSE_SECONDS:g} s")
+                    job.after = time.monotonic() + PAUSE_SECONDS
+                    waiting.appendleft(job)
+                elif end.ran and end.lost and job.attempt < ATTEMPTS:
+                    say(f"{run.name}: {why}; it goes on from its last checkpoint")
+                    job.attempt += 1
+                    waiting.appendleft(job)
                 else:
-                    failed[run.name] = f"{end.message or 'it left no result'} (see {log_of(run)})"
+                    times = f"; begun {job.never_ran} times, it never ran" if not end.ran else ""
+                    failed[run.name] = f"{why}{times} (see {log_of(run)})"
                     say(f"{run.name}: failed: {failed[run.name]}")
             if time.monotonic() - news > NEWS_SECONDS:
                 news = time.monotonic()
-                at = ", ".join(f"{run.name} {100 * _share(run):.0f} %" for _, run, _ in going)
+                shares = [(job.run.name, _share(job.run)) for _, job in going]
+                at = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares)
                 say(f"{done} of {len(given)} done; {at}")
             time.sleep(POLL_SECONDS)
     finally:
-        for at_work, _, _ in going:  # after a Ctrl-C: each run can be continued
+        for at_work, _ in going:  # after a Ctrl-C: each run can be continued
             at_work.stop()
     return failed
 
@@ -172,6 +199,11 @@ def complaint(failed: dict[str, str]) -> str:
     """What failed, in one line."""
     each = "; ".join(f"{name}: {why}" for name, why in failed.items())
     return f"{len(failed)} of the trainings failed: {each}; the same command tries them again"
+
+
+def _next(waiting: Iterable[_Job]) -> _Job | None:
+    """The first that may be begun now."""
+    return next((job for job in waiting if job.after <= time.monotonic()), None)
 
 
 def log_of(run: PlannedRun) -> Path:

@@ -20,6 +20,8 @@ from quadrl import cli
 from quadrl.errors import QuadrlError
 from quadrl.learning.run import train
 from quadrl.studies import crew, worker
+from quadrl.studies.cluster import on_ray
+from quadrl.studies.plan import read_plan
 
 SETTINGS = {
     "num_envs": 8,
@@ -213,14 +215,37 @@ def patiently(start):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_node_that_dies_changes_no_policy(alone, tmp_path, cluster):
+@pytest.mark.parametrize("graceful", [True, False], ids=["told to go", "killed"])
+def test_a_node_that_dies_changes_no_policy_and_costs_one_attempt(
+    alone, tmp_path, cluster, graceful
+):
+    """Of one that is killed the cluster knows late: it sends trainings there for a while."""
     made, nodes = cluster
     lines = []
-    with once_begun(tmp_path / "hover-ppo-0", lambda: made.remove_node(nodes[0])):
+    with once_begun(
+        tmp_path / "hover-ppo-0", lambda: made.remove_node(nodes[0], allow_graceful=graceful)
+    ):
         found = quadrl.study(STUDY, out=tmp_path, ray=made.address, on_line=lines.append)
     assert any("was lost" in line for line in lines), lines
+    assert not any("attempt 3" in line for line in lines), lines
     assert [digest(tmp_path / f"hover-ppo-{seed}") for seed in (0, 1)] == alone
     assert not found.failed and (tmp_path / "hover-ppo-1" / "learning_curve.png").exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_died_before_it_ran_is_told_from_what_ran(tmp_path):
+    """Two trainings on one CPU: the second one waits for it."""
+    ray = pytest.importorskip("ray")
+    plan = read_plan(STUDY, tmp_path)
+    with on_ray("local", 2, 1, ()) as crew_of_ray:
+        log = tmp_path / "log.txt"
+        workers = [crew_of_ray.begin(run, log) for run in plan.runs]
+        checkpoint = plan.runs[0].folder / "checkpoint.safetensors"
+        wait_for(lambda: workers[0].poll() or checkpoint.exists(), "a checkpoint")
+        for worker_of_ray in reversed(workers):
+            ray.kill(worker_of_ray._actor)
+        ends = [wait_for(one.poll, "an end") for one in workers]
+    assert [(end.lost, end.ran) for end in ends] == [(True, True), (True, False)]
 
 
 @pytest.mark.filterwarnings("ignore")
