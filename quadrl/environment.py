@@ -12,7 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import observer, observing, parameters, records, saving, tasks, transition, validation
+from quadrl import (
+    machine,
+    observer,
+    observing,
+    parameters,
+    records,
+    saving,
+    tasks,
+    transition,
+    validation,
+)
 from quadrl.compiled import CompiledStep
 from quadrl.control import modes
 from quadrl.draw import Draw
@@ -70,6 +80,10 @@ class Environment(saving.Copied):
         draw, self.observing = Draw(randomization, self.vehicle), observing.resolve(observe)
         self.randomization = draw.given
         world: Any = {"num_threads": num_threads, "per_row": draw.given.per_row}
+        if not isinstance(engine, Engine):
+            validation.number("num_envs", num_envs, 1, mujoco.MAX_ENVS, whole=True)
+            per_row = row_memory(self.task, self.vehicle, draw, self.observing)
+            machine.check_memory(f"num_envs = {num_envs}", num_envs * per_row)
         engine = mujoco.of_task(engine, self.task, self.vehicle, num_envs, **world)
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
         self.control_mode = modes.make(control_mode, self.vehicle)
@@ -328,3 +342,12 @@ class Environment(saving.Copied):
         """
         now, see = saving.restore(self, saved), self.observer
         return see.again(now) if see else self.task.observe(now)
+
+
+def row_memory(task: Task, vehicle: Vehicle, draw: Draw, seen: observing.Observing) -> float:
+    """Memory that one more aircraft takes at least [bytes]; measured, and the histories counted."""
+    rotors, (commands, observations) = vehicle.rotor_count, draw.delays
+    single = sum(term.width(rotors) for term in task.observation.values())
+    kept = single * (1 + observations[1] + seen.observation_history) + rotors * commands[1]
+    flat = single * (1 + seen.observation_history) + rotors * seen.action_history
+    return 3_000 + 5_000 * draw.given.per_row + 8 * (kept + 2 * flat)

@@ -1,12 +1,20 @@
-"""What a measurement was made on."""
+"""The machine: what a measurement was made on, and how much memory there is."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import math
 import os
 import platform
+import resource
 from pathlib import Path
+
+from quadrl.errors import QuadrlError
+
+GIB = 1 << 30
+CGROUP = Path("/sys/fs/cgroup")
+WORTH_ASKING = 1 << 26  # [bytes]: less is not looked at, since the look takes time
 
 
 def machine() -> dict[str, str | int]:
@@ -47,3 +55,40 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def free_memory() -> float:
+    """Memory that this process may still take [bytes]; infinite where nothing says.
+
+    The least of what Linux says is available, of what is left of the limit of its control group
+    (a container's), and of what is left of its own (`ulimit -v`).
+    """
+    left = [math.inf]
+    with contextlib.suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        left.append(1024 * next(int(x.split()[1]) for x in lines if x.startswith("MemAvailable")))
+    with contextlib.suppress(OSError, ValueError):
+        most, used = (int((CGROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
+        stat = dict(line.split() for line in (CGROUP / "memory.stat").read_text().splitlines())
+        left.append(most - used + int(stat.get("inactive_file", 0)))  # files give way
+    with contextlib.suppress(OSError, ValueError):
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            taken = int(Path("/proc/self/statm").read_text().split()[0])
+            left.append(limit - taken * resource.getpagesize())
+    return max(0.0, min(left))
+
+
+def check_memory(what: str, size: float) -> None:
+    """Refuse what takes more memory than there is, before any is taken.
+
+    Args:
+        what: It, in words.
+        size: What it takes at least [bytes].
+
+    Raises:
+        QuadrlError: There is not as much; the message has both numbers.
+    """
+    if size > WORTH_ASKING and size > (free := free_memory()):
+        reason = f"{what} would take {size / GIB:.1f} GiB of memory, and {free / GIB:.1f} are free"
+        raise QuadrlError(f"{reason}: ask for fewer")

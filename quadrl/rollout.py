@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from quadrl import machine
 from quadrl.engines.engine import EngineName
 from quadrl.environment import Environment
 from quadrl.errors import QuadrlError
@@ -69,6 +70,8 @@ def fly(
         {"weather": weather, "randomization": randomization, "observe": observe},
     )
     task, timestep = environment.task, environment.vehicle.control_timestep
+    steps, numbers = environment.time_limit_steps, 21 + len(environment.vehicle.rotors)
+    machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
     observation = environment.flatten(environment.reset())
     history: dict[str, list[np.ndarray]] = {name: [] for name in HISTORY}
     alive = np.ones(episodes, dtype=bool)

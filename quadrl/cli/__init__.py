@@ -84,6 +84,11 @@ def main(arguments: list[str] | None = None) -> None:
         said = console.reason(error) if isinstance(error, OSError) else error
         stderr.print(f"quadrl: {said}")
         sys.exit(2)
+    except (MemoryError, RuntimeError) as error:
+        if os.environ.get("QUADRL_TRACEBACK") or not console.is_of_memory(error):
+            raise
+        stderr.print(f"quadrl: there is not enough memory: {console.in_a_line(error)}")
+        sys.exit(2)
     except KeyboardInterrupt as stop:
         stderr.print(f"quadrl: {stop.args[0] if stop.args else 'stopped'}")
         sys.exit(128 + (stop.number if isinstance(stop, Stopped) else signal.SIGINT))

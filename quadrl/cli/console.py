@@ -45,3 +45,17 @@ def reason(error: OSError) -> str:
     """What the system refused, in a shell's words."""
     path = error.filename2 or error.filename
     return f"cannot read or write {path}: {error.strerror}" if path else str(error)
+
+
+def is_of_memory(error: BaseException) -> bool:
+    """Whether an error says that there is no memory left, in Python, NumPy, MuJoCo or torch."""
+    said = str(error).lower()
+    return isinstance(error, MemoryError) or any(words in said for words in OUT_OF_MEMORY)
+
+
+def in_a_line(error: BaseException) -> str:
+    """What an error says, in a line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+OUT_OF_MEMORY = ("allocate memory", "out of memory", "bad_alloc", "could not allocate")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import gc
+import itertools
 import time
 import warnings
 import weakref
@@ -43,7 +44,7 @@ from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE, export, make_act
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
-from quadrl.machine import processor_kind
+from quadrl.machine import check_memory, processor_kind
 from quadrl.policy import FILE as POLICY_FILE
 from quadrl.policy import Policy
 from quadrl.vehicle import VEHICLES
@@ -125,6 +126,7 @@ class Training:
         torch.manual_seed(config.seed)
         self.env = make_env(config, device)
         size, actions = self.env.environment.size, self.env.environment.action_size
+        self._check_memory(size)
         given = self.env.observation_spec.get(PRIVILEGED, None)
         self.actor, self.critic, self.normalisers = make_actor_critic(
             size, actions, config, 0 if given is None else given.shape[-1]
@@ -165,6 +167,20 @@ class Training:
             write_config(folder, resolved, before)
         if self.iteration < config.iterations:
             (folder / EVALUATION).unlink(missing_ok=True)
+
+    def _check_memory(self, size: int) -> None:
+        """Refuse networks and batches that do not fit, of observations of a size.
+
+        Of a weight there are four numbers, with gradient and Adam's two; of a transition some ten
+        times its observation and 1 kB more, as was measured.
+        """
+        config = self.config
+        for name, hidden in (("hidden", config.hidden), ("critic_hidden", config.critic_hidden)):
+            widths = (size, *hidden, 1)
+            weights = sum(a * b for a, b in itertools.pairwise(widths))
+            check_memory(f"{name} = {hidden}", 16.0 * weights)
+        batch = config.num_envs * config.rollout
+        check_memory(f"num_envs * rollout = {batch}", batch * (40.0 * size + 1000))
 
     @property
     def steps(self) -> int:

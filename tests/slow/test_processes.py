@@ -153,3 +153,30 @@ def test_the_contract_needs_neither_pytest_nor_torch():
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+LIMITED = """
+import resource, sys
+from quadrl import cli
+from quadrl.learning import run
+size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+limit = size + int(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+cli.main(sys.argv[2:])
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="ulimit -v is Linux's")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "hover", "--episodes", "100000"],
+        ["train", "hover", "--num-envs", "65536", "--no-video", "--out", "run"],
+        ["train", "hover", "--hidden", "8000", "8000", "--no-video", "--out", "run"],
+    ],
+)
+def test_under_a_limit_of_the_shell_the_command_ends_in_one_line(words, tmp_path):
+    command = [sys.executable, "-c", LIMITED, str(300 << 20), *words]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=ENVIRONMENT)
+    (line,) = ended.stderr.splitlines()
+    assert ended.returncode == 2 and "memory" in line, ended.stderr

@@ -20,7 +20,6 @@ from quadrl.control import feasibility
 from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
 from quadrl.draw import Draw
 from quadrl.errors import QuadrlWarning
-from quadrl.evaluation import trained_with
 from quadrl.learning.defaults import VARIANTS
 from quadrl.parameters import rows
 from quadrl.policy import Policy, shipped
@@ -164,7 +163,7 @@ def test_what_ships_can_hover_wherever_it_was_trained(name):
     task, _, algo = name.rpartition("_")
     robust = algo == "robust"
     policy = Policy.pretrained(task, "ppo" if robust else algo, *(["robust"] if robust else []))
-    vehicle = trained_with(policy)
+    vehicle = policy.make_vehicle()
     given = policy.conditions.get("randomization")
     assert ("mass" in (given or {})) == robust
     assert unreached(vehicle, Draw(given, vehicle))[0] == 0

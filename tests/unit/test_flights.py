@@ -45,6 +45,7 @@ def test_a_flight_is_that_of_the_environment_bit_for_bit(task, vehicle):
     memory, engine = Memory(environment), environment.engine
     rotors, size = environment.vehicle.rotor_count, environment.size
     memory["parameters"][:] = parameters.rows(environment.vehicle).view(float)
+    memory["scale"][:] = environment.vehicle.action_scale
     memory["drawn"][: memory.drawn] = uniform(
         np.array([seed]), np.array([0]), START, 0, memory.drawn
     )[0]

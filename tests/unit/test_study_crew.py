@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import EVALUATION, write_json
+from quadrl.learning.folder import EVALUATION, write_config, write_json
 from quadrl.studies import crew
 from quadrl.studies.crew import End, train_all
 from quadrl.studies.plan import PlannedRun
@@ -24,7 +24,7 @@ class Worker:
     def poll(self):
         if self.end == DONE:
             self.run.folder.mkdir(exist_ok=True)
-            write_json(self.run.folder / "config.json", self.run.config.resolved())
+            write_config(self.run.folder, self.run.config.resolved())
             write_json(self.run.folder / EVALUATION, {})
         return self.end
 
