@@ -193,7 +193,8 @@ class Draw:
     def _check_unlike_rotors(self) -> None:
         """Each rotor is drawn alone: every combination of weak and strong ones must hover."""
         given, count = self.given, self._vehicle.rotor_count
-        corners = np.indices((4,) * count).reshape(count, -1).T  # (4^R, R)
+        kinds = 4 if given.rotors[0] < given.rotors[1] else 1  # weak or strong, twice
+        corners = np.indices((kinds,) * count).reshape(count, -1).T  # (kinds^R, R)
         shifts = [(0.0, 0.0)]
         if given.centre_of_mass:
             shifts = itertools.product((-given.centre_of_mass, given.centre_of_mass), repeat=2)

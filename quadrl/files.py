@@ -173,12 +173,12 @@ def read_safetensors(
         table = json.loads(content[8 : 8 + size])
         header = json.loads((table.get("__metadata__") or {}).get(HEADER, "{}"))
         written = header.get("format")
-        known = written in wanted or written in unsealed
-        arrays = of_bytes(content) if known else {}
+        if written not in (*wanted, *unsealed):
+            allowed = " or ".join(wanted)
+            raise QuadrlError(name=f"format of {path}", value=written, allowed=allowed)
+        check_seal(path, content, unsealed=written in unsealed)
+        return of_bytes(content), header
+    except QuadrlError:
+        raise
     except UNREADABLE as error:
         raise QuadrlError(f"{path} is damaged or not a safetensors file: {error}") from error
-    if not known:
-        allowed = " or ".join(wanted)
-        raise QuadrlError(name=f"format of {path}", value=written, allowed=allowed)
-    check_seal(path, content, unsealed=written in unsealed)
-    return arrays, header

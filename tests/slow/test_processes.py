@@ -6,6 +6,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import mujoco
@@ -180,3 +181,64 @@ def test_under_a_limit_of_the_shell_the_command_ends_in_one_line(words, tmp_path
     ended = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=ENVIRONMENT)
     (line,) = ended.stderr.splitlines()
     assert ended.returncode == 2 and "memory" in line, ended.stderr
+
+
+FORKED = """
+    import os, signal, sys
+    import numpy as np
+    from quadrl.engines.mujoco import BatchEngine
+    from quadrl.environment import Environment
+    from quadrl.errors import QuadrlError
+    from quadrl.vehicle import Vehicle
+
+    def fly(environment, steps):
+        actions = 0.3 * np.random.default_rng(1).uniform(-1, 1, (steps, environment.num_envs, 4))
+        done = [environment.step(action) for action in actions]
+        seen = environment.flatten(done[-1].observation)
+        environment.reset(done[-1].terminated)
+        return environment.engine.qpos.tobytes(), seen.tobytes()
+
+    def in_a_child(work):
+        sys.stdout.flush()
+        if child := os.fork():
+            _, status = os.waitpid(child, 0)
+            assert os.waitstatus_to_exitcode(status) == 0, status
+        else:
+            signal.alarm(60)  # a child that hangs is killed
+            work()
+            sys.exit(0)  # by the long way, which frees everything
+
+    def child():
+        assert fly(environment, 5) == expected
+
+    for engine, count in (("mujoco", 128), ("free_flight", 2048)):
+        for settings in ({}, {"weather": "light", "randomization": "full"}):
+            given = {"num_envs": count, "seed": 3, "engine": engine, "num_threads": 2, **settings}
+            environment, other = (Environment("hover", **given) for _ in range(2))
+            in_a_child(environment.reset)  # before its first flight
+            for each in (environment, other):
+                each.reset()
+                fly(each, 3)
+            expected = fly(other, 5)
+            in_a_child(child)
+            in_a_child(lambda: in_a_child(child))
+            assert fly(environment, 5) == expected
+
+    bare = BatchEngine(Vehicle(), 128, altitude=3.0, num_threads=2)
+    bare.advance(1)
+
+    def refused():
+        try:
+            bare.advance(1)
+        except QuadrlError as error:
+            assert "forked" in str(error)
+        else:
+            sys.exit(1)
+
+    in_a_child(refused)
+"""
+
+
+def test_batches_that_have_flown_fly_on_in_a_forked_process_bit_for_bit():
+    code = textwrap.dedent(FORKED)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
