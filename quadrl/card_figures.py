@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import matplotlib
@@ -25,6 +25,7 @@ TEXT: Any = {"font.size": 9, "axes.titlesize": 9.5, "axes.labelsize": 9, "legend
 FONTS: Any = {"pdf.fonttype": 42, "svg.fonttype": "none"}  # text stays text
 GREY = "#6b7280"
 HATCHED: Any = {"fc": "none", "hatch": "////", "lw": 0.0, "alpha": 0.45}
+NEAR = 0.5  # of the span of the levels: so far beyond them it is drawn where actions end
 BANDS = 3  # as many can be told apart
 LEAST_ERROR = 1e-4  # [m], that is drawn
 SHADES = "cividis"
@@ -103,7 +104,7 @@ def _panels(upper: Any, lower: Any, axis: Mapping[str, Any], flown: list[str]) -
     lower.set_yscale("log")
     lower.set_xlabel(f"[{axis['unit']}]" if "of" not in axis["unit"] else f"{axis['unit']}")
     for panel in (upper, lower):
-        panel.set_xlim(*_view(levels))
+        panel.set_xlim(*_view(axis))
         panel.grid(alpha=0.22, lw=0.6)
         panel.spines[["top", "right"]].set_visible(False)
         if axis["usual"] != levels[0]:
@@ -111,15 +112,20 @@ def _panels(upper: Any, lower: Any, axis: Mapping[str, Any], flown: list[str]) -
     upper.tick_params(labelbottom=False)
 
 
-def _view(levels: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    """The levels and a margin on both sides."""
-    margin = 0.03 * (levels[-1] - levels[0])
-    return levels[0] - margin, levels[-1] + margin
+def _view(axis: Mapping[str, Any]) -> tuple[float, float]:
+    """The levels with a margin on both sides, and with where actions end if that is near."""
+    first, last = axis["levels"][0], axis["levels"][-1]
+    margin, far = 0.03 * (last - first), NEAR * (last - first)
+    ends = (end for pair in axis.get("reach", {}).values() for end in pair if end is not None)
+    near = [end for end in ends if first - far < end < last + far]
+    low = min([first - margin, *(end - 3 * margin for end in near if end < axis["usual"])])
+    high = max([last + margin, *(end + 3 * margin for end in near if end > axis["usual"])])
+    return low, high
 
 
 def _beyond(axis: Mapping[str, Any], name: str) -> list[tuple[float, float]]:
     """Stretches of the view that the actions of one that flew do not reach."""
-    (start, end), (low, high) = _view(axis["levels"]), axis.get("reach", {}).get(name, (None, None))
+    (start, end), (low, high) = _view(axis), axis.get("reach", {}).get(name, (None, None))
     spans = [(start, start if low is None else low), (end if high is None else high, end)]
     return [(first, last) for first, last in spans if first < last]
 
@@ -184,9 +190,9 @@ def _head(figure: Figure, words: str, hatched: bool, handles: list[Any], names: 
             (Patch(**HATCHED, ec=GREY), "beyond the reach of the actions (no level hover)")
         )
     marks, texts = zip(*entries, strict=True)
-    figure.legend(
-        [*handles, *marks], [*names, *texts], loc="outside lower left", ncols=4, frameon=False
-    )
+    columns = max(1, min(4, round(figure.get_figwidth() / PANEL[0]) - 1))
+    legend: dict[str, Any] = {"loc": "outside lower left", "ncols": columns, "frameon": False}
+    figure.legend([*handles, *marks], [*names, *texts], **legend)
 
 
 def content(figure: Figure, kind: str) -> bytes:
