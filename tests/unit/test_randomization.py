@@ -11,7 +11,7 @@ from quadrl import tasks
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
 from quadrl.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
-from quadrl.rng import NOISE, uniform_array_api
+from quadrl.rng import NOISE, PUSHES, uniform_array_api
 from quadrl.rotation import norm
 from quadrl.vehicle import VEHICLES, Vehicle
 
@@ -235,6 +235,27 @@ def test_pushes_come_by_chance_and_change_velocity_and_body_rate(engine):
     np.testing.assert_allclose(norm(hits[hit, 3:]), 1.0, rtol=1e-9)
     # Evenly over the sphere: each component has mean 0 and deviation 1 / sqrt(3).
     assert np.abs(hits[hit].mean(axis=0) / ([0.5] * 3 + [1.0] * 3)).max() < 5 / math.sqrt(3 * 190)
+
+
+def test_the_pushes_are_the_definition():
+    # Eight numbers a control step: whether it hits, two directions by height and heading.
+    pushes = Pushes(rate=20.0, velocity=0.5, body_rate=1.0)
+    environment = helpers.begun("hover", 20, seed=2**40, randomization={"pushes": pushes})
+    disturbances, qvel, hits = environment.disturbances, environment.engine.qvel, 0
+    for step in range(5):
+        keys, episodes = disturbances.place
+        u = uniform_array_api(keys, episodes, PUSHES, 8 * step, 8)
+        expected = qvel.copy()
+        for first, share, turn, size in ((0, 1, 2, 0.5), (3, 3, 4, 1.0)):
+            height, heading = 2 * u[:, share] - 1, 2 * math.pi * u[:, turn]
+            level = np.sqrt(1 - height**2)
+            way = np.stack([level * np.cos(heading), level * np.sin(heading), height], axis=1)
+            hit = u[:, 0] < 1 - math.exp(-20.0 * PAPER.control_timestep)
+            expected[:, first : first + 3] += size * hit[:, None] * way
+        disturbances.begin_step()
+        np.testing.assert_allclose(qvel, expected, rtol=0, atol=1e-14)
+        hits += hit.sum()
+    assert 20 < hits < 80  # of 100, with a chance of 0.63
 
 
 def test_what_diverges_is_counted_and_finite():

@@ -104,6 +104,14 @@ def test_streams_do_not_overlap():
     assert len(every) == 4000 and len(np.unique(every, axis=0)) == 4000
 
 
+def test_every_purpose_has_a_stream_of_its_own():
+    # Every whole number of the module but these is a stream, and so is one that is added.
+    others = ("MAX_SEED", "ADVANCE", "MASK")
+    streams = {k: v for k, v in vars(rng).items() if k not in others and type(v) is int}
+    assert {"START", "PARAMETERS", "WEATHER", "TURBULENCE", "NOISE", "PUSHES"} <= set(streams)
+    assert len(set(streams.values())) == len(streams), streams
+
+
 COUNT = 100_000
 ONE = np.ones(COUNT, dtype=np.int64)
 DRAWS = {  # names to COUNT numbers of one kind

@@ -13,7 +13,7 @@ from dm_control.rl import control
 from runs import refused
 from scipy import stats
 
-from quadrl import air, mjcf, tasks
+from quadrl import air, mjcf, parameters, tasks
 from quadrl.engines.mujoco import DataEngine
 from quadrl.environment import Environment
 from quadrl.envs.dm_control import Physics, QuadrotorTask
@@ -97,6 +97,15 @@ def test_normal_numbers_have_mean_0_and_variance_1():
     np.testing.assert_allclose(stats.kurtosis(drawn, axis=1, fisher=False), 2.7, atol=0.06)
     correlation = np.corrcoef(drawn) - np.eye(14)
     assert abs(correlation).max() < SIGMAS / math.sqrt(count)
+
+
+def test_no_step_draws_the_numbers_of_another():
+    # Two numbers of a block, which 2800 blocks share by chance once in 10000 times.
+    steps = np.arange(400.0)
+    streams = np.full(400, 5), np.full(400, 2)
+    drawn = np.array(air.normals(streams, steps, 0, 6 + parameters.MAX_ROTORS))
+    blocks = drawn.reshape(-1, 2, 400).transpose(0, 2, 1).reshape(-1, 2)
+    assert len(np.unique(blocks, axis=0)) == len(blocks) == 400 * air.BLOCKS
 
 
 # ----------------------------------------------------------------------------------- mean wind
