@@ -125,11 +125,11 @@ def test_nothing_that_free_flight_takes_comes_near_the_ground_in_a_step(name):
 @pytest.mark.parametrize("name", ["drag", "drag of the rotors"])
 def test_an_aircraft_that_the_wind_pushes_to_the_ground_is_handed_over(name):
     # At rest in wind of 60 m/s from above, which pushes far more than weight and thrust can: level,
-    # by drag with 0.009 * 60^2 / 0.65 = 50 m/s^2, or on its side, by the rotors' own drag.
-    vehicle, attitude = PAPER, (1, 0, 0, 0)
+    # by drag with 0.009 * 60^2 / 0.3 = 108 m/s^2, or on its side, by the rotors' own drag.
+    vehicle, attitude = dataclasses.replace(PAPER, mass=0.3), (1, 0, 0, 0)
     if name != "drag":
         rotors = Aerodynamics(rotor_drag=1e-3)
-        vehicle = dataclasses.replace(PAPER, drag_coefficient=0.0, aerodynamics=rotors)
+        vehicle = dataclasses.replace(vehicle, drag_coefficient=0.0, aerodynamics=rotors)
         attitude = (math.sqrt(0.5), math.sqrt(0.5), 0, 0)
     count, reach = 200, max(np.linalg.norm(r.position) + r.radius for r in vehicle.rotors)
     motion = helpers.random_motion(vehicle, count, speed=0.0, turn=0.0, rotor=0.0)

@@ -207,6 +207,9 @@ def test_the_goal_is_seen_from_where_the_estimate_is():
     to_goal = np.einsum("nij,nj->ni", state.rotation, seen["goal"])
     np.testing.assert_allclose(seen["position"] + to_goal, 0.0, atol=1e-12)  # the goal of hover
     assert np.abs(seen["position"] - state.position).max() > 0.1
+    # What has no error is seen as it is, to the last bit.
+    estimate = environment.observer.frame.state
+    np.testing.assert_array_equal(estimate.quaternion, state.quaternion)
 
 
 # ---------------------------------------------------------------------------------------- pushes
