@@ -122,6 +122,25 @@ def test_somebody_elses_parts_in_our_model_are_left_alone():
     assert data.qfrc_passive[6] == 0
 
 
+def test_two_aircraft_in_a_model_fly_as_if_alone():
+    vehicle = helpers.IN_AIR["paper in air"]
+
+    def fly(two):
+        spec = mjcf.spec(vehicle, drawn=False)
+        if two:
+            frame = spec.worldbody.add_frame(pos=[0, 9, 0])
+            spec.attach(mjcf.spec(vehicle, drawn=False), prefix="other ", frame=frame)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qpos[2::7], data.userdata[:3] = 1.0, (2, 1, 0.5)  # near the ground, in wind
+        data.act[:4], data.ctrl[:4] = 200.0, (210, 190, 220, 180)
+        data.act[4:], data.ctrl[4:] = 150.0, 240.0
+        mujoco.mj_step(model, data, 30)
+        return data
+
+    np.testing.assert_allclose(fly(two=True).qpos[:7], fly(two=False).qpos, atol=1e-12)
+
+
 def test_a_model_without_room_for_wind_flies_in_calm_air():
     # `nuserdata` of a model that somebody strips. Past its end stand the sensors, here a height of
     # 5 m, which must not be taken for a wind.
