@@ -117,7 +117,7 @@ def _check(model: mujoco.MjModel) -> None:
         model.geom(k).name or f"number {k}"
         for k in np.flatnonzero(model.geom_bodyid != 1)
         if (model.geom_contype[k] or model.geom_conaffinity[k])
-        and model.geom_type[k] != mujoco.mjtGeom.mjGEOM_PLANE
+        and (model.geom_type[k] != mujoco.mjtGeom.mjGEOM_PLANE or model.geom_quat[k, 1:3].any())
     ]
     turned = not (model.body_iquat[-1] == (1, 0, 0, 0)).all() or model.body_ipos[-1].any()
     for wrong, what in (
