@@ -224,6 +224,7 @@ def test_a_policy_flies_with_the_options_of_its_training_and_no_others():
         with pytest.raises(QuadrlError) as caught:
             evaluate(policy, "hover", episodes=2, observe=other)
         assert caught.value.name == "observe" and "action_history" in caught.value.allowed
+    evaluate(policy, "hover", episodes=2, time_limit=0.2, sampled=True)
     # What only the critic sees makes no difference.
     evaluate(policy, "hover", episodes=1, time_limit=0.1, observe=observe | {"privileged": True})
 

@@ -108,6 +108,8 @@ def test_an_observation_of_another_size_is_refused(shape):
         (linear(22, 4), {"vehicle": "hexa"}, "observation size", 22, "24"),
         (linear(24, 4), {"vehicle": "hexa"}, "action size", 4, "6"),
         (linear(24, 6, control_mode="velocity"), {"vehicle": "hexa"}, "action size", 6, "4"),
+        # As many rotors, but turned by 45 degrees.
+        (linear(22, 4, vehicle="paper"), {"vehicle": "racer"}, "vehicle", "racer", "one with"),
     ],
 )
 def test_a_policy_for_another_layout_is_refused(policy, settings, name, value, needed):

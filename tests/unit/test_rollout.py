@@ -9,9 +9,11 @@ import pytest
 from runs import refused
 
 from quadrl import tasks
+from quadrl.engines.mujoco import MAX_ENVS
 from quadrl.environment import Environment
 from quadrl.evaluation import evaluate
 from quadrl.learning.config import MAX_SEED
+from quadrl.learning.environments import SEED_STRIDE
 from quadrl.rollout import EVALUATION_SEED, Rollout, fly, summarize
 from quadrl.vehicle import Vehicle
 
@@ -118,6 +120,7 @@ def test_an_evaluation_is_the_same_every_time_and_another_with_another_seed():
 
 def test_evaluation_episodes_are_none_of_the_trainings():
     # Row seeds of a training: seed * 2^20 + i, with up to 2^20 aircraft.
+    assert SEED_STRIDE == MAX_ENVS == 2**20
     assert EVALUATION_SEED >= (MAX_SEED + 1) * 2**20
     assert MAX_SEED == 2**32 - 1
 

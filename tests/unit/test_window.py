@@ -1,5 +1,7 @@
 """Derivatives of windows of flight, beside differences of the flights themselves."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -40,6 +42,20 @@ def flown(name, weights, shifts):
             environment.reset(over)
             share[over] = 1.0
     return Window(environment, moments), total
+
+
+def test_what_comes_after_a_step_is_expected_where_the_window_does_not_hold_it():
+    # An episode that only runs out of time, or the window, goes on; one that ended does not, and
+    # what follows within the window is no expectation.
+    window, _ = flown("hover", np.zeros((22, 4)), np.zeros((3, COUNT, 4)))
+    ends = np.array([[0, 0, 1, 0, 0], [0, 1, 0, 0, 0], [1, 0, 0, 0, 0]], dtype=bool)
+    late = np.array([[0, 0, 0, 1, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 1]], dtype=bool)
+    window.moments[:] = [
+        dataclasses.replace(moment, terminated=end, truncated=out)
+        for moment, end, out in zip(window.moments, ends, late, strict=True)
+    ]
+    expected = [[0, 0, 0, 1, 0], [0, 0, 0, 0, 0], [0, 1, 1, 1, 1]]
+    np.testing.assert_array_equal(window.goes_on.reshape(3, COUNT), expected)
 
 
 @pytest.mark.parametrize("name", CASES)
