@@ -94,6 +94,8 @@ LANDINGS = [
     ((0, 0, 0.1), 0, 0, (0, 0, 0.51), (False, False)),  # in the air
     (touching(0.25), 0, 0.25, (0, 0, 0), (False, False)),  # tilted by 14.3 degrees
     (touching(0.27), 0, 0.27, (0, 0, 0), (True, False)),  # by 15.5 degrees
+    (touching(0.27), 0, 0.27, (1, 4, 0), (True, False)),  # and at rest for 0.25 s
+    (touching(0.25), 0, 0.25, (1, 4, 0), (True, True)),  # so by 14.3 degrees
     ((0, 0, 1), 0, 0.27, (0, 0, 0), (False, False)),  # the same in the air
     ((0, 0, -0.01), 0, 1.4, (0, 0, 0), (True, False)),  # on a rotor
     ((0, 0, 0), 0, 0, (1, 3, 0), (False, False)),  # at rest for 0.2 s
