@@ -62,6 +62,13 @@ def test_an_aircraft_that_is_controlled_more_often_learns_as_many_seconds():
     assert (given.gamma, given.steps, given.rollout) == (0.9, 4096, 40)
 
 
+def test_a_training_has_at_least_the_steps_that_are_asked_for():
+    # Batches of 32 steps: 64 and 65 take two and three of them, and one step a whole one.
+    batches = {64: 2, 65: 3, 1: 1}
+    for steps, iterations in batches.items():
+        assert TrainConfig("hover", num_envs=8, rollout=4, steps=steps).iterations == iterations
+
+
 def test_every_task_trains_by_default():
     for name, task in tasks.TASKS.items():
         config = TrainConfig(name)

@@ -17,6 +17,7 @@ from safetensors.numpy import save
 import quadrl
 from quadrl.environment import Environment
 from quadrl.envs.torchrl import QuadrotorEnv
+from quadrl.evaluation import setting
 from quadrl.files import write_safetensors
 from quadrl.policy import FORMAT, SHIPPED, Policy, shipped
 from quadrl.rollout import fly
@@ -273,6 +274,13 @@ def test_pretrained_is_the_file_that_ships(algo):
     loaded = Policy.load(SHIPPED / f"{name}.safetensors")
     for part, array in parts(loaded).items():
         np.testing.assert_array_equal(parts(policy)[part], array)
+
+
+@pytest.mark.parametrize(
+    ("name", "task"), [("hover", "hover"), ("hover_robust", "hover"), ("landing_gae", "landing")]
+)
+def test_what_ships_flies_by_its_task_and_by_its_own_name(name, task):
+    assert setting(name)[2].name == task
 
 
 @pytest.mark.parametrize(("task", "algo"), [("hovr", "ppo"), ("hover", "sac"), ("../hover", "ppo")])
