@@ -251,6 +251,21 @@ def test_goals_and_headings_are_approached_the_right_way(name, task, goal, headi
     np.testing.assert_array_equal(np.sign(np.round(action, 2)), [sign])
 
 
+def test_a_task_brings_gains_of_its_own_unless_others_are_given():
+    class Gentle(Hover):
+        gains = {"level": 0.6, "max_speed": 1.0}
+
+    seen = observations(Hover(), goal=(0.2, 0, 0))
+
+    def action(task, *gains):
+        return control.GeometricController(PAPER, task, *gains)(seen)
+
+    own = action(Gentle())
+    np.testing.assert_array_equal(own, action(Hover(), Gains(**Gentle.gains)))
+    np.testing.assert_array_equal(action(Gentle(), Gains()), action(Hover()))
+    assert np.abs(own).max() < 0.5 * np.abs(action(Hover())).max()
+
+
 @both
 @layouts
 def test_rows_are_flown_as_each_alone_and_no_attitude_breaks_it(name, vehicle):
