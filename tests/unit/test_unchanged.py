@@ -119,6 +119,27 @@ def test_episodes_are_what_they_were(name):
             )
 
 
+# Sums of the sizes of position, quaternion, velocities, goal and wind, of 8 first snapshots each.
+BEGUN = {
+    "hover": (3.69439906441, 10.3859899678, 3.20346829367, 0, 82.2386720872),
+    "static_waypoint": (0, 8.1076259848, 0.604501802722, 20, 82.0435621314),
+    "random_waypoint": (0, 9.97897281487, 0, 23.1516261284, 82.0435621314),
+    "straight_and_level": (0, 10.0618801519, 10.6558647747, 9.92696926415, 82.0435621314),
+    "landing": (32.8302220445, 10.0618801519, 0, 0, 82.5074578145),
+    "target_following": (9.92696926415, 10.2773571421, 0, 0, 82.0435621314),
+}
+
+
+@pytest.mark.parametrize("name", tasks.TASKS)
+def test_the_episodes_of_a_seed_begin_where_they_did(name):
+    settings = {"weather": "moderate", "randomization": "full"}
+    environment = helpers.begun(name, 8, seed=1, **settings)
+    state, engine = environment.snapshot.state, environment.engine
+    goal = environment.snapshot.task.goal
+    parts = state.position, state.quaternion, engine.qvel, goal, engine.wind
+    assert [np.abs(part).sum() for part in parts] == pytest.approx(BEGUN[name], rel=1e-9)
+
+
 def test_the_record_holds_every_kind_of_end():
     cases, arrays = recorded()
     ends = {

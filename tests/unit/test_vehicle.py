@@ -56,6 +56,12 @@ def test_the_mixer_is_equation_7():
     np.testing.assert_allclose(PAPER.mixer, [[3.13e-5] * 4, *moments, yaw], rtol=1e-14, atol=0)
 
 
+def test_the_layout_says_which_way_each_rotor_lifts_and_turns():
+    # The signs of equation 7.
+    signs = [[1, 1, 1, 1], [0, 1, 0, -1], [-1, 0, 1, 0], [-1, 1, -1, 1]]
+    np.testing.assert_array_equal(PAPER.layout, signs)
+
+
 def test_the_mixer_of_tilted_rotors():
     # Rotors 1 and 3 lean towards each other by 30 degrees, 0.1 m above the centre of mass. Of
     # rotor 1 at (0.23, 0, 0.1), axis (-0.5, 0, 0.866025): position x axis =

@@ -191,6 +191,13 @@ COVARIANCE = np.array([[0.5, 0.25], [0.25, 0.25]])
 OUTPUT = np.array([math.sqrt(3), 1 - math.sqrt(3)])
 
 
+def test_turbulence_is_that_at_the_altitude_of_the_task():
+    # 0.1 * 7.72 m/s over (0.177 + 0.000823 h)^0.4, with 60 m = 196.85 ft.
+    made, _ = process(LIGHT, altitude=60.0)
+    expected = 0.772 / (0.177 + 0.000823 * 196.85) ** 0.4
+    assert column(made, "level_deviation") == pytest.approx(expected, rel=1e-4)
+
+
 @pytest.mark.parametrize("rate", RATES)
 def test_a_step_of_any_length_keeps_the_covariance(rate):
     turn, noise = matrices("up", rate)
