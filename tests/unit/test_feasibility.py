@@ -239,11 +239,14 @@ def drawn(found):
 
 def test_a_picture_is_hatched_from_there_on(card):
     hatched, named = drawn(card.found)
-    below, above = (patch.get_bbox() for patch in hatched[0])
-    assert named and [len(patches) for patches in hatched] == [2, 0, 2, 0]
-    assert (below.x1, above.x0) == pytest.approx([0.831, 1.185], abs=1e-3)
-    usual = card.found | {"flown": ["usual"]}  # beyond the levels
-    assert drawn(usual) == ([[], [], [], []], False)
+    assert named and [len(patches) for patches in hatched] == [4, 0, 4, 0]
+    boxes = [patch.get_bbox() for patch in hatched[0]]
+    # The two ends of each that flew; those of the usual one lie beyond the levels, 0.8 to 1.3.
+    ends = sorted([box.x1 for box in boxes if box.x1 < 1] + [box.x0 for box in boxes if box.x0 > 1])
+    assert ends == pytest.approx([LEAST, 0.831, 1.185, MOST], abs=1e-3)
+    far = json.loads(json.dumps(card.found)) | {"flown": ["usual"]}
+    far["axes"]["mass"]["reach"] = {"usual": [0.3, 1.9]}  # farther than is shown
+    assert drawn(far) == ([[], [], [], []], False)
 
 
 def test_an_older_card_has_none_and_is_drawn(card, tmp_path):
