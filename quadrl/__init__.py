@@ -13,6 +13,7 @@ The import registers the Gymnasium ids; dm_control, torch and rendering are impo
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 from quadrl import envs, tasks
@@ -50,6 +51,11 @@ LAZY = {
     "check": "quadrl.checked",
 }
 """Functions that are imported on first use, and their modules."""
+
+MOVED = {"errors": "base.errors", "rotation": "base.rotation"}
+"""Modules that have moved, by the names under which users' files import them, until 0.2."""
+for _old, _new in MOVED.items():
+    sys.modules[f"quadrl.{_old}"] = globals()[_old] = importlib.import_module(f"quadrl.{_new}")
 
 envs.register_ids()
 shield_triton()  # whoever imports triton later may have drawn before

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice, number
 from quadrl.rotors import GRAVITY, MAX, MIN
-from quadrl.validation import choice, number
 
 if TYPE_CHECKING:
     from quadrl.vehicle import Vehicle

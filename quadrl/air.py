@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.base.rotation import Array, namespace, stack
 from quadrl.rng import MASK, TURBULENCE, philox
-from quadrl.rotation import Array, namespace, stack
 from quadrl.vehicle import MAX_ROTORS
 
 REFERENCE = 6.096  # [m], 20 ft: the height of W20

@@ -23,10 +23,10 @@ import numpy as np
 from mujoco.batch import Batch
 
 from quadrl import mjcf, suite, tasks
+from quadrl.base.machine import cores, machine
 from quadrl.draw import Draw
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
-from quadrl.machine import cores, machine
 from quadrl.randomization import FACTORS, RANDOMIZATIONS, Randomization
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, in_real_air

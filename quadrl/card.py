@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import write_whole
 from quadrl.evaluation import html_table
-from quadrl.files import write_whole
 from quadrl.show import Media
 
 if TYPE_CHECKING:

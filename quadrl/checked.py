@@ -11,6 +11,7 @@ import numpy as np
 
 from quadrl import tasks
 from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.base.validation import choice
 from quadrl.control.feasibility import (
     MARGIN,
     Reach,
@@ -26,7 +27,6 @@ from quadrl.evaluation import html_table
 from quadrl.randomization import Randomized
 from quadrl.rotors import GRAVITY
 from quadrl.task import Task
-from quadrl.validation import choice
 from quadrl.vehicle import Vehicle, resolve
 
 OK = "ok"

@@ -1,9 +1,9 @@
 """The control step of a task, compiled: `transition.finish` as one loop over rows.
 
-The functions of a task are called twice, with symbols (`quadrl.trace`); what they compute becomes
-a C function, and NumPy's rows fly with it. One aircraft alone would spend more time in eighty
-calls of NumPy than in its simulation. A task whose functions do more than arithmetic cannot be
-compiled and is run as it is written, with the same results.
+The functions of a task are called twice, with symbols (`quadrl.base.trace`); what they compute
+becomes a C function, and NumPy's rows fly with it. One aircraft alone would spend more time in
+eighty calls of NumPy than in its simulation. A task whose functions do more than arithmetic cannot
+be compiled and is run as it is written, with the same results.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import native, records
+from quadrl import native
+from quadrl.base import records
+from quadrl.base.rotation import Array
+from quadrl.base.trace import Trace
 from quadrl.engines.engine import Engine, Frame
 from quadrl.parameters import AIRCRAFT, ROW_SIZE, Parameters
-from quadrl.rotation import Array
 from quadrl.snapshot import Snapshot
 from quadrl.state import State
 from quadrl.task import Task
-from quadrl.trace import Trace
 from quadrl.transition import Clock, Episode, Transition, finish
 
 _ALONE = [object()]

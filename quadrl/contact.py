@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from quadrl.rotation import Array, namespace, norm
+from quadrl.base.rotation import Array, namespace, norm
 from quadrl.snapshot import Snapshot
 
 CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing

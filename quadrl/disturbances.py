@@ -12,11 +12,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from quadrl import native
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
 from quadrl.draw import Draw
 from quadrl.engines.engine import Engine
-from quadrl.errors import QuadrlError
 from quadrl.rng import PARAMETERS, PUSHES, uniform
-from quadrl.rotation import Array
 from quadrl.weather import Weather
 
 

@@ -11,20 +11,20 @@ import numpy as np
 
 from quadrl.aerodynamics import Aerodynamics
 from quadrl.axes import AXES, Axis
+from quadrl.base.errors import QuadrlError
+from quadrl.base.progress import ProgressBar
+from quadrl.base.validation import choice, number
 from quadrl.card import QUARTILES, Card, half_level, wilson
 from quadrl.control.feasibility import limit
 from quadrl.draw import Draw
 from quadrl.engines.engine import EngineName
-from quadrl.errors import QuadrlError
 from quadrl.evaluation import setting
 from quadrl.kept import Kept
 from quadrl.policy import Policy
-from quadrl.progress import ProgressBar
 from quadrl.randomization import Randomization
 from quadrl.recovery import MAPS, recovered
 from quadrl.rollout import EVALUATION_SEED, MAX_EPISODES, MAX_SEED, Controller, flights, fly
 from quadrl.task import Task
-from quadrl.validation import choice, number
 from quadrl.vehicle import Vehicle, resolve
 from quadrl.weather import Weather
 

@@ -8,10 +8,10 @@ import itertools
 import numpy as np
 
 from quadrl import parameters
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
+from quadrl.base.validation import number
 from quadrl.randomization import DELAYS, FACTORS, NONE, Randomized, Range, resolve
-from quadrl.rotation import Array
-from quadrl.validation import number
 from quadrl.vehicle import Vehicle
 
 AXES = "xyz"

@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from quadrl.base.rotation import Array, namespace, norm, rotation_matrix, stack, to_body, to_world
 from quadrl.parameters import WIND, Parameters
-from quadrl.rotation import Array, namespace, norm, rotation_matrix, stack, to_body, to_world
 
 
 @dataclasses.dataclass(frozen=True)

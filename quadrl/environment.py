@@ -12,17 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import (
-    machine,
-    observer,
-    observing,
-    parameters,
-    records,
-    saving,
-    tasks,
-    transition,
-    validation,
-)
+from quadrl import observer, observing, parameters, saving, tasks, transition
+from quadrl.base import machine, records, validation
+from quadrl.base.rotation import Array
 from quadrl.compiled import CompiledStep
 from quadrl.control import modes
 from quadrl.draw import Draw
@@ -32,7 +24,6 @@ from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.randomization import Randomized
 from quadrl.rng import Rng, Seed, seeds_of_rows
-from quadrl.rotation import Array
 from quadrl.task import Snapshot, Task, layout
 from quadrl.transition import Clock, Episode, Observation, Transition
 from quadrl.vehicle import Vehicle, resolve

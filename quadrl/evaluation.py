@@ -12,11 +12,12 @@ from typing import Any, cast
 
 from quadrl import tasks
 from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import write_whole
+from quadrl.base.validation import number
 from quadrl.control import CONTROLLERS
 from quadrl.control import make as make_controller
 from quadrl.control.feasibility import warn_of_unreached
-from quadrl.errors import QuadrlError
-from quadrl.files import write_whole
 from quadrl.observing import Observed
 from quadrl.policy import Policy, shipped
 from quadrl.randomization import Randomized
@@ -31,7 +32,6 @@ from quadrl.rollout import (
 )
 from quadrl.snapshot import Rollout
 from quadrl.task import Task
-from quadrl.validation import number
 from quadrl.vehicle import Vehicle, resolve
 from quadrl.weather import Weathered
 

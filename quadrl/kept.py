@@ -21,8 +21,8 @@ import mujoco
 import numpy as np
 
 from quadrl import __version__
-from quadrl.errors import QuadrlWarning
-from quadrl.files import write_whole
+from quadrl.base.errors import QuadrlWarning
+from quadrl.base.files import write_whole
 from quadrl.task import Task
 
 FILE = "flown.json"

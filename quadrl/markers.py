@@ -8,8 +8,8 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from quadrl.errors import QuadrlError
-from quadrl.validation import choice
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice
 
 Rgba: TypeAlias = tuple[float, float, float, float]
 Kind = Literal["goal", "sphere", "ring", "pad", "line", "arrow", "path"]

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from quadrl import native, parameters
+from quadrl.base.rotation import Array, to_body, to_world
 from quadrl.disturbances import Disturbances
 from quadrl.draw import Draw
 from quadrl.dynamics import thrust_wrench
@@ -16,7 +17,6 @@ from quadrl.observing import Observing
 from quadrl.parameters import Parameters
 from quadrl.randomization import NONE
 from quadrl.rng import NOISE
-from quadrl.rotation import Array, to_body, to_world
 from quadrl.rotors import GRAVITY
 from quadrl.snapshot import Snapshot
 from quadrl.state import State

@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from quadrl.errors import QuadrlError
-from quadrl.validation import choice, keys, number
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice, keys, number
 
 ROTOR_SPEEDS = ("true", "estimated", "none")
 LONGEST_HISTORY = 1000

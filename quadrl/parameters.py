@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.aerodynamics import Aerodynamics
-from quadrl.rotation import Array
+from quadrl.base.rotation import Array
 from quadrl.rotors import Rotor, hover_squares, mixer
 from quadrl.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
 

@@ -19,11 +19,11 @@ from safetensors.numpy import load as of_bytes
 from safetensors.numpy import save as to_bytes
 
 from quadrl.aerodynamics import Aerodynamics, with_effects
-from quadrl.errors import QuadrlError, QuadrlWarning
-from quadrl.files import read_safetensors, read_sealed_json, write_safetensors
+from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.files import read_safetensors, read_sealed_json, write_safetensors
+from quadrl.base.validation import choice, number
 from quadrl.memory import GRU, NAMES, PREFIX, Flyer
 from quadrl.observing import resolve
-from quadrl.validation import choice, number
 from quadrl.vehicle import VEHICLES, Vehicle
 from quadrl.vehicle import resolve as resolve_vehicle
 

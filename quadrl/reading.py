@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.errors import QuadrlError
-from quadrl.rotation import Array, heading_of, norm, rotation_of_angles, to_world
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, heading_of, norm, rotation_of_angles, to_world
 from quadrl.vehicle import Vehicle
 
 

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.base.rotation import quaternion_from_heading_and_tilt
 from quadrl.contact import touches_ground
 from quadrl.engines.engine import EngineName
 from quadrl.environment import Environment
 from quadrl.randomization import NONE
 from quadrl.rollout import FINAL_STRETCH, Controller, prepared
-from quadrl.rotation import quaternion_from_heading_and_tilt
 from quadrl.state import State
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadrl.errors import QuadrlError
-from quadrl.rotation import Array, namespace, quaternion_from_heading_and_tilt, stack
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, namespace, quaternion_from_heading_and_tilt, stack
+from quadrl.base.validation import number
 from quadrl.state import Start
-from quadrl.validation import number
 
 if TYPE_CHECKING:
     from quadrl.parameters import Parameters

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import machine
+from quadrl.base import machine
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.engine import EngineName
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.memory import Flyer
 from quadrl.observing import Observed
 from quadrl.policy import Policy

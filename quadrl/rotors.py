@@ -10,9 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from quadrl.errors import QuadrlError
-from quadrl.rotation import Array
-from quadrl.validation import number, numbers
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
+from quadrl.base.validation import number, numbers
 
 GRAVITY = 9.81  # [m/s^2]
 MIN, MAX = mujoco.mjMINVAL, mujoco.mjMAXVAL  # what MuJoCo takes for zero, and for unstable

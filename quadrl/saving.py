@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadrl import records
+from quadrl.base import records
+from quadrl.base.errors import QuadrlError
 from quadrl.compiled import MOMENT
-from quadrl.errors import QuadrlError
 from quadrl.rng import MAX_SEED
 from quadrl.task import Snapshot
 

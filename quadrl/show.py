@@ -10,11 +10,11 @@ from typing import Any
 
 from quadrl import mjcf
 from quadrl.aerodynamics import Aerodynamics
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import write_whole
+from quadrl.base.progress import ProgressBar
 from quadrl.evaluation import Evaluation, evaluate
-from quadrl.files import write_whole
 from quadrl.learning.folder import METRICS, read_config
-from quadrl.progress import ProgressBar
 from quadrl.randomization import Randomized
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle

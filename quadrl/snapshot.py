@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quadrl.base.rotation import Array
 from quadrl.parameters import Parameters
-from quadrl.rotation import Array
 from quadrl.state import State
 from quadrl.vehicle import Vehicle
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.errors import QuadrlError
-from quadrl.rotation import Array, norm, rotation_matrix, sin_cos_attitude, to_body
-from quadrl.validation import keys
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, norm, rotation_matrix, sin_cos_attitude, to_body
+from quadrl.base.validation import keys
 
 SIZES = {
     "position": 3,

@@ -13,7 +13,8 @@ from typing import Any
 from dm_control.rl import control
 from dm_control.utils import containers
 
-from quadrl import tasks, validation
+from quadrl import tasks
+from quadrl.base import validation
 from quadrl.envs.dm_control import make
 
 DOMAIN = "quadrotor"

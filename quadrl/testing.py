@@ -23,12 +23,13 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from quadrl import parameters, records, tasks
+from quadrl import parameters, tasks
+from quadrl.base import records
+from quadrl.base.rotation import Array
 from quadrl.description import docstrings, source
 from quadrl.environment import Environment
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng
-from quadrl.rotation import Array
 from quadrl.snapshot import EpisodeEnd, Snapshot
 from quadrl.state import State
 from quadrl.task import Task

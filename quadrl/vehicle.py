@@ -17,8 +17,9 @@ import numpy as np
 
 from quadrl.aerodynamics import Aerodynamics, check_air
 from quadrl.aerodynamics import in_real_air as in_real_air  # beside the aircraft
-from quadrl.errors import QuadrlError
-from quadrl.rotation import Array
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
+from quadrl.base.validation import choice, keys, number, numbers
 from quadrl.rotors import (
     GRAVITY,
     LENGTHS,
@@ -31,7 +32,6 @@ from quadrl.rotors import (
     plus,
     ring,
 )
-from quadrl.validation import choice, keys, number, numbers
 
 MIN_ROTORS, MAX_ROTORS = 4, 8
 DRAWN_SIZE = 0.23  # [m], distance of a rotor from the centre in the drawings of assets/

@@ -25,11 +25,11 @@ import numpy as np
 
 from quadrl import native
 from quadrl.air import FIXED, ROWS, fixed_of
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
+from quadrl.base.validation import choice, keys, number
 from quadrl.rng import FULL_TURN, WEATHER, Rng
-from quadrl.rotation import Array
 from quadrl.rotors import GRAVITY
-from quadrl.validation import choice, keys, number
 
 if TYPE_CHECKING:
     from quadrl.engines.engine import Engine

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice
 from quadrl.task import Task
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
@@ -12,7 +13,6 @@ from quadrl.tasks.random_waypoint import RandomWaypoint
 from quadrl.tasks.static_waypoint import StaticWaypoint
 from quadrl.tasks.straight_and_level import StraightAndLevel
 from quadrl.tasks.target_following import TargetFollowing
-from quadrl.validation import choice
 
 TASKS: dict[str, type[Task]] = {
     task.name: task

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
+from quadrl.base.rotation import Array, namespace
 from quadrl.contact import touches_ground
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng, hovering
-from quadrl.rotation import Array, namespace
 from quadrl.state import Start
 from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState
 

@@ -8,15 +8,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, namespace
+from quadrl.base.validation import MAX_OPTION, numbers
 from quadrl.contact import touches_ground
-from quadrl.errors import QuadrlError
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng, hovering
-from quadrl.rotation import Array, namespace
 from quadrl.state import Start
 from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
-from quadrl.validation import MAX_OPTION, numbers
 
 WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
 

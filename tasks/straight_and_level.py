@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quadrl.base.rotation import Array, namespace, norm
+from quadrl.base.validation import number
 from quadrl.contact import touches_ground
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.rng import Rng
-from quadrl.rotation import Array, namespace, norm
 from quadrl.state import Start
 from quadrl.task import (
     OBSERVATION,
@@ -24,7 +25,6 @@ from quadrl.task import (
     Task,
     TaskState,
 )
-from quadrl.validation import number
 
 if TYPE_CHECKING:
     from quadrl.reading import Reading

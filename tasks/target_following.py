@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, namespace, norm, stack
+from quadrl.base.validation import number
 from quadrl.contact import touches_ground
-from quadrl.errors import QuadrlError
 from quadrl.markers import Marker
 from quadrl.parameters import Parameters
 from quadrl.rng import FULL_TURN, Rng
-from quadrl.rotation import Array, namespace, norm, stack
 from quadrl.state import Start
 from quadrl.task import (
     OBSERVATION,
@@ -25,7 +26,6 @@ from quadrl.task import (
     Task,
     TaskState,
 )
-from quadrl.validation import number
 
 if TYPE_CHECKING:
     from quadrl.reading import Reading

@@ -6,8 +6,8 @@ import numpy as np
 import reference
 from scipy.stats import qmc
 
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import BatchEngine
-from quadrl.errors import QuadrlError
 from quadrl.vehicle import Vehicle, ring
 
 STEP = 0.01  # [s]

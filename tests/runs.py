@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.evaluation import evaluate
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training

@@ -21,6 +21,7 @@ from rich.console import Console
 from tyro.conf import CascadeSubcommandArgs, DisallowNone, UseAppendAction, arg, subcommand
 
 from quadrl import __version__
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.cli import choices, console
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
@@ -33,7 +34,6 @@ from quadrl.cli.study import Study
 from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
 from quadrl.cli.view import View
-from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.signals import IN_ORDER, Stopped, handling
 from quadrl.tasks import TASKS
 

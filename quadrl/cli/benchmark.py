@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+from quadrl.base.validation import number
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
-from quadrl.validation import number
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,14 +11,14 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from quadrl import tasks
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice
 from quadrl.cli import choices
 from quadrl.control import CONTROLLERS
-from quadrl.errors import QuadrlError
 from quadrl.evaluation import comes_with_quadrl, setting
 from quadrl.learning.config import tuples
 from quadrl.rollout import Controller
 from quadrl.task import Task
-from quadrl.validation import choice
 from quadrl.vehicle import Vehicle
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from quadrl.base.errors import QuadrlError
 from quadrl.cli.console import say
-from quadrl.errors import QuadrlError
 from quadrl.learning.folder import LEARNING_CURVE, METRICS, read_config
 
 

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from quadrl import mjcf
+from quadrl.base.progress import ProgressBar
 from quadrl.cli import choices
 from quadrl.cli.console import console, say
 from quadrl.cli.flown import Flown
 from quadrl.evaluation import evaluate
 from quadrl.policy import FILE
-from quadrl.progress import ProgressBar
 from quadrl.rollout import Controller
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle

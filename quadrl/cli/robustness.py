@@ -10,14 +10,14 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
 from quadrl.cli.flown import parse_options
 from quadrl.control import CONTROLLERS
 from quadrl.disturbed import robustness
-from quadrl.errors import QuadrlError
 from quadrl.evaluation import comes_with_quadrl
-from quadrl.validation import choice
 
 
 @dataclasses.dataclass(frozen=True)

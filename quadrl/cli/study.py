@@ -9,9 +9,9 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from quadrl.base.errors import QuadrlError
 from quadrl.cli import console as shared
 from quadrl.cli.console import console, make_table, say
-from quadrl.errors import QuadrlError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,11 +6,11 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from quadrl.base.errors import RenderingUnavailable
 from quadrl.cli.console import say
 from quadrl.cli.flown import Flown
 from quadrl.control import CONTROLLERS
 from quadrl.control import make as make_controller
-from quadrl.errors import RenderingUnavailable
 from quadrl.policy import Policy, shipped
 from quadrl.rollout import Controller
 from quadrl.task import Task

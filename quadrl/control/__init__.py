@@ -7,12 +7,12 @@ yardstick they are.
 from __future__ import annotations
 
 from quadrl import tasks
+from quadrl.base.validation import choice
 from quadrl.control.geometric import Controller, GeometricController
 from quadrl.control.loops import Gains
 from quadrl.control.lqr import LQRController, Weights
 from quadrl.control.modes import CONTROL_MODES, ActionTerm, ControlMode
 from quadrl.task import Task
-from quadrl.validation import choice
 from quadrl.vehicle import Vehicle, resolve
 
 __all__ = [

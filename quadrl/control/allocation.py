@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from quadrl.rotation import Array
+from quadrl.base.rotation import Array
 
 TINY = 1e-12  # [N]
 

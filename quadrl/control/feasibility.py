@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from quadrl import parameters
+from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.rotation import Array
 from quadrl.control.allocation import Allocation
 from quadrl.draw import WHICH, Draw
-from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.randomization import Randomization, Randomized
 from quadrl.rng import PARAMETERS, uniform
-from quadrl.rotation import Array
 from quadrl.rotors import GRAVITY, mixer
 from quadrl.vehicle import Vehicle
 from quadrl.weather import Weather

@@ -12,9 +12,9 @@ import math
 
 import numpy as np
 
+from quadrl.base.rotation import Array
 from quadrl.control.loops import MAX_HEADING_ERROR, Gains, Loops, turned
 from quadrl.reading import Reading
-from quadrl.rotation import Array
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle
 

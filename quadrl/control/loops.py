@@ -21,11 +21,11 @@ from typing import Literal
 
 import numpy as np
 
+from quadrl.base.rotation import Array, norm, to_body
+from quadrl.base.validation import number
 from quadrl.control.allocation import Allocation, columns, product, within
 from quadrl.reading import Reading
-from quadrl.rotation import Array, norm, to_body
 from quadrl.state import State
-from quadrl.validation import number
 from quadrl.vehicle import GRAVITY, Vehicle
 
 MAX_HEADING_ERROR = 0.5  # [rad], of the desired heading from the present one

@@ -10,13 +10,13 @@ import dataclasses
 
 import numpy as np
 
+from quadrl.base.rotation import Array
+from quadrl.base.validation import number
 from quadrl.control.allocation import Allocation, columns, product
 from quadrl.control.geometric import Controller
 from quadrl.control.loops import MAX_HEADING_ERROR, limited, sampled, turned
 from quadrl.reading import Reading
-from quadrl.rotation import Array
 from quadrl.task import Task
-from quadrl.validation import number
 from quadrl.vehicle import GRAVITY, Vehicle
 
 STATES = {

@@ -19,11 +19,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from quadrl.base.rotation import Array, heading_of
+from quadrl.base.validation import choice
 from quadrl.control.allocation import columns, within
 from quadrl.control.loops import MAX_HEADING_ERROR, Controlled, Loops, turned
-from quadrl.rotation import Array, heading_of
 from quadrl.state import State
-from quadrl.validation import choice
 from quadrl.vehicle import GRAVITY, Vehicle
 
 RESPONSE_TIME = 1.0

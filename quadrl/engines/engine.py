@@ -12,10 +12,10 @@ import mujoco
 import numpy as np
 
 from quadrl import native, parameters
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import norm
 from quadrl.engines.adjoint import Leg
 from quadrl.engines.free_flight import FreeFlight
-from quadrl.errors import QuadrlError
-from quadrl.rotation import norm
 from quadrl.state import FIRST, Start, State
 from quadrl.vehicle import Vehicle
 

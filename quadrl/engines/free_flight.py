@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from quadrl import native
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")

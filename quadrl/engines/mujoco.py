@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from quadrl import mjcf, native, parameters, validation
+from quadrl import mjcf, native, parameters
+from quadrl.base import validation
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.engine import ENGINES, Engine, EngineName
 from quadrl.engines.free_flight import FIELDS
-from quadrl.errors import QuadrlError
 from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import mjcf, tasks, validation
+from quadrl import mjcf, tasks
 from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.base import validation
+from quadrl.base.errors import RenderingUnavailable
+from quadrl.base.rotation import norm
 from quadrl.environment import Environment
-from quadrl.errors import RenderingUnavailable
-from quadrl.rotation import norm
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
 

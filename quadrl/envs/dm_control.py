@@ -24,12 +24,13 @@ from dm_control.rl import control
 from dm_control.suite import base
 from dm_env import specs
 
-from quadrl import mjcf, native, validation
+from quadrl import mjcf, native
 from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.base import validation
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import ENGINES, DataEngine
 from quadrl.environment import Environment, Transition
 from quadrl.envs.common import make_task, with_timestep
-from quadrl.errors import QuadrlError
 from quadrl.observing import Observed
 from quadrl.randomization import Randomized
 from quadrl.task import Task

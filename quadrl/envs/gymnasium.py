@@ -20,10 +20,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers import HumanRendering
 
-from quadrl import validation
+from quadrl.base import validation
+from quadrl.base.errors import QuadrlError
 from quadrl.environment import Environment, Transition
 from quadrl.envs.common import PICTURE, Named, Pictures, make, told
-from quadrl.errors import QuadrlError
 from quadrl.rng import Seed
 from quadrl.task import Task
 

@@ -13,8 +13,8 @@ except ImportError as error:
     reason = "quadrl.envs.sb3 needs Stable-Baselines3: pip install stable-baselines3"
     raise ImportError(reason) from error
 
+from quadrl.base.errors import QuadrlError
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
-from quadrl.errors import QuadrlError
 from quadrl.task import Task
 
 Array = np.ndarray

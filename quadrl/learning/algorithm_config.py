@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from quadrl.validation import number
+from quadrl.base.validation import number
 
 
 @dataclasses.dataclass(frozen=True)

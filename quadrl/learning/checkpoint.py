@@ -13,8 +13,8 @@ from safetensors.torch import load as of_bytes
 from safetensors.torch import save as to_bytes
 from tensordict import TensorDict
 
-from quadrl.errors import QuadrlError
-from quadrl.files import read_safetensors, write_safetensors
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import read_safetensors, write_safetensors
 from quadrl.learning.folder import CHANGEABLE
 
 FORMAT, UNSEALED = "quadrl-checkpoint-6", "quadrl-checkpoint-5"

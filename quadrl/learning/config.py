@@ -11,10 +11,11 @@ from typing import Any
 
 from quadrl import __version__, tasks
 from quadrl.aerodynamics import with_effects
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice, keys, number
 from quadrl.control.modes import CONTROL_MODES
 from quadrl.draw import Draw
 from quadrl.engines.mujoco import ENGINES, MAX_ENVS, MAX_THREADS
-from quadrl.errors import QuadrlError
 from quadrl.learning.algorithm_config import (
     ALGORITHM_CONFIGS,
     APGConfig,
@@ -30,7 +31,6 @@ from quadrl.observing import resolve as resolve_observing
 from quadrl.randomization import Randomization, resolve
 from quadrl.rollout import MAX_SEED
 from quadrl.task import Task
-from quadrl.validation import choice, keys, number
 from quadrl.vehicle import Vehicle
 from quadrl.vehicle import resolve as resolve_vehicle
 from quadrl.weather import Weather

@@ -6,10 +6,10 @@ import dataclasses
 from typing import Any
 
 from quadrl import tasks
+from quadrl.base.validation import choice, keys
 from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
 from quadrl.randomization import RANDOMIZATIONS
 from quadrl.task import Task
-from quadrl.validation import choice, keys
 from quadrl.vehicle import VEHICLES
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")

@@ -14,11 +14,11 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from quadrl.errors import QuadrlError
-from quadrl.files import write_whole
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import write_whole
+from quadrl.base.validation import choice
 from quadrl.learning.folder import METRICS, read_config
 from quadrl.rollout import Rollout
-from quadrl.validation import choice
 
 Metrics = dict[str, np.ndarray]
 """Columns of a metrics.csv, (iterations,) each; missing values are NaN."""

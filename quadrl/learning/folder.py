@@ -15,9 +15,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from quadrl.errors import QuadrlError, QuadrlWarning
-from quadrl.files import NO_LOCKS, lock, read_sealed_json, write_sealed_json, write_whole
-from quadrl.machine import processor_kind
+from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.files import NO_LOCKS, lock, read_sealed_json, write_sealed_json, write_whole
+from quadrl.base.machine import processor_kind
 from quadrl.policy import RUN as CONFIG
 from quadrl.policy import RUN_FORMAT
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.base.errors import QuadrlError
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
 from quadrl.task import layout
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.observing import Observing
 from quadrl.observing import resolve as resolve_observing
 from quadrl.randomization import NONE, resolve

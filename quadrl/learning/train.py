@@ -22,9 +22,10 @@ import numpy as np
 import torch
 
 from quadrl import native
+from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.files import PART
+from quadrl.base.machine import check_memory, processor_kind
 from quadrl.envs.torchrl import QuadrotorEnv
-from quadrl.errors import QuadrlError, QuadrlWarning
-from quadrl.files import PART
 from quadrl.learning import checkpoint
 from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.apg import APG
@@ -44,7 +45,6 @@ from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE, export, make_act
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
-from quadrl.machine import check_memory, processor_kind
 from quadrl.policy import FILE as POLICY_FILE
 from quadrl.policy import Policy
 from quadrl.vehicle import VEHICLES

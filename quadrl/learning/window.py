@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from quadrl import records
+from quadrl.base import records
+from quadrl.base.errors import QuadrlError
 from quadrl.control.modes import Rotor
 from quadrl.engines.adjoint import Leg
 from quadrl.engines.engine import Engine
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.snapshot import Snapshot
 from quadrl.state import State
 from quadrl.transition import Clock, Episode, Transition, finish

@@ -33,8 +33,8 @@ import mujoco
 import numpy as np
 
 from quadrl.air import c_weather
-from quadrl.errors import NativeError
-from quadrl.files import lock, put
+from quadrl.base.errors import NativeError
+from quadrl.base.files import lock, put
 from quadrl.parameters import c_structs
 from quadrl.state import c_rows
 

@@ -4,7 +4,7 @@ Everything is in the world frame (East-North-Up, metres). Drawing calls only MuJ
 never its dynamics: it needs no rotor callbacks and leaves the simulation's own data alone.
 """
 
-from quadrl.errors import RenderingUnavailable
+from quadrl.base.errors import RenderingUnavailable
 from quadrl.rendering.scene import Renderer
 from quadrl.rendering.sheet import write_contact_sheet
 from quadrl.rendering.trajectory import Trajectory

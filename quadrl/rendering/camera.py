@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from quadrl.base.rotation import Array
 from quadrl.markers import Marker
-from quadrl.rotation import Array
 from quadrl.vehicle import DRAWN_SIZE
 
 FOLLOW, CHASE = "follow", "chase"

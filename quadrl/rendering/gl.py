@@ -19,7 +19,7 @@ from typing import Any
 
 import mujoco
 
-from quadrl.errors import RenderingUnavailable
+from quadrl.base.errors import RenderingUnavailable
 
 GL_RENDERER = 0x1F01
 SOFTWARE = (b"llvmpipe", b"softpipe", b"swrast", b"swiftshader", b"software")

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from quadrl.rotation import Array
+from quadrl.base.rotation import Array
 
 FIELD = 50.0  # [deg] of pitch from the middle to the edge
 LADDER = (-40, -20, 20, 40)  # [deg], of the short lines

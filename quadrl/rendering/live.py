@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.base.rotation import Array
 from quadrl.markers import Marker
 from quadrl.rendering.camera import (
     CHASE,
@@ -20,7 +21,6 @@ from quadrl.rendering.camera import (
 )
 from quadrl.rendering.scene import TRAIL_SECONDS, Renderer
 from quadrl.rendering.streaks import streaks
-from quadrl.rotation import Array
 
 
 class LiveFlight:

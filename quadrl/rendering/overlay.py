@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quadrl.errors import RenderingUnavailable
+from quadrl.base.errors import RenderingUnavailable
+from quadrl.base.rotation import Array
 from quadrl.rendering.horizon import horizon
-from quadrl.rotation import Array
 
 MARGIN, HEIGHT = 18, 138  # [pixels] at a height of 720, as are those below
 LINE = 21  # from one to the next

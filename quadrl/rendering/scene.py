@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadrl import landmarks
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
+from quadrl.base.validation import choice, number
 from quadrl.markers import GOAL_RGBA, Marker
 from quadrl.rendering import gl
 from quadrl.rendering.camera import (
@@ -24,8 +26,6 @@ from quadrl.rendering.camera import (
     headings,
     in_view,
 )
-from quadrl.rotation import Array
-from quadrl.validation import choice, number
 
 MAX_SHAPES = 2000
 TRAIL_SEGMENTS = 60

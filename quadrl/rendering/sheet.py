@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from quadrl.files import write_whole
+from quadrl.base.files import write_whole
 from quadrl.rendering.overlay import Panel, require
 from quadrl.rendering.trajectory import Trajectory
 from quadrl.rendering.video import OneOrMore, OnFrame, checked, listed, render_trajectory

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from quadrl.base.rotation import Array
 from quadrl.markers import Marker
-from quadrl.rotation import Array
 
 FASTEST_GOAL = 10.0  # [m/s]; one that moves faster has jumped
 

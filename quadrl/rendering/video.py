@@ -17,7 +17,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quadrl.errors import QuadrlError, RenderingUnavailable
+from quadrl.base.errors import QuadrlError, RenderingUnavailable
+from quadrl.base.validation import number
 from quadrl.rendering.camera import (
     CHASE,
     FOLLOW,
@@ -31,7 +32,6 @@ from quadrl.rendering.overlay import Panel, flight_lines, grid, require, task_ti
 from quadrl.rendering.scene import TRAIL_SECONDS, Renderer
 from quadrl.rendering.streaks import streaks
 from quadrl.rendering.trajectory import Trajectory
-from quadrl.validation import number
 
 T = TypeVar("T")
 OneOrMore = T | Sequence[T]

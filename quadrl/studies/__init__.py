@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import number
 from quadrl.studies.crew import Local, complaint, train_all
 from quadrl.studies.plan import PlannedRun, parse_seeds, read_plan
 from quadrl.studies.table import StudyResult, summed_up
-from quadrl.validation import number
 
 __all__ = ["MAX_JOBS", "PlannedRun", "StudyResult", "parse_seeds", "study"]
 MAX_JOBS = 4096

@@ -18,10 +18,10 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
-from quadrl.errors import QuadrlError
-from quadrl.files import PART, write_whole
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import PART, write_whole
+from quadrl.base.machine import cores
 from quadrl.learning.folder import CONFIG, EVALUATION, LOCK, METRICS, lock_folder
-from quadrl.machine import cores
 from quadrl.studies import worker
 from quadrl.studies.crew import End, ended
 from quadrl.studies.plan import PlannedRun

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Protocol
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.machine import cores
 from quadrl.learning.folder import METRICS
-from quadrl.machine import cores
 from quadrl.studies import worker
 from quadrl.studies.plan import PlannedRun
 

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import keys, number
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import CONFIG, EVALUATION, FREE
 from quadrl.rollout import MAX_EPISODES, MAX_SEED
-from quadrl.validation import keys, number
 
 KEYS = ("tasks", "algorithms", "seeds", "episodes", "settings", "variants")
 OWN = {

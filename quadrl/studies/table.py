@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.base.files import write_whole
 from quadrl.evaluation import html_table
-from quadrl.files import write_whole
 from quadrl.learning.folder import EVALUATION, METRICS, write_json
 from quadrl.studies.plan import Plan, PlannedRun, fields
 

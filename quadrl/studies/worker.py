@@ -16,7 +16,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import CONFIG, EVALUATION
 from quadrl.signals import Stopped, heeded, unheeded

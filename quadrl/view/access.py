@@ -21,7 +21,7 @@ from websockets.asyncio import server
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 
 LARGEST_MESSAGE = 1 << 14  # [bytes] of a client; the largest tells its camera
 Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]

@@ -18,9 +18,9 @@ from typing import Any, cast
 import numpy as np
 import viser
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import number
 from quadrl.rollout import Controller
-from quadrl.validation import number
 from quadrl.view import access, readout
 from quadrl.view.flight import KEYS, Flight, Keyboard
 from quadrl.view.scene import CAMERAS, Scene

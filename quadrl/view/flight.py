@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.base.rotation import Array
+from quadrl.base.validation import number
 from quadrl.environment import Environment
 from quadrl.markers import Marker
 from quadrl.memory import Flyer
@@ -14,9 +16,7 @@ from quadrl.policy import Policy
 from quadrl.randomization import Randomized
 from quadrl.rendering.scene import GOAL_RADIUS
 from quadrl.rollout import Controller
-from quadrl.rotation import Array
 from quadrl.task import Task
-from quadrl.validation import number
 from quadrl.vehicle import Vehicle
 
 MAX_AIRCRAFT = 256

@@ -13,7 +13,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from quadrl import landmarks
-from quadrl.rotation import Array
+from quadrl.base.rotation import Array
 from quadrl.view.shapes import blade_ids
 
 SHARPEST = 0.7  # [rad], an edge that is shaded round

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from quadrl import mjcf
+from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.engines.mujoco import DataEngine
-from quadrl.errors import QuadrlError, RenderingUnavailable
 from quadrl.view import shapes
 from quadrl.view.flight import Flight
 

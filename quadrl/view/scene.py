@@ -12,8 +12,8 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from quadrl import mjcf
+from quadrl.base.rotation import Array
 from quadrl.rendering.scene import TRAIL_NEW, TRAIL_OLD
-from quadrl.rotation import Array
 from quadrl.view import meshes, shapes
 from quadrl.view.flight import Flight
 

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from quadrl.base.rotation import Array
 from quadrl.markers import Marker
 from quadrl.rendering.scene import CIRCLE, PAD_RGBA
-from quadrl.rotation import Array
 
 # The letter H on a pad of radius 1, as strokes.
 LETTER = np.array([[(-1, -2, 0), (-1, 2, 0)], [(1, -2, 0), (1, 2, 0)], [(-1, 0, 0), (1, 0, 0)]])

@@ -7,7 +7,7 @@ from typing import Any
 
 import tyro
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.learning.figures import learning_curves, read_metrics
 from quadrl.learning.folder import EVALUATION, METRICS, read_config
 from scripts.reports import report

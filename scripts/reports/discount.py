@@ -17,10 +17,10 @@ import tyro
 
 import quadrl
 from quadrl import tasks
+from quadrl.base.rotation import Array
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training
 from quadrl.rollout import EVALUATION_SEED, flights, fly
-from quadrl.rotation import Array
 from quadrl.snapshot import Snapshot
 from quadrl.task import EpisodeEnd
 from quadrl.tasks.hover import Hover

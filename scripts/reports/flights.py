@@ -1,7 +1,7 @@
 """C of whole flights, for a page that flies them: what quadrl's own functions compute.
 
-A task, an aircraft and the geometric controller are called with symbols (`quadrl.trace`), as the
-compiled step of `quadrl.compiled` is, and become C functions per task and aircraft:
+A task, an aircraft and the geometric controller are called with symbols (`quadrl.base.trace`), as
+the compiled step of `quadrl.compiled` is, and become C functions per task and aircraft:
 
     begin      the start of an episode, from numbers that were drawn
     first      its first observation
@@ -22,18 +22,18 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import records
+from quadrl.base import records
+from quadrl.base.rotation import Array, to_body
+from quadrl.base.trace import Trace
 from quadrl.control.geometric import GeometricController
 from quadrl.environment import Environment
 from quadrl.observer import felt, moving
 from quadrl.parameters import AIR, AIRCRAFT, ROW_SIZE, Parameters
 from quadrl.reading import Reading
 from quadrl.rng import Rng
-from quadrl.rotation import Array, to_body
 from quadrl.snapshot import Potentials, Snapshot
 from quadrl.state import FIRST, State
 from quadrl.task import total
-from quadrl.trace import Trace
 from quadrl.transition import Clock, Episode, begin, finish
 from quadrl.vehicle import MAX_ROTORS, commanded
 

@@ -19,12 +19,12 @@ import tyro
 
 from quadrl import tasks
 from quadrl.aerodynamics import EFFECTS, with_effects
+from quadrl.base.rotation import Array, norm
 from quadrl.control import Gains, GeometricController
 from quadrl.learning.defaults import WIDE
 from quadrl.randomization import RANDOMIZATIONS, Errors, Randomization
 from quadrl.reading import Reading
 from quadrl.rollout import fly, summarize
-from quadrl.rotation import Array, norm
 from quadrl.task import Task
 from quadrl.vehicle import Vehicle, resolve
 from quadrl.weather import WEATHERS

@@ -20,9 +20,9 @@ import mujoco
 import numpy as np
 
 from quadrl import mjcf, native, parameters
+from quadrl.base.files import HEADER
 from quadrl.engines.free_flight import world
 from quadrl.environment import Environment
-from quadrl.files import HEADER
 from quadrl.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
 from quadrl.rng import START
 from quadrl.state import c_rows

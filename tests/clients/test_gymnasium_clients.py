@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import vector as vector_wrappers
 
 import quadrl  # noqa: F401 - registers the ids
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.testing import varied_actions
 
 HOVER = "quadrl/Hover-v0"

@@ -14,8 +14,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
 import quadrl  # noqa: F401 - registers the ids
+from quadrl.base.errors import QuadrlError
 from quadrl.envs.sb3 import QuadrotorVecEnv
-from quadrl.errors import QuadrlError
 from quadrl.testing import varied_actions
 
 HOVER = "quadrl/Hover-v0"

@@ -12,7 +12,7 @@ import pytest
 from apis import APIS, StableBaselines, Vector
 
 import quadrl
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
 

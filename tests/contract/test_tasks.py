@@ -7,10 +7,10 @@ import flights
 import numpy as np
 import pytest
 
+from quadrl.base.rotation import namespace
 from quadrl.control.modes import CONTROL_MODES
 from quadrl.envs.gymnasium import QuadrotorEnv
 from quadrl.reading import Reading
-from quadrl.rotation import namespace
 from quadrl.task import Potentials, TaskState
 from quadrl.tasks import TASKS, make
 from quadrl.tasks.hover import Hover

@@ -16,8 +16,8 @@ from tensordict import TensorDict
 
 import quadrl
 from quadrl import native
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.learning import checkpoint
 from quadrl.learning.config import ALGORITHMS
 from quadrl.learning.environments import SEED_STRIDE

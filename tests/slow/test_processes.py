@@ -188,7 +188,7 @@ FORKED = """
     import numpy as np
     from quadrl.engines.mujoco import BatchEngine
     from quadrl.environment import Environment
-    from quadrl.errors import QuadrlError
+    from quadrl.base.errors import QuadrlError
     from quadrl.vehicle import Vehicle
 
     def fly(environment, steps):

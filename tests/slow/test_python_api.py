@@ -7,9 +7,9 @@ import pytest
 from runs import TINY, refused
 
 import quadrl
+from quadrl.base.errors import QuadrlError
 from quadrl.cli import main
 from quadrl.control import make as make_controller
-from quadrl.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import free_folder
 
@@ -167,7 +167,7 @@ def test_a_notebook_updates_one_line(run, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "IPython.display", Display)
     from rich.console import Console
 
-    from quadrl.progress import ProgressBar
+    from quadrl.base.progress import ProgressBar
 
     with ProgressBar(Console(force_jupyter=True)) as bar:
         for done in range(1, 5):

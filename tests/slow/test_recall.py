@@ -6,10 +6,10 @@ import pytest
 from runs import train
 
 from quadrl import tasks
+from quadrl.base.rotation import Array
 from quadrl.evaluation import evaluate
 from quadrl.learning.config import TrainConfig
 from quadrl.policy import Policy
-from quadrl.rotation import Array
 from quadrl.task import ObservationTerm, Task, TaskState
 
 

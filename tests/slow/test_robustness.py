@@ -17,11 +17,11 @@ from runs import refused
 import quadrl
 from quadrl import Randomization, disturbed
 from quadrl.axes import AXES
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.card import Card, half_level, wilson
 from quadrl.cli import import_own, main
 from quadrl.draw import Draw
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.kept import FILE, digest
 from quadrl.parameters import rows
 from quadrl.recovery import MAPS, begin

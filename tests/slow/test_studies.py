@@ -17,7 +17,7 @@ import pytest
 
 import quadrl
 from quadrl import cli
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.learning.run import train
 from quadrl.studies import crew, worker
 from quadrl.studies.cluster import on_ray

@@ -9,8 +9,8 @@ import helpers
 import numpy as np
 import pytest
 
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import BatchEngine
-from quadrl.errors import QuadrlError
 from quadrl.vehicle import GRAVITY
 
 COUNT = 19  # more than the kernel takes at a time, and no whole lanes

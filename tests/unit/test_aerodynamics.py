@@ -18,9 +18,9 @@ import reference
 
 from quadrl import dynamics, mjcf
 from quadrl.aerodynamics import EFFECTS, Aerodynamics, in_real_air, with_effects
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.parameters import WIND, Parameters, rows
 from quadrl.vehicle import VEHICLES, Vehicle
 

@@ -7,8 +7,8 @@ import pytest
 from runs import assert_same_run, metrics, refused, stopped, train
 
 from quadrl import tasks
+from quadrl.base.rotation import norm
 from quadrl.learning.config import TrainConfig
-from quadrl.rotation import norm
 from quadrl.tasks.hover import Hover
 
 TINY = TrainConfig(

@@ -16,8 +16,8 @@ from runs import contents, metrics
 
 import quadrl
 from quadrl import cli, tasks
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.cli.flown import parse_options
-from quadrl.errors import QuadrlError, QuadrlWarning
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import read_config, write_config
 from quadrl.vehicle import VEHICLES
@@ -360,14 +360,14 @@ def test_a_device_that_is_not_there(refusal, tmp_path):
 
 
 def test_an_interrupted_run_can_be_flown(tmp_path, capsys, monkeypatch):
-    folder, shown = tmp_path / "run", quadrl.progress.ProgressBar.show
+    folder, shown = tmp_path / "run", quadrl.base.progress.ProgressBar.show
 
     def stop(bar, now):
         shown(bar, now)
         if now.iteration == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("quadrl.progress.ProgressBar.show", stop)
+    monkeypatch.setattr("quadrl.base.progress.ProgressBar.show", stop)
     assert command("train", "hover", *TINY, "--out", folder) == 130
     assert f"quadrl train --resume {folder}" in capsys.readouterr().err
     assert quadrl.Policy.load(folder).metadata["steps"] == 64

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from quadrl import native, tasks
+from quadrl.base.trace import FLAGS, LOGICAL, C, Trace
 from quadrl.environment import Environment
 from quadrl.tasks.hover import Hover
-from quadrl.trace import FLAGS, LOGICAL, C, Trace
 
 STEPS = 40
 SEEN = {"rotor_speed": "estimated", "airspeed": True, "disturbance": True, "action_history": 2}

@@ -10,6 +10,8 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from quadrl import control, parameters, tasks
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import heading_of, quaternion_from_heading_and_tilt
 from quadrl.control import CONTROL_MODES, CONTROLLERS, Gains, Weights, lqr, modes
 from quadrl.control.allocation import Allocation
 from quadrl.control.geometric import towards_east
@@ -22,10 +24,8 @@ from quadrl.control.loops import (
     turned,
 )
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.reading import Reading
 from quadrl.rollout import fly, summarize
-from quadrl.rotation import heading_of, quaternion_from_heading_and_tilt
 from quadrl.state import Start, State
 from quadrl.task import Snapshot, TaskState
 from quadrl.tasks.hover import Hover

@@ -1,11 +1,15 @@
 """What is said of a task is what it does."""
 
 import dataclasses
+import importlib
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
+import quadrl
 from quadrl import tasks
 from quadrl.description import describe, docstrings
 from quadrl.environment import Environment
@@ -63,3 +67,11 @@ def test_the_layout_is_that_of_the_aircraft():
     speeds = next(t for t in described["observation"] if t["name"] == "rotor_speed")
     assert (speeds["first"], speeds["last"]) == (15, 20)
     assert described["action"].startswith("6 numbers")
+
+
+def test_modules_that_have_moved_are_found_under_their_old_names():
+    for old, new in quadrl.MOVED.items():
+        module = importlib.import_module(f"quadrl.{old}")
+        assert module is importlib.import_module(f"quadrl.{new}") is getattr(quadrl, old)
+    code = "from quadrl.rotation import namespace; from quadrl.errors import QuadrlError"
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)

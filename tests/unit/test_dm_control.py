@@ -7,8 +7,8 @@ import pytest
 
 import quadrl
 from quadrl import suite  # before dm_control: it chooses what draws
+from quadrl.base.errors import QuadrlError
 from quadrl.envs import dm_control
-from quadrl.errors import QuadrlError
 from quadrl.tasks import TASKS
 from quadrl.tasks.hover import Hover
 

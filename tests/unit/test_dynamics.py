@@ -11,9 +11,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from quadrl import dynamics, mjcf
+from quadrl.base.rotation import norm
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.parameters import Parameters, rows
-from quadrl.rotation import norm
 from quadrl.vehicle import GRAVITY, MAX_ROTORS, Vehicle, plus
 
 COUNT = 9  # more than free flight takes at a time

@@ -9,10 +9,10 @@ import pytest
 
 from quadrl import mjcf, native, parameters
 from quadrl.aerodynamics import in_real_air
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.free_flight import LANES
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.vehicle import MAX_ROTORS, Vehicle
 
 CALM, IN_AIR = Vehicle(), in_real_air(Vehicle())

@@ -6,8 +6,8 @@ import pytest
 from helpers import begun, idle
 
 from quadrl import control, tasks
+from quadrl.base.errors import QuadrlError
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.task import total
 from quadrl.tasks.hover import Hover
 

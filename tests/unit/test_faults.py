@@ -8,9 +8,9 @@ import pytest
 from helpers import begun, idle
 
 from quadrl import tasks
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import MAX_ENVS
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.tasks.hover import Hover
 from quadrl.vehicle import Vehicle
 

@@ -14,12 +14,12 @@ from scipy.optimize import linprog
 import quadrl
 from quadrl import card_figures, cli
 from quadrl.axes import AXES
+from quadrl.base.errors import QuadrlWarning
 from quadrl.card import Card
 from quadrl.checked import OK
 from quadrl.control import feasibility
 from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
 from quadrl.draw import Draw
-from quadrl.errors import QuadrlWarning
 from quadrl.learning.defaults import VARIANTS
 from quadrl.parameters import rows
 from quadrl.policy import Policy, shipped

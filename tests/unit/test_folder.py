@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from quadrl.errors import QuadrlError, QuadrlWarning
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.learning.folder import LOCK, lock_folder
 from quadrl.studies import cluster
 

@@ -13,10 +13,10 @@ import pytest
 
 from quadrl import mjcf, tasks
 from quadrl.aerodynamics import Aerodynamics
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.free_flight import MARGIN
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.vehicle import Vehicle
 
 PAPER = Vehicle()

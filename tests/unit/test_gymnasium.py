@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 import quadrl
 from quadrl import envs
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from quadrl import tasks
+from quadrl.base.errors import QuadrlError
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
 from quadrl.learning.config import TrainConfig
 from quadrl.observing import Observing

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from test_hostile import EXAMPLES, profile, refusal
 from test_memory import make_policy
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.learning import checkpoint
 from quadrl.policy import RECURRENT_UNSEALED, SHIPPED, UNSEALED, Policy
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from quadrl import mjcf
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import DataEngine
-from quadrl.errors import QuadrlError
 from quadrl.task import TaskState
 from quadrl.tasks.hover import Hover
 from quadrl.vehicle import VEHICLES, Vehicle

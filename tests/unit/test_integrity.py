@@ -11,12 +11,12 @@ from test_hostile_files import unsealed
 from test_memory import make_policy as make_recurrent
 from test_policy import make_policy
 
-from quadrl.errors import QuadrlWarning
+from quadrl.base.errors import QuadrlWarning
+from quadrl.base.machine import processor_kind
 from quadrl.evaluation import setting
 from quadrl.learning import checkpoint
 from quadrl.learning.folder import read_config, write_config
 from quadrl.learning.train import Training
-from quadrl.machine import processor_kind
 from quadrl.policy import Policy
 
 FLIPS = 1000

@@ -12,7 +12,7 @@ from test_policy import linear
 
 import quadrl
 from quadrl import evaluation, tasks
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import make_env

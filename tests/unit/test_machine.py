@@ -5,9 +5,9 @@ import resource
 import pytest
 from runs import changed
 
-from quadrl import machine
+from quadrl.base import machine
+from quadrl.base.errors import QuadrlError
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.learning.train import Training
 from quadrl.rollout import fly
 from quadrl.tasks.hover import Hover

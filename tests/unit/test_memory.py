@@ -12,9 +12,9 @@ from torchrl.data import Unbounded
 from torchrl.modules import set_recurrent_mode
 
 from quadrl import tasks
+from quadrl.base.files import write_safetensors
 from quadrl.environment import Environment
 from quadrl.evaluation import evaluate
-from quadrl.files import write_safetensors
 from quadrl.learning import checkpoint, environments
 from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import ALGORITHMS, TrainConfig

@@ -8,13 +8,13 @@ import pytest
 from apis import APIS
 from test_policy import linear
 
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import to_body
 from quadrl.environment import Environment
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
-from quadrl.errors import QuadrlError
 from quadrl.evaluation import evaluate
 from quadrl.observer import SMOOTHING
 from quadrl.observing import Observing
-from quadrl.rotation import to_body
 from quadrl.rotors import GRAVITY
 from quadrl.vehicle import Vehicle
 

@@ -10,11 +10,11 @@ from helpers import EVERYTHING, drawn, flying
 
 from quadrl import mjcf, tasks
 from quadrl.aerodynamics import in_real_air
+from quadrl.base.errors import QuadrlError
 from quadrl.draw import EACH_ROTOR
 from quadrl.engines import mujoco as engines
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
-from quadrl.errors import QuadrlError
 from quadrl.randomization import FACTORS
 from quadrl.rng import PARAMETERS, Rng
 from quadrl.tasks.hover import Hover

@@ -15,10 +15,10 @@ from runs import refused
 from safetensors.numpy import save
 
 import quadrl
+from quadrl.base.files import write_safetensors
 from quadrl.environment import Environment
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.evaluation import setting
-from quadrl.files import write_safetensors
 from quadrl.policy import FORMAT, SHIPPED, Policy, shipped
 from quadrl.rollout import fly
 from quadrl.vehicle import VEHICLES

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.base.rotation import norm
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
 from quadrl.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
 from quadrl.rng import NOISE, PUSHES, uniform_array_api
-from quadrl.rotation import norm
 from quadrl.vehicle import VEHICLES, Vehicle
 
 ENGINES = ("mujoco", "free_flight")

@@ -17,9 +17,9 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from quadrl import landmarks, mjcf, rendering
+from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.environment import Environment
 from quadrl.envs.common import Pictures
-from quadrl.errors import QuadrlError, RenderingUnavailable
 from quadrl.markers import Marker
 from quadrl.rendering import (
     Renderer,

@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 
 from quadrl import native, rng
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.rng import Rng
 
 # Salmon et al. 2011, the known answers of Random123 for philox4x32-10: counter, key, words.

@@ -8,7 +8,7 @@ import pytest
 from helpers import EVERYTHING, drawn, flying
 
 from quadrl import tasks
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.task import TaskState
 from quadrl.tasks.hover import Hover
 from quadrl.vehicle import Vehicle

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quadrl import mjcf, rotation
+from quadrl import mjcf
+from quadrl.base import rotation
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import BatchEngine, DataEngine
-from quadrl.errors import QuadrlError
 from quadrl.state import Start, State
 from quadrl.vehicle import VEHICLES, Vehicle
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import quadrl
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
 from quadrl.studies.plan import parse_seeds, read_plan

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 from quadrl.vehicle import PAPER_ROTORS, VEHICLES, Rotor, Vehicle, plus, resolve, ring
 
 PAPER = Vehicle()

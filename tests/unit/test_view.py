@@ -13,9 +13,9 @@ import scipy.spatial
 from scipy.spatial.transform import Rotation
 
 from quadrl import cli, mjcf, tasks
+from quadrl.base.errors import QuadrlError
 from quadrl.cli.view import others
 from quadrl.control import make as make_controller
-from quadrl.errors import QuadrlError
 from quadrl.markers import Marker
 from quadrl.policy import Policy
 from quadrl.vehicle import resolve

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.base.errors import QuadrlError
 from quadrl.control import make as make_controller
-from quadrl.errors import QuadrlError
 from quadrl.vehicle import resolve
 from quadrl.view.flight import Flight
 

@@ -14,10 +14,10 @@ from runs import refused
 from scipy import stats
 
 from quadrl import air, mjcf, parameters, tasks
+from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import DataEngine
 from quadrl.environment import Environment
 from quadrl.envs.dm_control import Physics, QuadrotorTask
-from quadrl.errors import QuadrlError
 from quadrl.vehicle import Vehicle
 from quadrl.weather import WEATHERS, Weather, WeatherProcess
 

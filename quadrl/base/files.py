@@ -16,7 +16,7 @@ from typing import Any
 
 from safetensors import SafetensorError
 
-from quadrl.errors import QuadrlError, QuadrlWarning
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 
 UNREADABLE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError,
               RecursionError)  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 
 
 def mapped(function: Callable[[Any], Any], record: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.errors import QuadrlError, UnknownKeyword
+from quadrl.base.errors import QuadrlError, UnknownKeyword
 
 MAX_OPTION = 1e9
 """Larger options of a task would take the digits from what is added to them."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.rotation import Array
+from quadrl.base.rotation import Array
 
 OPERATORS = {
     "add": "+", "subtract": "-", "multiply": "*", "divide": "/", "less": "<", "less_equal": "<=",

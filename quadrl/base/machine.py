@@ -10,7 +10,7 @@ import platform
 import resource
 from pathlib import Path
 
-from quadrl.errors import QuadrlError
+from quadrl.base.errors import QuadrlError
 
 GIB = 1 << 30
 CGROUP = Path("/sys/fs/cgroup")
