@@ -17,12 +17,13 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from quadrl import envs, tasks
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.observing import Observing
 from quadrl.policy import Policy
 from quadrl.randomization import RANDOMIZATIONS, Randomization
 from quadrl.shield import shield_triton
 from quadrl.task import Task
-from quadrl.vehicle import VEHICLES, Vehicle
 
 if TYPE_CHECKING:
     from dm_control.rl.control import Environment as ControlEnvironment
@@ -52,7 +53,12 @@ LAZY = {
 }
 """Functions that are imported on first use, and their modules."""
 
-MOVED = {"errors": "base.errors", "rotation": "base.rotation"}
+MOVED = {
+    "errors": "base.errors",
+    "rotation": "base.rotation",
+    "vehicle": "aircraft.presets",
+    "aerodynamics": "aircraft.presets",
+}
 """Modules that have moved, by the names under which users' files import them, until 0.2."""
 for _old, _new in MOVED.items():
     sys.modules[f"quadrl.{_old}"] = globals()[_old] = importlib.import_module(f"quadrl.{_new}")

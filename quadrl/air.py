@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.vehicle import MAX_ROTORS
 from quadrl.base.rotation import Array, namespace, stack
 from quadrl.rng import MASK, TURBULENCE, philox
-from quadrl.vehicle import MAX_ROTORS
 
 REFERENCE = 6.096  # [m], 20 ft: the height of W20
 FOOT = 0.3048  # [m]

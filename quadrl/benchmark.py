@@ -23,13 +23,14 @@ import numpy as np
 from mujoco.batch import Batch
 
 from quadrl import mjcf, suite, tasks
+from quadrl.aircraft.presets import in_real_air
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.machine import cores, machine
 from quadrl.draw import Draw
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
 from quadrl.randomization import FACTORS, RANDOMIZATIONS, Randomization
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, in_real_air
 
 Work = Iterator[int]
 """Flies some control steps each time, and says how many."""

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 
 from quadrl import tasks
-from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import resolve, with_effects
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.validation import choice
 from quadrl.control.feasibility import (
     MARGIN,
@@ -25,9 +28,7 @@ from quadrl.control.modes import CONTROL_MODES
 from quadrl.draw import Draw
 from quadrl.evaluation import html_table
 from quadrl.randomization import Randomized
-from quadrl.rotors import GRAVITY
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
 
 OK = "ok"
 DRIFT = 0.5  # [m], chosen: how far a tilted aircraft may go until it is level
@@ -86,7 +87,7 @@ def check(
         task: A task or its name; it may ask for a turn of the heading within its time.
         randomization: What is drawn for each aircraft; the worst ones are checked as well.
         control_mode: Meaning of the actions; all but "rotor" answer at every physics step.
-        aerodynamics: Effects of the air, as `quadrl.aerodynamics.with_effects` takes them.
+        aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them.
         **task_options: Options of the task.
 
     Raises:

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from quadrl import native
+from quadrl.aircraft.parameters import AIRCRAFT, ROW_SIZE, Parameters
 from quadrl.base import records
 from quadrl.base.rotation import Array
 from quadrl.base.trace import Trace
 from quadrl.engines.engine import Engine, Frame
-from quadrl.parameters import AIRCRAFT, ROW_SIZE, Parameters
 from quadrl.snapshot import Snapshot
 from quadrl.state import State
 from quadrl.task import Task

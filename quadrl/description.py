@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.environment import Environment
 from quadrl.learning.defaults import own_settings
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
 
 
 def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]:

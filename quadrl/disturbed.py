@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.aerodynamics import Aerodynamics
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.axes import AXES, Axis
 from quadrl.base.errors import QuadrlError
 from quadrl.base.progress import ProgressBar
@@ -25,7 +27,6 @@ from quadrl.randomization import Randomization
 from quadrl.recovery import MAPS, recovered
 from quadrl.rollout import EVALUATION_SEED, MAX_EPISODES, MAX_SEED, Controller, flights, fly
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
 from quadrl.weather import Weather
 
 CELL_SHARE = 10  # a cell of a recovery map has this part of the flights of a level

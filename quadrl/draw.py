@@ -7,12 +7,12 @@ import itertools
 
 import numpy as np
 
-from quadrl import parameters
+from quadrl.aircraft import parameters
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 from quadrl.base.validation import number
 from quadrl.randomization import DELAYS, FACTORS, NONE, Randomized, Range, resolve
-from quadrl.vehicle import Vehicle
 
 AXES = "xyz"
 DRAG = ("drag_coefficient", "moment_coefficient", "rotor_drag", "flapping_moment")

@@ -1,8 +1,8 @@
 """The equations of motion in the array API: the definition that the C of `native/` is held against.
 
 Equations 3 to 10 of the paper for rows of aircraft, in NumPy or torch, and what the air does to
-rotors beside them (`quadrl.aerodynamics`). `native/aero.h` has the same forces; a force term is
-written there and here, under the same name.
+rotors beside them (`quadrl.aircraft.aerodynamics`). `native/aero.h` has the same forces; a force
+term is written there and here, under the same name.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from quadrl.aircraft.parameters import WIND, Parameters
 from quadrl.base.rotation import Array, namespace, norm, rotation_matrix, stack, to_body, to_world
-from quadrl.parameters import WIND, Parameters
 
 
 @dataclasses.dataclass(frozen=True)

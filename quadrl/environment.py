@@ -12,7 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import observer, observing, parameters, saving, tasks, transition
+from quadrl import observer, observing, saving, tasks, transition
+from quadrl.aircraft import parameters
+from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import machine, records, validation
 from quadrl.base.rotation import Array
 from quadrl.compiled import CompiledStep
@@ -21,12 +25,10 @@ from quadrl.draw import Draw
 from quadrl.engines import mujoco
 from quadrl.engines.engine import Engine, EngineName
 from quadrl.markers import Marker
-from quadrl.parameters import Parameters
 from quadrl.randomization import Randomized
 from quadrl.rng import Rng, Seed, seeds_of_rows
 from quadrl.task import Snapshot, Task, layout
 from quadrl.transition import Clock, Episode, Observation, Transition
-from quadrl.vehicle import Vehicle, resolve
 from quadrl.weather import Weather, Weathered, WeatherProcess
 
 

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from quadrl import tasks
-from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import resolve, with_effects
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
 from quadrl.base.validation import number
@@ -32,7 +34,6 @@ from quadrl.rollout import (
 )
 from quadrl.snapshot import Rollout
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
 from quadrl.weather import Weathered
 
 SAMPLING_SEED = 0  # of the actions drawn from a policy
@@ -105,7 +106,7 @@ def evaluate(
         episodes: Their number.
         seed: Of the episodes; the same ones for every controller.
         vehicle: The aircraft or its name; by default the one that the policy was trained with.
-        aerodynamics: Effects of the air, as `quadrl.aerodynamics.with_effects` takes them; by
+        aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them; by
             default those of the training.
         weather: A `Weather` or its name, one of `quadrl.weather.WEATHERS`; by default that of the
             training.

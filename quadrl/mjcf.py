@@ -9,8 +9,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from quadrl import landmarks, native, parameters
-from quadrl.vehicle import DRAWN_SIZE, GRAVITY, Vehicle
+from quadrl import landmarks, native
+from quadrl.aircraft import parameters
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import DRAWN_SIZE, Vehicle
 
 ASSETS = Path(__file__).parent / "assets"
 DRAWN_RADIUS = 0.06  # [m], of the rotor in assets/rotor.xml

@@ -7,17 +7,18 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from quadrl import native, parameters
+from quadrl import native
+from quadrl.aircraft import parameters
+from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.rotation import Array, to_body, to_world
 from quadrl.disturbances import Disturbances
 from quadrl.draw import Draw
 from quadrl.dynamics import thrust_wrench
 from quadrl.engines.engine import Engine, Frame
 from quadrl.observing import Observing
-from quadrl.parameters import Parameters
 from quadrl.randomization import NONE
 from quadrl.rng import NOISE
-from quadrl.rotors import GRAVITY
 from quadrl.snapshot import Snapshot
 from quadrl.state import State
 from quadrl.task import ObservationTerm, Task, layout

@@ -18,14 +18,15 @@ import numpy as np
 from safetensors.numpy import load as of_bytes
 from safetensors.numpy import save as to_bytes
 
-from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import VEHICLES, with_effects
+from quadrl.aircraft.presets import resolve as resolve_vehicle
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import read_safetensors, read_sealed_json, write_safetensors
 from quadrl.base.validation import choice, number
 from quadrl.memory import GRU, NAMES, PREFIX, Flyer
 from quadrl.observing import resolve
-from quadrl.vehicle import VEHICLES, Vehicle
-from quadrl.vehicle import resolve as resolve_vehicle
 
 if TYPE_CHECKING:
     from quadrl.environment import Environment
@@ -87,8 +88,8 @@ class Policy:
         """The aircraft of its training.
 
         Args:
-            aerodynamics: Effects of the air, as `quadrl.aerodynamics.with_effects` takes them; None
-                for those of the training.
+            aerodynamics: Effects of the air, as `with_effects` takes them; None for those of the
+                training.
         """
         own = self.metadata
         vehicle = resolve_vehicle(own.get("vehicle"), own.get("vehicle_options"))

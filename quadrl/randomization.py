@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.rotors import MAX
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, keys, number, numbers
-from quadrl.rotors import MAX
 
 Range = tuple[float, float]
 LEAST, MOST = 0.01, 100.0  # of a factor

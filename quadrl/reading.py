@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, heading_of, norm, rotation_of_angles, to_world
-from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)

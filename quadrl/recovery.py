@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import quaternion_from_heading_and_tilt
 from quadrl.contact import touches_ground
 from quadrl.engines.engine import EngineName
@@ -22,7 +23,6 @@ from quadrl.randomization import NONE
 from quadrl.rollout import FINAL_STRETCH, Controller, prepared
 from quadrl.state import State
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 from quadrl.weather import Weather
 
 RECOVERED = 0.5  # [m], largest final error of a flight that has recovered; chosen

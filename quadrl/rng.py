@@ -21,7 +21,7 @@ from quadrl.base.validation import number
 from quadrl.state import Start
 
 if TYPE_CHECKING:
-    from quadrl.parameters import Parameters
+    from quadrl.aircraft.parameters import Parameters
 
 MAX_SEED = (1 << 62) - 1
 FULL_TURN = 2 * math.pi

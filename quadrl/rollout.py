@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import machine
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.engine import EngineName
@@ -17,7 +18,6 @@ from quadrl.policy import Policy
 from quadrl.randomization import Randomized
 from quadrl.snapshot import Rollout
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 from quadrl.weather import Weathered
 
 Controller = Callable[[np.ndarray], np.ndarray]

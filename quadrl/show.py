@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from quadrl import mjcf
-from quadrl.aerodynamics import Aerodynamics
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
 from quadrl.base.progress import ProgressBar
@@ -17,7 +18,6 @@ from quadrl.evaluation import Evaluation, evaluate
 from quadrl.learning.folder import METRICS, read_config
 from quadrl.randomization import Randomized
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 from quadrl.weather import Weathered
 
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array
-from quadrl.parameters import Parameters
 from quadrl.state import State
-from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadrl.rendering import Trajectory

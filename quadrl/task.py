@@ -18,11 +18,11 @@ import operator
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, norm, square_norm, to_body
 from quadrl.base.validation import keys, like, number
 from quadrl.markers import Marker
-from quadrl.parameters import Parameters
 from quadrl.rng import Rng
 from quadrl.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
 from quadrl.state import Start

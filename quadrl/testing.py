@@ -23,17 +23,18 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from quadrl import parameters, tasks
+from quadrl import tasks
+from quadrl.aircraft import parameters
+from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import records
 from quadrl.base.rotation import Array
 from quadrl.description import docstrings, source
 from quadrl.environment import Environment
-from quadrl.parameters import Parameters
 from quadrl.rng import Rng
 from quadrl.snapshot import EpisodeEnd, Snapshot
 from quadrl.state import State
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 
 PAPER = Vehicle()
 ROWS = 4

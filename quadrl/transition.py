@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, square_norm
-from quadrl.parameters import Parameters
 from quadrl.rng import Rng
 from quadrl.state import Start, State
 from quadrl.task import EpisodeEnd, Snapshot, Task, total

@@ -25,15 +25,15 @@ import numpy as np
 
 from quadrl import native
 from quadrl.air import FIXED, ROWS, fixed_of
+from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 from quadrl.base.validation import choice, keys, number
 from quadrl.rng import FULL_TURN, WEATHER, Rng
-from quadrl.rotors import GRAVITY
 
 if TYPE_CHECKING:
+    from quadrl.aircraft.vehicle import Vehicle
     from quadrl.engines.engine import Engine
-    from quadrl.vehicle import Vehicle
 
 MAX_WIND = 100.0  # [m/s]
 

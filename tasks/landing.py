@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace, norm, square_norm, stack
 from quadrl.contact import stands, strikes_ground
 from quadrl.markers import Marker
-from quadrl.parameters import Parameters
 from quadrl.rng import Rng
 from quadrl.state import REST_SPEED, Start
 from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east, reward_share

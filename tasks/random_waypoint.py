@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.contact import touches_ground
-from quadrl.parameters import Parameters
 from quadrl.rng import Rng, hovering
 from quadrl.state import Start
 from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState

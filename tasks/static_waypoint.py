@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
 from quadrl.base.validation import MAX_OPTION, numbers
 from quadrl.contact import touches_ground
 from quadrl.markers import Marker
-from quadrl.parameters import Parameters
 from quadrl.rng import Rng, hovering
 from quadrl.state import Start
 from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east

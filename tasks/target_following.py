@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, norm, stack
 from quadrl.base.validation import number
 from quadrl.contact import touches_ground
 from quadrl.markers import Marker
-from quadrl.parameters import Parameters
 from quadrl.rng import FULL_TURN, Rng
 from quadrl.state import Start
 from quadrl.task import (

@@ -6,9 +6,10 @@ import numpy as np
 import reference
 from scipy.stats import qmc
 
+from quadrl.aircraft.rotors import ring
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import BatchEngine
-from quadrl.vehicle import Vehicle, ring
 
 STEP = 0.01  # [s]
 CONTROL_STEPS = 10

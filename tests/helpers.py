@@ -6,13 +6,16 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from quadrl import parameters, tasks
-from quadrl.aerodynamics import Aerodynamics, in_real_air
+from quadrl import tasks
+from quadrl.aircraft import parameters
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import VEHICLES, in_real_air
+from quadrl.aircraft.rotors import ring
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
 from quadrl.randomization import Randomization
 from quadrl.state import Start
-from quadrl.vehicle import VEHICLES, Vehicle, ring
 
 # ------------------------------------------------------------------- motions, flown by an engine
 

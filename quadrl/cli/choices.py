@@ -10,13 +10,13 @@ from typing import Any
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.control import CONTROL_MODES, CONTROLLERS
 from quadrl.engines.mujoco import ENGINES
 from quadrl.learning.config import ALGORITHMS, ALIASES, MEMORIES
 from quadrl.learning.defaults import VARIANTS
 from quadrl.randomization import RANDOMIZATIONS
 from quadrl.tasks import TASKS
-from quadrl.vehicle import VEHICLES
 from quadrl.weather import WEATHERS
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from quadrl import tasks
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
 from quadrl.cli import choices
@@ -19,7 +20,6 @@ from quadrl.evaluation import comes_with_quadrl, setting
 from quadrl.learning.config import tuples
 from quadrl.rollout import Controller
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.cli.console import say
 from quadrl.cli.flown import Flown
@@ -15,7 +16,6 @@ from quadrl.policy import Policy, shipped
 from quadrl.rollout import Controller
 from quadrl.task import Task
 from quadrl.tasks import TASKS
-from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)

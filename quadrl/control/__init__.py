@@ -7,13 +7,14 @@ yardstick they are.
 from __future__ import annotations
 
 from quadrl import tasks
+from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.validation import choice
 from quadrl.control.geometric import Controller, GeometricController
 from quadrl.control.loops import Gains
 from quadrl.control.lqr import LQRController, Weights
 from quadrl.control.modes import CONTROL_MODES, ActionTerm, ControlMode
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
 
 __all__ = [
     "CONTROLLERS", "CONTROL_MODES", "ActionTerm", "ControlMode", "Controller", "Gains",

@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import parameters
+from quadrl.aircraft import parameters
+from quadrl.aircraft.rotors import GRAVITY, mixer
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.rotation import Array
 from quadrl.control.allocation import Allocation
 from quadrl.draw import WHICH, Draw
 from quadrl.randomization import Randomization, Randomized
 from quadrl.rng import PARAMETERS, uniform
-from quadrl.rotors import GRAVITY, mixer
-from quadrl.vehicle import Vehicle
 from quadrl.weather import Weather
 
 MARGIN = 1.2

@@ -12,11 +12,11 @@ import math
 
 import numpy as np
 
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array
 from quadrl.control.loops import MAX_HEADING_ERROR, Gains, Loops, turned
 from quadrl.reading import Reading
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 
 
 class Controller(abc.ABC):

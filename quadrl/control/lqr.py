@@ -10,6 +10,8 @@ import dataclasses
 
 import numpy as np
 
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array
 from quadrl.base.validation import number
 from quadrl.control.allocation import Allocation, columns, product
@@ -17,7 +19,6 @@ from quadrl.control.geometric import Controller
 from quadrl.control.loops import MAX_HEADING_ERROR, limited, sampled, turned
 from quadrl.reading import Reading
 from quadrl.task import Task
-from quadrl.vehicle import GRAVITY, Vehicle
 
 STATES = {
     "position": slice(0, 3),  # [m], from where it should be

@@ -19,12 +19,13 @@ from typing import ClassVar
 
 import numpy as np
 
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, heading_of
 from quadrl.base.validation import choice
 from quadrl.control.allocation import columns, within
 from quadrl.control.loops import MAX_HEADING_ERROR, Controlled, Loops, turned
 from quadrl.state import State
-from quadrl.vehicle import GRAVITY, Vehicle
 
 RESPONSE_TIME = 1.0
 """[s] in which the largest acceleration reaches the velocity at action 1; at the offset of action 1

@@ -14,8 +14,8 @@ import dataclasses
 import numpy as np
 
 from quadrl import native
+from quadrl.aircraft.parameters import MAX_ROTORS
 from quadrl.engines.free_flight import LANES
-from quadrl.parameters import MAX_ROTORS
 
 COORDINATES = 13
 """Numbers of a motion beside its rotor speeds: 7 of qpos, 6 of qvel."""

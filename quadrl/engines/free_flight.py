@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 
 from quadrl import native
+from quadrl.aircraft.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 from quadrl.base.errors import QuadrlError
-from quadrl.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
 """Those of mjData that free flight reads or writes."""

@@ -13,12 +13,13 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from quadrl import mjcf, native, parameters
+from quadrl import mjcf, native
+from quadrl.aircraft import parameters
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.engine import ENGINES, Engine, EngineName
 from quadrl.engines.free_flight import FIELDS
-from quadrl.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadrl.task import Task

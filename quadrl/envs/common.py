@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from quadrl import mjcf, tasks
-from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import resolve, with_effects
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.rotation import norm
 from quadrl.environment import Environment
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
 
 ENVIRONMENT = (
     *("control_mode", "engine", "weather", "randomization", "observe", "num_threads", "seed"),

@@ -25,7 +25,9 @@ from dm_control.suite import base
 from dm_env import specs
 
 from quadrl import mjcf, native
-from quadrl.aerodynamics import Aerodynamics, with_effects
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import resolve, with_effects
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import ENGINES, DataEngine
@@ -34,7 +36,6 @@ from quadrl.envs.common import make_task, with_timestep
 from quadrl.observing import Observed
 from quadrl.randomization import Randomized
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
 from quadrl.weather import Weathered
 
 KEYWORDS = "random vehicle aerodynamics control_mode engine weather randomization observe".split()
@@ -191,7 +192,7 @@ def make(
         vehicle: A name of `quadrl.VEHICLES` or a Vehicle; None for the paper's.
         control_mode: What actions mean, a name of `quadrl.control.CONTROL_MODES`.
         engine: "mujoco" or "free_flight".
-        aerodynamics: Effects of the air, as `quadrl.aerodynamics.with_effects` takes them.
+        aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them.
         weather: What the wind is like, as `quadrl.weather.Weather.of` takes it.
         randomization: What is drawn at each reset and disturbs the flight, as
             `quadrl.randomization.resolve` takes it; `task.environment.disturbances.shown()` has

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from quadrl import __version__, tasks
-from quadrl.aerodynamics import with_effects
+from quadrl.aircraft.presets import resolve as resolve_vehicle
+from quadrl.aircraft.presets import with_effects
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, keys, number
 from quadrl.control.modes import CONTROL_MODES
@@ -31,8 +33,6 @@ from quadrl.observing import resolve as resolve_observing
 from quadrl.randomization import Randomization, resolve
 from quadrl.rollout import MAX_SEED
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
-from quadrl.vehicle import resolve as resolve_vehicle
 from quadrl.weather import Weather
 
 ALGORITHMS = ("ppo", "trpo", "vpg", "apg")

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from quadrl import native
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import PART
 from quadrl.base.machine import check_memory, processor_kind
@@ -47,7 +48,6 @@ from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
 from quadrl.policy import FILE as POLICY_FILE
 from quadrl.policy import Policy
-from quadrl.vehicle import VEHICLES
 
 with warnings.catch_warnings():
     # TorchRL 0.14 warns about its own classes at this import.

@@ -6,8 +6,8 @@ library is kept in a cache folder (`$QUADRL_CACHE`, else the user's cache folder
 version of mujoco, of the sources and of the flags; `$QUADRL_CFLAGS` adds flags at the end of
 these (`scripts/sanitize` does). Its name ends with a digest of its bytes, so that one that was
 damaged is known before it is loaded, and built anew. `layout.h`, which declares a row of parameters
-and the rows of the state and of the weather, is written from `quadrl.parameters`, `quadrl.state`
-and `quadrl.air` into the build.
+and the rows of the state and of the weather, is written into the build from
+`quadrl.aircraft.parameters`, `quadrl.state` and `quadrl.air`.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ import mujoco
 import numpy as np
 
 from quadrl.air import c_weather
+from quadrl.aircraft.parameters import c_structs
 from quadrl.base.errors import NativeError
 from quadrl.base.files import lock, put
-from quadrl.parameters import c_structs
 from quadrl.state import c_rows
 
 SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",

@@ -2,7 +2,7 @@
 //
 // Aircraft are flown LANES at a time: every parameter is an array of LANES numbers, and each
 // function takes the lane i. The callbacks have one lane, which makes an Aircraft exactly a row of
-// quadrl/parameters.py. The same equations in NumPy and torch stand in quadrl/dynamics.py.
+// quadrl/aircraft/parameters.py. The same equations in NumPy and torch stand in quadrl/dynamics.py.
 //
 // Body frame: x forward, y left, z up, the origin at the centre of mass.
 #ifndef QUADRL_AERO_H_
@@ -10,7 +10,7 @@
 
 #include <math.h>
 
-#include "layout.h"  // Rotor, Aircraft: written by quadrl/native from quadrl/parameters.py
+#include "layout.h"  // Rotor, Aircraft: written by quadrl/native from quadrl/aircraft/parameters.py
 
 #define AERO static inline __attribute__((always_inline))
 

@@ -7,7 +7,7 @@
 //   body_user         its row, an Aircraft
 //   actuator_dynprm   [0] number of the rotor, [MARK_SLOT] mark
 //   actuator_gear     along and about the rotor's axis: 1, aero_reaction
-//   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/parameters.py says
+//   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/aircraft/parameters.py says
 #include <mujoco/mujoco.h>
 #include <stdint.h>
 #include <string.h>

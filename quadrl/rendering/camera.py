@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from quadrl.aircraft.vehicle import DRAWN_SIZE
 from quadrl.base.rotation import Array
 from quadrl.markers import Marker
-from quadrl.vehicle import DRAWN_SIZE
 
 FOLLOW, CHASE = "follow", "chase"
 MOVING = (FOLLOW, CHASE)

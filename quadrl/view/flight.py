@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array
 from quadrl.base.validation import number
 from quadrl.environment import Environment
@@ -17,7 +18,6 @@ from quadrl.randomization import Randomized
 from quadrl.rendering.scene import GOAL_RADIUS
 from quadrl.rollout import Controller
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 
 MAX_AIRCRAFT = 256
 LONGEST = 0.25  # [s] of flight at once; a machine that is slower shows slow motion

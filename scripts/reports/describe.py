@@ -8,11 +8,12 @@ from collections.abc import Iterable
 from typing import Any
 
 from quadrl import VEHICLES, cli, tasks
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.cli.tasks import observation_rows, reward_rows, settings
 from quadrl.control import CONTROL_MODES
 from quadrl.description import describe, describe_action
 from quadrl.learning.defaults import own_settings
-from quadrl.vehicle import GRAVITY, Vehicle
 from scripts.reports.report import Parts, asked, table
 
 

@@ -22,20 +22,20 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.aircraft.parameters import AIR, AIRCRAFT, ROW_SIZE, Parameters
+from quadrl.aircraft.vehicle import MAX_ROTORS, commanded
 from quadrl.base import records
 from quadrl.base.rotation import Array, to_body
 from quadrl.base.trace import Trace
 from quadrl.control.geometric import GeometricController
 from quadrl.environment import Environment
 from quadrl.observer import felt, moving
-from quadrl.parameters import AIR, AIRCRAFT, ROW_SIZE, Parameters
 from quadrl.reading import Reading
 from quadrl.rng import Rng
 from quadrl.snapshot import Potentials, Snapshot
 from quadrl.state import FIRST, State
 from quadrl.task import total
 from quadrl.transition import Clock, Episode, begin, finish
-from quadrl.vehicle import MAX_ROTORS, commanded
 
 PARTS = {
     "parameters": ROW_SIZE,  # the aircraft's row

@@ -8,7 +8,8 @@ import numpy as np
 import tyro
 
 from quadrl import tasks
-from quadrl.aerodynamics import with_effects
+from quadrl.aircraft.presets import resolve, with_effects
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.control import make as make_controller
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import WIDE
@@ -16,7 +17,6 @@ from quadrl.policy import Policy
 from quadrl.rollout import fly, summarize
 from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
-from quadrl.vehicle import Vehicle, resolve
 from scripts.reports import report
 from scripts.reports.report import Result, say, table
 

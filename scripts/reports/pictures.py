@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.integrate import cumulative_trapezoid
 
 from quadrl import mjcf, tasks
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.control import make as make_controller
 from quadrl.evaluation import evaluate
 from quadrl.learning.config import TrainConfig
@@ -28,7 +29,6 @@ from quadrl.policy import SHIPPED, Policy
 from quadrl.rendering import Renderer, render_trajectory
 from quadrl.rollout import Rollout, fly
 from quadrl.show import plot
-from quadrl.vehicle import Vehicle
 from quadrl.weather import Weather
 from scripts.reports.report import IMAGES
 

@@ -10,7 +10,10 @@ from collections.abc import Iterator
 from typing import Any, get_args
 
 from quadrl import VEHICLES, snapshot, state
-from quadrl import vehicle as vehicle_module
+from quadrl.aircraft import presets
+from quadrl.aircraft import vehicle as vehicle_module
+from quadrl.aircraft.rotors import GRAVITY, Rotor
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
 from quadrl.cli.completion import Completion
@@ -27,8 +30,6 @@ from quadrl.markers import Kind, Marker
 from quadrl.observing import Observing
 from quadrl.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
 from quadrl.rng import Rng
-from quadrl.rotors import GRAVITY, Rotor
-from quadrl.vehicle import Vehicle
 from scripts.reports.report import Parts, table
 
 FIRST_SOURCE = "gym-aero"
@@ -105,8 +106,8 @@ def aircraft(name: str) -> str:
 
 
 def _sources(name: str) -> dict[str, str]:
-    """Comments beside the numbers of an aircraft in quadrl/vehicle.py, by parameter."""
-    code = inspect.getsource(vehicle_module)
+    """Comments beside the numbers of an aircraft in quadrl/aircraft, by parameter."""
+    code = inspect.getsource(vehicle_module if name == "paper" else presets)
     if name == "paper":
         body = code.partition("PAPER_ROTORS = plus(")[2].partition("\n)\n")[0]
     else:

@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 
 from quadrl import tasks
+from quadrl.aircraft.presets import resolve
 from quadrl.card import wilson
 from quadrl.evaluation import setting
 from quadrl.learning.config import TrainConfig
@@ -22,7 +23,6 @@ from quadrl.randomization import Randomization
 from quadrl.rollout import flights, fly
 from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
-from quadrl.vehicle import resolve
 from scripts.reports import report
 from scripts.reports.evaluation import trained
 from scripts.reports.report import Result, say, table

@@ -13,10 +13,12 @@ import tyro
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from quadrl import dynamics, parameters
+from quadrl import dynamics
+from quadrl.aircraft import parameters
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.dynamics import Motion
 from quadrl.engines.mujoco import ENGINES, BatchEngine
-from quadrl.vehicle import GRAVITY, Vehicle
 from scripts.reports import report
 from scripts.reports.report import say, table
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from quadrl import tasks
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.cli.tasks import settings
 from quadrl.description import describe
 from quadrl.learning.defaults import own_settings
 from quadrl.policy import SHIPPED
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle
 from scripts.reports import report, training
 from scripts.reports.report import Parts, asked, factor, number, table
 

@@ -18,7 +18,9 @@ import numpy as np
 import tyro
 
 from quadrl import tasks
-from quadrl.aerodynamics import EFFECTS, with_effects
+from quadrl.aircraft.aerodynamics import EFFECTS
+from quadrl.aircraft.presets import resolve, with_effects
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm
 from quadrl.control import Gains, GeometricController
 from quadrl.learning.defaults import WIDE
@@ -26,7 +28,6 @@ from quadrl.randomization import RANDOMIZATIONS, Errors, Randomization
 from quadrl.reading import Reading
 from quadrl.rollout import fly, summarize
 from quadrl.task import Task
-from quadrl.vehicle import Vehicle, resolve
 from quadrl.weather import WEATHERS
 from scripts.reports import report
 from scripts.reports.report import Result, say

@@ -19,7 +19,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from quadrl import mjcf, native, parameters
+from quadrl import mjcf, native
+from quadrl.aircraft import parameters
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.files import HEADER
 from quadrl.engines.free_flight import world
 from quadrl.environment import Environment
@@ -27,7 +30,6 @@ from quadrl.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
 from quadrl.rng import START
 from quadrl.state import c_rows
 from quadrl.tasks import TASKS
-from quadrl.vehicle import VEHICLES, Vehicle
 from scripts.reports import flights
 from scripts.reports.report import DOCS, REPOSITORY, say
 

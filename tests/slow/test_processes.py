@@ -96,7 +96,7 @@ def test_environments_of_every_api_fly_on_in_another_process():
 FLY = """
 import quadrl, mujoco
 from quadrl import mjcf
-from quadrl.vehicle import Vehicle
+from quadrl.aircraft.vehicle import Vehicle
 {before}
 model = mjcf.compile_model(Vehicle(), drawn=False)
 data = mujoco.MjData(model)
@@ -189,7 +189,7 @@ FORKED = """
     from quadrl.engines.mujoco import BatchEngine
     from quadrl.environment import Environment
     from quadrl.base.errors import QuadrlError
-    from quadrl.vehicle import Vehicle
+    from quadrl.aircraft.vehicle import Vehicle
 
     def fly(environment, steps):
         actions = 0.3 * np.random.default_rng(1).uniform(-1, 1, (steps, environment.num_envs, 4))

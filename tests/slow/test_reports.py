@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from quadrl import benchmark
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.environment import Environment
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
@@ -19,7 +20,6 @@ from quadrl.rollout import fly, summarize
 from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
 from quadrl.tasks.hover import Hover
-from quadrl.vehicle import Vehicle
 from scripts.reports import (
     claims,
     discount,

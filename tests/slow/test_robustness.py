@@ -16,6 +16,8 @@ from runs import refused
 
 import quadrl
 from quadrl import Randomization, disturbed
+from quadrl.aircraft.parameters import rows
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.axes import AXES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.card import Card, half_level, wilson
@@ -23,10 +25,8 @@ from quadrl.cli import import_own, main
 from quadrl.draw import Draw
 from quadrl.environment import Environment
 from quadrl.kept import FILE, digest
-from quadrl.parameters import rows
 from quadrl.recovery import MAPS, begin
 from quadrl.rollout import flights
-from quadrl.vehicle import Vehicle
 from quadrl.weather import Weather
 
 SHORT: Any = dict(episodes=4, progress=False, time_limit=0.5)

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.control.geometric import GeometricController
 from quadrl.environment import Environment
 from quadrl.policy import SHIPPED, Policy
-from quadrl.vehicle import VEHICLES
 from scripts.reports import report, web
 
 FLOWN = [name for name, task in tasks.TASKS.items() if not task.contact]

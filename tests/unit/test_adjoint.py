@@ -9,9 +9,9 @@ import helpers
 import numpy as np
 import pytest
 
+from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import BatchEngine
-from quadrl.vehicle import GRAVITY
 
 COUNT = 19  # more than the kernel takes at a time, and no whole lanes
 STEPS = 5
@@ -80,7 +80,7 @@ def test_the_derivatives_are_those_of_the_equations_in_tensors(name):
     import torch
 
     from quadrl import dynamics
-    from quadrl.parameters import Parameters
+    from quadrl.aircraft.parameters import Parameters
 
     batch = flying(name)
     leg = batch.leg(2)

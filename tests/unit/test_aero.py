@@ -11,8 +11,9 @@ import helpers
 import numpy as np
 import pytest
 
-from quadrl import dynamics, native, parameters
-from quadrl.parameters import Parameters
+from quadrl import dynamics, native
+from quadrl.aircraft import parameters
+from quadrl.aircraft.parameters import Parameters
 
 LANES = 8
 SHIM = """

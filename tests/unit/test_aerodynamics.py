@@ -17,12 +17,13 @@ import pytest
 import reference
 
 from quadrl import dynamics, mjcf
-from quadrl.aerodynamics import EFFECTS, Aerodynamics, in_real_air, with_effects
+from quadrl.aircraft.aerodynamics import EFFECTS, Aerodynamics
+from quadrl.aircraft.parameters import WIND, Parameters, rows
+from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
-from quadrl.parameters import WIND, Parameters, rows
-from quadrl.vehicle import VEHICLES, Vehicle
 
 PAPER = Vehicle()
 FULL = Aerodynamics.full()

@@ -16,11 +16,11 @@ from runs import contents, metrics
 
 import quadrl
 from quadrl import cli, tasks
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.cli.flown import parse_options
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import read_config, write_config
-from quadrl.vehicle import VEHICLES
 from quadrl.weather import Weather
 
 SIZE = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16"]

@@ -9,7 +9,11 @@ from helpers import LAYOUTS, matrices, quaternions, random_quaternions
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from quadrl import control, parameters, tasks
+from quadrl import control, tasks
+from quadrl.aircraft import parameters
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import heading_of, quaternion_from_heading_and_tilt
 from quadrl.control import CONTROL_MODES, CONTROLLERS, Gains, Weights, lqr, modes
@@ -29,7 +33,6 @@ from quadrl.rollout import fly, summarize
 from quadrl.state import Start, State
 from quadrl.task import Snapshot, TaskState
 from quadrl.tasks.hover import Hover
-from quadrl.vehicle import GRAVITY, VEHICLES, Vehicle
 
 PAPER = Vehicle()
 LOOPED = [name for name in CONTROL_MODES if name != "rotor"]

@@ -11,10 +11,10 @@ import pytest
 
 import quadrl
 from quadrl import tasks
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.description import describe, docstrings
 from quadrl.environment import Environment
 from quadrl.tasks.hover import Hover
-from quadrl.vehicle import Vehicle
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from quadrl import dynamics, mjcf
+from quadrl.aircraft.parameters import Parameters, rows
+from quadrl.aircraft.rotors import GRAVITY, plus
+from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
 from quadrl.base.rotation import norm
 from quadrl.engines.mujoco import BatchEngine, DataEngine
-from quadrl.parameters import Parameters, rows
-from quadrl.vehicle import GRAVITY, MAX_ROTORS, Vehicle, plus
 
 COUNT = 9  # more than free flight takes at a time
 FIELDS = [field.name for field in dataclasses.fields(dynamics.Motion)]

@@ -7,13 +7,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import mjcf, native, parameters
-from quadrl.aerodynamics import in_real_air
+from quadrl import mjcf, native
+from quadrl.aircraft import parameters
+from quadrl.aircraft.presets import in_real_air
+from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.free_flight import LANES
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
-from quadrl.vehicle import MAX_ROTORS, Vehicle
 
 CALM, IN_AIR = Vehicle(), in_real_air(Vehicle())
 VEHICLES = {"calm": CALM, "in air": IN_AIR}

@@ -8,11 +8,11 @@ import pytest
 from helpers import begun, idle
 
 from quadrl import tasks
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import MAX_ENVS
 from quadrl.environment import Environment
 from quadrl.tasks.hover import Hover
-from quadrl.vehicle import Vehicle
 
 # ----------------------------------------------------------------------------------------- faults
 

@@ -13,6 +13,10 @@ from scipy.optimize import linprog
 
 import quadrl
 from quadrl import card_figures, cli
+from quadrl.aircraft.parameters import rows
+from quadrl.aircraft.presets import VEHICLES, resolve
+from quadrl.aircraft.rotors import GRAVITY, mixer
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.axes import AXES
 from quadrl.base.errors import QuadrlWarning
 from quadrl.card import Card
@@ -21,10 +25,7 @@ from quadrl.control import feasibility
 from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
 from quadrl.draw import Draw
 from quadrl.learning.defaults import VARIANTS
-from quadrl.parameters import rows
 from quadrl.policy import Policy, shipped
-from quadrl.rotors import GRAVITY, mixer
-from quadrl.vehicle import VEHICLES, Vehicle, resolve
 
 PAPER = Vehicle()
 # Action 1 commands 225.68 + 35 = 260.68 rad/s, which carry (260.68 / 225.68)^2 times the weight;

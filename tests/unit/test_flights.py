@@ -5,11 +5,12 @@ import ctypes
 import numpy as np
 import pytest
 
-from quadrl import native, parameters, tasks
+from quadrl import native, tasks
+from quadrl.aircraft import parameters
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.control.geometric import GeometricController
 from quadrl.environment import Environment
 from quadrl.rng import START, uniform
-from quadrl.vehicle import VEHICLES
 from scripts.reports import flights
 
 

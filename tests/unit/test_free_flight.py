@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from quadrl import mjcf, tasks
-from quadrl.aerodynamics import Aerodynamics
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.free_flight import MARGIN
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 from quadrl.environment import Environment
-from quadrl.vehicle import Vehicle
 
 PAPER = Vehicle()
 EVERY = helpers.LAYOUTS | helpers.IN_AIR

@@ -16,6 +16,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from quadrl import tasks
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.vehicle import PAPER_ROTORS, Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.environment import Environment
 from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
@@ -24,7 +26,6 @@ from quadrl.observing import Observing
 from quadrl.randomization import Randomization
 from quadrl.task import Task
 from quadrl.tasks.hover import Hover
-from quadrl.vehicle import PAPER_ROTORS, VEHICLES, Vehicle
 
 EXAMPLES = 25
 profile = settings(

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from quadrl import mjcf
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import DataEngine
 from quadrl.task import TaskState
 from quadrl.tasks.hover import Hover
-from quadrl.vehicle import VEHICLES, Vehicle
 
 # ------------------------------------------------------------------------------- a user's own task
 

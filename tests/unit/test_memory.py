@@ -12,6 +12,7 @@ from torchrl.data import Unbounded
 from torchrl.modules import set_recurrent_mode
 
 from quadrl import tasks
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.files import write_safetensors
 from quadrl.environment import Environment
 from quadrl.evaluation import evaluate
@@ -26,7 +27,6 @@ from quadrl.learning.vpg import VPG
 from quadrl.memory import GRU
 from quadrl.policy import RECURRENT_FORMAT, Policy
 from quadrl.rollout import fly
-from quadrl.vehicle import Vehicle
 from quadrl.view.flight import Flight
 
 SIZE, ACTIONS, WIDTH = 5, 2, 7

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from quadrl import landmarks, mjcf
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.vehicle import DRAWN_ROTOR_HEIGHT
 from quadrl.rendering import Renderer
-from quadrl.vehicle import DRAWN_ROTOR_HEIGHT, VEHICLES
 
 PAPER = VEHICLES["paper"]
 layouts = pytest.mark.parametrize("vehicle", helpers.LAYOUTS.values(), ids=helpers.LAYOUTS)

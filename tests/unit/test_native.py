@@ -13,7 +13,7 @@ from mujoco import rollout
 
 import quadrl
 from quadrl import mjcf, native
-from quadrl.vehicle import Vehicle
+from quadrl.aircraft.vehicle import Vehicle
 
 HOVER = Vehicle().hover_speed
 
@@ -216,7 +216,7 @@ import mujoco, numpy as np
 from pathlib import Path
 from quadrl import native
 from quadrl.engines.mujoco import BatchEngine
-from quadrl.vehicle import Vehicle
+from quadrl.aircraft.vehicle import Vehicle
 {before}
 engine = BatchEngine(Vehicle(), 64, altitude=3.0, num_threads=4)
 def diverge():

@@ -8,6 +8,8 @@ import pytest
 from apis import APIS
 from test_policy import linear
 
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import to_body
 from quadrl.environment import Environment
@@ -15,8 +17,6 @@ from quadrl.envs.gymnasium import QuadrotorVectorEnv
 from quadrl.evaluation import evaluate
 from quadrl.observer import SMOOTHING
 from quadrl.observing import Observing
-from quadrl.rotors import GRAVITY
-from quadrl.vehicle import Vehicle
 
 PAPER = Vehicle()
 ACTIONS = helpers.random_actions(12, 3)

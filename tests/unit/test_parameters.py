@@ -9,7 +9,8 @@ import pytest
 from helpers import EVERYTHING, drawn, flying
 
 from quadrl import mjcf, tasks
-from quadrl.aerodynamics import in_real_air
+from quadrl.aircraft.presets import VEHICLES, in_real_air
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.draw import EACH_ROTOR
 from quadrl.engines import mujoco as engines
@@ -18,7 +19,6 @@ from quadrl.environment import Environment
 from quadrl.randomization import FACTORS
 from quadrl.rng import PARAMETERS, Rng
 from quadrl.tasks.hover import Hover
-from quadrl.vehicle import VEHICLES, Vehicle
 
 ENGINES = ("mujoco", "free_flight")
 PAPER = Vehicle()

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from quadrl import dynamics, mjcf
+from quadrl.aircraft.parameters import Parameters, rows
+from quadrl.aircraft.vehicle import PAPER_ROTORS, Vehicle
 from quadrl.engines.mujoco import BatchEngine, DataEngine
-from quadrl.parameters import Parameters, rows
-from quadrl.vehicle import PAPER_ROTORS, Vehicle
 
 PAPER = Vehicle()
 VACUUM = Vehicle(drag_coefficient=0.0, moment_coefficient=0.0)

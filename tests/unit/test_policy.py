@@ -15,13 +15,13 @@ from runs import refused
 from safetensors.numpy import save
 
 import quadrl
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.files import write_safetensors
 from quadrl.environment import Environment
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.evaluation import setting
 from quadrl.policy import FORMAT, SHIPPED, Policy, shipped
 from quadrl.rollout import fly
-from quadrl.vehicle import VEHICLES
 
 SIZE = 3
 HEADER = {"format": FORMAT, "task": "hover", "metadata": {}}

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import norm
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.environment import Environment
 from quadrl.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
 from quadrl.rng import NOISE, PUSHES, uniform_array_api
-from quadrl.vehicle import VEHICLES, Vehicle
 
 ENGINES = ("mujoco", "free_flight")
 PAPER = Vehicle()

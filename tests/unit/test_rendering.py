@@ -17,6 +17,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from quadrl import landmarks, mjcf, rendering
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.environment import Environment
 from quadrl.envs.common import Pictures
@@ -33,7 +34,6 @@ from quadrl.rendering.horizon import horizon
 from quadrl.rendering.live import LiveFlight
 from quadrl.rendering.overlay import Panel, outcome
 from quadrl.shield import shield_triton
-from quadrl.vehicle import VEHICLES
 
 SIZE = 200  # [pixels], of square pictures
 PER_METRE = SIZE / 2 / math.tan(math.radians(21)) / 4  # [pixels] 4 m away, the field of view 42 deg

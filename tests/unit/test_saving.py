@@ -8,10 +8,10 @@ import pytest
 from helpers import EVERYTHING, drawn, flying
 
 from quadrl import tasks
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.task import TaskState
 from quadrl.tasks.hover import Hover
-from quadrl.vehicle import Vehicle
 
 ENGINES = ("mujoco", "free_flight")
 PAPER = Vehicle()

@@ -13,7 +13,7 @@ import helpers
 import numpy as np
 import pytest
 
-from quadrl.vehicle import VEHICLES
+from quadrl.aircraft.presets import VEHICLES
 
 ENGINES = ("mujoco", "free_flight")
 EVERY = VEHICLES | helpers.IN_AIR

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from quadrl import control, rollout, tasks, transition
-from quadrl.parameters import Parameters, rows
+from quadrl.aircraft.parameters import Parameters, rows
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.rng import Rng
 from quadrl.state import Start, State
-from quadrl.vehicle import VEHICLES, Vehicle
 
 VEHICLE = Vehicle()
 CLOCK = transition.Clock(control_timestep=0.05, time_limit_steps=200, settle_steps=40)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from quadrl import mjcf
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.environment import Environment
-from quadrl.vehicle import VEHICLES
 
 THREADS = 8
 STEPS = 30  # 1.5 s of hover, or 0.6 s of a racer: some episodes end, in the air and on the ground

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.aircraft.rotors import plus
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.environment import Environment
 from quadrl.state import Start
-from quadrl.vehicle import Vehicle, plus
 
 EVERY = 6  # control steps between two recorded observations
 TOLERANCE = 4e-12

@@ -6,8 +6,10 @@ import math
 import numpy as np
 import pytest
 
+from quadrl.aircraft.presets import VEHICLES, resolve
+from quadrl.aircraft.rotors import Rotor, plus, ring
+from quadrl.aircraft.vehicle import PAPER_ROTORS, Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.vehicle import PAPER_ROTORS, VEHICLES, Rotor, Vehicle, plus, resolve, ring
 
 PAPER = Vehicle()
 

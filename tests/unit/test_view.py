@@ -13,12 +13,12 @@ import scipy.spatial
 from scipy.spatial.transform import Rotation
 
 from quadrl import cli, mjcf, tasks
+from quadrl.aircraft.presets import resolve
 from quadrl.base.errors import QuadrlError
 from quadrl.cli.view import others
 from quadrl.control import make as make_controller
 from quadrl.markers import Marker
 from quadrl.policy import Policy
-from quadrl.vehicle import resolve
 from quadrl.view import readout
 from quadrl.view.flight import Flight, Keyboard
 from quadrl.view.shapes import sketch

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.aircraft.presets import resolve
 from quadrl.base.errors import QuadrlError
 from quadrl.control import make as make_controller
-from quadrl.vehicle import resolve
 from quadrl.view.flight import Flight
 
 viser = pytest.importorskip("viser")

@@ -13,12 +13,13 @@ from dm_control.rl import control
 from runs import refused
 from scipy import stats
 
-from quadrl import air, mjcf, parameters, tasks
+from quadrl import air, mjcf, tasks
+from quadrl.aircraft import parameters
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import DataEngine
 from quadrl.environment import Environment
 from quadrl.envs.dm_control import Physics, QuadrotorTask
-from quadrl.vehicle import Vehicle
 from quadrl.weather import WEATHERS, Weather, WeatherProcess
 
 LIGHT = WEATHERS["light"]

@@ -1,8 +1,8 @@
 """The aircraft: its numbers with their units and sources, and what follows from them.
 
-Body frame: x forward, y left, z up, the origin at the centre of mass. `quadrl.parameters` makes
-the rows of numbers from it that the engines fly, `quadrl.mjcf` the MuJoCo model. The file is longer
-than others because it also holds every aircraft that is known by name, with its sources.
+Body frame: x forward, y left, z up, the origin at the centre of mass. `presets` has the aircraft
+that are known by name, `parameters` makes the rows of numbers that the engines fly, and
+`quadrl.mjcf` the MuJoCo model.
 """
 
 from __future__ import annotations
@@ -10,17 +10,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import numpy as np
 
-from quadrl.aerodynamics import Aerodynamics, check_air
-from quadrl.aerodynamics import in_real_air as in_real_air  # beside the aircraft
-from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import Array
-from quadrl.base.validation import choice, keys, number, numbers
-from quadrl.rotors import (
+from quadrl.aircraft.aerodynamics import Aerodynamics, check_air
+from quadrl.aircraft.rotors import (
     GRAVITY,
     LENGTHS,
     MAX,
@@ -30,8 +26,10 @@ from quadrl.rotors import (
     hover_squares,
     mixer,
     plus,
-    ring,
 )
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
+from quadrl.base.validation import number, numbers
 
 MIN_ROTORS, MAX_ROTORS = 4, 8
 DRAWN_SIZE = 0.23  # [m], distance of a rotor from the centre in the drawings of assets/
@@ -101,7 +99,14 @@ class Vehicle:
         check_inertia("inertia", self.inertia, self.inertia)
         self._check_rotors()
         self._check_timesteps()
-        check_air(self)
+        check_air(
+            self.aerodynamics,
+            self.rotors,
+            mass=self.mass,
+            inertia=self.inertia,
+            max_speed=self.max_speed,
+            timestep=self.physics_timestep,
+        )
 
     def _check_rotors(self) -> None:
         """Refuse rotors that cannot hold the aircraft in hover and turn it about every axis."""
@@ -309,100 +314,3 @@ def check_inertia(name: str, low: Vector, high: Vector) -> None:
             value = high if low == high else (low, high)
             allowed = "three moments, each at most the sum of the other two"
             raise QuadrlError(name=name, value=value, allowed=allowed)
-
-
-def resolve(vehicle: Vehicle | str | None, options: Mapping[str, Any] | None = None) -> Vehicle:
-    """A vehicle, the one of a name, or the paper's for None.
-
-    Args:
-        vehicle: The vehicle.
-        options: Numbers that differ from it, by their fields' names.
-
-    Raises:
-        QuadrlError: It is something else, a name is unknown, or a number impossible.
-    """
-    if isinstance(vehicle, str):
-        vehicle = VEHICLES[choice("vehicle", vehicle, VEHICLES)]
-    vehicle = VEHICLES["paper"] if vehicle is None else vehicle
-    if not isinstance(vehicle, Vehicle):
-        allowed = f"a Vehicle or a name ({', '.join(VEHICLES)})"
-        raise QuadrlError(name="vehicle", value=vehicle, allowed=allowed)
-    keys("vehicle option", options or {}, OPTIONS)
-    return dataclasses.replace(vehicle, **options) if options else vehicle
-
-
-CRAZYFLIE = Vehicle(
-    name="crazyflie",  # Crazyflie 2.1, brushed; motors 1 to 4, clockwise from ahead on the right
-    mass=0.0293,  # Foerster 2015, "System Identification of the Crazyflie 2.0 Nano Quadrocopter"
-    inertia=(16.6e-6, 16.6e-6, 29.3e-6),  # Foerster 2015, principal part
-    rotors=ring(
-        (315, 225, 135, 45),
-        (1, -1, 1, -1),
-        0.046,  # Foerster 2015
-        thrust_coefficient=2.02e-8,  # thrust stand, stock propellers (IMRCLab, crazyflie-system-id)
-        torque_coefficient=2.02e-8 * 5.965e-3,  # ratio of torque to thrust: Foerster 2015
-        lag_up=1 / 0.049,  # brushed, from measured rotor speeds (IMRCLab flights)
-        lag_down=1 / 0.087,  # the same flights
-        max_speed=2426.0,  # the stand's largest, at a battery of 2.97 V
-        radius=0.0225,  # propellers of 45 mm
-    ),
-    drag_coefficient=5e-3,  # chosen: 7.6 m/s of terminal speed
-    moment_coefficient=1e-7,  # chosen: the paper's, over the fifth power of the arm length
-    action_scale=200.0,  # chosen
-    physics_timestep=0.005,  # chosen
-    control_timestep=0.02,  # chosen
-)
-RACER = Vehicle(
-    name="racer",  # Foehn et al. 2022, "Agilicious", Science Robotics 7: the Kingfisher
-    mass=0.752,
-    inertia=(2.5e-3, 2.1e-3, 4.3e-3),
-    rotors=tuple(
-        Rotor(
-            (x, y, 0.0),
-            spin=spin,  # chosen: Betaflight's motors 1 to 4 and their directions
-            thrust_coefficient=1.562e-6,
-            torque_coefficient=1.562e-6 * 0.022,
-            lag_up=1 / 0.033,
-            lag_down=1 / 0.033,
-            max_speed=math.sqrt(8.5 / 1.562e-6),  # 8.5 N per rotor
-            radius=0.0635,  # propellers of 5 inches
-        )
-        for x, y, spin in (
-            (-0.075, -0.1, -1.0),
-            (0.075, -0.1, 1.0),
-            (-0.075, 0.1, 1.0),
-            (0.075, 0.1, -1.0),
-        )
-    ),
-    drag_coefficient=2e-2,  # chosen: 19 m/s of terminal speed
-    moment_coefficient=1e-4,  # chosen
-    action_scale=150.0,  # chosen
-    physics_timestep=0.005,  # chosen
-    control_timestep=0.02,  # chosen
-)
-HEXA = Vehicle(
-    name="hexa",  # AscTec Firefly, in the numbers of RotorS (Furrer et al. 2016), rotors included
-    mass=1.53,
-    # RotorS gives 0.0977 about z, which is more than the sum of the other two: no body has that.
-    inertia=(0.0347563, 0.0458929, 0.08),
-    rotors=ring(
-        (30, 90, 150, 210, 270, 330),
-        (1, -1, 1, -1, 1, -1),
-        0.215,
-        thrust_coefficient=8.54858e-6,
-        torque_coefficient=8.54858e-6 * 0.016,
-        lag_up=1 / 0.025,
-        lag_down=1 / 0.025,
-        max_speed=838.0,
-        radius=0.1,
-    ),
-    drag_coefficient=3e-2,  # chosen: 22 m/s of terminal speed
-    moment_coefficient=2e-3,  # chosen
-    action_scale=110.0,  # chosen: a fifth of the hover speed, since its yaw is weak
-    physics_timestep=0.005,  # chosen
-    control_timestep=0.02,  # chosen
-)
-OPTIONS = ("mass", "inertia", "drag_coefficient", "moment_coefficient", "action_scale")
-"""Fields that may differ from an aircraft's without making another one of it."""
-VEHICLES = {vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, RACER, HEXA)}
-"""The aircraft that are known by name."""

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
+from quadrl.aircraft.rotors import GRAVITY, MAX, MIN, Rotor, Vector
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice, number
-from quadrl.rotors import GRAVITY, MAX, MIN
-
-if TYPE_CHECKING:
-    from quadrl.vehicle import Vehicle
+from quadrl.base.validation import number
 
 DENSITIES = (1e-3, 100.0)  # [kg/m^3]
 MAX_BODY_LIFT = 2.0
@@ -77,8 +74,16 @@ class Aerodynamics:
 
     @classmethod
     def full(cls) -> Aerodynamics:
-        """Every effect, with the numbers of the paper's aircraft; `in_real_air` has others'."""
-        return REAL_AIR["paper"][0]
+        """Every effect, with the numbers of the paper's aircraft; `presets` has those of others."""
+        return cls(
+            inflow=True,
+            ground_effect=True,
+            vortex_ring=0.44,
+            vortex_ring_noise=0.1,
+            # Blade theory of the OS4, with stiff plastic blades: the physics page says how.
+            rotor_drag=1.25e-4,
+            rotor_inertia=6e-5,  # OS4, with its gear
+        )
 
     @property
     def uses_discs(self) -> bool:
@@ -106,62 +111,32 @@ EFFECTS = {
 """What can be asked for by name, and the fields that it takes from the full set."""
 NONE, FULL = "none", "full"
 
-_ALL = Aerodynamics(inflow=True, ground_effect=True, vortex_ring=0.44, vortex_ring_noise=0.1)
-REAL_AIR = {
-    "paper": (
-        dataclasses.replace(
-            _ALL,
-            # Blade theory of the OS4, with stiff plastic blades: the physics page says how.
-            rotor_drag=1.25e-4,
-            rotor_inertia=6e-5,  # OS4, with its gear
-        ),
-        1.0,  # equation 8 is its drag beside the rotors' already
-    ),
-    "crazyflie": (
-        dataclasses.replace(
-            _ALL,
-            rotor_drag=9.18e-7,  # Foerster 2015
-            flapping_moment=9e-8,  # identified in flights: 6.4e-4 N m per m/s sideways
-            rotor_inertia=6e-8,  # identified in flights (ARPL, IMRCLab)
-            blade_lift=0.384,  # gives the heave damping of drone-models, 0.0128 N s/m
-            translational_lift=0.0,  # unknown
-        ),
-        0.2,  # estimated from its frontal area
-    ),
-    "racer": (
-        dataclasses.replace(
-            _ALL,
-            rotor_drag=6.2e-5,  # estimated
-            rotor_inertia=0.0,  # unknown
-            blade_lift=0.9,  # estimated, for three blades
-            translational_lift=0.0,  # unknown
-        ),
-        0.3,  # estimated from its frontal area
-    ),
-    "hexa": (
-        dataclasses.replace(
-            _ALL,
-            rotor_drag=8.06e-5,  # RotorS, for the same rotor on the hummingbird
-            rotor_inertia=0.0,  # unknown
-            blade_lift=0.8,  # estimated, for two blades
-            translational_lift=0.0,  # unknown
-        ),
-        0.3,  # estimated, as the racer's
-    ),
-}
-"""By aircraft: its full set, and the share of its quadratic drag that is not the rotors' own."""
 
-
-def check_air(vehicle: Vehicle) -> None:
+def check_air(
+    air: Aerodynamics,
+    rotors: Sequence[Rotor],
+    *,
+    mass: float,
+    inertia: Vector,
+    max_speed: np.ndarray,
+    timestep: float,
+) -> None:
     """Refuse discs that make power from nothing, and effects that are too fast for the step.
+
+    Args:
+        air: What the air does to the rotors of an aircraft.
+        rotors: Its rotors.
+        mass: Its mass [kg].
+        inertia: Its principal moments [kg m^2].
+        max_speed: Largest speeds of the rotors (R,) [rad/s].
+        timestep: Of the physics [s].
 
     Raises:
         QuadrlError: The message says what would be allowed.
     """
-    air = vehicle.aerodynamics
     if not isinstance(air, Aerodynamics):
         raise QuadrlError(name="aerodynamics", value=air, allowed="an Aerodynamics")
-    for k, rotor in enumerate(vehicle.rotors):
+    for k, rotor in enumerate(rotors):
         merit = rotor.figure_of_merit(air.air_density)
         if air.uses_discs and merit > 1:
             raise QuadrlError(
@@ -171,20 +146,25 @@ def check_air(vehicle: Vehicle) -> None:
                 value=rotor.disc,
                 allowed=f"at least {rotor.disc * merit:.3g} m",
             )
-    if vehicle.rotor_count * air.rotor_inertia > vehicle.inertia[2]:
-        allowed = f"at most {vehicle.inertia[2] / vehicle.rotor_count:.3g} kg m^2, a rotor's share"
+    if len(rotors) * air.rotor_inertia > inertia[2]:
+        allowed = f"at most {inertia[2] / len(rotors):.3g} kg m^2, a rotor's share"
         raise QuadrlError(name="rotor_inertia", value=air.rotor_inertia, allowed=allowed)
-    what, rate = max(_rates(vehicle).items(), key=lambda item: item[1])
-    if rate * vehicle.physics_timestep > 1:
+    rates = _rates(air, rotors, mass, np.array(inertia), max_speed)
+    what, rate = max(rates.items(), key=lambda item: item[1])
+    if rate * timestep > 1:
         reason = f"{what} changes the flight at up to {rate:.3g} 1/s, and rate times step may be 1"
-        step, allowed = vehicle.physics_timestep, f"at most {1 / rate:.3g} s"
-        raise QuadrlError(reason, name="physics_timestep", value=step, allowed=allowed)
+        allowed = f"at most {1 / rate:.3g} s"
+        raise QuadrlError(reason, name="physics_timestep", value=timestep, allowed=allowed)
 
 
-def _rates(vehicle: Vehicle) -> dict[str, float]:
+def _rates(
+    air: Aerodynamics,
+    rotors: Sequence[Rotor],
+    mass: float,
+    inertia: np.ndarray,
+    fastest: np.ndarray,
+) -> dict[str, float]:
     """Upper bounds of the rates [1/s] at which each effect damps or turns the aircraft."""
-    air, mass, inertia = vehicle.aerodynamics, vehicle.mass, np.array(vehicle.inertia)
-    rotors, fastest = vehicle.rotors, vehicle.max_speed
     arms = np.array([math.hypot(*rotor.position) for rotor in rotors])
     # Lift over climb speed: in fast descent the flow through the disc changes as much as the climb.
     thrust = np.array([rotor.thrust_coefficient for rotor in rotors]) * fastest
@@ -201,59 +181,3 @@ def _rates(vehicle: Vehicle) -> dict[str, float]:
         "ground_effect": air.ground_effect * math.sqrt(steep.sum() / mass),
     }
     return {name: float(rate) for name, rate in rates.items()}
-
-
-def in_real_air(vehicle: Vehicle) -> Vehicle:
-    """A vehicle with every effect of the air: its own set, or that of the known one of its name.
-
-    With rotor drag on, the quadratic drag is what remains beside it: the presets whose
-    `drag_coefficient` stands for both keep a share.
-
-    Raises:
-        QuadrlError: It has no set of its own, and its name is not one of `REAL_AIR`.
-    """
-    return with_effects(vehicle, FULL)
-
-
-def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> Vehicle:
-    """A vehicle in the air that is asked for.
-
-    Args:
-        vehicle: The aircraft.
-        aerodynamics: "none", "full", names of EFFECTS with commas between them (each with the
-            numbers of the full set), an Aerodynamics; None for what the vehicle has.
-
-    Raises:
-        QuadrlError: Unknown name, or a vehicle for which there is no full set.
-    """
-    if aerodynamics is None:
-        return vehicle
-    if isinstance(aerodynamics, Aerodynamics):
-        return dataclasses.replace(vehicle, aerodynamics=aerodynamics)
-    if not isinstance(aerodynamics, str):
-        allowed = f"an Aerodynamics, {NONE}, {FULL}, or names of {', '.join(EFFECTS)}"
-        raise QuadrlError(name="aerodynamics", value=aerodynamics, allowed=allowed)
-    if aerodynamics == NONE:
-        return dataclasses.replace(vehicle, aerodynamics=Aerodynamics())
-    own, share = _full_set(vehicle)
-    kept = set(SWITCHES)
-    if aerodynamics != FULL:
-        names = [name.strip() for name in aerodynamics.split(",")]
-        choices = [*EFFECTS, *([NONE, FULL] if len(names) == 1 else [])]
-        kept = {f for name in names for f in EFFECTS[choice("aerodynamics", name, choices)]}
-    off = {name: Aerodynamics.__dataclass_fields__[name].default for name in SWITCHES}
-    chosen = dataclasses.replace(own, **{n: off[n] for n in SWITCHES if n not in kept})
-    drag = vehicle.drag_coefficient * (share if chosen.rotor_drag else 1.0)
-    return dataclasses.replace(vehicle, aerodynamics=chosen, drag_coefficient=drag)
-
-
-def _full_set(vehicle: Vehicle) -> tuple[Aerodynamics, float]:
-    """Every effect of a vehicle, and the share of its quadratic drag beside its rotor drag."""
-    own = vehicle.aerodynamics
-    if own.effects:
-        return own, 1.0  # its drag is what it says
-    if vehicle.name not in REAL_AIR:
-        reason = f"quadrl knows the full set of {', '.join(REAL_AIR)}; give this one its own"
-        allowed = "an aircraft with aerodynamics=Aerodynamics(...)"
-        raise QuadrlError(reason, name="vehicle", value=vehicle.name, allowed=allowed)
-    return REAL_AIR[vehicle.name]

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.aerodynamics import Aerodynamics
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.rotors import Rotor, hover_squares, mixer
+from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
 from quadrl.base.rotation import Array
-from quadrl.rotors import Rotor, hover_squares, mixer
-from quadrl.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
 
 WIND = 3
 AIR = WIND + MAX_ROTORS
@@ -150,7 +150,7 @@ def c_structs() -> str:
 
     sizes = f"MAX_ROTORS = {MAX_ROTORS}, WIND = {WIND}, AIR = {AIR}, ROW_SIZE = {ROW_SIZE}"
     return (
-        "// Written by quadrl/parameters.py from the fields of Rotor, Vehicle and Aerodynamics.\n"
+        "// Written by quadrl/aircraft/parameters.py from Rotor, Vehicle and Aerodynamics.\n"
         f"#define QUADRL_MARK {MARK!r}\n"
         f"enum {{ {sizes} }};\n"
         f"typedef struct {{\n{fields(ROTOR)}\n}} Rotor;\n"

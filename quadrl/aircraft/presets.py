@@ -1,0 +1,202 @@
+"""The aircraft that are known by name, and their air, with the sources of all numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from quadrl.aircraft.aerodynamics import EFFECTS, FULL, NONE, SWITCHES, Aerodynamics
+from quadrl.aircraft.rotors import Rotor, ring
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice, keys
+
+CRAZYFLIE = Vehicle(
+    name="crazyflie",  # Crazyflie 2.1, brushed; motors 1 to 4, clockwise from ahead on the right
+    mass=0.0293,  # Foerster 2015, "System Identification of the Crazyflie 2.0 Nano Quadrocopter"
+    inertia=(16.6e-6, 16.6e-6, 29.3e-6),  # Foerster 2015, principal part
+    rotors=ring(
+        (315, 225, 135, 45),
+        (1, -1, 1, -1),
+        0.046,  # Foerster 2015
+        thrust_coefficient=2.02e-8,  # thrust stand, stock propellers (IMRCLab, crazyflie-system-id)
+        torque_coefficient=2.02e-8 * 5.965e-3,  # ratio of torque to thrust: Foerster 2015
+        lag_up=1 / 0.049,  # brushed, from measured rotor speeds (IMRCLab flights)
+        lag_down=1 / 0.087,  # the same flights
+        max_speed=2426.0,  # the stand's largest, at a battery of 2.97 V
+        radius=0.0225,  # propellers of 45 mm
+    ),
+    drag_coefficient=5e-3,  # chosen: 7.6 m/s of terminal speed
+    moment_coefficient=1e-7,  # chosen: the paper's, over the fifth power of the arm length
+    action_scale=200.0,  # chosen
+    physics_timestep=0.005,  # chosen
+    control_timestep=0.02,  # chosen
+)
+RACER = Vehicle(
+    name="racer",  # Foehn et al. 2022, "Agilicious", Science Robotics 7: the Kingfisher
+    mass=0.752,
+    inertia=(2.5e-3, 2.1e-3, 4.3e-3),
+    rotors=tuple(
+        Rotor(
+            (x, y, 0.0),
+            spin=spin,  # chosen: Betaflight's motors 1 to 4 and their directions
+            thrust_coefficient=1.562e-6,
+            torque_coefficient=1.562e-6 * 0.022,
+            lag_up=1 / 0.033,
+            lag_down=1 / 0.033,
+            max_speed=math.sqrt(8.5 / 1.562e-6),  # 8.5 N per rotor
+            radius=0.0635,  # propellers of 5 inches
+        )
+        for x, y, spin in (
+            (-0.075, -0.1, -1.0),
+            (0.075, -0.1, 1.0),
+            (-0.075, 0.1, 1.0),
+            (0.075, 0.1, -1.0),
+        )
+    ),
+    drag_coefficient=2e-2,  # chosen: 19 m/s of terminal speed
+    moment_coefficient=1e-4,  # chosen
+    action_scale=150.0,  # chosen
+    physics_timestep=0.005,  # chosen
+    control_timestep=0.02,  # chosen
+)
+HEXA = Vehicle(
+    name="hexa",  # AscTec Firefly, in the numbers of RotorS (Furrer et al. 2016), rotors included
+    mass=1.53,
+    # RotorS gives 0.0977 about z, which is more than the sum of the other two: no body has that.
+    inertia=(0.0347563, 0.0458929, 0.08),
+    rotors=ring(
+        (30, 90, 150, 210, 270, 330),
+        (1, -1, 1, -1, 1, -1),
+        0.215,
+        thrust_coefficient=8.54858e-6,
+        torque_coefficient=8.54858e-6 * 0.016,
+        lag_up=1 / 0.025,
+        lag_down=1 / 0.025,
+        max_speed=838.0,
+        radius=0.1,
+    ),
+    drag_coefficient=3e-2,  # chosen: 22 m/s of terminal speed
+    moment_coefficient=2e-3,  # chosen
+    action_scale=110.0,  # chosen: a fifth of the hover speed, since its yaw is weak
+    physics_timestep=0.005,  # chosen
+    control_timestep=0.02,  # chosen
+)
+OPTIONS = ("mass", "inertia", "drag_coefficient", "moment_coefficient", "action_scale")
+"""Fields that may differ from an aircraft's without making another one of it."""
+VEHICLES = {vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, RACER, HEXA)}
+"""The aircraft that are known by name."""
+_ALL = Aerodynamics.full()
+REAL_AIR = {
+    "paper": (_ALL, 1.0),  # equation 8 is its drag beside the rotors' already
+    "crazyflie": (
+        dataclasses.replace(
+            _ALL,
+            rotor_drag=9.18e-7,  # Foerster 2015
+            flapping_moment=9e-8,  # identified in flights: 6.4e-4 N m per m/s sideways
+            rotor_inertia=6e-8,  # identified in flights (ARPL, IMRCLab)
+            blade_lift=0.384,  # gives the heave damping of drone-models, 0.0128 N s/m
+            translational_lift=0.0,  # unknown
+        ),
+        0.2,  # estimated from its frontal area
+    ),
+    "racer": (
+        dataclasses.replace(
+            _ALL,
+            rotor_drag=6.2e-5,  # estimated
+            rotor_inertia=0.0,  # unknown
+            blade_lift=0.9,  # estimated, for three blades
+            translational_lift=0.0,  # unknown
+        ),
+        0.3,  # estimated from its frontal area
+    ),
+    "hexa": (
+        dataclasses.replace(
+            _ALL,
+            rotor_drag=8.06e-5,  # RotorS, for the same rotor on the hummingbird
+            rotor_inertia=0.0,  # unknown
+            blade_lift=0.8,  # estimated, for two blades
+            translational_lift=0.0,  # unknown
+        ),
+        0.3,  # estimated, as the racer's
+    ),
+}
+"""By aircraft: its full set, and the share of its quadratic drag that is not the rotors' own."""
+
+
+def resolve(vehicle: Vehicle | str | None, options: Mapping[str, Any] | None = None) -> Vehicle:
+    """A vehicle, the one of a name, or the paper's for None.
+
+    Args:
+        vehicle: The vehicle.
+        options: Numbers that differ from it, by their fields' names.
+
+    Raises:
+        QuadrlError: It is something else, a name is unknown, or a number impossible.
+    """
+    if isinstance(vehicle, str):
+        vehicle = VEHICLES[choice("vehicle", vehicle, VEHICLES)]
+    vehicle = VEHICLES["paper"] if vehicle is None else vehicle
+    if not isinstance(vehicle, Vehicle):
+        allowed = f"a Vehicle or a name ({', '.join(VEHICLES)})"
+        raise QuadrlError(name="vehicle", value=vehicle, allowed=allowed)
+    keys("vehicle option", options or {}, OPTIONS)
+    return dataclasses.replace(vehicle, **options) if options else vehicle
+
+
+def in_real_air(vehicle: Vehicle) -> Vehicle:
+    """A vehicle with every effect of the air: its own set, or that of the known one of its name.
+
+    With rotor drag on, the quadratic drag is what remains beside it: the presets whose
+    `drag_coefficient` stands for both keep a share.
+
+    Raises:
+        QuadrlError: It has no set of its own, and its name is not one of `REAL_AIR`.
+    """
+    return with_effects(vehicle, FULL)
+
+
+def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> Vehicle:
+    """A vehicle in the air that is asked for.
+
+    Args:
+        vehicle: The aircraft.
+        aerodynamics: "none", "full", names of EFFECTS with commas between them (each with the
+            numbers of the full set), an Aerodynamics; None for what the vehicle has.
+
+    Raises:
+        QuadrlError: Unknown name, or a vehicle for which there is no full set.
+    """
+    if aerodynamics is None:
+        return vehicle
+    if isinstance(aerodynamics, Aerodynamics):
+        return dataclasses.replace(vehicle, aerodynamics=aerodynamics)
+    if not isinstance(aerodynamics, str):
+        allowed = f"an Aerodynamics, {NONE}, {FULL}, or names of {', '.join(EFFECTS)}"
+        raise QuadrlError(name="aerodynamics", value=aerodynamics, allowed=allowed)
+    if aerodynamics == NONE:
+        return dataclasses.replace(vehicle, aerodynamics=Aerodynamics())
+    own, share = _full_set(vehicle)
+    kept = set(SWITCHES)
+    if aerodynamics != FULL:
+        names = [name.strip() for name in aerodynamics.split(",")]
+        choices = [*EFFECTS, *([NONE, FULL] if len(names) == 1 else [])]
+        kept = {f for name in names for f in EFFECTS[choice("aerodynamics", name, choices)]}
+    off = {name: Aerodynamics.__dataclass_fields__[name].default for name in SWITCHES}
+    chosen = dataclasses.replace(own, **{n: off[n] for n in SWITCHES if n not in kept})
+    drag = vehicle.drag_coefficient * (share if chosen.rotor_drag else 1.0)
+    return dataclasses.replace(vehicle, aerodynamics=chosen, drag_coefficient=drag)
+
+
+def _full_set(vehicle: Vehicle) -> tuple[Aerodynamics, float]:
+    """Every effect of a vehicle, and the share of its quadratic drag beside its rotor drag."""
+    own = vehicle.aerodynamics
+    if own.effects:
+        return own, 1.0  # its drag is what it says
+    if vehicle.name not in REAL_AIR:
+        reason = f"quadrl knows the full set of {', '.join(REAL_AIR)}; give this one its own"
+        allowed = "an aircraft with aerodynamics=Aerodynamics(...)"
+        raise QuadrlError(reason, name="vehicle", value=vehicle.name, allowed=allowed)
+    return REAL_AIR[vehicle.name]
