@@ -1,16 +1,25 @@
-"""A progress bar: redrawn in a terminal and in a notebook, a line now and then elsewhere."""
+"""Progress of a training, and a bar: redrawn in a terminal and a notebook, elsewhere lines."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich import progress
 from rich.console import Console
 
-if TYPE_CHECKING:
-    from quadrl.learning.train import Progress
+
+@dataclasses.dataclass
+class Progress:
+    """The state of a training after an iteration."""
+
+    iteration: int
+    iterations: int
+    steps: int
+    seconds: float
+    metrics: dict[str, float]
 
 
 class ProgressBar:

@@ -39,8 +39,8 @@ class View(Flown):
             say("stopped")
 
     def _native(self) -> None:
-        from quadrl.view import native
-        from quadrl.view.flight import Flight
+        from quadrl.rendering.live import native
+        from quadrl.rendering.live.flight import Flight
 
         native.check_screen()
         _, controller, task, vehicle = self.setting()
@@ -52,12 +52,12 @@ class View(Flown):
 
     def _browser(self) -> None:
         try:
-            from quadrl.view.browser import Page
+            from quadrl.rendering.live.browser import Page
         except ImportError as error:
             raise RenderingUnavailable(
                 f"quadrl view needs {error.name}: install the extra `view` of quadrl"
             ) from error
-        from quadrl.view.flight import Flight
+        from quadrl.rendering.live.flight import Flight
 
         _, controller, task, vehicle = self.setting()
         flight = Flight(controller, task, vehicle, **self._settings(controller))

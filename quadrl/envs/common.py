@@ -140,7 +140,7 @@ class Pictures:
         environment = self._environment
         if self._renderer is None:
             self._open()
-        from quadrl.rendering.live import LiveFlight
+        from quadrl.rendering.pictures import LiveFlight
 
         flight = self._flights.setdefault(row, LiveFlight(self._camera))
         now, qpos = environment.snapshot, environment.engine.qpos[row]

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from quadrl import mjcf
-from quadrl.base.progress import ProgressBar
+from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.validation import number
 from quadrl.control.feasibility import warn_of_unreached
 from quadrl.evaluation import Evaluation, evaluate, html_table
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO, write_json
-from quadrl.learning.train import Progress, Training
+from quadrl.learning.train import Training
 from quadrl.policy import Policy
 from quadrl.rollout import MAX_EPISODES
 

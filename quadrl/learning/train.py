@@ -8,7 +8,6 @@ moment continues and ends with the same policy, bit for bit.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import gc
 import itertools
 import time
@@ -26,6 +25,7 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import PART
 from quadrl.base.machine import check_memory, processor_kind
+from quadrl.base.progress import Progress
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning import checkpoint
 from quadrl.learning.algorithm import Algorithm
@@ -96,17 +96,6 @@ def one_thread() -> Generator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@dataclasses.dataclass
-class Progress:
-    """The state of a training after an iteration."""
-
-    iteration: int
-    iterations: int
-    steps: int
-    seconds: float
-    metrics: dict[str, float]
 
 
 class Training:

@@ -20,11 +20,12 @@ from scipy.integrate import cumulative_trapezoid
 
 from quadrl import mjcf, tasks
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.progress import Progress
 from quadrl.control import make as make_controller
 from quadrl.evaluation import evaluate
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import LEARNING_CURVE
-from quadrl.learning.train import Progress, Training
+from quadrl.learning.train import Training
 from quadrl.policy import SHIPPED, Policy
 from quadrl.rendering import Renderer, render_trajectory
 from quadrl.rollout import Rollout, fly

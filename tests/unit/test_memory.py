@@ -26,8 +26,8 @@ from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
 from quadrl.memory import GRU
 from quadrl.policy import RECURRENT_FORMAT, Policy
+from quadrl.rendering.live.flight import Flight
 from quadrl.rollout import fly
-from quadrl.view.flight import Flight
 
 SIZE, ACTIONS, WIDTH = 5, 2, 7
 ROWS, STEPS = 6, 9

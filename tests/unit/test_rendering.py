@@ -31,8 +31,8 @@ from quadrl.rendering import (
 )
 from quadrl.rendering.camera import aircraft_scale, eased, follow_cameras, headings, in_view
 from quadrl.rendering.horizon import horizon
-from quadrl.rendering.live import LiveFlight
 from quadrl.rendering.overlay import Panel, outcome
+from quadrl.rendering.pictures import LiveFlight
 from quadrl.shield import shield_triton
 
 SIZE = 200  # [pixels], of square pictures

@@ -19,9 +19,9 @@ from quadrl.cli.view import others
 from quadrl.control import make as make_controller
 from quadrl.markers import Marker
 from quadrl.policy import Policy
-from quadrl.view import readout
-from quadrl.view.flight import Flight, Keyboard
-from quadrl.view.shapes import sketch
+from quadrl.rendering.live import readout
+from quadrl.rendering.live.flight import Flight, Keyboard
+from quadrl.rendering.live.shapes import sketch
 
 VEHICLE = resolve(None)
 STEP = VEHICLE.control_timestep
@@ -35,7 +35,7 @@ def hover(count=1, vehicle=VEHICLE, **options):
 @pytest.fixture
 def page():
     """A page of two aircraft, served to nobody."""
-    browser = pytest.importorskip("quadrl.view.browser", exc_type=ModuleNotFoundError)
+    browser = pytest.importorskip("quadrl.rendering.live.browser", exc_type=ModuleNotFoundError)
     task = tasks.make("hover")
     geometric = make_controller("geometric", task, VEHICLE)
     choices = {
@@ -209,7 +209,7 @@ def test_numbers_are_those_of_the_aircraft():
 @pytest.mark.parametrize("vehicle", ["paper", "hexa"])
 def test_meshes_are_those_of_the_model(vehicle):
     trimesh = pytest.importorskip("trimesh")
-    from quadrl.view import meshes
+    from quadrl.rendering.live import meshes
 
     model = mjcf.compile_model(resolve(vehicle))
     data = mujoco.MjData(model)
@@ -239,7 +239,7 @@ def test_meshes_are_those_of_the_model(vehicle):
 
 def test_what_stands_in_the_world_is_drawn():
     pytest.importorskip("trimesh")
-    from quadrl.view import meshes
+    from quadrl.rendering.live import meshes
 
     def wall(spec):
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.1, 2, 1), pos=(3, 0, 1))
@@ -333,7 +333,7 @@ def test_the_camera_stays_with_its_aircraft(page, camera):
 
 
 def test_a_task_with_a_pad_and_one_with_labels_are_drawn():
-    browser = pytest.importorskip("quadrl.view.browser", exc_type=ModuleNotFoundError)
+    browser = pytest.importorskip("quadrl.rendering.live.browser", exc_type=ModuleNotFoundError)
     for name in ("landing", "static_waypoint"):
         task = tasks.make(name)
         flight = Flight(make_controller("geometric", task, VEHICLE), task, VEHICLE)
@@ -356,7 +356,7 @@ def test_a_port_that_is_taken_is_named(capsys):
 
 def test_without_the_extra_there_is_one_line(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.delitem(sys.modules, "quadrl.view.browser", raising=False)
+    monkeypatch.delitem(sys.modules, "quadrl.rendering.live.browser", raising=False)
     assert command("view", "hover") == 2
     said = capsys.readouterr().err
     assert "view" in said and said.count("\n") == 1
@@ -372,7 +372,7 @@ def test_without_a_screen_there_is_one_line(capsys, monkeypatch):
 
 
 def test_the_command_serves_until_it_is_interrupted(capsys, monkeypatch):
-    browser = pytest.importorskip("quadrl.view.browser", exc_type=ModuleNotFoundError)
+    browser = pytest.importorskip("quadrl.rendering.live.browser", exc_type=ModuleNotFoundError)
     frames = []
 
     def frame(page, seconds):

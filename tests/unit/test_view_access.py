@@ -15,7 +15,7 @@ from quadrl import tasks
 from quadrl.aircraft.presets import resolve
 from quadrl.base.errors import QuadrlError
 from quadrl.control import make as make_controller
-from quadrl.view.flight import Flight
+from quadrl.rendering.live.flight import Flight
 
 viser = pytest.importorskip("viser")
 import msgspec  # noqa: E402
@@ -25,7 +25,7 @@ from websockets.datastructures import Headers  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from quadrl.view import access, browser  # noqa: E402
+from quadrl.rendering.live import access, browser  # noqa: E402
 
 VEHICLE = resolve(None)
 CAMERA = {

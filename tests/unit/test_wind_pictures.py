@@ -10,7 +10,7 @@ from quadrl import mjcf
 from quadrl.envs.common import Pictures
 from quadrl.evaluation import evaluate
 from quadrl.rendering import Renderer, overlay, render_trajectory
-from quadrl.rendering.live import LiveFlight
+from quadrl.rendering.pictures import LiveFlight
 from quadrl.rendering.streaks import COUNT, TAIL, streaks
 from quadrl.weather import Weather
 

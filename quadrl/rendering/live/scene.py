@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from quadrl import mjcf
 from quadrl.base.rotation import Array
+from quadrl.rendering.live import meshes, shapes
+from quadrl.rendering.live.flight import Flight
 from quadrl.rendering.scene import TRAIL_NEW, TRAIL_OLD
-from quadrl.view import meshes, shapes
-from quadrl.view.flight import Flight
 
 CAMERAS = ("free", "follow", "chase")
 # Where the camera stands, seen from where it looks, in sizes of what it shows.

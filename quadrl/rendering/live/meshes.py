@@ -14,7 +14,7 @@ from trimesh.visual.material import PBRMaterial
 
 from quadrl import landmarks
 from quadrl.base.rotation import Array
-from quadrl.view.shapes import blade_ids
+from quadrl.rendering.live.shapes import blade_ids
 
 SHARPEST = 0.7  # [rad], an edge that is shaded round
 DRAWN_GROUPS = 3  # MuJoCo shows the groups 0 to 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadrl.mjcf import rotor_colour
-from quadrl.view.flight import Flight
+from quadrl.rendering.live.flight import Flight
 
 LINE = '<div style="display:flex;justify-content:space-between;line-height:1.5">{}</div>'
 CELL = (

@@ -13,8 +13,8 @@ import numpy as np
 from quadrl import mjcf
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.engines.mujoco import DataEngine
-from quadrl.view import shapes
-from quadrl.view.flight import Flight
+from quadrl.rendering.live import shapes
+from quadrl.rendering.live.flight import Flight
 
 FRAME = 1 / 60  # [s]
 LINE = 0.003  # [m], half the width of markers' lines
