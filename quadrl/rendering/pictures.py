@@ -49,7 +49,7 @@ class LiveFlight:
 
         Args:
             renderer: What draws.
-            time: Since the episode began [s]; if it goes back, this is another flight.
+            time: Since the episode began [s]; if it goes back or is 0, this is another flight.
             qpos: (7,) position [m] and attitude (w, x, y, z), world frame.
             rotor_speed: (R,) [rad/s].
             goal: (3,) [m], world frame.
@@ -61,7 +61,7 @@ class LiveFlight:
         """
         position, camera = np.array(qpos[:3]), self._camera
         seconds = time - self._time
-        begins = seconds < 0
+        begins = seconds < 0 or time == 0  # an episode may end before its second picture
         if begins:
             self._trail, self._angles = [], np.zeros(len(rotor_speed))
             self._drift = np.zeros(3)

@@ -580,6 +580,9 @@ def test_a_picture_of_a_flight_in_progress_shows_where_it_came_from(renderer):
     np.testing.assert_allclose(see(4.2, 2.0)["trail"][:, 0], [2])  # older than 4 s is gone
     fresh = see(0.05, 5.0)
     assert fresh["camera"].lookat[0] == 5 and not fresh["rotor_angles"].any()
+    for x in (7.0, 9.0):  # the next begins before the first was seen a second time
+        fresh = see(0.0, x)
+        assert fresh["camera"].lookat[0] == x and fresh["trail"][:, 0].tolist() == [x]
 
 
 # ------------------------------------------------------------------------------ graphics library
