@@ -32,10 +32,10 @@ _BATCHES: weakref.WeakSet[BatchEngine] = weakref.WeakSet()
 
 
 def _after_fork() -> None:
-    """In a forked process: its engines have no threads, and wait for them for ever."""
+    """In a forked process: mark its engines, whose threads are not there."""
     for engine in list(_BATCHES):
         engine.forked = True
-        # Never freed here: that would join the threads, too.
+        # Never freed here: that would wait for the threads, too.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(engine.batch))
     _BATCHES.clear()
 
