@@ -1,6 +1,6 @@
 """The loss of TRPO (Schulman et al. 2015) in the manner of TorchRL's losses, which have none.
 
-It uses nothing of quadrl: `scripts/reports/upstream.py` makes the patch for TorchRL from it.
+It uses nothing of quadrl.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""TRPO's loss as a module of TorchRL: names, shapes, estimators, distributions.
-
-It uses nothing of quadrl but the loss: `scripts/reports/upstream.py` takes it along.
-"""
+"""TRPO's loss as a module of TorchRL: names, shapes, estimators, distributions."""
 
 import sys
 
