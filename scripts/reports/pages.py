@@ -10,29 +10,23 @@ import tyro
 from quadrl.benchmark import ALL_CORES, ONE_CORE
 from scripts.reports import (
     describe,
-    discount,
-    examples,
     goals,
-    ground,
     noise,
     paper,
-    peers,
     reference,
     report,
     robust,
     robustness,
-    scaling,
     search,
     speed,
-    step_size,
     task_pages,
     training,
 )
 from scripts.reports.report import table
 
 MODULES = (
-    describe, discount, examples, goals, ground, noise, paper, peers, reference, robust, robustness,
-    scaling, search, speed, step_size, task_pages, training,
+    describe, goals, noise, paper, reference, robust, robustness, search, speed, task_pages,
+    training,
 )  # fmt: skip
 
 

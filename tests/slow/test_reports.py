@@ -11,7 +11,6 @@ import pytest
 
 from quadrl import benchmark
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.environment import Environment
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
 from quadrl.policy import Policy
@@ -19,23 +18,17 @@ from quadrl.randomization import Randomization
 from quadrl.rollout import fly, summarize
 from quadrl.studies.crew import train_here
 from quadrl.studies.plan import PlannedRun
-from quadrl.tasks.hover import Hover
 from scripts.reports import (
     claims,
-    discount,
     evaluation,
-    examples,
     goals,
-    ground,
     noise,
     paper,
-    peers,
     report,
     robust,
     search,
     ship,
     significance,
-    step_size,
     training,
     trial,
     tuning,
@@ -89,14 +82,6 @@ def test_shares_of_the_benchmark_are_within_one_turn():
             ratios = np.array(row["repeats"]) / yardstick["repeats"]
             assert row["share"] == pytest.approx(np.median(ratios))
     assert len(benchmark.rows(measured)) == len(measured["rates"])
-
-
-def test_step_size(monkeypatch):
-    monkeypatch.setattr(step_size, "CONTROL_STEPS", 2)
-    step_size.main((0.05, 0.5))
-    for rows in report.load("step_size")["tables"].values():  # the nearer, the worse
-        slow, fast = (row["errors"]["free_flight"]["position_m"] for row in rows)
-        assert slow < fast < 0.01
 
 
 # ------------------------------------------------------------------------------ others
@@ -176,36 +161,6 @@ def test_goals_are_counted_over_batches_of_flights(monkeypatch, tmp_path):
     assert "| 5 of 5 |" in goals.goals()
 
 
-def test_both_rewards_of_hover_have_the_same_discounted_sum():
-    """The differences give w (phi_0 - gamma^T phi_T) more, whatever is done on the way."""
-    sums, ends = {}, {}
-    for task in (Hover(), discount.HoverIntegral()):
-        environment = Environment(task, num_envs=3, seed=4)
-        environment.reset()
-        ends[task.name] = [environment.snapshot.potentials.distance.copy()]
-        sums[task.name] = np.zeros(3)
-        for t in range(12):
-            given = environment.step(0.1 * np.ones((3, 4)))
-            assert not given.terminated.any()
-            sums[task.name] += discount.OWN**t * given.reward_terms["progress"]
-        ends[task.name].append(environment.snapshot.potentials.distance.copy())
-    first, last = ends["hover"]
-    assert ends["hover_integral"][1] == pytest.approx(last)
-    more = Hover.progress_weight * (first - discount.OWN**12 * last)
-    assert sums["hover"] - sums["hover_integral"] == pytest.approx(more, rel=1e-9)
-
-
-def test_rewards_of_hover_are_compared_over_the_seeds(monkeypatch):
-    monkeypatch.setattr(discount, "SEEDS", (1, 2))
-    monkeypatch.setattr(discount, "DISCOUNTS", (0.9,))
-    monkeypatch.setattr(discount, "BUDGETS", ({"steps": 4096},))
-    discount.main()
-    rows = report.load("discount")["rows"]
-    assert [row["reward"] for row in rows] == ["differences"] * 2 + ["integral"] * 2
-    assert len({row["position_error_m"] for row in rows}) == 4
-    assert discount.discount().count("| 4,096 | 0.01 | 0.9 | 1000, 1000 |") == 2
-
-
 def test_noise_in_training_is_judged_by_pairs(monkeypatch, tmp_path):
     assert noise.chance(np.array([1.0, 2.0, 3.0, 4.0])) == 2 / 16
     assert noise.chance(np.array([1.0, -1.0, 2.0, -2.0])) == 1.0
@@ -221,22 +176,6 @@ def test_noise_in_training_is_judged_by_pairs(monkeypatch, tmp_path):
     assert len(report.load("noise")["success"]) == 4
     assert noise.shares().count("0.0 (0.0 to 0.0)") == 4
     assert noise.verdicts().count("no difference") == 2
-
-
-def test_what_lands_in_ground_effect_is_shown_beside_what_does_not(monkeypatch, tmp_path):
-    short = functools.partial(ground.TrainConfig, steps=4096)
-    monkeypatch.setattr(ground, "TrainConfig", short)
-    monkeypatch.setattr(ground, "SEEDS", (1,))
-    monkeypatch.setattr(ground, "EPISODES", 4)
-    monkeypatch.setattr(report, "RUNS", tmp_path)
-    ground.main()
-    rows = report.load("ground")["rows"]
-    assert [(row["scale"], len(row["reached"])) for row in rows] == [(35, 1)] * 2 + [(90, 1)] * 2
-    monkeypatch.setattr(ground, "EFFECT", "none")
-    shipped, usual = ground.Policy.pretrained("landing"), ground.Vehicle()
-    with_it, without = rows[1]["reached"][0], ground.landed(shipped, usual)
-    assert without["success_rate"] == 1.0 and with_it["success_rate"] == 0.0
-    assert ground.ground().count("\n") > len(rows)
 
 
 def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass(monkeypatch):
@@ -267,28 +206,6 @@ def test_gains_are_kept_for_each_task_and_disturbance(monkeypatch):
     assert controller.vehicle.aerodynamics != Vehicle().aerodynamics
     assert {"uncertain", "all together", "weather severe"} < set(every)
     assert "uncertain" not in tuning.conditions("landing")
-
-
-def test_examples_get_the_same_wall_clock():
-    examples.main((1,), ("cleanrl_ppo", "torchrl_ppo", "sb3_ppo"), steps=4096)
-    ours, *others = report.load("examples")["runs"]
-    assert (ours["example"], ours["steps"]) == ("quadrl train", 4096)
-    assert [run["settings"] for run in others] == ["library", "quadrl"] * 3
-    assert all(run["steps"] > 0 and run["seconds"] >= ours["seconds"] for run in others)
-    assert "[`sb3_ppo`](examples/sb3_ppo.py)" in examples.compared()
-
-
-def test_a_simulator_that_cannot_be_installed_is_reported(monkeypatch, tmp_path):
-    monkeypatch.setattr(peers, "ENVIRONMENTS", tmp_path)
-    without = {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": "", "PIP_CONFIG_FILE": "/dev/null"}
-    monkeypatch.setattr(peers, "ENVIRONMENT", report.ENVIRONMENT | without)
-    peers.main(("rotorpy", "quadrl"), (8,), seconds=0.01, rounds=2)
-    result = report.load("peers")
-    assert set(result["missing"]) == {"rotorpy"} and "\n" not in result["missing"]["rotorpy"]
-    kinds = {(row["what"], row["aircraft"]) for row in result["rows"]}
-    assert kinds == {("one", 1), ("batch", 8), ("physics", 8)}
-    assert all(len(row["rates"]) == 2 for row in result["rows"])
-    assert "Not measured: rotorpy" in peers.compared()
 
 
 # ------------------------------------------------------------------------------ the paper
