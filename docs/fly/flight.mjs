@@ -1,6 +1,6 @@
 // One aircraft in an episode. All that is computed here is quadrl's own C: the kernels of free
 // flight, of the state and of the random numbers, and the functions that
-// scripts/reports/flights.py writes from the tasks and the geometric controller.
+// quadrl/deploy/flights.py writes from the tasks and the geometric controller.
 
 export const SLOTS = 4; // flights that the memory has room for
 
@@ -13,7 +13,7 @@ export function decoded(text) {
 
 // The compiled C, and where the parts of a flight stand in its memory.
 export class Kernel {
-  // bytes: the WebAssembly; book: what scripts/reports/web.py exports.
+  // bytes: the WebAssembly; book: what quadrl/deploy/web.py exports.
   static async load(bytes, book) {
     const { instance } = await WebAssembly.instantiate(bytes, {});
     return new Kernel(instance.exports, book);

@@ -17,7 +17,7 @@ Each takes the memory of one flight, an array of doubles whose parts are named i
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from quadrl.environment import Environment
 from quadrl.observer import felt, moving
 from quadrl.reading import Reading
 from quadrl.rng import Rng
-from quadrl.snapshot import Potentials, Snapshot
+from quadrl.snapshot import Snapshot
 from quadrl.state import FIRST, State
 from quadrl.task import total
 from quadrl.transition import Clock, Episode, begin, finish
@@ -68,19 +68,66 @@ PARTS = {
 """Numbers in each part of a flight's memory."""
 LAYOUT = dict(zip(PARTS, np.cumsum([0, *PARTS.values()]).tolist(), strict=False))
 """Where each part begins."""
+SIZE = sum(PARTS.values())
+FUNCTION = """void {name}(double* m) {{
+    static const double c[] = {{{constants}}};
+    (void)c;
+    {body}
+}}
+"""
 
 
-class Draws(Rng):
+class _Memory:
+    """The memory of one flight, as symbols of a trace."""
+
+    def __init__(self, environment: Environment) -> None:
+        """Begin a trace."""
+        self.trace = Trace()
+        self._rotors = environment.vehicle.rotor_count
+        self._timestep = environment.vehicle.control_timestep
+
+    def read(self, part: str, numbers: Array | int, place: str = "m[{}]") -> Array:
+        """Symbols of the numbers of a part, by their places in it; a count reads (1, count)."""
+        numbers = np.arange(numbers)[None] if isinstance(numbers, int) else numbers
+        text = np.frompyfunc(lambda number: place.format(int(number) + LAYOUT[part]), 1, 1)
+        return self.trace.inputs(text(numbers))
+
+    def parameters(self) -> Parameters:
+        """The aircraft's row; each number says where it stands."""
+        places = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
+        own = Parameters.of(places, self._timestep, self._rotors)
+        return own.map(lambda numbers: self.read("parameters", numbers))
+
+    def state(self) -> State:
+        """The state that native/state.c fills."""
+        places = State.of_table(np.arange(FIRST["rotor_speed"] + self._rotors)[:, None])
+        return records.mapped(lambda numbers: self.read("state", numbers), places)
+
+    def kept(self, *like: Any) -> list[Any]:
+        """Records of the same shapes as those before, read from `kept` one after the other."""
+        first = 0
+
+        def place(array: Array) -> Array:
+            nonlocal first
+            numbers = first + np.arange(array.size).reshape(1, *array.shape[1:])
+            first += array.size
+            return self.read("kept", numbers)
+
+        found = [records.mapped(place, record) for record in like]
+        return [*found, self.read("kept", np.array([first]))]
+
+
+class _Draws(Rng):
     """Random numbers that are symbols."""
 
-    def __init__(self, trace: Trace) -> None:
+    def __init__(self, memory: _Memory) -> None:
         """Begin with the first number."""
-        self.used, self._trace = 0, trace
+        self.used, self._memory = 0, memory
 
     def uniform(self, low: float, high: float, size: int | None = None) -> Array:
         """Numbers in [low, high): (1,), or (1, size)."""
         count = 1 if size is None else size
-        drawn = read(self._trace, "drawn")(np.arange(self.used, self.used + count)[None])
+        drawn = self._memory.read("drawn", np.arange(self.used, self.used + count)[None])
         self.used += count
         return low + (high - low) * (drawn[..., 0] if size is None else drawn)
 
@@ -96,155 +143,94 @@ class Written:
 
 
 def write(environment: Environment) -> Written:
-    """The functions for the task and the aircraft of an environment."""
-    task, vehicle = environment.task, environment.vehicle
-    timestep = vehicle.control_timestep
+    """Trace the functions for the task and the aircraft of an environment."""
+    task, vehicle, origin = environment.task, environment.vehicle, environment.origin
+    timestep, rotors = vehicle.control_timestep, vehicle.rotor_count
     settle = max(1, round(task.settle_time / timestep))
     clock = Clock(timestep, environment.time_limit_steps, settle)
-    rotors, origin = vehicle.rotor_count, environment.origin
-    prefix = f"{task.name}_{vehicle.name}"
-    bodies: dict[str, tuple[Trace, dict[str, Any]]] = {}
+    functions: list[str] = []
 
-    trace = Trace()
-    draws = Draws(trace)
-    start, task_state = task.begin(draws, _parameters(trace, timestep, rotors))
+    def emit(name: str, memory: _Memory, **parts: Any) -> None:
+        outputs = {
+            f"m[{LAYOUT[part] + k}]": value
+            for part, values in parts.items()
+            for k, value in enumerate(_fitting(part, values))
+        }
+        body, name = memory.trace.body(outputs), f"{task.name}_{vehicle.name}_{name}"
+        # Writing the body may add constants.
+        constants = ", ".join(repr(float(number)) for number in (*memory.trace.constants, 0.0))
+        functions.append(FUNCTION.format(name=name, constants=constants, body=body))
+
+    def given(now: Snapshot, episode: Episode, *done: Array) -> dict[str, Any]:
+        """Where everything goes that a first observation or a step gives."""
+        goal = task.goal(now) + origin
+        reward, *flags = [part[0] for part in done] if done else [0.0] * 4
+        return {
+            "kept": [*_row(now.task), *_row(now.potentials), *_row(episode), *_flat(now.time)],
+            "observation": [x for term in task.observe(now).values() for x in _flat(term)],
+            "given": [*_flat(task.error(now)), reward, *_flat(goal), *flags],
+        }
+
+    memory = _Memory(environment)
+    draws = _Draws(memory)
+    start, task_state = task.begin(draws, memory.parameters())
     placed = np.concatenate([start.position + origin, start.quaternion], axis=-1)
     motion = np.concatenate([start.velocity, start.body_rate], axis=-1)
     places = {"qpos": placed, "qvel": motion, "act": start.rotor_speed}
-    bodies["begin"] = trace, _stores(places) | _stores({"kept": _row(task_state)})
+    emit("begin", memory, **places, kept=_row(task_state))
 
-    trace = Trace()
-    parameters, state = _parameters(trace, timestep, rotors), _state(trace, rotors)
-    remembered = _kept(trace, task_state)[0]
+    memory = _Memory(environment)
+    parameters, state = memory.parameters(), memory.state()
+    remembered, _ = memory.kept(task_state)
     now, episode = begin(task, state, remembered, parameters, environment.action_size)
-    bodies["first"] = trace, _outputs(environment, now, episode)
+    emit("first", memory, **given(now, episode))
 
-    trace = Trace()
-    parameters, state = _parameters(trace, timestep, rotors), _state(trace, rotors)
-    remembered, measured, episode, time = _kept(trace, task_state)
+    memory = _Memory(environment)
+    parameters, state = memory.parameters(), memory.state()
+    remembered, measured, episode, time = memory.kept(task_state, now.potentials, episode)
     before = Snapshot(None, remembered, parameters, None, None, time, measured)  # type: ignore[arg-type]
-    action, command = (read(trace, name)(np.arange(rotors)[None]) for name in ("action", "ctrl"))
-    diverged = trace.inputs(np.array([f"m[{LAYOUT['diverged']}] != 0"], object), is_flag=True)
+    action, command = memory.read("action", rotors), memory.read("ctrl", rotors)
+    flag = np.array([f"m[{LAYOUT['diverged']}] != 0"], object)
+    diverged = memory.trace.inputs(flag, is_flag=True)
     now, episode, done = finish(task, clock, episode, before, state, action, command, diverged)
-    flags = done.terminated, done.truncated, done.is_success
-    bodies["step"] = trace, _outputs(environment, now, episode, total(done.reward_terms), *flags)
+    ends = done.terminated, done.truncated, done.is_success
+    emit("step", memory, **given(now, episode, total(done.reward_terms), *ends))
 
-    trace = Trace()
-    action, scale = (read(trace, name) for name in ("action", "scale"))
-    given = action(np.arange(rotors)[None]), vehicle.hover_speed, scale(np.zeros((1, 1)))
-    command = commanded(*given, vehicle.max_speed)
-    bodies["command"] = trace, _stores({"ctrl": command})
+    memory = _Memory(environment)
+    action, scale = memory.read("action", rotors), memory.read("scale", 1)
+    emit("command", memory, ctrl=commanded(action, vehicle.hover_speed, scale, vehicle.max_speed))
 
-    trace = Trace()
+    memory = _Memory(environment)
     # As `Environment.flatten` gives it.
-    place = f"(double)(float)m[{{}} + {LAYOUT['observation']}]"
-    observation = _read(trace, place)(np.arange(environment.size)[None])
+    observation = memory.read("observation", environment.size, "(double)(float)m[{}]")
     controller = GeometricController(vehicle, task)
     reading = Reading.of(observation, task.observation, vehicle)
-    bodies["geometric"] = (
-        trace,
-        _stores({"action": controller.action(reading, *task.guide(reading))}),
-    )
+    emit("geometric", memory, action=controller.action(reading, *task.guide(reading)))
 
     for name in ("rest", "feel"):
-        trace = Trace()
-        state, numbers = _state(trace, rotors), np.arange(6)[None]
-        now = moving(_parameters(trace, timestep, rotors), state)
+        memory = _Memory(environment)
+        state = memory.state()
+        motion = moving(memory.parameters(), state)
         disturbance = np.zeros((1, 3))
         if name == "feel":
-            last, before = read(trace, "moving")(numbers), read(trace, "disturbance")
-            disturbance = felt(before(numbers[:, :3]), last, now, timestep)
+            last = memory.read("moving", 6)
+            disturbance = felt(memory.read("disturbance", 3), last, motion, timestep)
         seen = to_body(state.rotation, disturbance)
-        outputs = {"moving": now, "disturbance": disturbance, "felt": seen}
-        bodies[name] = trace, _stores(outputs)
-
-    functions = (function(f"{prefix}_{name}", *body) for name, body in bodies.items())
+        emit(name, memory, moving=motion, disturbance=disturbance, felt=seen)
     return Written("\n".join(functions), draws.used)
 
 
-def function(name: str, trace: Trace, outputs: Mapping[str, Any]) -> str:
-    """The C function that computes some outputs."""
-    body = trace.body(outputs)
-    constants = ", ".join(repr(float(number)) for number in (*trace.constants, 0.0))
-    return (
-        f"void {name}(double* m) {{\n"
-        f"    static const double c[] = {{{constants}}};\n"
-        f"    (void)c;\n    {body}\n}}\n"
-    )
-
-
-def read(trace: Trace, part: str) -> Callable[[Array], Array]:
-    """The symbols of the numbers of a part, by their places in it."""
-    return _read(trace, f"m[{{}} + {LAYOUT[part]}]")
-
-
-def _read(trace: Trace, place: str) -> Callable[[Array], Array]:
-    text = np.frompyfunc(lambda number: place.format(int(number)), 1, 1)
-    return lambda numbers: trace.inputs(text(numbers))
-
-
-def _parameters(trace: Trace, timestep: float, rotors: int) -> Parameters:
-    """Of the aircraft's row, each number saying where it stands."""
-    places = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
-    return Parameters.of(places, timestep, rotors).map(read(trace, "parameters"))
-
-
-def _state(trace: Trace, rotors: int) -> State:
-    places = np.arange(FIRST["rotor_speed"] + rotors)[:, None]
-    return records.mapped(read(trace, "state"), State.of_table(places))
-
-
-def _kept(trace: Trace, task_state: Any) -> tuple[Any, Potentials, Episode, Array]:
-    """What the task remembers, the distances and the episode of the step before, and its time."""
-    symbols, first, parts = read(trace, "kept"), 0, []
-    shapes = {name: getattr(task_state, name).shape[1:] for name in _names(type(task_state))}
-    for kind, sizes in (
-        (type(task_state), shapes),
-        (Potentials, {"to_goal": (3,)}),
-        (Episode, {}),
-    ):
-        values = {}
-        for name in _names(kind):
-            shape = sizes.get(name, ())
-            size = int(np.prod(shape))
-            values[name] = symbols(np.arange(first, first + size).reshape(1, *shape))
-            first += size
-        parts.append(kind(**values))
-    return (*parts, symbols(np.array([first])))
-
-
-def _outputs(
-    environment: Environment, now: Snapshot, episode: Episode, *done: Array
-) -> dict[str, Any]:
-    """Where everything goes that a first observation or a step gives."""
-    kept = [*_row(now.task), *_row(now.potentials), *_row(episode), *_flat(now.time)]
-    error = environment.task.error(now)
-    observation = [x for term in environment.task.observe(now).values() for x in _flat(term)]
-    zeros = [0.0] * 4
-    reward, *flags = [part[0] for part in done] if done else zeros
-    goal = _flat(environment.task.goal(now) + environment.origin)
-    given = [*_flat(error), reward, *goal, *flags]
-    return _stores({"kept": kept, "observation": observation, "given": given})
-
-
-def _stores(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """The C expressions that name where the numbers of parts go."""
-    found = {}
-    for part, values in parts.items():
-        values = _flat(values)
-        assert len(values) <= PARTS[part], part
-        found |= {f"m[{LAYOUT[part] + k}]": value for k, value in enumerate(values)}
-    return found
+def _fitting(part: str, values: Array | Iterable[Any]) -> list[Any]:
+    """The numbers of a part, of which there is room for."""
+    numbers = _flat(values)
+    assert len(numbers) <= PARTS[part], part
+    return numbers
 
 
 def _row(record: Any) -> list[Any]:
     """The numbers of a record's arrays, one after the other."""
-    return [x for name in _names(type(record)) for x in _flat(getattr(record, name))]
+    return [x for field in dataclasses.fields(record) for x in _flat(getattr(record, field.name))]
 
 
 def _flat(values: Array | Iterable[Any]) -> list[Any]:
     return list(np.asarray(values, dtype=object).ravel())
-
-
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(kind))

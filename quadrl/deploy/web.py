@@ -1,8 +1,8 @@
 """The page docs/fly, whole in one file: quadrl's C as WebAssembly, policies, aircraft, three.js.
 
 `scripts/web` runs it, with emcc on the path. It exports what the page's JavaScript has to know
-(the book), compiles quadrl's kernels and the C of `scripts.reports.flights`, and puts everything
-into one index.html, which needs no server and asks no other host for anything.
+(the book), compiles quadrl's kernels and the C of `quadrl.deploy.flights`, and puts everything into
+one index.html, which needs no server and asks no other host for anything.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from quadrl import mjcf, native
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
+from quadrl.deploy import flights
 from quadrl.engines.free_flight import world
 from quadrl.environment import Environment
 from quadrl.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
 from quadrl.rng import START
 from quadrl.state import c_rows
 from quadrl.tasks import TASKS
-from scripts.reports import flights
-from scripts.reports.report import DOCS, REPOSITORY, say
 
 GUST_TIME = 1.0  # [s], correlation time of the page's gusts
-SOURCE, BUILD = DOCS / "fly", REPOSITORY / "build" / "web"
+REPOSITORY = Path(__file__).resolve().parents[2]
+SOURCE, BUILD = REPOSITORY / "docs" / "fly", REPOSITORY / "build" / "web"
 SITE = REPOSITORY / "build" / "site" / "fly"
 THREE = "nicegui/elements/lib/three/three.module.js"
 """Where the wheel that `scripts/web` downloads holds three.js."""
@@ -46,19 +47,11 @@ KERNELS = {
 """Of quadrl/native, with what they export."""
 MODULES = ("flight", "policy", "episode", "link", "scene", "plot", "main")
 """Of docs/fly, each after those that it imports."""
-HEAD = """// Written by scripts/reports/flights.py.
+MEMORY = """// Written by quadrl/deploy/flights.py.
 #include <math.h>
 static double memory[{slots}][{size}];
 double* flight_memory(int slot) {{ return memory[slot]; }}
 """
-KINDS = {
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
-    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
-}
 
 
 def main() -> None:
@@ -66,21 +59,21 @@ def main() -> None:
     BUILD.mkdir(parents=True, exist_ok=True)
     book, source = make_book()
     wasm = compile_flights(source)
-    book["wasm"] = encoded(wasm)
+    book["wasm"] = _encoded(wasm)
     (BUILD / "book.json").write_text(json.dumps(book))
     page = join(book)
     SITE.mkdir(parents=True, exist_ok=True)
     (SITE / "index.html").write_text(page)
-    say(f"{SITE / 'index.html'}: {len(page) / 1e6:.2f} MB, WebAssembly {len(wasm) / 1e3:.0f} kB")
+    size = f"{len(page) / 1e6:.2f} MB, WebAssembly {len(wasm) / 1e3:.0f} kB"
+    print(f"{SITE / 'index.html'}: {size}", file=sys.stderr)
 
 
 def make_book() -> tuple[dict[str, Any], str]:
     """What the JavaScript has to know, as JSON can hold it, and the C of the flights."""
-    slots = int(found(r"export const SLOTS = (\d+)", (SOURCE / "flight.mjs").read_text()))
-    size = sum(flights.PARTS.values())
+    (slots,) = re.findall(r"export const SLOTS = (\d+)", (SOURCE / "flight.mjs").read_text())
     # Those that leave the air's laws alone: contact is MuJoCo's.
     tasks = {name: kind() for name, kind in TASKS.items() if not kind.contact}
-    pairs, sources = {}, [HEAD.format(slots=slots, size=size)]
+    pairs, sources = {}, [MEMORY.format(slots=slots, size=flights.SIZE)]
     for task in tasks.values():
         for vehicle in VEHICLES.values():
             environment = Environment(task, vehicle=vehicle, seed=0)
@@ -95,7 +88,7 @@ def make_book() -> tuple[dict[str, Any], str]:
             }
     book = {
         "layout": {name: [flights.LAYOUT[name], size] for name, size in flights.PARTS.items()},
-        "flightSize": size,
+        "flightSize": flights.SIZE,
         "startStream": START,
         "gustTime": GUST_TIME,
         "policy": {"formats": [FORMAT, UNSEALED], "header": HEADER, "clip": CLIP},
@@ -109,7 +102,7 @@ def make_book() -> tuple[dict[str, Any], str]:
         "vehicles": {name: describe(vehicle) for name, vehicle in VEHICLES.items()},
         "pairs": pairs,
         "policies": {
-            file.stem: {"task": policy.task, "file": encoded(file.read_bytes())}
+            file.stem: {"task": policy.task, "file": _encoded(file.read_bytes())}
             for file in shipped()
             if (policy := Policy.load(file)).task in tasks
         },
@@ -146,36 +139,32 @@ def shapes(model: mujoco.MjModel) -> dict[str, Any]:
     """What MuJoCo would draw of the aircraft: shapes in the body frame, and their meshes."""
     geoms, meshes = [], {}
     for k in np.flatnonzero(model.geom_bodyid == 1):
-        material, kind = model.geom_matid[k], KINDS[mujoco.mjtGeom(model.geom_type[k])]
-        name = model.geom(k).name
+        material, name = model.geom_matid[k], model.geom(k).name
+        kind = mujoco.mjtGeom(model.geom_type[k]).name.removeprefix("mjGEOM_").lower()
         # What only touches is not drawn, and the page has rims of its own.
         if model.geom_group[k] == 3 or name.endswith("_rim"):
             continue
         shape: dict[str, Any] = {
             "name": name,
             "kind": kind,
-            "size": rounded(model.geom_size[k]),
-            "position": rounded(model.geom_pos[k]),
-            "quaternion": rounded(model.geom_quat[k]),
-            "rgba": rounded(model.geom_rgba[k] if material < 0 else model.mat_rgba[material]),
+            "size": _rounded(model.geom_size[k]),
+            "position": _rounded(model.geom_pos[k]),
+            "quaternion": _rounded(model.geom_quat[k]),
+            "rgba": _rounded(model.geom_rgba[k] if material < 0 else model.mat_rgba[material]),
         }
         if material >= 0:
             shape["shine"] = float(model.mat_shininess[material])
             shape["glow"] = float(model.mat_emission[material])
         if kind == "mesh":
-            number = model.geom_dataid[k]
-            shape["mesh"] = name = model.mesh(number).name
-            vertex, face = (
-                slice(first, first + count)
-                for first, count in (
-                    (model.mesh_vertadr[number], model.mesh_vertnum[number]),
-                    (model.mesh_faceadr[number], model.mesh_facenum[number]),
-                )
-            )
-            meshes[name] = {
-                "vertices": encoded(model.mesh_vert[vertex].astype("<f4").tobytes()),
-                "faces": encoded(model.mesh_face[face].astype("<u2").tobytes()),
-            }
+            mesh = model.mesh(model.geom_dataid[k])
+            shape["mesh"] = mesh.name
+            parts = []
+            for table, kept, first, count in (
+                (model.mesh_vert, "<f4", mesh.vertadr[0], mesh.vertnum[0]),
+                (model.mesh_face, "<u2", mesh.faceadr[0], mesh.facenum[0]),
+            ):
+                parts.append(_encoded(table[first : first + count].astype(kept).tobytes()))
+            meshes[mesh.name] = dict(zip(("vertices", "faces"), parts, strict=True))
         geoms.append(shape)
     return {"shapes": geoms, "meshes": meshes}
 
@@ -201,53 +190,43 @@ def compile_flights(source: str) -> bytes:
 
 
 def join(book: dict[str, Any]) -> str:
-    """The whole page in one text."""
+    """The whole page in one text.
+
+    Raises:
+        QuadrlError: The page has no place, or several, for one of its parts.
+    """
     code = []
     for name in MODULES:
         text = (SOURCE / f"{name}.mjs").read_text()
         text = re.sub(r'^import .* from "\./.*";\n', "", text, flags=re.M)
         code.append(re.sub(r"^export ", "", text, flags=re.M))
-    script = "\n".join(code)
-    imports = {"three": "data:text/javascript;base64," + encoded(three().encode())}
+    (wheel,) = (BUILD / "wheels").glob("nicegui-*.whl")
+    with zipfile.ZipFile(wheel) as opened:
+        three = "data:text/javascript;base64," + _encoded(opened.read(THREE))
     parts = {
         "style": (SOURCE / "style.css").read_text(),
-        "imports": json.dumps({"imports": imports}),
+        "imports": json.dumps({"imports": {"three": three}}),
         # "</script" inside of a text would end the element.
         "book": json.dumps(book).replace("</", "<\\/"),
-        "script": script,
+        "script": "\n".join(code),
     }
     page = (SOURCE / "index.html").read_text()
     for name, text in parts.items():
         mark = f"/*{name}*/"
         if page.count(mark) != 1:
-            sys.exit(f"docs/fly/index.html must hold {mark} once")
+            raise QuadrlError(f"docs/fly/index.html must hold {mark} once")
         page = page.replace(mark, text)
     return page
 
 
-def three() -> str:
-    """three.js, from the newest wheel in build/web/wheels."""
-    (wheel,) = (BUILD / "wheels").glob("nicegui-*.whl")
-    with zipfile.ZipFile(wheel) as opened:
-        return opened.read(THREE).decode()
-
-
-def encoded(content: bytes) -> str:
+def _encoded(content: bytes) -> str:
     """Base64."""
     return base64.b64encode(content).decode()
 
 
-def rounded(values: np.ndarray) -> list[float]:
+def _rounded(values: np.ndarray) -> list[float]:
     """Numbers that are only drawn, with six digits."""
     return [float(f"{value:.6g}") for value in values]
-
-
-def found(pattern: str, text: str) -> str:
-    """The first group of a pattern that must be there."""
-    match = re.search(pattern, text)
-    if not match:
-        sys.exit(f"there is no {pattern}")
-    return match[1]
 
 
 if __name__ == "__main__":

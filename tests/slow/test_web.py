@@ -9,7 +9,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import time
 
 import chromium
@@ -19,9 +18,9 @@ import pytest
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.control.geometric import GeometricController
+from quadrl.deploy import web
 from quadrl.environment import Environment
 from quadrl.policy import SHIPPED, Policy
-from scripts.reports import report, web
 
 FLOWN = [name for name, task in tasks.TASKS.items() if not task.contact]
 PAIRS = [(task, vehicle) for task in FLOWN for vehicle in VEHICLES]
@@ -33,31 +32,25 @@ TRAINED = "hover_ppo"
 def need(*commands):
     """Skip without these commands, or fail where they are required."""
     missing = [command for command in commands if not shutil.which(command)]
+    if "emcc" in commands and not any((web.BUILD / "wheels").glob("*.whl")):
+        missing.append("the wheel that holds three.js")
     if missing:
-        lacking(f"{', '.join(missing)} is not installed")
-
-
-def lacking(what):
-    reason = f"{what}: run scripts/web"
-    pytest.fail(reason) if os.environ.get("QUADRL_REQUIRE_WEB") == "1" else pytest.skip(reason)
+        reason = f"not here: {', '.join(missing)}; run scripts/web"
+        pytest.fail(reason) if os.environ.get("QUADRL_REQUIRE_WEB") == "1" else pytest.skip(reason)
 
 
 @pytest.fixture(scope="module")
 def page():
     """The page, built."""
     need("emcc", "node")
-    if not any((web.BUILD / "wheels").glob("*.whl")):
-        lacking("the wheel that holds three.js is not in build/web")
-    command = [sys.executable, "-m", "scripts.reports.web"]
-    result = subprocess.run(command, capture_output=True, text=True, env=report.ENVIRONMENT)
-    assert result.returncode == 0, result.stderr
+    web.main()
     return web.SITE / "index.html"
 
 
 @pytest.fixture(scope="module")
 def node(page):
     """Run jobs of tests/fly.mjs."""
-    command = ["node", report.REPOSITORY / "tests/fly.mjs", web.BUILD / "book.json"]
+    command = ["node", web.REPOSITORY / "tests/fly.mjs", web.BUILD / "book.json"]
 
     def run(*jobs):
         text = json.dumps(jobs)
@@ -132,49 +125,43 @@ def test_policies_act_as_in_python(node):
         np.testing.assert_allclose(found, action, rtol=0, atol=1e-5)
 
 
-def fly(task, vehicle, controller, steps, events=(), seed=3, **settings):
+def fly(task, vehicle, controller, events=(), steps=200, **settings):
     """The flight in Python: what each control step saw, did and gave."""
-    environment, observation = begun(task, vehicle, seed, **settings)
-    task_size = sum(term.width(environment.vehicle.rotor_count)
-                    for term in environment.task.observation.values())  # fmt: skip
+    environment, observation = begun(task, vehicle, 3, **settings)
+    rotors = environment.vehicle.rotor_count
+    size = sum(term.width(rotors) for term in environment.task.observation.values())
     engine, flown = environment.engine, []
     for step in range(steps):
-        seen, action = observation[0, :task_size], np.asarray(controller(observation))
-        for event in events:
-            if event["step"] == step and event["kind"] == "push":
+        seen, action = observation[0, :size], np.asarray(controller(observation))
+        for event in (event for event in events if event["step"] == step):
+            if event["kind"] == "push":
                 engine.qvel[0] += event["values"]
-            elif event["step"] == step:
+            else:
                 engine.wind[0] = event["values"][:3]
         now = environment.step(action)
         observation = environment.flatten(now.observation)
-        flown.append(
-            {
-                "observation": seen,
-                "action": action[0],
-                "coordinates": coordinates(environment),
-                "error": now.error[0],
-                "reward": now.reward[0],
-                **{name: bool(getattr(now, name)[0]) for name in ("terminated", "truncated")},
-                "succeeded": bool(now.is_success[0]),
-                "goal": environment.goals()[0],
-            }
-        )
+        kept = {name: bool(getattr(now, name)[0]) for name in ("terminated", "truncated")}
+        kept |= {"observation": seen, "action": action[0], "goal": environment.goals()[0]}
+        kept |= {"coordinates": coordinates(environment), "succeeded": bool(now.is_success[0])}
+        flown.append(kept | {"error": now.error[0], "reward": now.reward[0]})
         if now.terminated[0]:
             break
     return flown
 
 
-def worst(found, expected):
-    """Largest difference of each quantity of two flights of the same length."""
-    assert len(found) == len(expected)
-    names = expected[0].keys()
-    return {
-        name: max(
-            float(np.abs(np.subtract(a[name], b[name], dtype=float)).max())
-            for a, b in zip(found, expected, strict=True)
-        )
-        for name in names
-    }
+def compared(node, expected, task, vehicle, controller, events=(), **place):
+    """A flight in JavaScript: its last step, and the largest difference of each quantity."""
+    settings = {"task": task, "aircraft": vehicle, "seed": 3}
+    job = dict(job="fly", settings=settings, controller=controller, steps=200, events=events)
+    (found,) = node(job | place)
+    flown = found["flown"]
+    assert len(flown) == len(expected) and found["outcome"] == ""
+
+    def difference(name):
+        pairs = zip(flown, expected, strict=True)
+        return max(np.abs(np.subtract(a[name], b[name], dtype=float)).max() for a, b in pairs)
+
+    return flown[-1], {name: difference(name) for name in expected[0]}
 
 
 PUSHES = [
@@ -184,44 +171,27 @@ PUSHES = [
 
 
 @pytest.mark.parametrize("events", ([], PUSHES), ids=("calm", "pushed"))
-def test_a_flight_of_the_hover_policy_is_pythons(node, events):
-    policy = Policy.pretrained("hover")
-    expected = fly("hover", "paper", policy, 200, events)
-    settings = {"task": "hover", "aircraft": "paper", "seed": 3}
-    job = dict(job="fly", settings=settings, controller=TRAINED, steps=200, events=events)
-    ((found, outcome),) = ((each["flown"], each["outcome"]) for each in node(job))
-    differences = worst(found, expected)
-    assert outcome == "" and expected[-1]["truncated"] and expected[-1]["succeeded"]
+@pytest.mark.parametrize("name", [TRAINED, "hover_robust", "target_following_robust"])
+def test_a_flight_of_a_policy_is_pythons(node, name, events):
+    policy = Policy.load(SHIPPED / f"{name}.safetensors")
+    needed = {"observe": policy.conditions["observe"]} if name != TRAINED else {}
+    expected = fly(policy.task, policy.make_vehicle(), policy, events, **needed)
+    last, differences = compared(node, expected, policy.task, "paper", name, events)
+    assert last["error"] < 0.1 and differences["succeeded"] == differences["truncated"] == 0
+    assert last["truncated"] == last["succeeded"] == (policy.task == "hover")
     # The action is rounded to float32 and its sums to another order: what follows is stable.
-    for name, bound in {"observation": 1e-5, "action": 1e-5, "coordinates": 1e-4}.items():
-        assert differences[name] < bound
-    assert differences["error"] < 1e-6 and differences["reward"] < 1e-3
-
-
-@pytest.mark.parametrize("events", ([], PUSHES), ids=("calm", "pushed"))
-@pytest.mark.parametrize("name", ["hover_robust", "target_following_robust"])
-def test_a_flight_of_a_robust_policy_is_pythons(node, name, events):
-    policy = Policy.pretrained(name)
-    needed = {"vehicle": policy.make_vehicle(), "observe": policy.conditions["observe"]}
-    expected = fly(policy.task, controller=policy, steps=200, events=events, **needed)
-    settings = {"task": policy.task, "aircraft": "paper", "seed": 3}
-    job = dict(job="fly", settings=settings, controller=name, steps=200, events=events)
-    ((found, outcome),) = ((each["flown"], each["outcome"]) for each in node(job))
-    differences = worst(found, expected)
-    assert outcome == "" and found[-1]["error"] < 0.1
-    assert differences["succeeded"] == 0 and found[-1]["succeeded"] == (name == "hover_robust")
     assert differences["action"] < 1e-5 and differences["coordinates"] < 1e-4
+    if name == TRAINED:
+        assert differences["observation"] < 1e-5
+        assert differences["error"] < 1e-6 and differences["reward"] < 1e-3
 
 
 @pytest.mark.parametrize("task, vehicle", PAIRS)
 def test_a_flight_of_the_geometric_controller_is_pythons(node, task, vehicle):
     controller = GeometricController(VEHICLES[vehicle], tasks.make(task))
-    expected = fly(task, vehicle, controller, 200)
-    settings = {"task": task, "aircraft": vehicle, "seed": 3}
+    expected = fly(task, vehicle, controller)
     start = coordinates(begun(task, vehicle, 3)[0]).tolist()
-    job = dict(job="fly", settings=settings, controller=None, steps=200, events=[], start=start)
-    (found,) = node(job)
-    differences = worst(found["flown"], expected)
+    _, differences = compared(node, expected, task, vehicle, None, start=start)
     # Where the goal comes from sines, a last bit can round an observation to another float32.
     bound = 0 if task in ("hover", "static_waypoint") else 1e-6
     assert max(differences.values()) <= bound, differences
@@ -230,16 +200,8 @@ def test_a_flight_of_the_geometric_controller_is_pythons(node, task, vehicle):
 def test_gusts_have_the_deviation_that_is_asked_for(node):
     settings = {"task": "hover", "aircraft": "paper", "seed": 1}
     events = [{"step": 0, "kind": "wind", "values": [1.0, 0.0, 0.0, 0.3]}]
-    jobs = [
-        dict(
-            job="fly",
-            settings=settings | {"seed": seed},
-            controller=TRAINED,
-            steps=200,
-            events=events,
-        )
-        for seed in range(30)
-    ]
+    job = dict(job="fly", controller=TRAINED, steps=200, events=events)
+    jobs = [job | {"settings": settings | {"seed": seed}} for seed in range(30)]
     wind = np.array([[step["wind"] for step in each["flown"]] for each in node(*jobs)])
     # 30 flights of 10 s with a correlation time of 1 s are about 150 numbers: 3 deviations.
     np.testing.assert_allclose(wind.mean(axis=(0, 1)), [1, 0, 0], atol=0.08)
@@ -312,10 +274,8 @@ def test_the_page_flies_and_is_pushed(browse):
         shown.wait("/at=[1-9]\\d+&events=push@\\d+:/.test(location.hash)")
         time.sleep(1)
         assert shown.value(TIME) - paused < 0.3  # a figure behind at most
-        errors, link = (
-            [shown.value(metres(s)) for s in ("left", "right")],
-            shown.value("location.hash"),
-        )
+        errors = [shown.value(metres(side)) for side in ("left", "right")]
+        link = shown.value("location.hash")
         assert shown.value(STAYS) and not shown.complaints
     with browse(link) as again:  # another page shows the same moment
         again.wait(f"{TIME} > 0")
@@ -361,7 +321,5 @@ def test_the_page_asks_no_other_host(page):
     assert "default-src 'none'" in document
     # Names of formats and licences stand in three.js; nothing is loaded from anywhere.
     assert not re.search(r"<(script|link|img|iframe)[^>]+(src|href)=.https?:", document)
-    own = list(web.SOURCE.iterdir())
-    assert not any(
-        re.search(r"https?://|fetch\(|XMLHttpRequest|WebSocket", f.read_text()) for f in own
-    )
+    own = "".join(file.read_text() for file in web.SOURCE.iterdir())
+    assert not re.search(r"https?://|fetch\(|XMLHttpRequest|WebSocket", own)

@@ -1,4 +1,4 @@
-"""The C that scripts/reports/flights.py writes for the page docs/fly, compiled for this machine."""
+"""The C that quadrl/deploy/flights.py writes for the page docs/fly, compiled for this machine."""
 
 import ctypes
 
@@ -11,7 +11,7 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.control.geometric import GeometricController
 from quadrl.environment import Environment
 from quadrl.rng import START, uniform
-from scripts.reports import flights
+from quadrl.deploy import flights
 
 
 class Memory:

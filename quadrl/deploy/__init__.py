@@ -1,0 +1,1 @@
+"""What carries a policy elsewhere: the page that flies in the browser."""
