@@ -9,9 +9,9 @@ from quadrl import native, tasks
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.control.geometric import GeometricController
+from quadrl.deploy import flights
 from quadrl.environment import Environment
 from quadrl.rng import START, uniform
-from quadrl.deploy import flights
 
 
 class Memory:
