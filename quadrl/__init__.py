@@ -19,22 +19,22 @@ from typing import TYPE_CHECKING, Any
 from quadrl import envs, tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.observing import Observing
-from quadrl.policy import Policy
-from quadrl.randomization import RANDOMIZATIONS, Randomization
-from quadrl.shield import shield_triton
-from quadrl.task import Task
+from quadrl.base.shield import shield_triton
+from quadrl.conditions.observing import Observing
+from quadrl.conditions.randomization import RANDOMIZATIONS, Randomization
+from quadrl.core.task import Task
+from quadrl.evaluation.policy import Policy
 
 if TYPE_CHECKING:
     from dm_control.rl.control import Environment as ControlEnvironment
 
     from quadrl import rendering, suite, testing
-    from quadrl.checked import check
-    from quadrl.disturbed import robustness
-    from quadrl.evaluation import evaluate
+    from quadrl.evaluation.checked import check
+    from quadrl.evaluation.evaluate import evaluate
+    from quadrl.evaluation.robustness import robustness
     from quadrl.learning.run import train
-    from quadrl.show import plot, render
-    from quadrl.studies import study
+    from quadrl.learning.show import plot, render
+    from quadrl.learning.studies import study
 
 __version__ = "0.1.0"
 __all__ = [
@@ -44,12 +44,12 @@ __all__ = [
 ]  # fmt: skip
 LAZY = {
     "train": "quadrl.learning.run",
-    "evaluate": "quadrl.evaluation",
-    "render": "quadrl.show",
-    "plot": "quadrl.show",
-    "robustness": "quadrl.disturbed",
-    "study": "quadrl.studies",
-    "check": "quadrl.checked",
+    "evaluate": "quadrl.evaluation.evaluate",
+    "render": "quadrl.learning.show",
+    "plot": "quadrl.learning.show",
+    "robustness": "quadrl.evaluation.robustness",
+    "study": "quadrl.learning.studies",
+    "check": "quadrl.evaluation.checked",
 }
 """Functions that are imported on first use, and their modules."""
 
@@ -58,6 +58,15 @@ MOVED = {
     "rotation": "base.rotation",
     "vehicle": "aircraft.presets",
     "aerodynamics": "aircraft.presets",
+    "native": "engines.native",
+    "weather": "conditions.weather",
+    "randomization": "conditions.randomization",
+    "task": "core.task",
+    "contact": "core.contact",
+    "markers": "core.markers",
+    "environment": "core.environment",
+    "policy": "evaluation.policy",
+    "rollout": "evaluation.rollout",
 }
 """Modules that have moved, by the names under which users' files import them, until 0.2."""
 for _old, _new in MOVED.items():

@@ -1,12 +1,8 @@
-"""The catalogue of tasks."""
+"""The tasks that come with quadrl."""
 
 from __future__ import annotations
 
-from typing import Any
-
-from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice
-from quadrl.task import Task
+from quadrl.core.catalogue import TASKS, make, register
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
 from quadrl.tasks.random_waypoint import RandomWaypoint
@@ -14,39 +10,7 @@ from quadrl.tasks.static_waypoint import StaticWaypoint
 from quadrl.tasks.straight_and_level import StraightAndLevel
 from quadrl.tasks.target_following import TargetFollowing
 
-TASKS: dict[str, type[Task]] = {
-    task.name: task
-    for task in (Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing)
-}
-"""Every registered task by name."""
+__all__ = ["TASKS", "make", "register"]
 
-
-def register(task: type[Task]) -> type[Task]:
-    """Add a task to the catalogue, so that every API knows it by its name.
-
-    Raises:
-        QuadrlError: It is not a Task subclass with a name, or another task has the name.
-    """
-    named = isinstance(task, type) and issubclass(task, Task) and hasattr(task, "name")
-    if not named or not isinstance(task.name, str) or not task.name.isidentifier():
-        allowed = "a Task subclass with a string `name` such as 'my_task'"
-        raise QuadrlError(name="task", value=task, allowed=allowed)
-    if TASKS.get(task.name, task) is not task:
-        allowed = "a name that no other task has"
-        raise QuadrlError(name="task name", value=task.name, allowed=allowed)
-    TASKS[task.name] = task
-    return task
-
-
-def make(name: str | Task, **options: Any) -> Task:
-    """The task of a name with some options changed.
-
-    Args:
-        name: A name of the catalogue, or a task already made.
-        **options: Fields of the task.
-
-    Raises:
-        QuadrlError: Unknown task or option; the message lists the choices.
-    """
-    task = name if isinstance(name, Task) else TASKS[choice("task", name, TASKS)]()
-    return task.replace(**options)
+for _task in (Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing):
+    register(_task)

@@ -7,10 +7,10 @@ import math
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
-from quadrl.contact import touches_ground
-from quadrl.rng import Rng, hovering
-from quadrl.state import Start
-from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.core.contact import touches_ground
+from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.engines.rng import Rng, hovering
+from quadrl.engines.state import Start
 
 
 @dataclasses.dataclass(frozen=True)

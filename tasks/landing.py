@@ -11,15 +11,15 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace, norm, square_norm, stack
-from quadrl.contact import stands, strikes_ground
-from quadrl.markers import Marker
-from quadrl.rng import Rng
-from quadrl.state import REST_SPEED, Start
-from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east, reward_share
+from quadrl.core.contact import stands, strikes_ground
+from quadrl.core.markers import Marker
+from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east, reward_share
+from quadrl.engines.rng import Rng
+from quadrl.engines.state import REST_SPEED, Start
 
 if TYPE_CHECKING:
-    from quadrl.reading import Reading
-    from quadrl.snapshot import Rollout
+    from quadrl.control.reading import Reading
+    from quadrl.core.snapshot import Rollout
 
 # How the yardstick controllers come down.
 DESCENT_RATE = 0.8  # [1/s], sink speed over the height

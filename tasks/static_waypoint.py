@@ -12,11 +12,11 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
 from quadrl.base.validation import MAX_OPTION, numbers
-from quadrl.contact import touches_ground
-from quadrl.markers import Marker
-from quadrl.rng import Rng, hovering
-from quadrl.state import Start
-from quadrl.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.core.contact import touches_ground
+from quadrl.core.markers import Marker
+from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.engines.rng import Rng, hovering
+from quadrl.engines.state import Start
 
 WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
 

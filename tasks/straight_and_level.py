@@ -11,11 +11,9 @@ import numpy as np
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace, norm
 from quadrl.base.validation import number
-from quadrl.contact import touches_ground
-from quadrl.markers import Marker
-from quadrl.rng import Rng
-from quadrl.state import Start
-from quadrl.task import (
+from quadrl.core.contact import touches_ground
+from quadrl.core.markers import Marker
+from quadrl.core.task import (
     OBSERVATION,
     TARGET_VELOCITY,
     EpisodeEnd,
@@ -25,10 +23,12 @@ from quadrl.task import (
     Task,
     TaskState,
 )
+from quadrl.engines.rng import Rng
+from quadrl.engines.state import Start
 
 if TYPE_CHECKING:
-    from quadrl.reading import Reading
-    from quadrl.snapshot import Rollout
+    from quadrl.control.reading import Reading
+    from quadrl.core.snapshot import Rollout
 
 LINE: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.45)
 

@@ -12,11 +12,9 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, norm, stack
 from quadrl.base.validation import number
-from quadrl.contact import touches_ground
-from quadrl.markers import Marker
-from quadrl.rng import FULL_TURN, Rng
-from quadrl.state import Start
-from quadrl.task import (
+from quadrl.core.contact import touches_ground
+from quadrl.core.markers import Marker
+from quadrl.core.task import (
     OBSERVATION,
     TARGET_VELOCITY,
     EpisodeEnd,
@@ -26,10 +24,12 @@ from quadrl.task import (
     Task,
     TaskState,
 )
+from quadrl.engines.rng import FULL_TURN, Rng
+from quadrl.engines.state import Start
 
 if TYPE_CHECKING:
-    from quadrl.reading import Reading
-    from quadrl.snapshot import Rollout
+    from quadrl.control.reading import Reading
+    from quadrl.core.snapshot import Rollout
 
 WAVES = 2  # sines in each coordinate of the target's path
 AXES = 3

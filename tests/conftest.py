@@ -12,7 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.append(str(Path(__file__).parents[1]))
 
 import quadrl  # noqa: E402, F401 - before any test imports mujoco: it chooses the renderer
-from quadrl import mjcf  # noqa: E402
+from quadrl.engines import mjcf  # noqa: E402
 
 
 @pytest.fixture(autouse=True)

@@ -6,15 +6,15 @@ import itertools
 import mujoco
 import numpy as np
 
-from quadrl import mjcf
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.control import modes
-from quadrl.environment import Environment
-from quadrl.rng import Rng
-from quadrl.snapshot import EpisodeEnd, Snapshot
-from quadrl.state import State
-from quadrl.task import total
+from quadrl.core.environment import Environment
+from quadrl.core.snapshot import EpisodeEnd, Snapshot
+from quadrl.core.task import total
+from quadrl.engines import mjcf
+from quadrl.engines.rng import Rng
+from quadrl.engines.state import State
 
 
 def fly(api, task, seed, actions, mode="rotor"):

@@ -12,10 +12,10 @@ from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import VEHICLES, in_real_air
 from quadrl.aircraft.rotors import ring
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.conditions.randomization import Randomization
+from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import BatchEngine
-from quadrl.environment import Environment
-from quadrl.randomization import Randomization
-from quadrl.state import Start
+from quadrl.engines.state import Start
 
 # ------------------------------------------------------------------- motions, flown by an engine
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from quadrl.base.errors import QuadrlError
-from quadrl.evaluation import evaluate
+from quadrl.evaluation.evaluate import evaluate
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training
 

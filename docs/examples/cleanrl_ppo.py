@@ -22,7 +22,7 @@ from torch import nn
 from torch.distributions import Independent, Normal
 
 import quadrl  # noqa: F401 - registers the ids
-from quadrl.rollout import fly, summarize
+from quadrl.evaluation.rollout import fly, summarize
 
 
 @dataclass

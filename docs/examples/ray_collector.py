@@ -25,7 +25,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from quadrl.envs.torchrl import QuadrotorEnv
-from quadrl.rollout import fly, summarize
+from quadrl.evaluation.rollout import fly, summarize
 
 # TorchRL warns of its own classes.
 warnings.filterwarnings("ignore", message=".*WeightUpdater.*", category=DeprecationWarning)

@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from quadrl.envs.sb3 import QuadrotorVecEnv
-from quadrl.rollout import fly, summarize
+from quadrl.evaluation.rollout import fly, summarize
 
 
 @dataclass

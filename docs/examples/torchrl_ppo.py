@@ -35,7 +35,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from quadrl.envs.torchrl import QuadrotorEnv
-from quadrl.rollout import fly, summarize
+from quadrl.evaluation.rollout import fly, summarize
 
 # TorchRL warns of its own classes, and that VecNormV2 over a batch is experimental.
 warnings.filterwarnings("ignore", message=".*WeightUpdater.*", category=DeprecationWarning)

@@ -57,7 +57,7 @@ export class Episode {
     flight.command(action);
   }
 
-  // What the controller sees now: as the options of its observation say (quadrl/observer.py).
+  // What the controller sees now: as the options of its observation say (quadrl/core/observer.py).
   #see() {
     const { disturbance, action_history, observation_history } = this.controller.observe;
     const seen = this.flight.seen(disturbance), { rotors } = this.flight.vehicle;

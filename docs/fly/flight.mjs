@@ -72,7 +72,7 @@ export class Flight {
     longs.set(numbers.map(BigInt), Math.ceil(parts.length / 2));
   }
 
-  // Numbers of a stream of the episode, uniform in [0, 1), as quadrl/rng.py gives them.
+  // Numbers of a stream of the episode, uniform in [0, 1), as quadrl/engines/rng.py gives them.
   uniform(stream, first, count) {
     const { functions } = this.kernel;
     const at = (part) => this.kernel.address(this.slot, part);

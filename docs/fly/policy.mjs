@@ -1,4 +1,4 @@
-// A trained policy: reads the file and gives the mean action, as quadrl/policy.py does.
+// A trained policy: reads the file and gives the mean action, as quadrl/evaluation/policy.py does.
 
 const LAYERS = ["weight", "bias"];
 const DAMAGED = "The file is damaged or not a safetensors file.";
@@ -24,7 +24,7 @@ export function readSafetensors(buffer) {
   return { arrays, texts };
 }
 
-// Options of the observation that this page knows, by their names in quadrl/observing.py.
+// Options of the observation that this page knows, by their names in quadrl/conditions/observing.py.
 const KNOWN = { disturbance: false, action_history: 0, observation_history: 0 };
 
 export class Policy {

@@ -1,7 +1,8 @@
 """What the air does to rotors beside equation 7, and which of it acts on an aircraft.
 
 All of it is off by default, so that the paper's equations stay what they are. The forces stand in
-`native/aero.h` and in `quadrl/dynamics.py`; docs/physics.md has the equations with their sources.
+`engines/native/aero.h` and in `engines/dynamics.py`; docs/physics.md has the equations with their
+sources.
 """
 
 from __future__ import annotations

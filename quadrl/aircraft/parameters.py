@@ -1,9 +1,9 @@
 """Rows of parameters: what the engines know of each aircraft, one C struct per row.
 
 The struct follows from the numeric fields of `Rotor`, `Vehicle` and `Aerodynamics`: a new
-parameter is a field there, and `native/aero.h` and `quadrl/dynamics.py` find it by its name. A row
-stands in the `user` data of the aircraft's body (`body_user`), where the callbacks read it; free
-flight reads the same bytes.
+parameter is a field there, and `engines/native/aero.h` and `engines/dynamics.py` find it by its
+name. A row stands in the `user` data of the aircraft's body (`body_user`), where the callbacks
+read it; free flight reads the same bytes.
 """
 
 from __future__ import annotations

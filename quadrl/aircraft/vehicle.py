@@ -2,7 +2,7 @@
 
 Body frame: x forward, y left, z up, the origin at the centre of mass. `presets` has the aircraft
 that are known by name, `parameters` makes the rows of numbers that the engines fly, and
-`quadrl.mjcf` the MuJoCo model.
+`quadrl.engines.mjcf` the MuJoCo model.
 """
 
 from __future__ import annotations

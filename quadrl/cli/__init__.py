@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib.util
-import inspect
 import os
 import signal
 import sys
-import traceback
 import warnings
 from collections.abc import Generator
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from tyro.conf import CascadeSubcommandArgs, DisallowNone, UseAppendAction, arg, subcommand
+from tyro.conf import (
+    CascadeSubcommandArgs,
+    DisallowNone,
+    Positional,
+    UseAppendAction,
+    arg,
+    subcommand,
+)
 
 from quadrl import __version__
 from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.signals import IN_ORDER, Stopped, handling
 from quadrl.cli import choices, console
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
-from quadrl.cli.completion import Completion
 from quadrl.cli.evaluate import Evaluate
 from quadrl.cli.plot import Plot
 from quadrl.cli.render import Render
@@ -34,8 +38,23 @@ from quadrl.cli.study import Study
 from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
 from quadrl.cli.view import View
-from quadrl.signals import IN_ORDER, Stopped, handling
-from quadrl.tasks import TASKS
+from quadrl.core.rules import import_own
+
+
+@dataclasses.dataclass(frozen=True)
+class Completion:
+    """Print a script that completes commands, options and names with the tab key.
+
+    bash: source <(quadrl completion bash). zsh: write it to a file _quadrl in a folder of fpath.
+    """
+
+    shell: Positional[Literal["bash", "zsh", "tcsh", "fish"]] = "bash"
+    """The shell to complete in."""
+
+    def run(self) -> None:
+        """Print the script."""
+        parse(["--tyro-print-completion", self.shell], enforced=True)
+
 
 Command = (
     Annotated[Tasks, subcommand("tasks")]
@@ -117,46 +136,3 @@ def _warned_in_a_line(stderr: Console) -> Generator[None]:
 
         warnings.showwarning = show
         yield
-
-
-def import_own(path: Path) -> None:
-    """Run a file, which registers the user's own tasks and aircraft.
-
-    Raises:
-        QuadrlError: There is no such file, or it fails, or a task in it breaks a rule; the message
-            names the file and the line.
-    """
-    if not path.is_file():
-        raise QuadrlError(name="--import", value=str(path), allowed="the path of a Python file")
-    known = set(TASKS)
-    spec: Any = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    with _located(path):
-        spec.loader.exec_module(module)
-    for name in TASKS.keys() - known:
-        from quadrl.testing import check_rules
-
-        kind = TASKS[name]
-        with _located(path, inspect.getsourcelines(kind)[1]):
-            check_rules(kind)
-
-
-@contextlib.contextmanager
-def _located(path: Path, line: int | None = None) -> Generator[None]:
-    """Report a failure with the last line of the user's file that led to it, or a given one."""
-    try:
-        yield
-    except Exception as error:
-        frames, cause = [], error
-        while cause is not None:
-            frames += traceback.extract_tb(cause.__traceback__)
-            cause = cause.__cause__
-        lines = [
-            frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()
-        ]
-        line = error.lineno if isinstance(error, SyntaxError) else (lines or [line])[-1]
-        where = f"{path}, line {line}" if line else str(path)
-        # What a check of quadrl says is a sentence; what Python says needs its kind.
-        said = error if isinstance(error, (AssertionError, QuadrlError)) else repr(error)
-        raise QuadrlError(f"{where}: {said}") from error

@@ -27,7 +27,7 @@ class Benchmark:
 
     def run(self) -> None:
         """Measure and print."""
-        from quadrl.benchmark import benchmark, rows, summary
+        from quadrl.learning.benchmark import benchmark, rows, summary
 
         number("seconds", self.seconds, positive=True)
         number("repeats", self.repeats, 1, whole=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from quadrl.checked import check
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table
 from quadrl.cli.flown import parse_named, parse_options
+from quadrl.evaluation.checked import check
 
 
 @dataclasses.dataclass(frozen=True)

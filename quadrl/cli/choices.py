@@ -11,13 +11,13 @@ from typing import Any
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.conditions.weather import WEATHERS
 from quadrl.control import CONTROL_MODES, CONTROLLERS
 from quadrl.engines.mujoco import ENGINES
 from quadrl.learning.config import ALGORITHMS, ALIASES, MEMORIES
 from quadrl.learning.defaults import VARIANTS
-from quadrl.randomization import RANDOMIZATIONS
 from quadrl.tasks import TASKS
-from quadrl.weather import WEATHERS
 
 
 class TaskName(str):

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from quadrl.evaluation import comes_with_quadrl
+from quadrl.evaluation.evaluate import comes_with_quadrl
 
 console = Console()
 own_files: list[Path] = []

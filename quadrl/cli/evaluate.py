@@ -9,7 +9,7 @@ from typing import Any
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
 from quadrl.cli.flown import Flown
-from quadrl.evaluation import evaluate, shown
+from quadrl.evaluation.evaluate import evaluate, shown
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,10 +16,10 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
 from quadrl.cli import choices
 from quadrl.control import CONTROLLERS
-from quadrl.evaluation import comes_with_quadrl, setting
+from quadrl.core.task import Task
+from quadrl.evaluation.evaluate import comes_with_quadrl, setting
+from quadrl.evaluation.rollout import Controller
 from quadrl.learning.config import tuples
-from quadrl.rollout import Controller
-from quadrl.task import Task
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,16 +9,16 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from quadrl import mjcf
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.progress import ProgressBar
 from quadrl.cli import choices
 from quadrl.cli.console import console, say
 from quadrl.cli.flown import Flown
-from quadrl.evaluation import evaluate
-from quadrl.policy import FILE
-from quadrl.rollout import Controller
-from quadrl.task import Task
+from quadrl.core.task import Task
+from quadrl.engines import mjcf
+from quadrl.evaluation.evaluate import evaluate
+from quadrl.evaluation.policy import FILE
+from quadrl.evaluation.rollout import Controller
 
 VIDEO, GIF, SHEET = (848, 480, 20.0), (640, 360, 12.5), (480, 270, 20.0)
 """What a kind of file is drawn with unless it is given: width and height [pixels], frames/s."""

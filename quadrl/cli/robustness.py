@@ -16,8 +16,8 @@ from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
 from quadrl.cli.flown import parse_options
 from quadrl.control import CONTROLLERS
-from quadrl.disturbed import robustness
-from quadrl.evaluation import comes_with_quadrl
+from quadrl.evaluation.evaluate import comes_with_quadrl
+from quadrl.evaluation.robustness import robustness
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,8 +12,8 @@ from tyro.conf import Positional
 from quadrl import tasks
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
-from quadrl.description import describe
 from quadrl.learning.defaults import PAIRS
+from quadrl.learning.description import describe
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.progress import ProgressBar
+from quadrl.base.signals import heeded
 from quadrl.base.validation import number
 from quadrl.cli import choices
 from quadrl.cli.console import again, console, make_table, reason, say
 from quadrl.cli.flown import parse_named, parse_options
-from quadrl.description import docstrings
+from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import PAIRS
-from quadrl.rollout import MAX_EPISODES
-from quadrl.signals import heeded
-from quadrl.studies.plan import parse_seeds
+from quadrl.learning.studies.plan import parse_seeds
 
 if TYPE_CHECKING:
     from quadrl.learning.run import Run

@@ -11,10 +11,10 @@ from quadrl.base.errors import RenderingUnavailable
 from quadrl.cli.console import say
 from quadrl.cli.flown import Flown
 from quadrl.control import CONTROLLERS
-from quadrl.control import make as make_controller
-from quadrl.policy import Policy, shipped
-from quadrl.rollout import Controller
-from quadrl.task import Task
+from quadrl.core.task import Task
+from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.policy import Policy, shipped
+from quadrl.evaluation.rollout import Controller
 from quadrl.tasks import TASKS
 
 

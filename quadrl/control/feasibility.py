@@ -20,12 +20,13 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.rotors import GRAVITY, mixer
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.philox import PARAMETERS
 from quadrl.base.rotation import Array
+from quadrl.conditions.draw import WHICH, Draw
+from quadrl.conditions.randomization import Randomization, Randomized
+from quadrl.conditions.weather import Weather
 from quadrl.control.allocation import Allocation
-from quadrl.draw import WHICH, Draw
-from quadrl.randomization import Randomization, Randomized
-from quadrl.rng import PARAMETERS, uniform
-from quadrl.weather import Weather
+from quadrl.engines.rng import uniform
 
 MARGIN = 1.2
 """Thrust over weight that an aircraft needs to be flown. With it thrust carries the weight at a

@@ -15,8 +15,7 @@ import numpy as np
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array
 from quadrl.control.loops import MAX_HEADING_ERROR, Gains, Loops, turned
-from quadrl.reading import Reading
-from quadrl.task import Task
+from quadrl.control.reading import Guide, Reading
 
 
 class Controller(abc.ABC):
@@ -25,7 +24,7 @@ class Controller(abc.ABC):
     control_mode = "rotor"
     """The control mode that it flies with."""
 
-    def __init__(self, vehicle: Vehicle, task: Task) -> None:
+    def __init__(self, vehicle: Vehicle, task: Guide) -> None:
         """Take the aircraft, and the task that says where to be and whether to head east."""
         self.vehicle, self.task = vehicle, task
 
@@ -50,7 +49,7 @@ class Controller(abc.ABC):
 class GeometricController(Controller):
     """Position, velocity, attitude and body rate loops."""
 
-    def __init__(self, vehicle: Vehicle, task: Task, gains: Gains | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, task: Guide, gains: Gains | None = None) -> None:
         """Place the poles, with the task's gains unless others are given."""
         super().__init__(vehicle, task)
         gains = gains or Gains(**task.gains)

@@ -26,8 +26,8 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm, to_body
 from quadrl.base.validation import number
 from quadrl.control.allocation import Allocation, columns, product, within
-from quadrl.reading import Reading
-from quadrl.state import State
+from quadrl.control.reading import Reading
+from quadrl.engines.state import State
 
 MAX_HEADING_ERROR = 0.5  # [rad], of the desired heading from the present one
 Controlled = Literal["position", "velocity", "body_rate"]

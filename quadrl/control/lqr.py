@@ -17,8 +17,7 @@ from quadrl.base.validation import number
 from quadrl.control.allocation import Allocation, columns, product
 from quadrl.control.geometric import Controller
 from quadrl.control.loops import MAX_HEADING_ERROR, limited, sampled, turned
-from quadrl.reading import Reading
-from quadrl.task import Task
+from quadrl.control.reading import Guide, Reading
 
 STATES = {
     "position": slice(0, 3),  # [m], from where it should be
@@ -82,7 +81,7 @@ def linear_model(vehicle: Vehicle) -> tuple[Array, Array]:
 class LQRController(Controller):
     """Linear state feedback."""
 
-    def __init__(self, vehicle: Vehicle, task: Task, weights: Weights | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, task: Guide, weights: Weights | None = None) -> None:
         """Solve the Riccati equation, with the default weights unless others are given."""
         from scipy.linalg import solve_discrete_are  # slow to import
 

@@ -25,7 +25,7 @@ from quadrl.base.rotation import Array, heading_of
 from quadrl.base.validation import choice
 from quadrl.control.allocation import columns, within
 from quadrl.control.loops import MAX_HEADING_ERROR, Controlled, Loops, turned
-from quadrl.state import State
+from quadrl.engines.state import State
 
 RESPONSE_TIME = 1.0
 """[s] in which the largest acceleration reaches the velocity at action 1; at the offset of action 1

@@ -1,7 +1,7 @@
 """C of whole flights, for a page that flies them: what quadrl's own functions compute.
 
 A task, an aircraft and the geometric controller are called with symbols (`quadrl.base.trace`), as
-the compiled step of `quadrl.compiled` is, and become C functions per task and aircraft:
+the compiled step of `quadrl.core.compiled` is, and become C functions per task and aircraft:
 
     begin      the start of an episode, from numbers that were drawn
     first      its first observation
@@ -28,14 +28,14 @@ from quadrl.base import records
 from quadrl.base.rotation import Array, to_body
 from quadrl.base.trace import Trace
 from quadrl.control.geometric import GeometricController
-from quadrl.environment import Environment
-from quadrl.observer import felt, moving
-from quadrl.reading import Reading
-from quadrl.rng import Rng
-from quadrl.snapshot import Snapshot
-from quadrl.state import FIRST, State
-from quadrl.task import total
-from quadrl.transition import Clock, Episode, begin, finish
+from quadrl.control.reading import Reading
+from quadrl.core.environment import Environment
+from quadrl.core.observer import felt, moving
+from quadrl.core.snapshot import Snapshot
+from quadrl.core.task import total
+from quadrl.core.transition import Clock, Episode, begin, finish
+from quadrl.engines.rng import Rng
+from quadrl.engines.state import FIRST, State
 
 PARTS = {
     "parameters": ROW_SIZE,  # the aircraft's row
@@ -55,7 +55,7 @@ PARTS = {
     "diverged": 1,
     "observation": 64,
     "scale": 1,  # of actions [rad/s]: Vehicle.action_scale, or that of a policy's training
-    "moving": 6,  # as quadrl.observer.moving gives it
+    "moving": 6,  # as quadrl.core.observer.moving gives it
     "disturbance": 3,  # [m/s^2], world frame
     "felt": 3,  # the same in the body frame, as policies see it
     "given": 8,  # error [m], reward, goal (3) [m, world], terminated, truncated, is_success

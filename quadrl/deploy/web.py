@@ -19,18 +19,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from quadrl import mjcf, native
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
+from quadrl.base.philox import START
+from quadrl.core.environment import Environment
 from quadrl.deploy import flights
+from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import world
-from quadrl.environment import Environment
-from quadrl.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
-from quadrl.rng import START
-from quadrl.state import c_rows
+from quadrl.engines.state import c_rows
+from quadrl.evaluation.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
 from quadrl.tasks import TASKS
 
 GUST_TIME = 1.0  # [s], correlation time of the page's gusts

@@ -13,8 +13,8 @@ import dataclasses
 
 import numpy as np
 
-from quadrl import native
 from quadrl.aircraft.parameters import MAX_ROTORS
+from quadrl.engines import native
 from quadrl.engines.free_flight import LANES
 
 COORDINATES = 13

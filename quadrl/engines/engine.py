@@ -11,14 +11,14 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from quadrl import native
 from quadrl.aircraft import parameters
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import norm
+from quadrl.engines import native
 from quadrl.engines.adjoint import Leg
 from quadrl.engines.free_flight import FreeFlight
-from quadrl.state import FIRST, Start, State
+from quadrl.engines.state import FIRST, Start, State
 
 EngineName = Literal["mujoco", "free_flight"]
 ENGINES: tuple[EngineName, ...] = ("mujoco", "free_flight")

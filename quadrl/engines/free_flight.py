@@ -14,9 +14,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import mujoco
 import numpy as np
 
-from quadrl import native
 from quadrl.aircraft.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 from quadrl.base.errors import QuadrlError
+from quadrl.engines import native
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
 """Those of mjData that free flight reads or writes."""
@@ -35,7 +35,7 @@ class FreeFlight:
         """Check the model and take the addresses.
 
         Args:
-            model: A model of `quadrl.mjcf`.
+            model: A model of `quadrl.engines.mjcf`.
             fields: Live arrays (N, k) of FIELDS, all with one stride between aircraft.
             threads: Threads to fly on.
 

@@ -7,22 +7,19 @@ import functools
 import os
 import weakref
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from quadrl import mjcf, native
 from quadrl.aircraft import parameters
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
+from quadrl.engines import mjcf, native
 from quadrl.engines.engine import ENGINES, Engine, EngineName
 from quadrl.engines.free_flight import FIELDS
-
-if TYPE_CHECKING:
-    from quadrl.task import Task
 
 __all__ = ["ENGINES", "BatchEngine", "DataEngine", "Engine", "EngineName", "make"]
 
@@ -131,7 +128,7 @@ class DataEngine(Engine):
         """Wrap a model of the vehicle and its data.
 
         Raises:
-            QuadrlError: The model is not one that `quadrl.mjcf` makes, or could make.
+            QuadrlError: The model is not one that `quadrl.engines.mjcf` makes, or could make.
         """
         _check_model(model, vehicle)
         self.model, self.data = model, data
@@ -217,13 +214,13 @@ def make(
 
 
 def of_task(
-    engine: str | Engine, task: Task, vehicle: Vehicle, num_envs: int, **settings: Any
+    engine: str | Engine, task: Any, vehicle: Vehicle, num_envs: int, **settings: Any
 ) -> Engine:
     """The engine of a name in the world of a task, or one that is made already.
 
     Args:
         engine: The name, or the engine.
-        task: The task.
+        task: A `Task`.
         vehicle: The aircraft.
         num_envs: N.
         **settings: Those of `make`; `per_row` is asked of either.
@@ -252,7 +249,7 @@ def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:
     step = model.opt.timestep
     for right, what in (
         (sizes, f"7 positions, 6 velocities, {count} rotors, and nothing else that moves"),
-        (marked and rotors, "the parameters of an aircraft: begin with quadrl.mjcf.spec"),
+        (marked and rotors, "the parameters of an aircraft: begin with quadrl.engines.mjcf.spec"),
         (
             model.nuserdata >= parameters.AIR,
             f"nuserdata of at least {parameters.AIR}, for the air",

@@ -1,4 +1,4 @@
-"""The APIs, thin layers over `quadrl.environment`: dm_control, Gymnasium, SB3 and TorchRL."""
+"""The APIs, thin layers over `quadrl.core.environment`: dm_control, Gymnasium, SB3 and TorchRL."""
 
 from __future__ import annotations
 

@@ -9,20 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import mjcf, tasks
+from quadrl import tasks
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import resolve, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.rotation import norm
-from quadrl.environment import Environment
-from quadrl.task import Task
+from quadrl.core.environment import Environment
+from quadrl.core.task import Task
+from quadrl.engines import mjcf
 
 ENVIRONMENT = (
     *("control_mode", "engine", "weather", "randomization", "observe", "num_threads", "seed"),
 )
-"""Keywords of `quadrl.environment.Environment` that every API passes on."""
+"""Keywords of `quadrl.core.environment.Environment` that every API passes on."""
 OWN = ("vehicle", "aerodynamics", "control_timestep", "max_episode_steps", "reward_terms")
 KEYWORDS = (*ENVIRONMENT, *OWN)
 PICTURE = ("width", "height", "camera")
@@ -53,7 +54,7 @@ def make(
         also: Keywords that the API takes itself.
         **settings: `control_mode` (what actions mean, a name of `quadrl.control.CONTROL_MODES`),
             `engine` ("mujoco", or "free_flight": no contact is computed where there is nothing to
-            touch), `weather` (a name of `quadrl.weather.WEATHERS` or a Weather), `randomization`
+            touch), `weather` (a name of `weather.WEATHERS` or a Weather), `randomization`
             (what is drawn at each reset and disturbs the flight: a name of `quadrl.RANDOMIZATIONS`
             or a `quadrl.Randomization`), `observe` (options of the observation, as
             `quadrl.Observing` has them), `num_threads` (of the simulation; 0 for every core),
@@ -168,7 +169,8 @@ class Pictures:
 
     def _values(self, row: int, time: float) -> tuple[Any, ...]:
         """What the panel shows of a row: values, rotor speeds, attitude, outcome."""
-        from quadrl.rendering.overlay import flight_lines, outcome
+        from quadrl.core.trajectory import outcome
+        from quadrl.rendering.overlay import flight_lines
 
         environment = self._environment
         now, done, reward, end = environment.snapshot, environment.transition, 0.0, ""

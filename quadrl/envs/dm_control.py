@@ -24,19 +24,19 @@ from dm_control.rl import control
 from dm_control.suite import base
 from dm_env import specs
 
-from quadrl import mjcf, native
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import resolve, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
+from quadrl.conditions.observing import Observed
+from quadrl.conditions.randomization import Randomized
+from quadrl.conditions.weather import Weathered
+from quadrl.core.environment import Environment, Transition
+from quadrl.core.task import Task
+from quadrl.engines import mjcf, native
 from quadrl.engines.mujoco import ENGINES, DataEngine
-from quadrl.environment import Environment, Transition
 from quadrl.envs.common import make_task, with_timestep
-from quadrl.observing import Observed
-from quadrl.randomization import Randomized
-from quadrl.task import Task
-from quadrl.weather import Weathered
 
 KEYWORDS = "random vehicle aerodynamics control_mode engine weather randomization observe".split()
 ENVIRONMENT_KWARGS = "time_limit control_timestep n_sub_steps flat_observation legacy_step".split()
@@ -193,11 +193,11 @@ def make(
         control_mode: What actions mean, a name of `quadrl.control.CONTROL_MODES`.
         engine: "mujoco" or "free_flight".
         aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them.
-        weather: What the wind is like, as `quadrl.weather.Weather.of` takes it.
+        weather: What the wind is like, as `quadrl.conditions.weather.Weather.of` takes it.
         randomization: What is drawn at each reset and disturbs the flight, as
-            `quadrl.randomization.resolve` takes it; `task.environment.disturbances.shown()` has
-            what was drawn.
-        observe: Options of the observation, as `quadrl.observing.resolve` takes them;
+            `conditions.randomization.resolve` takes it; `task.environment.disturbances.shown()`
+            has what was drawn.
+        observe: Options of the observation, as `quadrl.conditions.observing.resolve` takes them;
             `task.environment.privileged` is the observation for the critic alone.
         **options: Those of the task.
 

@@ -22,10 +22,10 @@ from gymnasium.wrappers import HumanRendering
 
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
-from quadrl.environment import Environment, Transition
+from quadrl.base.philox import Seed
+from quadrl.core.environment import Environment, Transition
+from quadrl.core.task import Task
 from quadrl.envs.common import PICTURE, Named, Pictures, make, told
-from quadrl.rng import Seed
-from quadrl.task import Task
 
 Array = np.ndarray
 Info = dict[str, Any]
@@ -108,7 +108,8 @@ class QuadrotorEnv(_Shared, gym.Env):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:
         """Begin an episode; a seed starts the sequence of episodes anew.
 
-        Options are arrays of the start, by names of `quadrl.state.Start`: {"position": (0, 0, 1)}.
+        Options are arrays of the start, by names of `engines.state.Start`:
+        {"position": (0, 0, 1)}.
         """
         begun = self.environment.reset(start=options, seed=seed)
         super().reset(seed=seed)

@@ -14,8 +14,8 @@ except ImportError as error:
     raise ImportError(reason) from error
 
 from quadrl.base.errors import QuadrlError
+from quadrl.core.task import Task
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
-from quadrl.task import Task
 
 Array = np.ndarray
 

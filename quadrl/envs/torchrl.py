@@ -10,9 +10,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from quadrl.core.task import Task
+from quadrl.core.transition import Transition
 from quadrl.envs.common import PICTURE, Pictures, make
-from quadrl.task import Task
-from quadrl.transition import Transition
 
 DONE = ("done", "terminated", "truncated")
 

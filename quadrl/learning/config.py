@@ -15,9 +15,15 @@ from quadrl.aircraft.presets import with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, keys, number
+from quadrl.conditions.draw import Draw
+from quadrl.conditions.observing import Observing
+from quadrl.conditions.observing import resolve as resolve_observing
+from quadrl.conditions.randomization import Randomization, resolve
+from quadrl.conditions.weather import Weather
 from quadrl.control.modes import CONTROL_MODES
-from quadrl.draw import Draw
+from quadrl.core.task import Task
 from quadrl.engines.mujoco import ENGINES, MAX_ENVS, MAX_THREADS
+from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning.algorithm_config import (
     ALGORITHM_CONFIGS,
     APGConfig,
@@ -28,12 +34,6 @@ from quadrl.learning.algorithm_config import (
 from quadrl.learning.defaults import PAIRS, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, free_folder, read_config
 from quadrl.learning.smooth import check_smooth
-from quadrl.observing import Observing
-from quadrl.observing import resolve as resolve_observing
-from quadrl.randomization import Randomization, resolve
-from quadrl.rollout import MAX_SEED
-from quadrl.task import Task
-from quadrl.weather import Weather
 
 ALGORITHMS = ("ppo", "trpo", "vpg", "apg")
 ALIASES = {"gae": "vpg"}

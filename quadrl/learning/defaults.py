@@ -8,9 +8,9 @@ from typing import Any
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.validation import choice, keys
+from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.core.task import Task
 from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
-from quadrl.randomization import RANDOMIZATIONS
-from quadrl.task import Task
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
 """Settings that the defaults follow from, or that have no better default than another."""

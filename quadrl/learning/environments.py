@@ -10,13 +10,13 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Unbounded
 
-from quadrl import native
+from quadrl.core.transition import Transition
+from quadrl.engines import native
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import STATE
 from quadrl.learning.plain import BehaviourPolicy, plain_policy
 from quadrl.learning.window import Moment, fly
-from quadrl.transition import Transition
 
 with warnings.catch_warnings():
     # TorchRL 0.14 warns about its own classes at this import.

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
 from quadrl.base.validation import choice
+from quadrl.evaluation.rollout import Rollout
 from quadrl.learning.folder import METRICS, read_config
-from quadrl.rollout import Rollout
 
 Metrics = dict[str, np.ndarray]
 """Columns of a metrics.csv, (iterations,) each; missing values are NaN."""

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
+from quadrl.evaluation.policy import LOG_VARIANCE
 from quadrl.learning.plain import (
     LOG_2_PI,
     backward,
@@ -27,7 +28,6 @@ from quadrl.learning.plain import (
     plain_value,
     rows,
 )
-from quadrl.policy import LOG_VARIANCE
 
 USUAL: dict[str, Any] = {
     "loss_critic_type": "l2",

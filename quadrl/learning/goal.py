@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from quadrl.base.errors import QuadrlError
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
+from quadrl.core.task import layout
 from quadrl.learning.config import TrainConfig
-from quadrl.task import layout
 
 DRAWN = 16  # goal states that are compared
 YAW = 2  # place of the yaw among the three angles

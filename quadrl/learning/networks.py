@@ -11,10 +11,10 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import GRUCell, IndependentNormal, ProbabilisticActor, recurrent_mode
 
+from quadrl.evaluation.memory import GRU
+from quadrl.evaluation.policy import CLIP, LOG_VARIANCE, Policy
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.goal import goal_state
-from quadrl.memory import GRU
-from quadrl.policy import CLIP, LOG_VARIANCE, Policy
 
 STATE, BEGINS = "recurrent_state", "is_init"
 """What a policy with a memory reads beside the observation, by TorchRL's names: its state before

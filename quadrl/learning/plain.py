@@ -18,8 +18,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from quadrl.evaluation.policy import LOG_VARIANCE
 from quadrl.learning.networks import Entries, HoldsGoal, Informed, MeanAndDeviation, Normaliser
-from quadrl.policy import LOG_VARIANCE
 
 LOG_2_PI = math.log(2 * math.pi)
 

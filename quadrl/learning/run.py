@@ -9,16 +9,16 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from quadrl import mjcf
 from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.validation import number
 from quadrl.control.feasibility import warn_of_unreached
-from quadrl.evaluation import Evaluation, evaluate, html_table
+from quadrl.engines import mjcf
+from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO, write_json
 from quadrl.learning.train import Training
-from quadrl.policy import Policy
-from quadrl.rollout import MAX_EPISODES
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

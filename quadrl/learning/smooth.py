@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from quadrl.base.errors import QuadrlError
-from quadrl.observing import Observing
-from quadrl.observing import resolve as resolve_observing
-from quadrl.randomization import NONE, resolve
-
-if TYPE_CHECKING:
-    from quadrl.learning.config import TrainConfig
+from quadrl.conditions.observing import Observing
+from quadrl.conditions.observing import resolve as resolve_observing
+from quadrl.conditions.randomization import NONE, resolve
 
 LATE_OR_UNSURE = ("command_delay", "observation_delay", "noise", "bias")
 """What a randomization may not have: the observation must follow from the state, and the rotors'
 commands from the action alone."""
 
 
-def check_smooth(config: TrainConfig) -> None:
-    """Refuse settings whose derivatives are not known.
+def check_smooth(config: Any) -> None:
+    """Refuse the settings of a `TrainConfig` whose derivatives are not known.
 
     Raises:
         QuadrlError: The message names the setting.

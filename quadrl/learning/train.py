@@ -20,13 +20,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from quadrl import native
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import PART
 from quadrl.base.machine import check_memory, processor_kind
 from quadrl.base.progress import Progress
+from quadrl.engines import native
 from quadrl.envs.torchrl import QuadrotorEnv
+from quadrl.evaluation.policy import FILE as POLICY_FILE
+from quadrl.evaluation.policy import Policy
 from quadrl.learning import checkpoint
 from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.apg import APG
@@ -46,8 +48,6 @@ from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE, export, make_act
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
-from quadrl.policy import FILE as POLICY_FILE
-from quadrl.policy import Policy
 
 with warnings.catch_warnings():
     # TorchRL 0.14 warns about its own classes at this import.

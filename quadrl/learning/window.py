@@ -17,12 +17,12 @@ from torch import Tensor
 from quadrl.base import records
 from quadrl.base.errors import QuadrlError
 from quadrl.control.modes import Rotor
+from quadrl.core.environment import Environment
+from quadrl.core.snapshot import Snapshot
+from quadrl.core.transition import Clock, Episode, Transition, finish
 from quadrl.engines.adjoint import Leg
 from quadrl.engines.engine import Engine
-from quadrl.environment import Environment
-from quadrl.snapshot import Snapshot
-from quadrl.state import State
-from quadrl.transition import Clock, Episode, Transition, finish
+from quadrl.engines.state import State
 
 FLAGS = ("terminated", "truncated")
 

@@ -5,9 +5,9 @@ never its dynamics: it needs no rotor callbacks and leaves the simulation's own 
 """
 
 from quadrl.base.errors import RenderingUnavailable
+from quadrl.core.trajectory import Trajectory
 from quadrl.rendering.scene import Renderer
 from quadrl.rendering.sheet import write_contact_sheet
-from quadrl.rendering.trajectory import Trajectory
 from quadrl.rendering.video import help_notebooks, render_trajectory, write_video
 
 __all__ = [

@@ -10,7 +10,7 @@ import numpy as np
 
 from quadrl.aircraft.vehicle import DRAWN_SIZE
 from quadrl.base.rotation import Array
-from quadrl.markers import Marker
+from quadrl.core.markers import Marker
 
 FOLLOW, CHASE = "follow", "chase"
 MOVING = (FOLLOW, CHASE)

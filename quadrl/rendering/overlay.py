@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.rotation import Array
+from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER
 from quadrl.rendering.horizon import horizon
 
 MARGIN, HEIGHT = 18, 138  # [pixels] at a height of 720, as are those below
@@ -21,15 +22,7 @@ BARS, BAR = 298, 21  # where the bars begin, and from one to the next
 TOP, BOTTOM = 17, 103  # of the bars
 ROOM = 0.8  # share of a picture's width that the panel may take
 GREY, WHITE, DARK = (150, 163, 180), (236, 240, 246), (44, 52, 64)
-SUCCESS, FAILURE, TIME_OVER = "successful", "failed", "time over"
 OUTCOMES = {SUCCESS: (38, 148, 84), FAILURE: (196, 58, 54), TIME_OVER: (176, 124, 30)}
-
-
-def outcome(terminated: Any, truncated: Any, is_success: Any) -> str:
-    """How an episode ended, in plain words; empty while it goes on."""
-    if is_success:
-        return SUCCESS
-    return FAILURE if terminated else TIME_OVER if truncated else ""
 
 
 class Panel:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.base.rotation import Array
-from quadrl.markers import Marker
+from quadrl.core.markers import Marker
 from quadrl.rendering.camera import (
     CHASE,
     MOVING,

@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quadrl import landmarks
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 from quadrl.base.validation import choice, number
-from quadrl.markers import GOAL_RGBA, Marker
+from quadrl.core.markers import GOAL_RGBA, Marker
+from quadrl.engines import landmarks
 from quadrl.rendering import gl
 from quadrl.rendering.camera import (
     CHASE,

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from quadrl.base.files import write_whole
+from quadrl.core.trajectory import Trajectory
 from quadrl.rendering.overlay import Panel, require
-from quadrl.rendering.trajectory import Trajectory
 from quadrl.rendering.video import OneOrMore, OnFrame, checked, listed, render_trajectory
 
 SHEETS = ("png", "jpg", "jpeg")

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from quadrl.base.rotation import Array
-from quadrl.markers import Marker
+from quadrl.core.markers import Marker
 
 COUNT = 60
 BOX = np.array([2.3, 2.3, 1.7])  # [m], around an aircraft with scale 1, that the streaks fill

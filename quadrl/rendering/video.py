@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.validation import number
+from quadrl.core.trajectory import Trajectory
 from quadrl.rendering.camera import (
     CHASE,
     FOLLOW,
@@ -31,7 +32,6 @@ from quadrl.rendering.camera import (
 from quadrl.rendering.overlay import Panel, flight_lines, grid, require, task_title
 from quadrl.rendering.scene import TRAIL_SECONDS, Renderer
 from quadrl.rendering.streaks import streaks
-from quadrl.rendering.trajectory import Trajectory
 
 T = TypeVar("T")
 OneOrMore = T | Sequence[T]

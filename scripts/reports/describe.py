@@ -12,8 +12,8 @@ from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.cli.tasks import observation_rows, reward_rows, settings
 from quadrl.control import CONTROL_MODES
-from quadrl.description import describe, describe_action
 from quadrl.learning.defaults import own_settings
+from quadrl.learning.description import describe, describe_action
 from scripts.reports.report import Parts, asked, table
 
 

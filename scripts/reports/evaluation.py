@@ -11,11 +11,11 @@ import numpy as np
 from scipy.signal import welch
 
 from quadrl import tasks
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import FINAL_STRETCH, Rollout, fly, summarize
 from quadrl.learning.figures import read_metrics
 from quadrl.learning.folder import EVALUATION, METRICS
-from quadrl.policy import Policy
-from quadrl.rollout import FINAL_STRETCH, Rollout, fly, summarize
-from quadrl.studies.plan import PlannedRun
+from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports.report import Result
 
 SMOOTHING = 0.05  # share of a training over which its curve is averaged for best and final

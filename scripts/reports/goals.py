@@ -16,13 +16,13 @@ import numpy as np
 import tyro
 from torchrl.objectives import ClipPPOLoss
 
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import EVALUATION_SEED, flights, fly
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import USUAL
+from quadrl.learning.studies.crew import train_here
+from quadrl.learning.studies.plan import PlannedRun
 from quadrl.learning.train import Training
-from quadrl.policy import Policy
-from quadrl.rollout import EVALUATION_SEED, flights, fly
-from quadrl.studies.crew import train_here
-from quadrl.studies.plan import PlannedRun
 from scripts.reports import report
 from scripts.reports.evaluation import trained
 from scripts.reports.report import Result, number, say, table

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import tyro
 
+from quadrl.conditions.randomization import RANDOMIZATIONS, Randomization
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning.config import TrainConfig
-from quadrl.policy import Policy
-from quadrl.randomization import RANDOMIZATIONS, Randomization
-from quadrl.rollout import fly, summarize
-from quadrl.studies.crew import train_here
-from quadrl.studies.plan import PlannedRun
+from quadrl.learning.studies.crew import train_here
+from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports import report
 from scripts.reports.evaluation import NOISE_SEED
 from scripts.reports.report import Result, say, table

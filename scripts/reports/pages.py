@@ -7,7 +7,7 @@ import sys
 
 import tyro
 
-from quadrl.benchmark import ALL_CORES, ONE_CORE
+from quadrl.learning.benchmark import ALL_CORES, ONE_CORE
 from scripts.reports import (
     describe,
     goals,

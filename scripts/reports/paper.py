@@ -19,14 +19,14 @@ import tyro
 from matplotlib.figure import Figure
 from PIL import Image
 
-from quadrl.card import wilson
+from quadrl.conditions.weather import WEATHERS
+from quadrl.evaluation.card import wilson
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning.figures import COLOURS, STYLE, learning_curves, read_metrics, save, trajectory
 from quadrl.learning.folder import METRICS
-from quadrl.policy import Policy
-from quadrl.rollout import fly, summarize
-from quadrl.studies.crew import train_here
-from quadrl.studies.plan import PlannedRun
-from quadrl.weather import WEATHERS
+from quadrl.learning.studies.crew import train_here
+from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports import evaluation, report
 from scripts.reports.claims import CLAIMS, judged
 from scripts.reports.report import Result, factor, number, say, spread, table

@@ -18,19 +18,20 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 from scipy.integrate import cumulative_trapezoid
 
-from quadrl import mjcf, tasks
+from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.progress import Progress
-from quadrl.control import make as make_controller
-from quadrl.evaluation import evaluate
+from quadrl.conditions.weather import Weather
+from quadrl.engines import mjcf
+from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.evaluate import evaluate
+from quadrl.evaluation.policy import SHIPPED, Policy
+from quadrl.evaluation.rollout import Rollout, fly
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import LEARNING_CURVE
+from quadrl.learning.show import plot
 from quadrl.learning.train import Training
-from quadrl.policy import SHIPPED, Policy
 from quadrl.rendering import Renderer, render_trajectory
-from quadrl.rollout import Rollout, fly
-from quadrl.show import plot
-from quadrl.weather import Weather
 from scripts.reports.report import IMAGES
 
 MOMENTS, DRAWN, SHOWN = 4, (640, 360), (320, 180)  # drawn larger, for smooth edges [pixels]

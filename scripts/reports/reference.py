@@ -9,14 +9,15 @@ import re
 from collections.abc import Iterator
 from typing import Any, get_args
 
-from quadrl import VEHICLES, snapshot, state
+from quadrl import VEHICLES
 from quadrl.aircraft import presets
 from quadrl.aircraft import vehicle as vehicle_module
 from quadrl.aircraft.rotors import GRAVITY, Rotor
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.docstrings import docstrings
+from quadrl.cli import Completion
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
-from quadrl.cli.completion import Completion
 from quadrl.cli.evaluate import Evaluate
 from quadrl.cli.plot import Plot
 from quadrl.cli.render import Render
@@ -24,12 +25,13 @@ from quadrl.cli.study import Study
 from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
 from quadrl.cli.view import View
-from quadrl.description import docstrings
+from quadrl.conditions.observing import Observing
+from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.core import snapshot
+from quadrl.core.markers import Kind, Marker
+from quadrl.engines import state
+from quadrl.engines.rng import Rng
 from quadrl.learning.config import ALGORITHM_CONFIGS, TrainConfig
-from quadrl.markers import Kind, Marker
-from quadrl.observing import Observing
-from quadrl.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
-from quadrl.rng import Rng
 from scripts.reports.report import Parts, table
 
 FIRST_SOURCE = "gym-aero"

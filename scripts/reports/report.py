@@ -13,8 +13,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from quadrl import benchmark
-from quadrl.task import Target
+from quadrl.core.task import Target
+from quadrl.learning import benchmark
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS, RUNS = REPOSITORY / "docs", REPOSITORY / "runs"

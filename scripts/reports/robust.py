@@ -14,15 +14,15 @@ import tyro
 
 from quadrl import tasks
 from quadrl.aircraft.presets import resolve
-from quadrl.card import wilson
-from quadrl.evaluation import setting
+from quadrl.conditions.randomization import Randomization
+from quadrl.evaluation.card import wilson
+from quadrl.evaluation.evaluate import setting
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import flights, fly
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import WIDE
-from quadrl.policy import Policy
-from quadrl.randomization import Randomization
-from quadrl.rollout import flights, fly
-from quadrl.studies.crew import train_here
-from quadrl.studies.plan import PlannedRun
+from quadrl.learning.studies.crew import train_here
+from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports import report
 from scripts.reports.evaluation import trained
 from scripts.reports.report import Result, say, table

@@ -10,8 +10,8 @@ import tyro
 
 import quadrl
 from quadrl import tasks
-from quadrl.card import Card
-from quadrl.evaluation import setting
+from quadrl.evaluation.card import Card
+from quadrl.evaluation.evaluate import setting
 from scripts.reports import report, tuning
 from scripts.reports.report import Result, say, table
 

@@ -17,12 +17,12 @@ import tyro
 from scipy.stats import qmc
 
 from quadrl import tasks
+from quadrl.core.task import Target
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import merged
 from quadrl.learning.folder import EVALUATION
-from quadrl.studies.crew import train_here
-from quadrl.studies.plan import PlannedRun
-from quadrl.task import Target
+from quadrl.learning.studies.crew import train_here
+from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports import report
 from scripts.reports.report import Result, factor, number, say, table
 

@@ -13,10 +13,10 @@ from typing import Annotated
 
 import tyro
 
+from quadrl.evaluation.policy import FILE, SHIPPED, SHIPPED_AS, Policy
+from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import FREE, write_json
-from quadrl.policy import FILE, SHIPPED, SHIPPED_AS, Policy
-from quadrl.rollout import fly, summarize
 from scripts.reports.report import say
 
 EPISODES = 500

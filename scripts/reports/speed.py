@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tyro
 
-from quadrl import benchmark
+from quadrl.learning import benchmark
 from scripts.reports import report
 from scripts.reports.report import table
 

@@ -12,10 +12,10 @@ import numpy as np
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.cli.tasks import settings
-from quadrl.description import describe
+from quadrl.core.task import Task
+from quadrl.evaluation.policy import SHIPPED
 from quadrl.learning.defaults import own_settings
-from quadrl.policy import SHIPPED
-from quadrl.task import Task
+from quadrl.learning.description import describe
 from scripts.reports import report, training
 from scripts.reports.report import Parts, asked, factor, number, table
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import tyro
 
 from quadrl import VEHICLES, tasks
-from quadrl.control import make as make_controller
 from quadrl.engines.mujoco import ENGINES
+from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import Controller, fly, summarize
 from quadrl.learning.config import TrainConfig
-from quadrl.policy import Policy
-from quadrl.rollout import Controller, fly, summarize
-from quadrl.studies.crew import train_here
-from quadrl.studies.plan import PlannedRun
+from quadrl.learning.studies.crew import train_here
+from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports import evaluation, report
 from scripts.reports.report import Result, asked, factor, number, say, table
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from quadrl.task import Target
+from quadrl.core.task import Target
 from scripts.reports import significance
 from scripts.reports.report import Result
 from scripts.reports.search import LABELS, SOLVED, precision

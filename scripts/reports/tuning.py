@@ -22,13 +22,13 @@ from quadrl.aircraft.aerodynamics import EFFECTS
 from quadrl.aircraft.presets import resolve, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm
+from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Randomization
+from quadrl.conditions.weather import WEATHERS
 from quadrl.control import Gains, GeometricController
+from quadrl.control.reading import Reading
+from quadrl.core.task import Task
+from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning.defaults import WIDE
-from quadrl.randomization import RANDOMIZATIONS, Errors, Randomization
-from quadrl.reading import Reading
-from quadrl.rollout import fly, summarize
-from quadrl.task import Task
-from quadrl.weather import WEATHERS
 from scripts.reports import report
 from scripts.reports.report import Result, say
 

@@ -10,7 +10,7 @@ import pytest
 from apis import APIS, Gymnasium
 
 import quadrl
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
 from quadrl.testing import varied_actions
 
 WAYS = {

@@ -9,9 +9,9 @@ import pytest
 
 from quadrl.base.rotation import namespace
 from quadrl.control.modes import CONTROL_MODES
+from quadrl.control.reading import Reading
+from quadrl.core.task import Potentials, TaskState
 from quadrl.envs.gymnasium import QuadrotorEnv
-from quadrl.reading import Reading
-from quadrl.task import Potentials, TaskState
 from quadrl.tasks import TASKS, make
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing

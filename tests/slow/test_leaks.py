@@ -59,7 +59,7 @@ def torchrl():
 
 def flights():
     """Half a second of random flights in both engines, down to the ground, with resets."""
-    from quadrl.environment import Environment
+    from quadrl.core.environment import Environment
 
     if not KEPT:
         for engine in ("mujoco", "free_flight"):

@@ -15,9 +15,10 @@ from safetensors.torch import save as to_safetensors
 from tensordict import TensorDict
 
 import quadrl
-from quadrl import native
 from quadrl.base.errors import QuadrlError, QuadrlWarning
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
+from quadrl.engines import native
+from quadrl.evaluation.rollout import fly
 from quadrl.learning import checkpoint
 from quadrl.learning.config import ALGORITHMS
 from quadrl.learning.environments import SEED_STRIDE
@@ -25,7 +26,6 @@ from quadrl.learning.figures import learning_curve, read_metrics
 from quadrl.learning.figures import trajectory as draw_trajectory
 from quadrl.learning.folder import LOCK, WARNINGS
 from quadrl.learning.train import Training
-from quadrl.rollout import fly
 
 
 @pytest.fixture(scope="module")

@@ -58,7 +58,12 @@ def test_wheel_has_every_file_of_the_package_and_no_other(wheel):
     paths = [path for folder in FOLDERS for path in (REPOSITORY / folder).rglob("*")]
     paths = [p for p in paths if p.is_file() and p.suffix not in left_out and p.name != ".DS_Store"]
     assert files == {str(path.relative_to(REPOSITORY)) for path in paths}
-    for name in ("py.typed", "tasks/hover.py", "native/aero.h", "assets/policies/hover_ppo.json"):
+    for name in (
+        "py.typed",
+        "tasks/hover.py",
+        "engines/native/aero.h",
+        "assets/policies/hover_ppo.json",
+    ):
         assert f"quadrl/{name}" in files
 
 

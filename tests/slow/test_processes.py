@@ -15,8 +15,8 @@ import pytest
 from apis import APIS
 
 import quadrl
-from quadrl import native
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
+from quadrl.engines import native
 from quadrl.testing import varied_actions
 
 REPOSITORY = Path(quadrl.__file__).parents[1]
@@ -26,7 +26,7 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(REPOSITORY)}
 def test_processes_that_build_at_once_do_not_disturb_each_other(tmp_path):
     settings = {"QUADRL_CACHE": str(tmp_path / "cache"), "QUADRL_CFLAGS": "-O0"}
     environment = ENVIRONMENT | settings
-    code = "from quadrl import native; print(native.build()); native.load(native.build())"
+    code = "from quadrl.engines import native; print(native.build()); native.load(native.build())"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     command = [sys.executable, "-c", code]
     running = [subprocess.Popen(command, env=environment, **pipes) for _ in range(4)]
@@ -95,7 +95,7 @@ def test_environments_of_every_api_fly_on_in_another_process():
 
 FLY = """
 import quadrl, mujoco
-from quadrl import mjcf
+from quadrl.engines import mjcf
 from quadrl.aircraft.vehicle import Vehicle
 {before}
 model = mjcf.compile_model(Vehicle(), drawn=False)
@@ -187,7 +187,7 @@ FORKED = """
     import os, signal, sys
     import numpy as np
     from quadrl.engines.mujoco import BatchEngine
-    from quadrl.environment import Environment
+    from quadrl.core.environment import Environment
     from quadrl.base.errors import QuadrlError
     from quadrl.aircraft.vehicle import Vehicle
 

@@ -9,7 +9,7 @@ from runs import TINY, refused
 import quadrl
 from quadrl.base.errors import QuadrlError
 from quadrl.cli import main
-from quadrl.control import make as make_controller
+from quadrl.evaluation.controllers import make_controller
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import free_folder
 

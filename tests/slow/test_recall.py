@@ -7,10 +7,10 @@ from runs import train
 
 from quadrl import tasks
 from quadrl.base.rotation import Array
-from quadrl.evaluation import evaluate
+from quadrl.core.task import ObservationTerm, Task, TaskState
+from quadrl.evaluation.evaluate import evaluate
+from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig
-from quadrl.policy import Policy
-from quadrl.task import ObservationTerm, Task, TaskState
 
 
 @dataclasses.dataclass(frozen=True)

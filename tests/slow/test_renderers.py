@@ -18,7 +18,7 @@ before = dict(os.environ)
 import quadrl
 assert dict(os.environ) == before
 def ours():
-    from quadrl import mjcf
+    from quadrl.engines import mjcf
     from quadrl.rendering import Renderer
     model = mjcf.compile_model(quadrl.Vehicle())
     model.vis.quality.shadowsize, model.vis.quality.offsamples = 256, 0  # cheaper to draw

@@ -9,15 +9,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import benchmark
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.conditions.randomization import Randomization
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import fly, summarize
+from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
-from quadrl.policy import Policy
-from quadrl.randomization import Randomization
-from quadrl.rollout import fly, summarize
-from quadrl.studies.crew import train_here
-from quadrl.studies.plan import PlannedRun
+from quadrl.learning.studies.crew import train_here
+from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports import (
     claims,
     evaluation,

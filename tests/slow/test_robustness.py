@@ -15,19 +15,21 @@ import pytest
 from runs import refused
 
 import quadrl
-from quadrl import Randomization, disturbed
+from quadrl import Randomization
 from quadrl.aircraft.parameters import rows
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.axes import AXES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
-from quadrl.card import Card, half_level, wilson
-from quadrl.cli import import_own, main
-from quadrl.draw import Draw
-from quadrl.environment import Environment
-from quadrl.kept import FILE, digest
-from quadrl.recovery import MAPS, begin
-from quadrl.rollout import flights
-from quadrl.weather import Weather
+from quadrl.cli import main
+from quadrl.conditions.draw import Draw
+from quadrl.conditions.weather import Weather
+from quadrl.core.environment import Environment
+from quadrl.core.rules import import_own
+from quadrl.evaluation import robustness as disturbed
+from quadrl.evaluation.axes import AXES
+from quadrl.evaluation.card import Card, half_level, wilson
+from quadrl.evaluation.kept import FILE, digest
+from quadrl.evaluation.recovery import MAPS, begin
+from quadrl.evaluation.rollout import flights
 
 SHORT: Any = dict(episodes=4, progress=False, time_limit=0.5)
 

@@ -19,9 +19,9 @@ import quadrl
 from quadrl import cli
 from quadrl.base.errors import QuadrlError
 from quadrl.learning.run import train
-from quadrl.studies import crew, worker
-from quadrl.studies.cluster import on_ray
-from quadrl.studies.plan import read_plan
+from quadrl.learning.studies import crew, worker
+from quadrl.learning.studies.cluster import on_ray
+from quadrl.learning.studies.plan import read_plan
 
 SETTINGS = {
     "num_envs": 8,
@@ -177,7 +177,7 @@ def test_a_worker_that_always_dies_is_given_up(tmp_path, monkeypatch):
         def begin(self, run, log):
             return crew.LocalWorker(dead(worker.order(run, 2), log), log)
 
-    monkeypatch.setattr("quadrl.studies.Local", Dying)
+    monkeypatch.setattr("quadrl.learning.studies.Local", Dying)
     lines = []
     with pytest.raises(QuadrlError, match="killed by signal 9"):
         quadrl.study(STUDY | {"seeds": [0]}, out=tmp_path, on_line=lines.append)

@@ -17,11 +17,11 @@ from scipy import stats
 
 import quadrl
 from quadrl import cli
-from quadrl.evaluation import evaluate, setting
+from quadrl.evaluation.evaluate import evaluate, setting
+from quadrl.evaluation.policy import SHIPPED_AS, Policy, shipped
+from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
 from quadrl.learning import checkpoint
 from quadrl.learning.config import TrainConfig
-from quadrl.policy import SHIPPED_AS, Policy, shipped
-from quadrl.rollout import EVALUATION_SEED, fly, summarize
 
 REPOSITORY = Path(quadrl.__file__).parents[1]
 

@@ -18,9 +18,9 @@ import pytest
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.control.geometric import GeometricController
+from quadrl.core.environment import Environment
 from quadrl.deploy import web
-from quadrl.environment import Environment
-from quadrl.policy import SHIPPED, Policy
+from quadrl.evaluation.policy import SHIPPED, Policy
 
 FLOWN = [name for name, task in tasks.TASKS.items() if not task.contact]
 PAIRS = [(task, vehicle) for task in FLOWN for vehicle in VEHICLES]

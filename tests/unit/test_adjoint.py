@@ -1,6 +1,6 @@
 """The reverse of free flight, beside differences of its steps and beside torch.
 
-The one is the C step itself, the other the same equations in `quadrl/dynamics.py`.
+The one is the C step itself, the other the same equations in `quadrl/engines/dynamics.py`.
 """
 
 import dataclasses
@@ -79,8 +79,8 @@ def test_the_derivatives_are_those_of_the_step(name, per_row):
 def test_the_derivatives_are_those_of_the_equations_in_tensors(name):
     import torch
 
-    from quadrl import dynamics
     from quadrl.aircraft.parameters import Parameters
+    from quadrl.engines import dynamics
 
     batch = flying(name)
     leg = batch.leg(2)

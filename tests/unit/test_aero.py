@@ -11,9 +11,9 @@ import helpers
 import numpy as np
 import pytest
 
-from quadrl import dynamics, native
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
+from quadrl.engines import dynamics, native
 
 LANES = 8
 SHIM = """

@@ -2,7 +2,7 @@
 
 Numbers are for the paper's aircraft unless said otherwise: T_h = 0.65 * 9.81 / 4 = 1.594125 N a
 rotor, A = pi 0.15^2 = 0.0706858 m^2, v_h = sqrt(T_h / (2 * 1.225 A)) = 3.03397 m/s. That
-`quadrl/dynamics.py` has the same as the C of both engines is in test_dynamics.py, that the
+`quadrl/engines/dynamics.py` has the same as the C of both engines is in test_dynamics.py, that the
 symmetries of a layout are those of its flights in test_symmetry.py.
 """
 
@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 import reference
 
-from quadrl import dynamics, mjcf
 from quadrl.aircraft.aerodynamics import EFFECTS, Aerodynamics
 from quadrl.aircraft.parameters import WIND, Parameters, rows
 from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
+from quadrl.core.environment import Environment
+from quadrl.engines import dynamics, mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
-from quadrl.environment import Environment
 
 PAPER = Vehicle()
 FULL = Aerodynamics.full()

@@ -11,7 +11,7 @@ import mujoco
 import pytest
 
 import quadrl
-from quadrl import native
+from quadrl.engines import native
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def run(tmp_path, cache):
     processes = []
 
     def start(code, **variables):
-        code = f"from quadrl import native; {code}"
+        code = f"from quadrl.engines import native; {code}"
         environment = os.environ | settings | variables
         command = [sys.executable, "-c", code]
         processes.append(subprocess.Popen(command, env=environment, start_new_session=True))

@@ -19,9 +19,9 @@ from quadrl import cli, tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.cli.flown import parse_options
+from quadrl.conditions.weather import Weather
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import read_config, write_config
-from quadrl.weather import Weather
 
 SIZE = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16"]
 TINY = [*SIZE, "--task-options", "time_limit=0.5", "--episodes", "2", "--checkpoint-seconds", "0"]
@@ -274,8 +274,10 @@ def test_plot_of_several_runs(run, tmp_path, capsys, refusal):
 
 def test_the_name_of_a_task_flies_the_policy_that_ships(capsys, refusal):
     short = ["--episodes", "5", "--json"]
-    file = quadrl.policy.SHIPPED / "hover_ppo.safetensors"
-    shutil.copytree(quadrl.policy.SHIPPED, "hover")  # a folder of that name is written ./hover
+    file = quadrl.evaluation.policy.SHIPPED / "hover_ppo.safetensors"
+    shutil.copytree(
+        quadrl.evaluation.policy.SHIPPED, "hover"
+    )  # a folder of that name is written ./hover
     printed = []
     for policy in ("hover", file):
         assert command("evaluate", policy, *short) == 0

@@ -8,9 +8,10 @@ import helpers
 import numpy as np
 import pytest
 
-from quadrl import native, tasks
+from quadrl import tasks
 from quadrl.base.trace import FLAGS, LOGICAL, C, Trace
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
+from quadrl.engines import native
 from quadrl.tasks.hover import Hover
 
 STEPS = 40

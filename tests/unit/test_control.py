@@ -27,11 +27,12 @@ from quadrl.control.loops import (
     sampled,
     turned,
 )
-from quadrl.environment import Environment
-from quadrl.reading import Reading
-from quadrl.rollout import fly, summarize
-from quadrl.state import Start, State
-from quadrl.task import Snapshot, TaskState
+from quadrl.control.reading import Reading
+from quadrl.core.environment import Environment
+from quadrl.core.task import Snapshot, TaskState
+from quadrl.engines.state import Start, State
+from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.rollout import fly, summarize
 from quadrl.tasks.hover import Hover
 
 PAPER = Vehicle()
@@ -205,7 +206,7 @@ def test_a_reading_gives_back_the_state():
 @both
 @pytest.mark.parametrize("task", tasks.TASKS)
 def test_every_task_of_the_paper_is_solved(name, task):
-    figures = summarize(fly(control.make(name, task), task, episodes=8))
+    figures = summarize(fly(make_controller(name, task), task, episodes=8))
     assert figures["success_rate"] == 1.0
     if task in ("hover", "static_waypoint", "random_waypoint"):
         assert figures["position_error_m"] < 1e-3
@@ -218,7 +219,7 @@ def test_every_task_of_the_paper_is_solved(name, task):
 def test_every_aircraft_hovers_without_tuning(name, vehicle):
     # An LQR with weights for small errors takes its time to turn round.
     task = tasks.make("hover", time_limit=20.0)
-    flight = fly(control.make(name, task, vehicle), task, episodes=12, vehicle=vehicle)
+    flight = fly(make_controller(name, task, vehicle), task, episodes=12, vehicle=vehicle)
     figures = summarize(flight)
     assert figures["success_rate"] == 1.0
     assert figures["position_error_m"] < 0.02
@@ -229,7 +230,7 @@ def test_recovers_from_sixty_degrees_of_tilt(name, speed, spin):
     """Far outside of what is linear; geometric control from tumbling as well."""
     wild = dict(tilt=math.radians(60), speed=speed, spin=spin, max_distance=20.0, altitude=20.0)
     task = tasks.make("hover", **wild)
-    assert summarize(fly(control.make(name, task), task, episodes=50))["success_rate"] == 1.0
+    assert summarize(fly(make_controller(name, task), task, episodes=50))["success_rate"] == 1.0
 
 
 @both
@@ -280,7 +281,7 @@ def test_rows_are_flown_as_each_alone_and_no_attitude_breaks_it(name, vehicle):
     speed = vehicle.hover_speed * rng.uniform(0.5, 1.1, (count, vehicle.rotor_count))
     motion = dict(quaternion=quaternion, velocity=rng.normal(size=(count, 3)), rotor_speed=speed)
     seen = observations(task, np.zeros(count), goal, vehicle, **motion)
-    controller = control.make(name, task, vehicle)
+    controller = make_controller(name, task, vehicle)
     action = controller(seen)
     assert action.shape == (count, vehicle.rotor_count) and (np.abs(action) <= 1).all()
     for k in range(count):
@@ -526,12 +527,12 @@ def test_loops_fly_every_physics_step_and_a_divergence_in_any_ends_the_episode(n
 @pytest.mark.parametrize(
     ("call", "name", "value"),
     [
-        (lambda: control.make("lqg", "hover"), "controller", "lqg"),
-        (lambda: control.make("lqr", "hovr"), "task", "hovr"),
-        (lambda: control.make("lqr", "hover", "papr"), "vehicle", "papr"),
+        (lambda: make_controller("lqg", "hover"), "controller", "lqg"),
+        (lambda: make_controller("lqr", "hovr"), "task", "hovr"),
+        (lambda: make_controller("lqr", "hover", "papr"), "vehicle", "papr"),
         (lambda: modes.make("velocty", PAPER), "control_mode", "velocty"),
         (lambda: Environment("hover", control_mode="velocty"), "control_mode", "velocty"),
-        (lambda: control.make("lqr", "hover")(np.zeros(25)), "observation size", 25),
+        (lambda: make_controller("lqr", "hover")(np.zeros(25)), "observation size", 25),
         (lambda: Gains(authority=1.1), "authority", 1.1),
         (lambda: Gains(max_tilt=2.0), "max_tilt", 2.0),
         (lambda: Weights(tilt=0.0), "tilt", 0.0),

@@ -12,8 +12,9 @@ import pytest
 import quadrl
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.description import describe, docstrings
-from quadrl.environment import Environment
+from quadrl.base.docstrings import docstrings
+from quadrl.core.environment import Environment
+from quadrl.learning.description import describe
 from quadrl.tasks.hover import Hover
 
 

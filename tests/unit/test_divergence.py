@@ -12,7 +12,7 @@ import pytest
 import reference
 import solutions
 
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
 
 ENGINES = ("mujoco", "free_flight")
 AIRCRAFT = 12

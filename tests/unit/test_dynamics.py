@@ -1,4 +1,4 @@
-"""The equations twice: in C (both engines) and in the array API (`quadrl/dynamics.py`)."""
+"""The equations twice: in C (both engines) and in the array API (`quadrl/engines/dynamics.py`)."""
 
 import dataclasses
 import math
@@ -10,11 +10,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from quadrl import dynamics, mjcf
 from quadrl.aircraft.parameters import Parameters, rows
 from quadrl.aircraft.rotors import GRAVITY, plus
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
 from quadrl.base.rotation import norm
+from quadrl.engines import dynamics, mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 
 COUNT = 9  # more than free flight takes at a time

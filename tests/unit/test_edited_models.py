@@ -7,14 +7,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import mjcf, native
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import in_real_air
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
 from quadrl.base.errors import QuadrlError
+from quadrl.core.environment import Environment
+from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import LANES
 from quadrl.engines.mujoco import BatchEngine, DataEngine
-from quadrl.environment import Environment
 
 CALM, IN_AIR = Vehicle(), in_real_air(Vehicle())
 VEHICLES = {"calm": CALM, "in air": IN_AIR}

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from helpers import begun, idle
 
-from quadrl import control, tasks
+from quadrl import tasks
 from quadrl.base.errors import QuadrlError
-from quadrl.environment import Environment
-from quadrl.task import total
+from quadrl.core.environment import Environment
+from quadrl.core.task import total
+from quadrl.evaluation.controllers import make_controller
 from quadrl.tasks.hover import Hover
 
 
@@ -245,7 +246,7 @@ def test_what_ends_a_hover_early():
 @pytest.mark.parametrize("name", ["hover", "static_waypoint", "random_waypoint"])
 def test_success_at_the_end_of_a_flight_that_is_held_at_the_goal(name):
     environment = Environment(name, num_envs=6, seed=0)
-    fly = control.make("geometric", environment.task, environment.vehicle)
+    fly = make_controller("geometric", environment.task, environment.vehicle)
     seen = environment.flatten(environment.reset())
     for k in range(200):
         now = environment.step(fly(seen))

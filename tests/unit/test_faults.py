@@ -10,8 +10,8 @@ from helpers import begun, idle
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
+from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import MAX_ENVS
-from quadrl.environment import Environment
 from quadrl.tasks.hover import Hover
 
 # ----------------------------------------------------------------------------------------- faults

@@ -12,20 +12,21 @@ from runs import TINY, refused
 from scipy.optimize import linprog
 
 import quadrl
-from quadrl import card_figures, cli
+from quadrl import cli
 from quadrl.aircraft.parameters import rows
 from quadrl.aircraft.presets import VEHICLES, resolve
 from quadrl.aircraft.rotors import GRAVITY, mixer
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.axes import AXES
 from quadrl.base.errors import QuadrlWarning
-from quadrl.card import Card
-from quadrl.checked import OK
+from quadrl.conditions.draw import Draw
 from quadrl.control import feasibility
 from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
-from quadrl.draw import Draw
+from quadrl.evaluation import card_figures
+from quadrl.evaluation.axes import AXES
+from quadrl.evaluation.card import Card
+from quadrl.evaluation.checked import OK
+from quadrl.evaluation.policy import Policy, shipped
 from quadrl.learning.defaults import VARIANTS
-from quadrl.policy import Policy, shipped
 
 PAPER = Vehicle()
 # Action 1 commands 225.68 + 35 = 260.68 rad/s, which carry (260.68 / 225.68)^2 times the weight;

@@ -5,13 +5,15 @@ import ctypes
 import numpy as np
 import pytest
 
-from quadrl import native, tasks
+from quadrl import tasks
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.base.philox import START
 from quadrl.control.geometric import GeometricController
+from quadrl.core.environment import Environment
 from quadrl.deploy import flights
-from quadrl.environment import Environment
-from quadrl.rng import START, uniform
+from quadrl.engines import native
+from quadrl.engines.rng import uniform
 
 
 class Memory:

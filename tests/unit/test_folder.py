@@ -10,7 +10,7 @@ import pytest
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.learning.folder import LOCK, lock_folder
-from quadrl.studies import cluster
+from quadrl.learning.studies import cluster
 
 HERE = socket.gethostname()
 

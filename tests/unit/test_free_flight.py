@@ -11,13 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import mjcf, tasks
+from quadrl import tasks
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
+from quadrl.core.environment import Environment
+from quadrl.engines import mjcf
 from quadrl.engines.free_flight import MARGIN
 from quadrl.engines.mujoco import BatchEngine, DataEngine
-from quadrl.environment import Environment
 
 PAPER = Vehicle()
 EVERY = helpers.LAYOUTS | helpers.IN_AIR

@@ -7,7 +7,7 @@ from runs import assert_same_run, changed, stopped, train
 from tensordict import TensorDict
 
 from quadrl.base.errors import QuadrlError
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import make_env
 from quadrl.learning.networks import export, make_actor_critic

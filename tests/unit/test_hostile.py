@@ -19,12 +19,12 @@ from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import PAPER_ROTORS, Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.environment import Environment
+from quadrl.conditions.observing import Observing
+from quadrl.conditions.randomization import Randomization
+from quadrl.core.environment import Environment
+from quadrl.core.task import Task
 from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
 from quadrl.learning.config import TrainConfig
-from quadrl.observing import Observing
-from quadrl.randomization import Randomization
-from quadrl.task import Task
 from quadrl.tasks.hover import Hover
 
 EXAMPLES = 25

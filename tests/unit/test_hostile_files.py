@@ -15,8 +15,8 @@ from test_hostile import EXAMPLES, profile, refusal
 from test_memory import make_policy
 
 from quadrl.base.errors import QuadrlError
+from quadrl.evaluation.policy import RECURRENT_UNSEALED, SHIPPED, UNSEALED, Policy
 from quadrl.learning import checkpoint
-from quadrl.policy import RECURRENT_UNSEALED, SHIPPED, UNSEALED, Policy
 
 # Of files without a digest: a digest would keep the rest of the reader from seeing them.
 pytestmark = pytest.mark.filterwarnings("ignore:.*has no digest")

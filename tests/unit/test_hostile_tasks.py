@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import mjcf
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
+from quadrl.core.task import TaskState
+from quadrl.engines import mjcf
 from quadrl.engines.mujoco import DataEngine
-from quadrl.task import TaskState
 from quadrl.tasks.hover import Hover
 
 # ------------------------------------------------------------------------------- a user's own task

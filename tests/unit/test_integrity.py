@@ -13,11 +13,11 @@ from test_policy import make_policy
 
 from quadrl.base.errors import QuadrlWarning
 from quadrl.base.machine import processor_kind
-from quadrl.evaluation import setting
+from quadrl.evaluation.evaluate import setting
+from quadrl.evaluation.policy import Policy
 from quadrl.learning import checkpoint
 from quadrl.learning.folder import read_config, write_config
 from quadrl.learning.train import Training
-from quadrl.policy import Policy
 
 FLIPS = 1000
 PARTS = ("config.json", "checkpoint.safetensors", "policy.safetensors")

@@ -11,8 +11,9 @@ from runs import TINY, refused
 from test_policy import linear
 
 import quadrl
-from quadrl import evaluation, tasks
+from quadrl import tasks
 from quadrl.base.errors import QuadrlError
+from quadrl.evaluation import evaluate as evaluation
 from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import make_env

@@ -7,9 +7,9 @@ from runs import changed
 
 from quadrl.base import machine
 from quadrl.base.errors import QuadrlError
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
+from quadrl.evaluation.rollout import fly
 from quadrl.learning.train import Training
-from quadrl.rollout import fly
 from quadrl.tasks.hover import Hover
 
 GIB = 1 << 30

@@ -14,8 +14,11 @@ from torchrl.modules import set_recurrent_mode
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.files import write_safetensors
-from quadrl.environment import Environment
-from quadrl.evaluation import evaluate
+from quadrl.core.environment import Environment
+from quadrl.evaluation.evaluate import evaluate
+from quadrl.evaluation.memory import GRU
+from quadrl.evaluation.policy import RECURRENT_FORMAT, Policy
+from quadrl.evaluation.rollout import fly
 from quadrl.learning import checkpoint, environments
 from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import ALGORITHMS, TrainConfig
@@ -24,10 +27,7 @@ from quadrl.learning.ppo import PPO
 from quadrl.learning.train import Training
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
-from quadrl.memory import GRU
-from quadrl.policy import RECURRENT_FORMAT, Policy
 from quadrl.rendering.live.flight import Flight
-from quadrl.rollout import fly
 
 SIZE, ACTIONS, WIDTH = 5, 2, 7
 ROWS, STEPS = 6, 9

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import landmarks, mjcf
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import DRAWN_ROTOR_HEIGHT
+from quadrl.engines import landmarks, mjcf
 from quadrl.rendering import Renderer
 
 PAPER = VEHICLES["paper"]

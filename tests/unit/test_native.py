@@ -12,8 +12,8 @@ import pytest
 from mujoco import rollout
 
 import quadrl
-from quadrl import mjcf, native
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.engines import mjcf, native
 
 HOVER = Vehicle().hover_speed
 
@@ -214,7 +214,7 @@ def test_without_one_of_the_callbacks_nothing_steps(name):
 DIVERGE = """
 import mujoco, numpy as np
 from pathlib import Path
-from quadrl import native
+from quadrl.engines import native
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.aircraft.vehicle import Vehicle
 {before}

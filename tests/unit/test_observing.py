@@ -12,11 +12,11 @@ from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import to_body
-from quadrl.environment import Environment
+from quadrl.conditions.observing import Observing
+from quadrl.core.environment import Environment
+from quadrl.core.observer import SMOOTHING
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
-from quadrl.evaluation import evaluate
-from quadrl.observer import SMOOTHING
-from quadrl.observing import Observing
+from quadrl.evaluation.evaluate import evaluate
 
 PAPER = Vehicle()
 ACTIONS = helpers.random_actions(12, 3)

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 from helpers import EVERYTHING, drawn, flying
 
-from quadrl import mjcf, tasks
+from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES, in_real_air
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.draw import EACH_ROTOR
+from quadrl.base.philox import PARAMETERS
+from quadrl.conditions.draw import EACH_ROTOR
+from quadrl.conditions.randomization import FACTORS
+from quadrl.core.environment import Environment
+from quadrl.engines import mjcf
 from quadrl.engines import mujoco as engines
 from quadrl.engines.mujoco import BatchEngine, DataEngine
-from quadrl.environment import Environment
-from quadrl.randomization import FACTORS
-from quadrl.rng import PARAMETERS, Rng
+from quadrl.engines.rng import Rng
 from quadrl.tasks.hover import Hover
 
 ENGINES = ("mujoco", "free_flight")

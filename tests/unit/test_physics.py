@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import dynamics, mjcf
 from quadrl.aircraft.parameters import Parameters, rows
 from quadrl.aircraft.vehicle import PAPER_ROTORS, Vehicle
+from quadrl.engines import dynamics, mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 
 PAPER = Vehicle()

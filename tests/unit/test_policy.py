@@ -17,11 +17,11 @@ from safetensors.numpy import save
 import quadrl
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.files import write_safetensors
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
 from quadrl.envs.torchrl import QuadrotorEnv
-from quadrl.evaluation import setting
-from quadrl.policy import FORMAT, SHIPPED, Policy, shipped
-from quadrl.rollout import fly
+from quadrl.evaluation.evaluate import setting
+from quadrl.evaluation.policy import FORMAT, SHIPPED, Policy, shipped
+from quadrl.evaluation.rollout import fly
 
 SIZE = 3
 HEADER = {"format": FORMAT, "task": "hover", "metadata": {}}
@@ -185,7 +185,7 @@ def test_every_flipped_byte_of_the_header_is_refused_or_harmless(tmp_path):
         path.write_bytes(content[:k] + bytes([content[k] ^ 0x15]) + content[k + 1 :])
         try:
             Policy.load(path)
-        except quadrl.policy.QuadrlError as error:
+        except quadrl.evaluation.policy.QuadrlError as error:
             assert "\n" not in str(error)
             count += 1
     assert count > 300  # of about 600; the others are in names and numbers of the metadata
@@ -302,9 +302,10 @@ def imported(code: str) -> set[str]:
 
 def test_a_policy_and_its_evaluation_stay_light(tmp_path):
     make_policy().save(tmp_path / "policy.safetensors")
-    code = f"import quadrl, quadrl.rollout\nquadrl.Policy.load({str(tmp_path)!r})([1, 2, 3])"
+    load = f"quadrl.Policy.load({str(tmp_path)!r})([1, 2, 3])"
+    code = f"import quadrl, quadrl.evaluation.rollout\n{load}"
     modules = imported(code)
-    assert "quadrl.policy" in modules
+    assert "quadrl.evaluation.policy" in modules
     heavy = {"torch", "tensordict", "torchrl", "matplotlib", "mediapy", "PIL", "quadrl.rendering"}
     assert not heavy & modules
     assert not [name for name in modules if name.startswith("dm_control")]

@@ -10,11 +10,11 @@ import pytest
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.philox import NOISE, PUSHES, uniform_array_api
 from quadrl.base.rotation import norm
+from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import BatchEngine
-from quadrl.environment import Environment
-from quadrl.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
-from quadrl.rng import NOISE, PUSHES, uniform_array_api
 
 ENGINES = ("mujoco", "free_flight")
 PAPER = Vehicle()

@@ -7,10 +7,10 @@ import pytest
 from runs import refused
 
 import quadrl  # noqa: F401 - registers the ids
-from quadrl.air import ROWS as WEATHER_ROWS
-from quadrl.environment import Environment
+from quadrl.base.philox import MAX_SEED
+from quadrl.core.environment import Environment
+from quadrl.engines.air import ROWS as WEATHER_ROWS
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
-from quadrl.rng import MAX_SEED
 
 ROWS, ROW_OF_STEPS = 9, WEATHER_ROWS.index("steps")
 ACTIONS = 0.3 * helpers.random_actions(12, ROWS)

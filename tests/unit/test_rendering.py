@@ -16,12 +16,15 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from quadrl import landmarks, mjcf, rendering
+from quadrl import rendering
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
-from quadrl.environment import Environment
+from quadrl.base.shield import shield_triton
+from quadrl.core.environment import Environment
+from quadrl.core.markers import Marker
+from quadrl.core.trajectory import outcome
+from quadrl.engines import landmarks, mjcf
 from quadrl.envs.common import Pictures
-from quadrl.markers import Marker
 from quadrl.rendering import (
     Renderer,
     gl,
@@ -31,9 +34,8 @@ from quadrl.rendering import (
 )
 from quadrl.rendering.camera import aircraft_scale, eased, follow_cameras, headings, in_view
 from quadrl.rendering.horizon import horizon
-from quadrl.rendering.overlay import Panel, outcome
+from quadrl.rendering.overlay import Panel
 from quadrl.rendering.pictures import LiveFlight
-from quadrl.shield import shield_triton
 
 SIZE = 200  # [pixels], of square pictures
 PER_METRE = SIZE / 2 / math.tan(math.radians(21)) / 4  # [pixels] 4 m away, the field of view 42 deg

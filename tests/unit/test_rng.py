@@ -7,9 +7,10 @@ import pytest
 import torch
 from scipy import stats
 
-from quadrl import native, rng
+from quadrl.base import philox
 from quadrl.base.errors import QuadrlError
-from quadrl.rng import Rng
+from quadrl.engines import native, rng
+from quadrl.engines.rng import Rng
 
 # Salmon et al. 2011, the known answers of Random123 for philox4x32-10: counter, key, words.
 KNOWN = [
@@ -43,7 +44,7 @@ def by_c(keys, episodes, stream, first, count):
 @pytest.mark.parametrize(("counter", "key", "words"), KNOWN)
 def test_philox_gives_the_published_answers(counter, key, words):
     for as_array in (lambda x: np.array([x]), lambda x: torch.tensor([x])):
-        got = rng.philox(tuple(map(as_array, counter)), tuple(map(as_array, key)))
+        got = philox.philox(tuple(map(as_array, counter)), tuple(map(as_array, key)))
         assert [int(word[0]) for word in got] == list(words)
     # In C: word j of the block at counter (number / 4, stream, episode).
     episode = signed(*counter[2:])
@@ -53,13 +54,13 @@ def test_philox_gives_the_published_answers(counter, key, words):
 
 @pytest.mark.parametrize(("first", "count"), [(0, 1), (0, 64), (3, 6), (5, 2), (1000, 9)])
 def test_numpy_c_and_torch_give_the_same_numbers(first, count):
-    keys = np.array([0, 1, 5, 2**31, 2**32 - 1, 2**32, 2**53 + 7, rng.MAX_SEED])
+    keys = np.array([0, 1, 5, 2**31, 2**32 - 1, 2**32, 2**53 + 7, philox.MAX_SEED])
     episodes = np.array([0, 3, 2**31, 1, 2**33, 0, 9, 2**40])
     expected = by_c(keys, episodes, 2, first, count)
     tensors = torch.from_numpy(keys), torch.from_numpy(episodes)
     for got in (
         rng.uniform(keys, episodes, 2, first, count),
-        rng.uniform_array_api(keys, episodes, 2, first, count),
+        philox.uniform_array_api(keys, episodes, 2, first, count),
         rng.uniform(*tensors, 2, first, count),
     ):
         assert got.shape == expected.shape and "float64" in str(got.dtype)
@@ -69,9 +70,9 @@ def test_numpy_c_and_torch_give_the_same_numbers(first, count):
 
 def test_a_row_has_its_own_numbers_whatever_its_neighbours_and_the_order():
     keys, episodes = 7 + np.arange(9), np.arange(9) // 2
-    whole = rng.uniform(keys, episodes, rng.START, 0, 20)
+    whole = rng.uniform(keys, episodes, philox.START, 0, 20)
     some = np.array([6, 0, 3])
-    picked = rng.uniform(keys[some], episodes[some], rng.START, 0, 20)
+    picked = rng.uniform(keys[some], episodes[some], philox.START, 0, 20)
     np.testing.assert_array_equal(picked, whole[some])
     # In pieces they are the same numbers as at once.
     pieces = Rng(keys, episodes)
@@ -84,10 +85,10 @@ def test_a_row_has_its_own_numbers_whatever_its_neighbours_and_the_order():
 @pytest.mark.parametrize("seed", [0, 1, 2**31 - 3, 2**32 - 1, 2**53])
 def test_row_i_of_seed_s_is_row_0_of_seed_s_plus_i(seed):
     zero = np.zeros(5, dtype=np.int64)
-    whole = rng.uniform(seed + np.arange(5), zero, rng.START, 0, 8)
+    whole = rng.uniform(seed + np.arange(5), zero, philox.START, 0, 8)
     for i in range(5):
         np.testing.assert_array_equal(
-            rng.uniform(np.array([seed + i]), zero[:1], rng.START, 0, 8), whole[i : i + 1]
+            rng.uniform(np.array([seed + i]), zero[:1], philox.START, 0, 8), whole[i : i + 1]
         )
 
 
@@ -98,7 +99,7 @@ def test_streams_do_not_overlap():
         rng.uniform(np.array([key]), np.array([episode]), stream, 0, 200).reshape(-1, 4)
         for key in (0, 1, 2**32, 2**32 + 1)
         for episode in (0, 1, 2, 2**32, 2**32 + 1)
-        for stream in (rng.START, rng.PARAMETERS, 2, 3)
+        for stream in (philox.START, philox.PARAMETERS, 2, 3)
     ]
     every = np.concatenate(blocks)
     assert len(every) == 4000 and len(np.unique(every, axis=0)) == 4000
@@ -106,8 +107,8 @@ def test_streams_do_not_overlap():
 
 def test_every_purpose_has_a_stream_of_its_own():
     # Every whole number of the module but these is a stream, and so is one that is added.
-    others = ("MAX_SEED", "ADVANCE", "MASK")
-    streams = {k: v for k, v in vars(rng).items() if k not in others and type(v) is int}
+    others = ("MAX_SEED", "MASK")
+    streams = {k: v for k, v in vars(philox).items() if k not in others and type(v) is int}
     # Another number would change every episode of a seed.
     known = dict(START=0, PARAMETERS=1, WEATHER=8, TURBULENCE=9, NOISE=16, PUSHES=17)
     assert known.items() <= streams.items()
@@ -183,10 +184,10 @@ def test_attitudes_have_a_heading_and_a_tilt():
 @pytest.mark.parametrize("seed", [-1, 2**62, 2**70, 1.5, "7", True, math.nan])
 def test_what_is_no_seed_is_refused(seed):
     with pytest.raises(QuadrlError) as caught:
-        rng.check_seed(seed)
+        philox.check_seed(seed)
     assert caught.value.name == "seed" and caught.value.value is seed
     assert caught.value.allowed
 
 
 def test_every_whole_number_of_32_bits_is_a_seed():
-    assert [rng.check_seed(s) for s in (0, np.int64(5), 2**32 - 1)] == [0, 5, 2**32 - 1]
+    assert [philox.check_seed(s) for s in (0, np.int64(5), 2**32 - 1)] == [0, 5, 2**32 - 1]

@@ -10,12 +10,12 @@ from runs import refused
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import MAX_ENVS
-from quadrl.environment import Environment
-from quadrl.evaluation import evaluate
+from quadrl.evaluation.evaluate import evaluate
+from quadrl.evaluation.rollout import EVALUATION_SEED, Rollout, fly, summarize
 from quadrl.learning.config import MAX_SEED
 from quadrl.learning.environments import SEED_STRIDE
-from quadrl.rollout import EVALUATION_SEED, Rollout, fly, summarize
 
 
 def brake(observation: np.ndarray) -> np.ndarray:

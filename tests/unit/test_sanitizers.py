@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from quadrl import native
+from quadrl.engines import native
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "sanitize"
 FAULTS = {

@@ -10,7 +10,7 @@ from helpers import EVERYTHING, drawn, flying
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.task import TaskState
+from quadrl.core.task import TaskState
 from quadrl.tasks.hover import Hover
 
 ENGINES = ("mujoco", "free_flight")

@@ -8,9 +8,9 @@ import pytest
 from runs import TINY, assert_same_run, changed, train
 
 import quadrl
+from quadrl.base.signals import Stopped, heeded
 from quadrl.learning import checkpoint
 from quadrl.learning.run import train_in
-from quadrl.signals import Stopped, heeded
 
 RARE = changed(checkpoint_seconds=1e9)
 

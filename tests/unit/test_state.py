@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quadrl import mjcf
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import rotation
 from quadrl.base.errors import QuadrlError
+from quadrl.engines import mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
-from quadrl.state import Start, State
+from quadrl.engines.state import Start, State
 
 NAMES = [field.name for field in dataclasses.fields(State)]
 ALTITUDE = 3.0

@@ -6,9 +6,9 @@ import pytest
 
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import EVALUATION, write_config, write_json
-from quadrl.studies import crew
-from quadrl.studies.crew import End, train_all
-from quadrl.studies.plan import PlannedRun
+from quadrl.learning.studies import crew
+from quadrl.learning.studies.crew import End, train_all
+from quadrl.learning.studies.plan import PlannedRun
 
 DIED = End("its machine was lost", lost=True)
 NEVER_RAN = dataclasses.replace(DIED, ran=False)

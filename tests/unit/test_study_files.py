@@ -9,8 +9,8 @@ import quadrl
 from quadrl.base.errors import QuadrlError
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
-from quadrl.studies.plan import parse_seeds, read_plan
-from quadrl.studies.table import interval
+from quadrl.learning.studies.plan import parse_seeds, read_plan
+from quadrl.learning.studies.table import interval
 
 STUDY = """
 tasks = ["hover", "landing"]

@@ -7,12 +7,15 @@ import helpers
 import numpy as np
 import pytest
 
-from quadrl import control, rollout, tasks, transition
+from quadrl import tasks
 from quadrl.aircraft.parameters import Parameters, rows
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.rng import Rng
-from quadrl.state import Start, State
+from quadrl.core import transition
+from quadrl.engines.rng import Rng
+from quadrl.engines.state import Start, State
+from quadrl.evaluation import rollout
+from quadrl.evaluation.controllers import make_controller
 
 VEHICLE = Vehicle()
 CLOCK = transition.Clock(control_timestep=0.05, time_limit_steps=200, settle_steps=40)
@@ -158,7 +161,7 @@ def test_every_aircraft_lands_on_its_feet(name):
     task, vehicle = tasks.make("landing"), VEHICLES[name]
     assert helpers.begun(task, vehicle=vehicle).origin[2] == vehicle.ground_clearance
     flight = rollout.fly(
-        control.make("geometric", task, vehicle), task, episodes=8, vehicle=vehicle
+        make_controller("geometric", task, vehicle), task, episodes=8, vehicle=vehicle
     )
     assert flight.is_success.all()
     height = flight.position[flight.length - 1, np.arange(8), 2]

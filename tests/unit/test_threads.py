@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl import mjcf
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
+from quadrl.engines import mjcf
 
 THREADS = 8
 STEPS = 30  # 1.5 s of hover, or 0.6 s of a racer: some episodes end, in the air and on the ground
@@ -116,8 +116,8 @@ def test_the_first_environments_of_a_process_may_be_made_in_threads():
     code = (
         "import time\n"
         "from concurrent.futures import ThreadPoolExecutor\n"
-        "from quadrl import native\n"
-        "from quadrl.environment import Environment\n"
+        "from quadrl.engines import native\n"
+        "from quadrl.core.environment import Environment\n"
         "load = native.load\n"
         "native.load = lambda path: (time.sleep(0.5), load(path))[1]\n"  # so that they meet
         "def make(seed): return Environment('hover', seed=seed).reset()\n"

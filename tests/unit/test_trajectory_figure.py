@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quadrl import control, tasks
+from quadrl import tasks
+from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.rollout import fly
 from quadrl.learning import figures
-from quadrl.rollout import fly
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def drawn(monkeypatch):
     def draw(name, vehicle="paper", episodes=3, weather=None, **options):
         task = tasks.make(name, time_limit=0.5, **options)
         flown = {"episodes": episodes, "vehicle": vehicle, "weather": weather}
-        rollout = fly(control.make("lqr", task), task, **flown)
+        rollout = fly(make_controller("lqr", task), task, **flown)
         figures.trajectory(rollout, "title", Path("a.png"))
         axes = [axis for part in kept[-1].subfigs for axis in part.axes if axis.get_visible()]
         return {a.get_ylabel() or a.get_title("left"): a for a in axes}, rollout

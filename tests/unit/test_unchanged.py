@@ -15,8 +15,8 @@ import pytest
 from quadrl import tasks
 from quadrl.aircraft.rotors import plus
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.environment import Environment
-from quadrl.state import Start
+from quadrl.core.environment import Environment
+from quadrl.engines.state import Start
 
 EVERY = 6  # control steps between two recorded observations
 TOLERANCE = 4e-12

@@ -12,13 +12,14 @@ import pytest
 import scipy.spatial
 from scipy.spatial.transform import Rotation
 
-from quadrl import cli, mjcf, tasks
+from quadrl import cli, tasks
 from quadrl.aircraft.presets import resolve
 from quadrl.base.errors import QuadrlError
 from quadrl.cli.view import others
-from quadrl.control import make as make_controller
-from quadrl.markers import Marker
-from quadrl.policy import Policy
+from quadrl.core.markers import Marker
+from quadrl.engines import mjcf
+from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.policy import Policy
 from quadrl.rendering.live import readout
 from quadrl.rendering.live.flight import Flight, Keyboard
 from quadrl.rendering.live.shapes import sketch

@@ -14,7 +14,7 @@ import pytest
 from quadrl import tasks
 from quadrl.aircraft.presets import resolve
 from quadrl.base.errors import QuadrlError
-from quadrl.control import make as make_controller
+from quadrl.evaluation.controllers import make_controller
 from quadrl.rendering.live.flight import Flight
 
 viser = pytest.importorskip("viser")

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import math
 
+import air_reference as definition
 import helpers
 import numpy as np
 import pytest
@@ -13,14 +14,15 @@ from dm_control.rl import control
 from runs import refused
 from scipy import stats
 
-from quadrl import air, mjcf, tasks
+from quadrl import tasks
 from quadrl.aircraft import parameters
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
+from quadrl.conditions.weather import WEATHERS, Weather, WeatherProcess
+from quadrl.core.environment import Environment
+from quadrl.engines import air, mjcf
 from quadrl.engines.mujoco import DataEngine
-from quadrl.environment import Environment
 from quadrl.envs.dm_control import Physics, QuadrotorTask
-from quadrl.weather import WEATHERS, Weather, WeatherProcess
 
 LIGHT = WEATHERS["light"]
 GUSTY = Weather(wind_speed=7.72, gust_speed=5.0, gust_time=1.5)
@@ -64,34 +66,36 @@ def test_c_is_the_definition_bit_for_bit(count, noise_time, as_array):
     height, rotors = as_array(engine.qpos[:, 2].copy()), 4 if noise_time else 0
     streams = tuple(map(as_array, made.save()["weather.streams"]))
     kept = dict(zip(air.ROWS, map(as_array, made.save()["weather.table"]), strict=True))
-    now = air.begun(kept, streams, rotors)
+    now = definition.begun(kept, streams, rotors)
     for step in range(220):  # past the gust
         for name, values in now.items():
             np.testing.assert_array_equal(column(made, name), np.asarray(values), err_msg=name)
         if step:
             how = 1 / GUSTY.roughness, STEP, 1 / GUSTY.gust_time
-            wind = np.asarray(air.blowing(now, height, *how))
+            wind = np.asarray(definition.blowing(now, height, *how))
             np.testing.assert_array_equal(engine.wind, wind)
             assert not (np.signbit(wind) & (wind == 0)).any()
         noise = np.stack([np.asarray(now[name]) for name in air.NOISE], axis=-1)
         np.testing.assert_array_equal(engine.air[:, 3:], noise * (np.arange(8) < rotors))
         made.advance()
-        now = air.advanced(now, streams, rotors)
+        now = definition.advanced(now, streams, rotors)
 
 
 def test_series_are_the_functions():
     x = np.geomspace(1, 1e10, 100_001)
-    np.testing.assert_allclose(air.logarithm(x), np.log(x), rtol=0, atol=4e-15)
-    np.testing.assert_array_equal(air.logarithm(np.array([1.0, 0.5, 0.0, -3.0])), 0)
+    np.testing.assert_allclose(definition.logarithm(x), np.log(x), rtol=0, atol=4e-15)
+    np.testing.assert_array_equal(definition.logarithm(np.array([1.0, 0.5, 0.0, -3.0])), 0)
     share = np.linspace(0, 1, 10_001)
-    np.testing.assert_allclose(air.half_wave(share), np.sin(np.pi * share), rtol=0, atol=1e-15)
-    np.testing.assert_array_equal(air.half_wave(np.array([-9.0, -1e-9, 1.0 + 1e-9, 7.0])), 0)
+    np.testing.assert_allclose(
+        definition.half_wave(share), np.sin(np.pi * share), rtol=0, atol=1e-15
+    )
+    np.testing.assert_array_equal(definition.half_wave(np.array([-9.0, -1e-9, 1.0 + 1e-9, 7.0])), 0)
 
 
 def test_normal_numbers_have_mean_0_and_variance_1():
     count = 100_000
     keys, zero = np.arange(count), np.zeros(count, dtype=np.int64)
-    drawn = np.array(air.normals((keys, zero), 3.0 + zero, 0, 14))
+    drawn = np.array(definition.normals((keys, zero), 3.0 + zero, 0, 14))
     # A sum of four uniform ones: kurtosis 3 - 1.2 / 4 = 2.7, so its square has variance 1.7.
     assert (abs(drawn.mean(axis=1)) < SIGMAS / math.sqrt(count)).all()
     assert (abs(drawn.var(axis=1) - 1) < SIGMAS * math.sqrt(1.7 / count)).all()
@@ -104,7 +108,7 @@ def test_no_step_draws_the_numbers_of_another():
     # Two numbers of a block, which 2800 blocks share by chance once in 10000 times.
     steps = np.arange(400.0)
     streams = np.full(400, 5), np.full(400, 2)
-    drawn = np.array(air.normals(streams, steps, 0, 6 + parameters.MAX_ROTORS))
+    drawn = np.array(definition.normals(streams, steps, 0, 6 + parameters.MAX_ROTORS))
     blocks = drawn.reshape(-1, 2, 400).transpose(0, 2, 1).reshape(-1, 2)
     assert len(np.unique(blocks, axis=0)) == len(blocks) == 400 * air.BLOCKS
 
@@ -121,7 +125,7 @@ def test_mean_wind_follows_the_profile(height, share):
     made, _ = process(dataclasses.replace(LIGHT, direction=0.7))
     still = dict(zip(air.ROWS, made.save()["weather.table"], strict=True))
     still |= {name: np.zeros(1) for name in air.FILTERS}
-    wind = air.blowing(still, np.array([height]), 1 / LIGHT.roughness, STEP, 1.0)
+    wind = definition.blowing(still, np.array([height]), 1 / LIGHT.roughness, STEP, 1.0)
     expected = share * 7.72 * np.array([[math.cos(0.7), math.sin(0.7), 0.0]])
     np.testing.assert_allclose(wind, expected, rtol=1e-3)
 

@@ -6,13 +6,13 @@ import helpers
 import numpy as np
 import pytest
 
-from quadrl import mjcf
+from quadrl.conditions.weather import Weather
+from quadrl.engines import mjcf
 from quadrl.envs.common import Pictures
-from quadrl.evaluation import evaluate
+from quadrl.evaluation.evaluate import evaluate
 from quadrl.rendering import Renderer, overlay, render_trajectory
 from quadrl.rendering.pictures import LiveFlight
 from quadrl.rendering.streaks import COUNT, TAIL, streaks
-from quadrl.weather import Weather
 
 WEST = Weather(wind_speed=12.0, direction=np.pi)
 HIGH = np.array([0.0, 0.0, 30.0])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from quadrl import tasks
-from quadrl.environment import Environment
+from quadrl.core.environment import Environment
 from quadrl.learning.window import Window, fly
 
 STEPS, COUNT, GAMMA = 12, 5, 0.9

@@ -20,10 +20,10 @@ import viser
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import number
+from quadrl.evaluation.rollout import Controller
 from quadrl.rendering.live import access, readout
 from quadrl.rendering.live.flight import KEYS, Flight, Keyboard
 from quadrl.rendering.live.scene import CAMERAS, Scene
-from quadrl.rollout import Controller
 
 FRAME = 1 / 30  # [s]
 READOUT = 0.1  # [s] between two updates of the numbers

@@ -9,15 +9,15 @@ import numpy as np
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array
 from quadrl.base.validation import number
-from quadrl.environment import Environment
-from quadrl.markers import Marker
-from quadrl.memory import Flyer
-from quadrl.observing import resolve
-from quadrl.policy import Policy
-from quadrl.randomization import Randomized
+from quadrl.conditions.observing import resolve
+from quadrl.conditions.randomization import Randomized
+from quadrl.core.environment import Environment
+from quadrl.core.markers import Marker
+from quadrl.core.task import Task
+from quadrl.evaluation.memory import Flyer
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import Controller
 from quadrl.rendering.scene import GOAL_RADIUS
-from quadrl.rollout import Controller
-from quadrl.task import Task
 
 MAX_AIRCRAFT = 256
 LONGEST = 0.25  # [s] of flight at once; a machine that is slower shows slow motion

@@ -12,8 +12,8 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from quadrl import landmarks
 from quadrl.base.rotation import Array
+from quadrl.engines import landmarks
 from quadrl.rendering.live.shapes import blade_ids
 
 SHARPEST = 0.7  # [rad], an edge that is shaded round

@@ -10,8 +10,8 @@ import glfw
 import mujoco
 import numpy as np
 
-from quadrl import mjcf
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
+from quadrl.engines import mjcf
 from quadrl.engines.mujoco import DataEngine
 from quadrl.rendering.live import shapes
 from quadrl.rendering.live.flight import Flight

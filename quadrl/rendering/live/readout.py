@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quadrl.mjcf import rotor_colour
+from quadrl.engines.mjcf import rotor_colour
 from quadrl.rendering.live.flight import Flight
 
 LINE = '<div style="display:flex;justify-content:space-between;line-height:1.5">{}</div>'

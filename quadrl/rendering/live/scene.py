@@ -11,8 +11,8 @@ import trimesh
 import viser
 from scipy.spatial.transform import Rotation
 
-from quadrl import mjcf
 from quadrl.base.rotation import Array
+from quadrl.engines import mjcf
 from quadrl.rendering.live import meshes, shapes
 from quadrl.rendering.live.flight import Flight
 from quadrl.rendering.scene import TRAIL_NEW, TRAIL_OLD

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from quadrl.base.rotation import Array
-from quadrl.markers import Marker
+from quadrl.core.markers import Marker
 from quadrl.rendering.scene import CIRCLE, PAD_RGBA
 
 # The letter H on a pad of radius 1, as strokes.

@@ -1,0 +1,43 @@
+"""Pictures and videos that show themselves in a notebook."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+from pathlib import Path
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import write_whole
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Media:
+    """A picture or a video."""
+
+    content: bytes
+    """Of the file."""
+    kind: str
+    """The file's ending: png, mp4 or gif."""
+
+    def __repr__(self) -> str:
+        return f"{self.kind}, {len(self.content) // 1024} kB; save(path) writes it"
+
+    def _repr_html_(self) -> str:
+        data = base64.b64encode(self.content).decode()
+        if self.kind == "mp4":
+            return f'<video controls loop src="data:video/mp4;base64,{data}"></video>'
+        return f'<img style="max-width:100%" src="data:image/{self.kind};base64,{data}"/>'
+
+    def save(self, path: str | Path) -> Path:
+        """Write the file, whole or not at all.
+
+        Raises:
+            QuadrlError: The name has another ending.
+        """
+        path = Path(path)
+        if path.suffix != f".{self.kind}":
+            allowed = f"a name that ends in .{self.kind}"
+            raise QuadrlError(name="path", value=str(path), allowed=allowed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, self.content)
+        return path

@@ -1,0 +1,92 @@
+"""Keyed random numbers in any array namespace: the definition of those that `engines/rng.py` draws.
+
+Philox4x32-10 (Salmon, Moraes, Dror and Shaw, "Parallel Random Numbers: As Easy as 1, 2, 3", SC
+2011) of a key (the seed of a row, 64 bits) and a counter (number, stream, episode).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, namespace
+from quadrl.base.validation import number
+
+MAX_SEED = (1 << 62) - 1
+# Streams of an episode. A new purpose takes a new number, so that the others stay as they are.
+START, PARAMETERS = 0, 1
+WEATHER, TURBULENCE = 8, 9  # numbers of an episode; blocks of its control steps
+NOISE, PUSHES = 16, 17  # blocks of its control steps
+MASK = 0xFFFFFFFF
+"""Of a 32-bit word."""
+Seed = int | Sequence[int | None] | None
+"""Of all rows, or one for each; None for one from the system, or for none."""
+
+
+def check_seed(seed: Any) -> int:
+    """A seed as an int.
+
+    Raises:
+        QuadrlError: It is no whole number from 0 to `MAX_SEED`.
+    """
+    return number("seed", seed, 0, MAX_SEED, whole=True)
+
+
+def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
+    """Those of some rows (n,) that get a seed, and their seeds.
+
+    Args:
+        seed: Row i gets seed + i, or seed[i] unless that is None.
+        rows: Numbers of rows.
+        count: Number of all rows.
+
+    Raises:
+        QuadrlError: The seed of a row would be no whole number from 0 to `MAX_SEED`, or there are
+            not `count` seeds.
+    """
+    if not isinstance(seed, (list, tuple, np.ndarray)):
+        # The last row has a seed, too.
+        return rows, number("seed", seed, 0, MAX_SEED - (count - 1), whole=True) + rows
+    if len(seed) != count:
+        allowed = f"a whole number, or a sequence of {count}"
+        raise QuadrlError(name="seed", value=seed, allowed=allowed)
+    own = [row for row in rows.tolist() if seed[row] is not None]
+    return np.array(own, dtype=np.int64), [check_seed(seed[row]) for row in own]
+
+
+def philox(counter: tuple[Array, ...], key: tuple[Array, Array]) -> tuple[Array, ...]:
+    """The four 32-bit words of blocks.
+
+    Args:
+        counter: Four arrays of 32-bit words, held as int64.
+        key: Two such arrays.
+
+    Returns:
+        Four arrays of 32-bit words, held as int64.
+    """
+    c0, c1, c2, c3 = counter
+    low, high = key
+    for _ in range(10):
+        # The products wrap around as those of unsigned numbers do.
+        p0, p1 = c0 * 0xD2511F53, c2 * 0xCD9E8D57
+        c0, c1 = ((p1 >> 32) & MASK) ^ c1 ^ low, p1 & MASK
+        c2, c3 = ((p0 >> 32) & MASK) ^ c3 ^ high, p0 & MASK
+        low, high = (low + 0x9E3779B9) & MASK, (high + 0xBB67AE85) & MASK
+    return c0, c1, c2, c3
+
+
+def uniform_array_api(keys: Array, episodes: Array, stream: int, first: int, count: int) -> Array:
+    """The definition of `uniform`, in any array namespace."""
+    xp = namespace(keys)
+    blocks = range(first // 4, (first + count - 1) // 4 + 1)
+    words: list[Array] = []
+    for block in blocks:
+        zero = xp.zeros_like(keys)
+        counter = (zero + block, zero + stream, episodes & MASK, (episodes >> 32) & MASK)
+        words += philox(counter, (keys & MASK, (keys >> 32) & MASK))
+    start = first - 4 * blocks[0]
+    chosen = xp.stack(words[start : start + count], axis=-1)
+    return xp.astype(chosen, xp.float64) * 2.0**-32

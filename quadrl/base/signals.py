@@ -1,0 +1,85 @@
+"""Signals to a process: what ends in order, and what a training does at the end of an iteration.
+
+Handlers belong to whoever owns the process, the command line or the process of a study's training.
+A library leaves them alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Generator, Mapping
+from typing import Any, Protocol
+
+Handler = Callable[[int, Any], object]
+
+
+class Asked(Protocol):
+    """A training that can be asked for a checkpoint."""
+
+    def ask(self, *, stop: bool = False) -> None:
+        """Write one at the end of the iteration, and stop there or go on."""
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal has stopped a training at the end of an iteration, after its checkpoint."""
+
+    def __init__(self, number: int) -> None:
+        """Remember the number of the signal."""
+        super().__init__()
+        self.number = number
+
+
+@contextlib.contextmanager
+def handling(handlers: Mapping[int, Handler]) -> Generator[None]:
+    """Send signals to these functions; nowhere else than in the main thread can that be done."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def ending(number: int, _: Any) -> None:
+    """End the program as an exception does: what was begun is cleaned up."""
+    raise SystemExit(128 + number)
+
+
+def unheeded(*_: Any) -> None:
+    """Do nothing: what is meant for a training must end nothing where none is at work."""
+
+
+IN_ORDER: Mapping[int, Handler] = {signal.SIGTERM: ending, signal.SIGUSR1: unheeded}
+"""How a command takes signals."""
+
+
+@contextlib.contextmanager
+def heeded(training: Asked) -> Generator[None]:
+    """Let signals ask a training for a checkpoint at the end of its iteration.
+
+    After SIGTERM and Ctrl-C it stops there; a further Ctrl-C stops it at once. After SIGUSR1 it
+    goes on.
+
+    Raises:
+        Stopped: A signal came that stops it.
+    """
+    came: list[int] = []
+
+    def stop(number: int, frame: Any) -> None:
+        if came and number == signal.SIGINT:
+            signal.default_int_handler(number, frame)
+        came.append(number)
+        training.ask(stop=True)
+
+    handlers: dict[int, Handler] = {signal.SIGTERM: stop, signal.SIGUSR1: lambda *_: training.ask()}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # in the background it is not
+        handlers[signal.SIGINT] = stop
+    with handling(handlers):
+        yield
+    if came:
+        raise Stopped(came[0])

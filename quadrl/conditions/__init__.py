@@ -1,0 +1,1 @@
+"""The conditions of a flight: weather, what is drawn for an aircraft, disturbances, sensors."""

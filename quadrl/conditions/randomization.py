@@ -1,0 +1,221 @@
+"""The aircraft that is not quite the one: what is drawn for each row at the start of an episode.
+
+Aircraft are drawn around the one that is specified, by factors, so that a preset fits all of them.
+`quadrl.conditions.draw` makes the aircraft, `quadrl.conditions.disturbances` flies them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from quadrl.aircraft.rotors import MAX
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import choice, keys, number, numbers
+
+Range = tuple[float, float]
+LEAST, MOST = 0.01, 100.0  # of a factor
+LONGEST_DELAY = 10.0  # [s]
+LONGEST_SHIFT = 1.0  # [m]
+FACTORS = ("mass", "inertia", "thrust", "torque", "lag", "drag", "inflow", "max_speed")
+DELAYS = ("command_delay", "observation_delay")
+
+
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """Sizes of errors of the state estimate, the same along or about each of three axes."""
+
+    position: float = 0.0
+    """[m], world frame."""
+    attitude: float = 0.0
+    """[rad], about the axes of the body."""
+    velocity: float = 0.0
+    """[m/s], world frame."""
+    body_rate: float = 0.0
+    """[rad/s], body frame."""
+
+    def __post_init__(self) -> None:
+        """Validate the sizes."""
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, number(name, value, 0, MAX))
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Of all twelve errors, (12,), in the order of the fields."""
+        return np.repeat([*vars(self).values()], 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pushes:
+    """Impulses that hit an aircraft now and then, between two control steps."""
+
+    rate: float = 0.0
+    """Pushes in a second, on average."""
+    velocity: float = 0.0
+    """Change of the velocity by each push [m/s], in any direction."""
+    body_rate: float = 0.0
+    """Change of the body rate by each push [rad/s], about any axis."""
+
+    def __post_init__(self) -> None:
+        """Validate the numbers."""
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, number(f"pushes {name}", value, 0, MAX))
+
+
+def _record(name: str, given: Any, kind: type) -> Any:
+    """A record of a kind, from one or from some of its fields."""
+    if isinstance(given, kind):
+        return given
+    if not isinstance(given, Mapping):
+        names = (
+            f", or a name of {', '.join(RANDOMIZATIONS)}"
+            if kind is not Errors and kind is not Pushes
+            else ""
+        )
+        allowed = f"a {kind.__name__}, or a mapping of its fields{names}"
+        raise QuadrlError(name=name, value=given, allowed=allowed)
+    fields = [field.name for field in dataclasses.fields(kind)]
+    keys(f"field of {name}", given, fields)
+    return kind(**given)
+
+
+def _pair(name: str, given: Any, low: float, high: float) -> Range:
+    """A range, from two numbers or from one for both ends."""
+    whole = isinstance(given, (list, tuple, np.ndarray))
+    first, last = numbers(name, given if whole else (given, given), 2, low, high)
+    if first > last:
+        raise QuadrlError(name=name, value=given, allowed="(low, high) with low at most high")
+    return first, last
+
+
+@dataclasses.dataclass(frozen=True)
+class Randomization:
+    """What is drawn anew for each aircraft at each reset, evenly between two ends (low, high).
+
+    One number in place of a pair stands for both ends. Factors are of what is specified.
+    """
+
+    mass: Range = (1.0, 1.0)
+    """Factor of the mass."""
+    inertia: Range = (1.0, 1.0)
+    """Factor of the moments of inertia, the same about every axis."""
+    thrust: Range = (1.0, 1.0)
+    """Factor of the thrust of all rotors at a rotor speed."""
+    torque: Range = (1.0, 1.0)
+    """Factor of their torque."""
+    lag: Range = (1.0, 1.0)
+    """Factor of their time constants, rising and falling."""
+    drag: Range = (1.0, 1.0)
+    """Factor of the aircraft's drag and aerodynamic moment, and of the drag of its rotors."""
+    inflow: Range = (1.0, 1.0)
+    """Factor of the lift of the blades, with which thrust answers climb and descent."""
+    max_speed: Range = (1.0, 1.0)
+    """Factor of the largest rotor speed, at most 1: a battery that runs low."""
+    rotors: Range = (1.0, 1.0)
+    """Further factor of the thrust, the torque and the time constant of each rotor on its own."""
+    one_rotor: Range = (1.0, 1.0)
+    """Further factor of the thrust and the torque of one rotor, any of them: a damaged one."""
+    wind: Range = (1.0, 1.0)
+    """Factor of the weather's mean wind, with which its turbulence grows."""
+    centre_of_mass: float = 0.0
+    """Largest distance of the centre of mass from where it should be, along each axis [m]."""
+    command_delay: Range = (0.0, 0.0)
+    """Time from a command to the rotors that get it [s], in whole physics steps."""
+    observation_delay: Range = (0.0, 0.0)
+    """Age of the observation [s], in whole control steps."""
+    noise: Errors = Errors()
+    """Standard deviations of the errors of the state estimate, drawn anew at each control step."""
+    bias: Errors = Errors()
+    """Largest errors of it that last for the episode."""
+    pushes: Pushes = Pushes()
+    """Impulses."""
+
+    def __post_init__(self) -> None:
+        """Validate what can be judged without an aircraft."""
+        for field in dataclasses.fields(self):
+            name, given = field.name, getattr(self, field.name)
+            if field.name == "centre_of_mass":
+                value: Any = number(name, given, 0, LONGEST_SHIFT)
+            elif field.name in ("noise", "bias", "pushes"):
+                value = _record(name, given, Pushes if name == "pushes" else Errors)
+            elif field.name in DELAYS:
+                value = _pair(name, given, 0, LONGEST_DELAY)
+            else:
+                least = 0.0 if name in ("drag", "wind") else LEAST
+                value = _pair(name, given, least, 1.0 if name == "max_speed" else MOST)
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"Randomization({', '.join(f'{k}={v!r}' for k, v in self.given().items())})"
+
+    def given(self) -> dict[str, Any]:
+        """The fields that differ from none, as JSON has them."""
+        off, own = dataclasses.asdict(NONE), dataclasses.asdict(self)
+        return {name: value for name, value in own.items() if value != off[name]}
+
+    @property
+    def per_row(self) -> bool:
+        """Whether parameters of the aircraft are drawn."""
+        return self.centre_of_mass > 0 or any(
+            getattr(self, name) != (1.0, 1.0) for name in (*FACTORS, "rotors", "one_rotor")
+        )
+
+
+NONE = Randomization()
+RANDOMIZATIONS = {
+    "none": NONE,
+    # An aircraft that has been identified: half of what "full" has, and noise as in learning-to-fly
+    # (Eschmann et al. 2024).
+    "light": Randomization(
+        mass=(0.95, 1.05),  # chosen
+        inertia=(0.92, 1.08),  # chosen
+        torque=(0.85, 1.15),  # chosen
+        lag=(0.8, 1.25),  # chosen
+        drag=(0.5, 1.5),  # chosen
+        inflow=(0.85, 1.15),  # chosen
+        rotors=(0.975, 1.025),  # chosen
+        centre_of_mass=0.001,  # chosen
+        command_delay=(0.0, 0.01),  # 5 to 10 ms on Crazyflies (fitted to flights by IMRCLab)
+        noise=Errors(position=1e-3, attitude=1e-3, velocity=2e-3, body_rate=2e-3),
+    ),
+    # An aircraft that is known from its data sheet.
+    "full": Randomization(
+        mass=(0.8, 1.2),  # chosen: a battery or a camera more or less
+        inertia=(0.85, 1.15),  # chosen
+        thrust=(0.95, 1.05),  # chosen: with the mass, within what an action of 1 can carry
+        torque=(0.7, 1.3),  # chosen
+        lag=(0.5, 2.0),  # chosen: measured on one kind of aircraft were 39 to 87 ms (IMRCLab)
+        drag=(0.0, 2.0),  # chosen
+        inflow=(0.7, 1.3),  # chosen
+        max_speed=(0.97, 1.0),  # chosen: 0.94 to 1 of the thrust
+        wind=(0.0, 1.0),  # chosen
+        rotors=(0.96, 1.04),  # chosen; others take 0.9 to 1.1 (Molchanov et al. 2019)
+        centre_of_mass=0.002,  # chosen
+        command_delay=(0.0, 0.05),  # chosen: about 10 ms from sensor to policy (RAPTOR), and radio
+        noise=Errors(position=5e-3, attitude=5e-3, velocity=2e-2, body_rate=2e-2),
+        # position: Molchanov et al. 2019; the others chosen
+        bias=Errors(position=1e-2, attitude=1e-2, velocity=2e-2, body_rate=5e-3),  # chosen
+        pushes=Pushes(rate=0.2, velocity=0.3, body_rate=0.5),  # chosen
+    ),
+}
+"""What is known by name."""
+
+
+Randomized = Randomization | Mapping[str, Any] | str | None
+"""What `resolve` takes."""
+
+
+def resolve(given: Randomized) -> Randomization:
+    """A randomization, the one of a name or of some fields, or none for None.
+
+    Raises:
+        QuadrlError: It is something else, a name or field is unknown, or a value out of range.
+    """
+    if given is None or isinstance(given, Randomization):
+        return given or NONE
+    if isinstance(given, str):
+        return RANDOMIZATIONS[choice("randomization", given, RANDOMIZATIONS)]
+    return _record("randomization", given, Randomization)

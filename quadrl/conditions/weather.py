@@ -1,0 +1,233 @@
+"""The weather: what the wind is like, and the process that lets it blow.
+
+The wind is one vector for an aircraft. It changes once a control step, before the physics, and
+stands in the aircraft's row of air (`engine.air`) meanwhile.
+
+- Mean wind over rough ground: U(h) = W20 ln(h/z0) / ln(6.096/z0) at the height h of the aircraft,
+  zero up to h = z0.
+- Turbulence: Dryden's spectra at low altitude (MIL-F-8785C, 3.7.2), along the mean wind, to its
+  left and up. The filters are discretised exactly, so the spectra do not depend on the step. The
+  mean wind carries the turbulence past, at the task's altitude: the air is the same whatever the
+  aircraft does.
+- One gust an episode: a pulse (1 - cos), at a random time.
+- Where it is asked for, a noise of the lift of each rotor: independent first-order processes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.base.errors import QuadrlError
+from quadrl.base.philox import WEATHER
+from quadrl.base.rotation import Array
+from quadrl.base.validation import choice, keys, number
+from quadrl.engines import native
+from quadrl.engines.air import FIXED, ROWS, fixed_of
+from quadrl.engines.rng import FULL_TURN, Rng
+
+if TYPE_CHECKING:
+    from quadrl.aircraft.vehicle import Vehicle
+    from quadrl.engines.engine import Engine
+
+MAX_WIND = 100.0  # [m/s]
+
+
+@dataclasses.dataclass(frozen=True)
+class Weather:
+    """What the wind is like. The default is calm air."""
+
+    wind_speed: float = 0.0
+    """Mean wind at a height of 6.096 m (20 ft) [m/s]; turbulence grows with it."""
+    direction: float | None = None
+    """Where mean wind and gust blow to, from east towards north [rad]; None: each episode draws
+    one for the wind and one for the gust."""
+    roughness: float = 0.0457
+    """Height z0 under which there is no mean wind [m]. The default is 0.15 ft: open country."""
+    gust_speed: float = 0.0
+    """Peak of the gust, which blows once an episode [m/s]."""
+    gust_time: float = 2.0
+    """How long the gust lasts [s]. An episode draws when it begins."""
+
+    def __post_init__(self) -> None:
+        """Validate the numbers."""
+        number("wind_speed", self.wind_speed, 0, MAX_WIND)
+        if self.direction is not None:
+            number("direction", self.direction)
+        number("roughness", self.roughness, 1e-6, 1.0)
+        number("gust_speed", self.gust_speed, 0, MAX_WIND)
+        number("gust_time", self.gust_time, 1e-3, 1e6)
+
+    @classmethod
+    def of(cls, weather: str | Weather | Mapping[str, Any] | None) -> Weather:
+        """The weather of a name, of the fields that a file holds, or as it is; None is calm.
+
+        Raises:
+            QuadrlError: There is no such weather, or it has no such field.
+        """
+        if isinstance(weather, Weather):
+            return weather
+        if isinstance(weather, Mapping):
+            keys("weather", weather, [field.name for field in dataclasses.fields(cls)])
+            return cls(**weather)
+        return WEATHERS["calm" if weather is None else choice("weather", weather, WEATHERS)]
+
+    @property
+    def calm(self) -> bool:
+        """Whether the air never moves."""
+        return self.wind_speed == 0 and self.gust_speed == 0
+
+
+WEATHERS: dict[str, Weather] = {
+    "calm": Weather(),
+    "light": Weather(wind_speed=7.72),
+    "moderate": Weather(wind_speed=15.4),
+    "severe": Weather(wind_speed=23.1),
+}
+"""Named weathers: those of turbulence in MIL-F-8785C, 15, 30 and 45 knots; without a gust."""
+
+
+Weathered = str | Weather | Mapping[str, Any] | None
+"""What `Weather.of` takes."""
+
+
+class _Rows(ctypes.Structure):
+    """`Rows` of native/weather.c."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("table", "keys", "episodes", "height", "air")),
+        *((name, ctypes.c_int64) for name in ("columns", "stride", "rotors")),
+        *((name, ctypes.c_double) for name in ("per_roughness", "timestep", "per_gust_time")),
+    ]
+
+
+def noise_time_of(vehicle: Vehicle) -> float:
+    """Correlation time of the noise of the rotors' lift in the vortex ring state [s]; 0 for none.
+
+    Ten times the time in which the induced velocity of hover crosses a rotor's radius (chosen).
+    """
+    air = vehicle.aerodynamics
+    if not air.vortex_ring_noise:
+        return 0.0
+    radius = vehicle.rotors[0].disc
+    thrust = vehicle.mass * GRAVITY / vehicle.rotor_count
+    induced = math.sqrt(thrust / (2 * air.air_density * math.pi * radius**2))
+    return 10 * radius / induced
+
+
+class WeatherProcess:
+    """The weather of the aircraft of an engine, a column of its table for each.
+
+    An aircraft's weather depends on the key and the number of its episode alone.
+    """
+
+    def __init__(
+        self, weather: Weather, engine: Engine, time_limit: float, noise_time: float = 0.0
+    ) -> None:
+        """Set up the table.
+
+        Args:
+            weather: The weather.
+            engine: Whose air it writes.
+            time_limit: Of an episode [s]: the gust blows within it.
+            noise_time: Correlation time of the noise of each rotor's lift [s]; 0 for none.
+        """
+        self.weather = weather
+        count, step = engine.num_envs, engine.vehicle.control_timestep
+        self._setting = weather.roughness, float(engine.origin[2]), step, noise_time
+        self._latest = max(0.0, time_limit - weather.gust_time)
+        # As wide as the engine's own tables, against set conflicts between rows.
+        self._whole = np.zeros((len(ROWS), engine.frames[0].columns))
+        self._table = self._whole[:, :count]
+        self._streams = np.zeros((2, count), dtype=np.int64)
+        self._varied = False
+        self._write(slice(None), weather.wind_speed)
+        self._engine = engine  # its buffers stay where they are
+        arrays = (self._whole, *self._streams, engine.qpos[:, 2], engine.air)
+        pointers = [array.ctypes.data for array in arrays]
+        self._rows = _Rows(
+            *pointers,
+            columns=self._whole.shape[1],
+            stride=engine.qpos.strides[0] // 8,
+            rotors=engine.vehicle.rotor_count if noise_time else 0,
+            per_roughness=1 / weather.roughness,
+            timestep=step,
+            per_gust_time=1 / weather.gust_time,
+        )
+        self._address = ctypes.addressof(self._rows)
+        self._kernel = native.library().quadrl_weather
+
+    @classmethod
+    def of(cls, weather: Weather, engine: Engine, time_limit: float) -> WeatherProcess | None:
+        """The process, unless the air never moves."""
+        noise_time = noise_time_of(engine.vehicle)
+        if weather.calm and not noise_time:
+            return None
+        return cls(weather, engine, time_limit, noise_time)
+
+    def begin(
+        self, rows: np.ndarray, keys: Array, episodes: Array, wind_speed: Array | None = None
+    ) -> None:
+        """Begin episodes, and write their first air.
+
+        Args:
+            rows: Numbers (n,) of the aircraft, which are where their episodes begin.
+            keys: (n,) int64, of those rows.
+            episodes: (n,) int64, numbers of the episodes.
+            wind_speed: (n,) [m/s], where each has another than the weather's.
+        """
+        self._streams[:, rows] = keys, episodes
+        if wind_speed is not None:
+            self._write(rows, wind_speed)
+            self._varied = True
+        rng, gust = Rng(keys, episodes, WEATHER), self.weather.gust_speed
+        drawn = [rng.uniform(0.0, 1.0) for _ in range(3)]
+        bearing, gust_bearing = FULL_TURN * drawn[0], FULL_TURN * drawn[1]
+        if self.weather.direction is not None:
+            bearing = gust_bearing = 0.0 * bearing + self.weather.direction
+        values = {
+            "east": np.cos(bearing),
+            "north": np.sin(bearing),
+            "gust_start": self._latest * drawn[2],
+            "gust_east": gust * np.cos(gust_bearing),
+            "gust_north": gust * np.sin(gust_bearing),
+        }
+        for name, value in values.items():
+            self._table[ROWS.index(name), rows] = value
+        self._kernel(self._address, len(rows), rows.ctypes.data, True)
+
+    def advance(self) -> None:
+        """Bring the weather of all aircraft one control step forward, and write their air."""
+        self._kernel(self._address, self._table.shape[1], None, False)
+
+    def _write(self, rows: Any, wind_speed: Any) -> None:
+        fixed = fixed_of(wind_speed, *self._setting)
+        for name, value in fixed.items():
+            self._table[ROWS.index(name), rows] = value
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Everything that the next steps depend on, as arrays."""
+        return {"weather.table": self._table.copy(), "weather.streams": self._streams.copy()}
+
+    def check(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Refuse what was saved in another weather, or is not finite.
+
+        Raises:
+            QuadrlError: The message names the array.
+        """
+        table, fixed = saved["weather.table"], slice(0, len(FIXED))
+        same = self._varied or np.array_equal(table[fixed], self._table[fixed])
+        same &= np.array_equal(table[ROWS.index("steps")], saved["episode.steps"])
+        if not (same and np.isfinite(table).all()):
+            reason = "the state was saved in another weather"
+            raise QuadrlError(reason, name="weather.table", value=table, allowed="this weather's")
+
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Take up what `save` gave; the engine restores its air itself."""
+        self._table[:], self._streams[:] = saved["weather.table"], saved["weather.streams"]

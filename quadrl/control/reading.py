@@ -1,0 +1,81 @@
+"""What controllers and the guides of tasks know: a flat observation, taken apart."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, heading_of, norm, rotation_of_angles, to_world
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """What a flat observation says, in the frames that controllers use."""
+
+    rotation: Array  # (N, 3, 3), body to world
+    velocity: Array  # (N, 3) [m/s], world frame
+    body_rate: Array  # (N, 3) [rad/s], body frame
+    rotor_speed: Array  # (N, R) [rad/s]
+    to_goal: Array  # (N, 3) [m], from the aircraft to the goal, world frame
+    target_velocity: Array  # (N, 3) [m/s], world frame; zero where nothing moves
+
+    @classmethod
+    def of(cls, observation: Array, terms: Mapping[str, Any], vehicle: Vehicle) -> Reading:
+        """Read the observation (N, size) of a task with some observation terms.
+
+        Raises:
+            QuadrlError: The observation has another size.
+        """
+        widths = [term.width(vehicle.rotor_count) for term in terms.values()]
+        ends = np.cumsum(widths)
+        if observation.shape[1] != ends[-1]:
+            size, allowed = observation.shape[1], f"{ends[-1]} for this task and aircraft"
+            raise QuadrlError(name="observation size", value=size, allowed=allowed)
+        term = dict(zip(terms, np.split(observation, ends[:-1], axis=-1), strict=True))
+        rotation = rotation_of_angles(term["sin_attitude"], term["cos_attitude"])
+        velocity = to_world(rotation, term["velocity"])
+        relative = to_world(rotation, term.get("target_velocity", -term["velocity"]))
+        return cls(
+            rotation=rotation,
+            velocity=velocity,
+            body_rate=term["body_rate"],
+            rotor_speed=term["rotor_speed"] * vehicle.max_speed,
+            to_goal=to_world(rotation, term["goal"]),
+            target_velocity=velocity + relative,
+        )
+
+    @functools.cached_property
+    def heading(self) -> Array:
+        """Unit vectors (N, 2), east and north, of where body x points; east if up or down."""
+        return heading_of(self.rotation)
+
+    @property
+    def speed(self) -> Array:
+        """(N,) [m/s]."""
+        return norm(self.velocity)
+
+    @property
+    def angular_speed(self) -> Array:
+        """(N,) [rad/s]."""
+        return norm(self.body_rate)
+
+
+class Guide(Protocol):
+    """What a controller asks of a task: `quadrl.core.task.Task` answers it."""
+
+    observation: ClassVar[dict[str, Any]]
+    """The terms of the flat observation."""
+    gains: ClassVar[dict[str, float]]
+    """Gains of the geometric controller that differ from its defaults."""
+    heading_matters: ClassVar[bool]
+    """Whether to head east."""
+
+    def guide(self, reading: Reading) -> tuple[Array, Array]:
+        """Where to be, as an offset (N, 3) [m], and the velocity (N, 3) [m/s] of that place."""
+        ...

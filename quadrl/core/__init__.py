@@ -1,0 +1,1 @@
+"""Tasks and the environment that flies them: one pure step of rows, under every API."""

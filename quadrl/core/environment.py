@@ -1,0 +1,348 @@
+"""The core of every API: a task and an engine make transitions.
+
+An environment owns N rows: seeds, episodes, and the snapshot that the engine and the pure
+functions of `core/transition.py` bring forward. It resets what it is told to and never by itself.
+Row i of a batch seeded with s is the single environment seeded with s + i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from quadrl.aircraft import parameters
+from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base import machine, records, validation
+from quadrl.base.philox import Seed, seeds_of_rows
+from quadrl.base.rotation import Array
+from quadrl.conditions import observing
+from quadrl.conditions.draw import Draw
+from quadrl.conditions.randomization import Randomized
+from quadrl.conditions.weather import Weather, Weathered, WeatherProcess
+from quadrl.control import modes
+from quadrl.core import catalogue, observer, saving, transition
+from quadrl.core.compiled import CompiledStep
+from quadrl.core.markers import Marker
+from quadrl.core.task import Snapshot, Task, layout
+from quadrl.core.transition import Clock, Episode, Observation, Transition
+from quadrl.engines import mujoco
+from quadrl.engines.engine import Engine, EngineName
+from quadrl.engines.rng import Rng
+
+
+class Environment(saving.Copied):
+    """A task flown by N aircraft; a single one is N = 1."""
+
+    def __init__(
+        self,
+        task: str | Task,
+        *,
+        num_envs: int = 1,
+        seed: Seed = None,
+        vehicle: Vehicle | str | None = None,
+        num_threads: int = 0,
+        engine: EngineName | Engine = "mujoco",
+        control_mode: str = "rotor",
+        randomization: Randomized = None,
+        observe: observing.Observed = None,
+        weather: Weathered = None,
+    ) -> None:
+        """Make the engine and seed the rows.
+
+        Args:
+            task: A name of the catalogue or a task.
+            num_envs: Number of aircraft N.
+            seed: As `seed` takes it.
+            vehicle: The aircraft or its name; None for the paper's.
+            num_threads: Threads of a batch; 0 for every core.
+            engine: "mujoco", "free_flight" (wherever there is nothing to touch), or an engine that
+                is made already, whose vehicle and N count then.
+            control_mode: What actions mean, a name of `control.modes.CONTROL_MODES`.
+            randomization: What is drawn at each reset, a name of `randomization.RANDOMIZATIONS`.
+            observe: Options of the observation.
+            weather: What the wind is like, a name of `weather.WEATHERS`; None for calm air.
+
+        Raises:
+            QuadrlError: An unknown name or an impossible value.
+            NativeError: The rotor callbacks cannot be built or installed.
+        """
+        self.task = catalogue.make(task)
+        self.vehicle = engine.vehicle if isinstance(engine, Engine) else resolve(vehicle)
+        draw, self.observing = Draw(randomization, self.vehicle), observing.resolve(observe)
+        self.randomization = draw.given
+        world: Any = {"num_threads": num_threads, "per_row": draw.given.per_row}
+        if not isinstance(engine, Engine):
+            validation.number("num_envs", num_envs, 1, mujoco.MAX_ENVS, whole=True)
+            per_row = row_memory(self.task, self.vehicle, draw, self.observing)
+            machine.check_memory(f"num_envs = {num_envs}", num_envs * per_row)
+        engine = mujoco.of_task(engine, self.task, self.vehicle, num_envs, **world)
+        self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
+        self.control_mode = modes.make(control_mode, self.vehicle)
+        self.action_size = self.control_mode.size
+        timestep = self.vehicle.control_timestep
+        self._clock = Clock.of(self.task, timestep)
+        self.time_limit_steps = self._clock.time_limit_steps
+        self._true = self.task.true_parameters and draw.given.per_row
+        nominal = parameters.rows(self.vehicle)
+        self._rows = engine.parameters if self._true else nominal  # those that the task sees
+        self._parameters, seen = (Parameters.of(k, timestep) for k in (self._rows, nominal))
+        self.term_names = transition.check_task(self.task, seen, self.action_size, self.origin[2])
+        """Names of the reward's terms, in their order."""
+        given = draw, self.observing, self.task, engine, self.action_size
+        self.disturbances, self.observer, terms = observer.make(*given)
+        self.layout = layout(terms, self.vehicle.rotor_count)
+        """Where each named term of the observation stands in the flat vector."""
+        self.size = max(part.stop for part in self.layout.values())
+        self.stepwise = self.control_mode.has_loops or self.disturbances.late
+        """Whether the rotors get a command at each physics step, from `control`."""
+        self.weather = Weather.of(weather)
+        self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
+        self._all = np.arange(self.num_envs)
+        self._keys, self._episodes = np.zeros((2, self.num_envs), np.int64)  # seeds; begun since
+        self._episode: Episode | None = None
+        self._snapshot: Snapshot | None = None
+        self.compiled: CompiledStep | None = None
+        """The task's step in C from the first reset on; None where it cannot be compiled."""
+        self.not_compiled = ""  # why
+        self._action = np.zeros((self.num_envs, self.action_size))
+        self._command = np.zeros((self.num_envs, self.vehicle.rotor_count))  # [rad/s]
+        self.transition: Transition | None = None  # what the last step gave
+        self._setpoint: Any = None
+        self._flown = 0  # physics steps of this control step that the mode's loops have flown
+        self._diverged = np.zeros(self.num_envs, dtype=bool)  # in this control step
+        self.seed(seed)
+
+    def seed(self, seed: Seed = None, rows: np.ndarray | None = None) -> Seed:
+        """Begin the episodes of a seed anew; returns the seed.
+
+        Args:
+            seed: Row i gets seed + i, or seed[i] unless that is None; None for one from the system.
+            rows: Numbers (n,) or mask (N,) of the aircraft that it is for; None for all.
+
+        Raises:
+            QuadrlError: A seed is not a whole number from 0 on, or there are not N of them.
+        """
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        chosen = self._all if rows is None else validation.rows(rows, self.num_envs)
+        self._keys, self._episodes = self._seeded(seed, chosen)
+        return seed
+
+    def _seeded(self, seed: Seed, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Keys and numbers of the episodes of all (N,), with some rows (n,) seeded anew."""
+        chosen, own = seeds_of_rows(seed, rows, self.num_envs)
+        keys, episodes = self._keys.copy(), self._episodes.copy()
+        keys[chosen], episodes[chosen] = own, 0
+        return keys, episodes
+
+    def reset(
+        self,
+        rows: np.ndarray | None = None,
+        start: Mapping[str, Any] | None = None,
+        seed: Seed = None,
+    ) -> Observation:
+        """Begin an episode.
+
+        Args:
+            rows: Numbers (n,) or mask (N,) of the aircraft that begin one; None for all.
+            start: Arrays (N, k) or (k,) by names of `engines.state.Start`, in place of the task's.
+            seed: Seeds those aircraft anew first, as `seed` does; None to go on with their seeds.
+
+        Returns:
+            The observation of those aircraft, terms (n, k).
+
+        Raises:
+            QuadrlError: A number of an aircraft that is not there, or one twice; or the task gives
+                arrays of the wrong shape, or the start is one that no aircraft can have. Nothing
+                has changed then.
+        """
+        if self.engine.forked:
+            self.make_anew()
+        rows = self._all if rows is None else validation.rows(rows, self.num_envs)
+        if self._episode is None and len(rows) < self.num_envs:
+            raise RuntimeError("the first reset must be of every aircraft")
+        if not len(rows):
+            return {name: np.zeros((0, at.stop - at.start)) for name, at in self.layout.items()}
+        seeds = (self._keys, self._episodes) if seed is None else self._seeded(seed, rows)
+        place = seeds[0][rows], seeds[1][rows]
+        drawn, table, seen = self.disturbances.of_episodes(*place), None, self._parameters
+        if drawn is not None and self.disturbances.draw.given.per_row:
+            table = self.disturbances.draw.table(drawn)
+            if self._true:
+                seen = Parameters.of(table, self._clock.control_timestep)
+        begun, task_state = self.task.begin(Rng(*place), seen)
+        # Up to here nothing is written, and `place` refuses before it writes.
+        begun = begun.replaced(start or {}, rows, self.num_envs)
+        state = self.engine.place(rows, begun, table)
+        self._keys, self._episodes = seeds
+        self.disturbances.begin(rows, *place, drawn)
+        if self.blowing:
+            self.blowing.begin(rows, *place, self.disturbances.wind_speed(rows, self.weather))
+        now, episode = transition.begin(self.task, state, task_state, seen, self.action_size)
+        self._episodes[rows] += 1
+        if len(rows) == self.num_envs:
+            self._take(now, episode)
+        else:
+            records.put(self.snapshot, rows, now)
+            records.put(self._episode, rows, episode)
+        return self.observer.begin(rows, now) if self.observer else self.task.observe(now)
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """What tasks see now: live, valid until the next step."""
+        if self._snapshot is None:
+            assert self.compiled
+            self._snapshot, self._episode = self.compiled.snapshot()
+        return self._snapshot
+
+    @property
+    def episode(self) -> Episode:
+        """How far the episodes are: as live as the snapshot."""
+        _ = self.snapshot  # a compiled step hands out both at once
+        assert self._episode is not None
+        return self._episode
+
+    def _take(self, now: Snapshot, episode: Episode) -> None:
+        """Take a snapshot of all rows as the present one."""
+        # What a task remembers must not be a view of buffers that the next steps write.
+        now.task, now.parameters = records.owned(now.task), self._parameters
+        if self._episode is None and self.task.compiled:
+            inputs = self._action, self._command, self._diverged
+            rows = self.engine, self._rows, inputs, now, episode
+            rows += self.control_mode.has_loops, self.observer and self.observer.frame
+            try:
+                self.compiled = CompiledStep(self.task, self._clock, *rows)
+            except Exception as error:  # whatever the functions of a task raise
+                self.not_compiled = str(error)
+        self._snapshot, self._episode = now, episode
+        if self.compiled:
+            self.compiled.begin(now, episode)
+            self._snapshot = None
+
+    def step(self, action: Array) -> Transition:
+        """Fly one control step.
+
+        Args:
+            action: (N, k), clipped to [-1, 1]; the control mode says what it means.
+
+        Returns:
+            The transition. An aircraft whose episode is over flies on until it is reset.
+
+        Raises:
+            QuadrlError: Wrong shape or kind, or a number that is not finite; or the task gave a
+                reward that is not finite.
+            RuntimeError: There was no reset before.
+        """
+        self.begin(action)
+        if self.stepwise:
+            for _ in range(self.vehicle.substeps):
+                self.control()
+                self.engine.advance(1)
+        else:
+            self.engine.advance(self.vehicle.substeps)
+        return self.finish()
+
+    def begin(self, action: Array) -> None:
+        """First half of a step: the commands to the rotors, or the setpoint of the loops."""
+        if self._episode is None:
+            raise RuntimeError("call reset before the first step")
+        if self.engine.forked:
+            self.make_anew()
+        self._action[:] = validation.action(action, (self.num_envs, self.action_size))
+        if self.blowing:
+            self.blowing.advance()
+        self.engine.check_air()
+        self._setpoint = self.control_mode.setpoint(self.engine.state, self._action)
+        if self.disturbances.active:
+            self.disturbances.begin_step()
+        self._flown, self._diverged[:] = 0, False
+        if self.control_mode.has_loops:
+            self._command[:] = 0.0
+            if not self.compiled:
+                # The loops read the state past the life of its buffers.
+                self._snapshot = records.copied(self._snapshot)
+        else:
+            self._command[:] = self.engine.ctrl[:] = self._setpoint
+            if self.observer:
+                self.observer.follow(self._command, self.vehicle.control_timestep)
+
+    def control(self) -> None:
+        """Command the rotors before a physics step, where they get more than one in a step."""
+        command = self._setpoint
+        if self.control_mode.has_loops:
+            if self._flown and (diverged := self.engine.read()) is not None:
+                self._diverged |= diverged
+            command = self.control_mode.rotor_command(self.engine.state, self._setpoint)
+            self._command += command / self.vehicle.substeps  # their mean counts
+            self._flown += 1
+            if self.observer:
+                self.observer.follow(command, self.vehicle.physics_timestep)
+        self.engine.ctrl[:] = self.disturbances.passed_on(command)
+
+    def finish(self) -> Transition:
+        """Second half of a step, after the engine has advanced."""
+        if (diverged := self.engine.read()) is not None:
+            self._diverged |= diverged
+        assert self._episode is not None
+        estimate = self.observer.estimate() if self.observer else None
+        if self.compiled:
+            done, self._snapshot = self.compiled.finish(), None
+        else:
+            self._snapshot, self._episode, done = transition.finish(
+                *(self.task, self._clock, self._episode, self.snapshot, self.engine.state),
+                *(self._action.copy(), self._command.copy(), self._diverged.copy(), estimate),
+            )
+            self._snapshot.task = records.owned(self._snapshot.task)
+        transition.check_reward(self.task, done)
+        if self.observer:
+            done.observation = self.observer.observe(done, self._action)
+        self.transition = done
+        return done
+
+    def flatten(self, observation: Observation) -> np.ndarray:
+        """The terms of an observation as vectors (n, size), float32."""
+        if self.observer and observation is self.observer.observation:
+            return self.observer.flat.astype(np.float32)
+        if self.compiled and observation is self.compiled.observation:
+            return self.compiled.flat()
+        return np.concatenate(list(observation.values()), axis=-1, dtype=np.float32)
+
+    @property
+    def privileged(self) -> Array | None:
+        """The observation for the critic alone (N, p); None unless `observe` asks for it."""
+        return self.observer.privileged if self.observer else None
+
+    def goals(self) -> np.ndarray:
+        """Where each aircraft should be, (N, 3) [m], world frame."""
+        return self.task.goal(self.snapshot) + self.origin
+
+    def markers(self, row: int = 0) -> tuple[Marker, ...]:
+        """What the task asks to be drawn of one aircraft's episode, world frame."""
+        alone = records.mapped(lambda array: array[row : row + 1], self.snapshot)
+        return tuple(marker.moved(self.origin) for marker in self.task.markers(alone))
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Everything that the next steps depend on, as arrays: `restore` continues bit for bit."""
+        return saving.save(self)
+
+    def restore(self, saved: dict[str, np.ndarray]) -> Observation:
+        """Take up what `save` gave; returns the observation of that moment.
+
+        Raises:
+            QuadrlError: It is not of such an environment; nothing has changed then.
+        """
+        now, see = saving.restore(self, saved), self.observer
+        return see.again(now) if see else self.task.observe(now)
+
+
+def row_memory(task: Task, vehicle: Vehicle, draw: Draw, seen: observing.Observing) -> float:
+    """Memory that one more aircraft takes at least [bytes]; measured, and the histories counted."""
+    rotors, (commands, observations) = vehicle.rotor_count, draw.delays
+    single = sum(term.width(rotors) for term in task.observation.values())
+    kept = single * (1 + observations[1] + seen.observation_history) + rotors * commands[1]
+    flat = single * (1 + seen.observation_history) + rotors * seen.action_history
+    return 3_000 + 5_000 * draw.given.per_row + 8 * (kept + 2 * flat)

@@ -1,0 +1,123 @@
+"""What a task may look at: snapshots of rows of aircraft in flight, and rollouts afterwards."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.rotation import Array
+from quadrl.core.trajectory import Trajectory, outcome
+from quadrl.engines.state import State
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskState:
+    """What a task remembers of an episode, arrays (N, ...); a task may add its own."""
+
+    goal: Array  # (N, 3) [m], task frame
+
+
+@dataclasses.dataclass(slots=True)
+class Potentials:
+    """Distances from what is asked; the reward is their decrease over a control step."""
+
+    to_goal: Array  # (N, 3) [m], from the aircraft to the goal, world frame
+    distance: Array  # (N,) [m], what is left to the goal
+    attitude: Array  # (N,) attitude error |sin zeta - sin zeta_g| + |cos zeta - cos zeta_g|
+    speed: Array  # (N,) [m/s], relative to the target where there is one
+    angular_speed: Array  # (N,) [rad/s]
+
+
+@dataclasses.dataclass(slots=True)
+class Snapshot:
+    """All that a task may look at, at the end of a control step; arrays (N, ...)."""
+
+    state: State
+    task: Any  # the task's own TaskState
+    parameters: Parameters  # of the aircraft as it is specified, unless the task asks for the true
+    action: Array  # (N, k), that led here; zero at the start
+    rotor_command: Array  # (N, R) [rad/s], mean over the control step; the rotor speed at the start
+    time: Array  # (N,) [s], since the start of the episode
+    potentials: Potentials = None  # type: ignore[assignment] - what `Task.measure` gives
+
+
+@dataclasses.dataclass(slots=True)
+class EpisodeEnd:
+    """Where an episode stands, for the judgement of those that end now; arrays (N,)."""
+
+    terminated: Array  # bool: failure, or success where the task says so
+    truncated: Array  # bool: the clock; never together with terminated
+    steps: Array  # control steps so far
+    error_sum: Array  # [m], of the task's error over them
+    final_sum: Array  # [m], of those in the last `settle_steps` before the time limit
+    settle_steps: int
+    succeeded: Array = None  # bool; only the reward sees it
+
+    @property
+    def final_error(self) -> Array:
+        """Mean error over the last `settle_time` before the time limit, (N,) [m]."""
+        return self.final_sum / self.settle_steps
+
+    @property
+    def mean_error(self) -> Array:
+        """Mean error over the episode so far, (N,) [m]."""
+        return self.error_sum / self.steps
+
+    @property
+    def failed(self) -> Array:
+        """Terminated, and not by success, (N,) bool; for the reward."""
+        return self.terminated & ~self.succeeded
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Rollout:
+    """One episode of each of N aircraft, step by step; T steps are the longest of them.
+
+    Everything after the end of an aircraft's episode is NaN.
+    """
+
+    position: np.ndarray  # (T, N, 3) [m], task frame
+    quaternion: np.ndarray  # (T, N, 4) (w, x, y, z)
+    velocity: np.ndarray  # (T, N, 3) [m/s], world frame
+    body_rate: np.ndarray  # (T, N, 3) [rad/s], body frame
+    rotor_speed: np.ndarray  # (T, N, R) [rad/s]
+    goal: np.ndarray  # (T, N, 3) [m], task frame
+    action: np.ndarray  # (T, N, k), within [-1, 1]
+    error: np.ndarray  # (T, N) [m]
+    reward: np.ndarray  # (T, N)
+    wind: np.ndarray  # (T, N, 3) [m/s], world frame; that of the step which led to each state
+    length: np.ndarray  # (N,) steps of each episode
+    terminated: np.ndarray  # (N,) bool
+    is_success: np.ndarray  # (N,) bool
+    diverged: np.ndarray  # (N,) bool
+    markers: tuple[Any, ...]  # (T,) of what the task shows of the first aircraft, world frame
+    origin: np.ndarray  # (3,) [m], of the task frame in the world frame
+    control_timestep: float  # [s]
+    task: Any  # the Task that was flown
+
+    def __repr__(self) -> str:
+        steps, flights = self.error.shape
+        return f"Rollout of {self.task.name}: {flights} flights, {steps} control steps at most"
+
+    def trajectory(self, vehicle: Vehicle, episode: int = 0) -> Trajectory:
+        """The flight of one aircraft, to be drawn; the markers are those of the first."""
+        steps = slice(0, int(self.length[episode]))
+        position, wind = self.position[steps, episode] + self.origin, self.wind[steps, episode]
+        return Trajectory(
+            time=np.arange(1, len(position) + 1) * self.control_timestep,
+            qpos=np.concatenate([position, self.quaternion[steps, episode]], axis=1),
+            rotor_speed=self.rotor_speed[steps, episode],
+            error=self.error[steps, episode],
+            reward=self.reward[steps, episode],
+            goal=self.goal[steps, episode] + self.origin,
+            control_timestep=self.control_timestep,
+            max_rotor_speed=vehicle.max_speed,
+            task=self.task.name,
+            markers=self.markers[steps],
+            outcome=outcome(self.terminated[episode], True, self.is_success[episode]),
+            wind=wind if wind.any() else None,
+        )

@@ -1,0 +1,301 @@
+"""What a task is: where an episode begins, what is seen, what is rewarded and what ends it.
+
+A task is a frozen dataclass: its fields are its options, its methods are pure functions of arrays
+with a leading axis N, in any array namespace (NumPy, torch) and on any device. It knows no API, no
+clock and no vehicle: all that it may look at is a `Snapshot`. Everything that is the task's stands
+in its own file: options, reward weights and terms, start, observation, ends, training defaults, the
+yardstick controller's way to fly it, and what counts as solved.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import functools
+import itertools
+import math
+import operator
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from quadrl.aircraft.parameters import Parameters
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, norm, square_norm, to_body
+from quadrl.base.validation import keys, like, number
+from quadrl.core.markers import Marker
+from quadrl.core.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
+from quadrl.engines.rng import Rng
+from quadrl.engines.state import Start
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from quadrl.control.reading import Reading
+    from quadrl.core.snapshot import Rollout
+
+REWARD_TIME = 0.05  # [s], the control step of the paper's aircraft
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationTerm:
+    """One named entry of the observation."""
+
+    size: int
+    """Numbers in it; per rotor where `per_rotor`."""
+    unit: str
+    meaning: str
+    """And the frame."""
+    per_rotor: bool = False
+
+    def width(self, rotors: int) -> int:
+        """Numbers in it for an aircraft with some rotors."""
+        return self.size * rotors if self.per_rotor else self.size
+
+
+def layout(terms: Mapping[str, ObservationTerm], rotors: int) -> dict[str, slice]:
+    """Where each term stands in the flat vector of an aircraft with some rotors."""
+    ends = list(itertools.accumulate(term.width(rotors) for term in terms.values()))
+    return dict(zip(terms, map(slice, [0, *ends], ends), strict=False))
+
+
+OBSERVATION = {
+    "position": ObservationTerm(3, "m", "world frame, from the origin of the task's frame"),
+    "sin_attitude": ObservationTerm(3, "1", "sine of roll, pitch and yaw (Z-Y-X)"),
+    "cos_attitude": ObservationTerm(3, "1", "cosine of roll, pitch and yaw"),
+    "velocity": ObservationTerm(3, "m/s", "body frame"),
+    "body_rate": ObservationTerm(3, "rad/s", "angular velocity, body frame"),
+    "rotor_speed": ObservationTerm(1, "1", "over the largest rotor speed", per_rotor=True),
+    "goal": ObservationTerm(3, "m", "from the aircraft to the goal, body frame"),
+}
+"""The observation of every task, in the order of the flat vector."""
+
+TARGET_VELOCITY = {
+    "target_velocity": ObservationTerm(
+        3, "m/s", "of the target relative to the aircraft, body frame"
+    )
+}
+"""What tasks with a moving target add at the end."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A figure of an evaluation that a policy has to reach for a task to count as solved."""
+
+    metric: str
+    """Name of the figure in `quadrl.evaluation.rollout.summarize`."""
+    words: str
+    """What it is."""
+    limit: float
+    """In the unit of the metric's name; shares as shares."""
+    at_least: bool = False
+    """Whether the figure must reach the limit, or stay under it."""
+    unit: Literal["%", "cm", "m/s", "deg", "s"] = "%"
+    """To show it in."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Task(abc.ABC):
+    """Base of all tasks: fly to a goal and stay there."""
+
+    name: ClassVar[str]
+    """The name in the catalogue."""
+    asks: ClassVar[str]
+    """What it asks of the aircraft, in a line."""
+    starts: ClassVar[str]
+    """How an episode begins, in a line."""
+    ends: ClassVar[str]
+    """What ends an episode early, in a line."""
+    solved: ClassVar[str]
+    """What counts as success, in a line."""
+    targets: ClassVar[tuple[Target, ...]] = (Target("success_rate", "successful", 0.99, True),)
+    """What a trained policy has to reach over many episodes."""
+    training: ClassVar[dict[str, Any]] = {}
+    """Training settings that differ from the defaults of `quadrl.learning.config.TrainConfig`."""
+    training_with: ClassVar[dict[str, dict[str, Any]]] = {}
+    """What is different again with an algorithm, by its name."""
+    gains: ClassVar[dict[str, float]] = {}
+    """Gains of the geometric controller that differ from its defaults."""
+    observation: ClassVar[dict[str, ObservationTerm]] = OBSERVATION
+    """The entries of the observation in the order of the flat vector."""
+    heading_matters: ClassVar[bool] = False
+    """Whether the attitude error counts yaw against east (0), or only roll and pitch."""
+    contact: ClassVar[bool] = False
+    """Whether the aircraft can touch anything without the episode being over."""
+    compiled: ClassVar[bool] = True
+    """Whether its step may be compiled (`core/compiled.py`); False for a task whose functions look
+    at anything but their arguments."""
+    true_parameters: ClassVar[bool] = False
+    """Whether snapshots show the parameters that were drawn, instead of the specified ones."""
+    variants: ClassVar[dict[str, dict[str, Any]]] = {}
+    """Settings of other trainings than the usual one that differ from it, by variant."""
+    signed: ClassVar[tuple[str, ...]] = ()
+    """Options that may be negative although their default is positive."""
+
+    time_limit: float = 10.0
+    """Time limit of an episode [s]."""
+    settle_time: float = 2.0
+    """Length of the stretch before the time limit over which the final error is taken [s]; the
+    default is cut to a shorter time limit."""
+    altitude: float = 3.0
+    """Height of the origin of the task's frame above the ground [m]; at least that of the
+    aircraft's centre when it stands on its feet."""
+    progress_weight: float = 100.0
+    """Reward per metre by which the distance to the goal falls."""
+    attitude_weight: float = 30.0
+    """Reward per unit by which the attitude error falls. With 10 the heading is learned
+    late or never, and such policies sometimes tip over."""
+    speed_weight: float = 2.0
+    """Reward per m/s by which the speed falls, or the speed relative to a target (gym-aero has 0.1,
+    with which hover takes twice the steps)."""
+    spin_weight: float = 1.0
+    """Reward per rad/s by which the body rate falls (gym-aero: 0.1)."""
+    control_weight: float = 1.0
+    """Cost of sum((Omega_c - Omega_hover)^2) / Omega_max^2, for each 0.05 s."""
+    smoothness_weight: float = 0.0
+    """Cost of sum((Omega_c - Omega_c before)^2) / Omega_max^2, the change of the commands from one
+    control step to the next, for each 0.05 s."""
+    survival_weight: float = 10.0
+    """Reward for each 0.05 s in the air."""
+
+    def __post_init__(self) -> None:
+        """Validate options."""
+        number(f"{self.name} time_limit", self.time_limit, positive=True)
+        for field in dataclasses.fields(self):
+            default, name = field.default, f"{self.name} {field.name}"
+            if default is dataclasses.MISSING:
+                continue
+            value = like(name, getattr(self, field.name), default)
+            counts = isinstance(default, (int, float)) and not isinstance(default, bool)
+            if counts and default > 0 and field.name not in self.signed:
+                number(name, value, 0)
+        number(f"{self.name} altitude", self.altitude, 0)
+        number(f"{self.name} smoothness_weight", self.smoothness_weight, 0)
+        if self.settle_time != Task.settle_time:
+            number(f"{self.name} settle_time", self.settle_time, 0, self.time_limit)
+
+    @abc.abstractmethod
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
+        """How an episode begins, from random numbers and the aircraft's parameters alone."""
+
+    def update(self, before: Snapshot, now: Snapshot) -> TaskState:
+        """What is remembered after a control step: a new record, or `now.task` itself."""
+        return now.task
+
+    def goal(self, now: Snapshot) -> Array:
+        """Where to be, (N, 3) [m], task frame."""
+        return now.task.goal
+
+    def target_velocity(self, now: Snapshot) -> Array | None:
+        """Velocity of the target, (N, 3) [m/s], world frame; None where nothing moves."""
+        return None
+
+    def error(self, now: Snapshot) -> Array:
+        """How far the task is from being done, (N,) [m]."""
+        return now.potentials.distance
+
+    def measure(self, now: Snapshot) -> Potentials:
+        """The distances that the reward is made of; `now` has no potentials yet."""
+        state, target_velocity = now.state, self.target_velocity(now)
+        to_goal = self.goal(now) - state.position
+        relative = state.velocity - target_velocity if target_velocity is not None else None
+        return Potentials(
+            to_goal=to_goal,
+            distance=norm(to_goal),
+            attitude=state.east_error if self.heading_matters else state.level_error,
+            speed=state.speed if relative is None else norm(relative),
+            angular_speed=state.angular_speed,
+        )
+
+    def observe(self, now: Snapshot) -> dict[str, Array]:
+        """What the policy sees, by name, in the order of `observation`."""
+        state = now.state
+        terms = {
+            "position": state.position,
+            "sin_attitude": state.sin_attitude,
+            "cos_attitude": state.cos_attitude,
+            "velocity": state.body_velocity,
+            "body_rate": state.body_rate,
+            "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
+            "goal": to_body(state.rotation, now.potentials.to_goal),
+        }
+        target_velocity = self.target_velocity(now)
+        if target_velocity is not None:
+            terms["target_velocity"] = to_body(state.rotation, target_velocity - state.velocity)
+        return terms
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Named terms (N,) of the reward of one control step; it is their sum, in this order."""
+        was, is_, rotor = before.potentials, now.potentials, now.parameters.rotor
+        share = reward_share(now.parameters)
+        effort = square_norm((now.rotor_command - rotor.hover_speed) / rotor.max_speed)
+        terms = {
+            "progress": self.progress_weight * (was.distance - is_.distance),
+            "attitude": self.attitude_weight * (was.attitude - is_.attitude),
+            "speed": self.speed_weight * (was.speed - is_.speed),
+            "spin": self.spin_weight * (was.angular_speed - is_.angular_speed),
+            "control": (-self.control_weight * share) * effort,
+            "survival": 0.0 * effort + self.survival_weight * share,
+        }
+        if self.smoothness_weight > 0:
+            change = (now.rotor_command - before.rotor_command) / rotor.max_speed
+            terms["smoothness"] = (-self.smoothness_weight * share) * square_norm(change)
+        return terms
+
+    @abc.abstractmethod
+    def terminated(self, now: Snapshot) -> Array:
+        """Whether the episode is over before its time, (N,) bool."""
+
+    @abc.abstractmethod
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
+        """Whether an episode that ends now did what was asked, (N,) bool."""
+
+    def guide(self, reading: Reading) -> tuple[Array, Array]:
+        """What the yardstick controllers fly: to the goal, and along with it where it moves.
+
+        Returns:
+            Offset (N, 3) [m] from the aircraft to where it should be, and the velocity (N, 3)
+            [m/s] of that place; both in the world frame.
+        """
+        return reading.to_goal, reading.target_velocity
+
+    def scene(self, spec: mujoco.MjSpec) -> None:
+        """Add what stands in the world; free flight knows level ground alone."""
+        return
+
+    def markers(self, now: Snapshot) -> Sequence[Marker]:
+        """What to draw of the episode of one aircraft (N = 1); the goal is drawn anyway."""
+        return ()
+
+    def metrics(self, rollout: Rollout) -> dict[str, float]:
+        """The task's own figures of an evaluation, with their units in their names."""
+        return {}
+
+    def replace(self, **options: Any) -> Task:
+        """A variant with other options.
+
+        Raises:
+            QuadrlError: An option that the task does not have; the message lists the choices.
+        """
+        keys(f"{self.name} option", options, [f.name for f in dataclasses.fields(self)])
+        try:
+            return dataclasses.replace(self, **options)
+        except (TypeError, ArithmeticError) as error:  # of a check that is the task's own
+            raise QuadrlError(f"{self.name} options {options}: {error}") from error
+
+
+def heads_east(now: Snapshot, tolerance: float) -> Array:
+    """Whether the heading is at most `tolerance` [rad] off east, (N,) bool."""
+    return now.state.cos_attitude[..., 2] >= math.cos(min(tolerance, math.pi))
+
+
+def reward_share(parameters: Parameters) -> float:
+    """What a control step counts of the 0.05 s that weights of running rewards are for.
+
+    Progress adds up to the same whatever the step is; what is paid by the step is paid by time.
+    """
+    return parameters.control_timestep / REWARD_TIME
+
+
+def total(terms: dict[str, Array]) -> Array:
+    """The sum of reward terms, from the first to the last."""
+    return functools.reduce(operator.add, terms.values())

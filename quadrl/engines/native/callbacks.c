@@ -1,0 +1,166 @@
+// MuJoCo's actuator and passive-force callbacks of the rotors and the airframe.
+//
+// They are global to the process, so each first asks whether the actuator or body is ours and
+// otherwise answers exactly what MuJoCo does with no callback installed.
+//
+// Where an aircraft's numbers stand in a model (written there by quadrl/engines/mjcf.py):
+//   body_user         its row, an Aircraft
+//   actuator_dynprm   [0] number of the rotor, [MARK_SLOT] mark
+//   actuator_gear     along and about the rotor's axis: 1, aero_reaction
+//   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/aircraft/parameters.py says
+#include <mujoco/mujoco.h>
+#include <stdint.h>
+#include <string.h>
+
+#define LANES 1
+#include "aero.h"
+#include "export.h"
+
+enum { MARK_SLOT = 9 };
+
+// The struct layouts of mjModel and mjData are compiled in: the loader compares these.
+QUADRL_EXPORT int quadrl_mujoco_version(void) { return mjVERSION_HEADER; }
+
+// Whether a number of a model is this one, bit for bit: that is quicker than `==`.
+static int is_same(mjtNum number, mjtNum expected) {
+  return memcmp(&number, &expected, sizeof number) == 0;
+}
+
+// The row of a body, or NULL where it is not one of ours.
+static const Aircraft* aircraft_of(const mjModel* m, int body) {
+  if (m->nuser_body < ROW_SIZE) return 0;
+  const Aircraft* a = (const Aircraft*)(m->body_user + (size_t)m->nuser_body * body);
+  return is_same(a->mark[0], QUADRL_MARK) && is_same(a->size[0], ROW_SIZE) ? a : 0;
+}
+
+// A number of a model as an int from 0 to the one below `count`, or -1. A model can be edited: none
+// of its numbers is an index before it was looked at.
+static int index_of(mjtNum number, int count) {
+  if (!(number >= 0 && number < count)) return -1;  // nor is what is not a number
+  const int index = (int)number;
+  return index == number ? index : -1;
+}
+
+// Whether an aircraft is one that can fly: on a free joint, with as many rotors and such effects as
+// there are.
+static int can_fly(const mjModel* m, const Aircraft* a, int body) {
+  const int joint = m->body_jntadr[body], dof = m->body_dofadr[body];
+  return joint >= 0 && joint < m->njnt && m->jnt_type[joint] == mjJNT_FREE && dof >= 0 &&
+         dof + 6 <= m->nv && index_of(a->rotor_count[0], MAX_ROTORS + 1) >= 0 &&
+         aero_effects(a, 0) >= 0;
+}
+
+enum { FOREIGN = -1, UNSOUND = -2 };
+
+// What a marked actuator is that is on no aircraft: a foreign one, unless the model has an aircraft
+// that it is missing from. Out of line, since it is rare.
+static __attribute__((noinline, cold)) int lost_rotor(const mjModel* m) {
+  for (int body = 1; body < m->nbody; ++body) {
+    if (aircraft_of(m, body)) return UNSOUND;
+  }
+  return FOREIGN;
+}
+
+// Whether an address of a model is one in an array of some length; as unsigned numbers, since then a
+// negative one is too large.
+static int is_in(int address, mjtSize length) { return (uint64_t)address < (uint64_t)length; }
+
+// The number of the rotor that an actuator is, and whose. FOREIGN where it is not one of ours;
+// UNSOUND where it is, but the model does not say of which aircraft, or not which of its rotors.
+static int rotor_of(const mjModel* m, int actuator, const Aircraft** owner) {
+  const mjtNum* parameters = m->actuator_dynprm + mjNDYN * actuator;
+  if (!is_same(parameters[MARK_SLOT], QUADRL_MARK)) return FOREIGN;
+  const int site = m->actuator_trnid[2 * actuator];
+  if (m->actuator_trntype[actuator] != mjTRN_SITE || !is_in(site, m->nsite)) return lost_rotor(m);
+  const Aircraft* a = aircraft_of(m, m->site_bodyid[site]);
+  if (!a) return lost_rotor(m);
+  *owner = a;
+  if (!is_in(m->actuator_actadr[actuator], m->na)) return UNSOUND;
+  if (!(parameters[0] < a->rotor_count[0])) return UNSOUND;
+  const int rotor = index_of(parameters[0], MAX_ROTORS);
+  return rotor >= 0 ? rotor : UNSOUND;
+}
+
+QUADRL_EXPORT mjtNum quadrl_act_dyn(const mjModel* m, const mjData* d, int actuator) {
+  const Aircraft* a;
+  const int rotor = rotor_of(m, actuator, &a);
+  if (rotor < 0) return rotor == FOREIGN ? 0 : NAN;
+  return aero_rotor_acceleration(a->rotor + rotor, d->act[m->actuator_actadr[actuator]],
+                                 d->ctrl[m->actuator_ctrladr[actuator]], 0);
+}
+
+QUADRL_EXPORT mjtNum quadrl_act_gain(const mjModel* m, const mjData* d, int actuator) {
+  const Aircraft* a;
+  const int rotor = rotor_of(m, actuator, &a);
+  if (rotor < 0) return rotor == FOREIGN ? 1 : NAN;
+  return aero_rotor_gain(a->rotor + rotor, d->act[m->actuator_actadr[actuator]], 0);
+}
+
+// What the air does to the rotors of a body beside equation 7, and their inertia.
+static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft* a, int body,
+                              const mjtNum airspeed[3], mjtNum force[3], mjtNum moment[3]) {
+  const mjtNum *turn = d->xmat + 9 * body, *rate = d->qvel + m->body_dofadr[body] + 3;
+  Lanes speed[MAX_ROTORS] = {{0}}, command[MAX_ROTORS] = {{0}}, noise[MAX_ROTORS] = {{0}};
+  Lanes air[3], body_rate[3], up[3], push[3] = {{0}}, twist[3] = {{0}}, height;
+  Disc disc[MAX_ROTORS];
+  for (int k = 0; k < m->nactuator; ++k) {
+    const Aircraft* owner;
+    const int rotor = rotor_of(m, k, &owner);
+    if (rotor < 0 || owner != a) continue;
+    speed[rotor][0] = d->act[m->actuator_actadr[k]];
+    command[rotor][0] = d->ctrl[m->actuator_ctrladr[k]];
+    if (m->nuserdata >= AIR) noise[rotor][0] = d->userdata[WIND + rotor];
+  }
+  for (int k = 0; k < 3; ++k) {
+    air[k][0] = airspeed[k];
+    body_rate[k][0] = rate[k];
+    up[k][0] = turn[6 + k];
+  }
+  height[0] = d->xpos[3 * body + 2];
+  const int rotors = (int)a->rotor_count[0];
+  for (int k = 0; k < rotors; ++k) aero_disc(a, a->rotor + k, disc + k);
+  const int effects = a->effects[0] == GROUND_EFFECT ? GROUND_EFFECT : ROTOR_EFFECTS;
+  aero_rotors(a, disc, effects, rotors, speed, command, noise, air, body_rate, up, height, push,
+              twist);
+  for (int k = 0; k < 3; ++k) {
+    force[k] += push[k][0];
+    moment[k] += twist[k][0];
+  }
+}
+
+QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
+  for (int body = 1; body < m->nbody; ++body) {
+    const Aircraft* a = aircraft_of(m, body);
+    if (!a) continue;
+    if (!can_fly(m, a, body)) {
+      // It fails as a model of ours without callbacks does.
+      for (int k = 0; k < m->nv; ++k) d->qfrc_passive[k] = NAN;
+      return;
+    }
+    const int dof = m->body_dofadr[body];
+    // A model of ours carries a gravity compensation that is not a number, so that stepping it
+    // without these callbacks fails at once (MuJoCo warns and resets). Here it is taken out again.
+    for (int k = dof; k < dof + 6; ++k) {
+      d->qfrc_passive[k] = d->qfrc_spring[k] + d->qfrc_damper[k] + d->qfrc_fluid[k];
+    }
+    const mjtNum* turn = d->xmat + 9 * body;  // body to world
+    mjtNum air[3], airspeed[3], force[3] = {0}, moment[3] = {0};
+    for (int k = 0; k < 3; ++k) {
+      air[k] = d->qvel[dof + k] - (m->nuserdata >= AIR ? d->userdata[k] : 0);
+    }
+    for (int k = 0; k < 3; ++k) {
+      airspeed[k] = turn[k] * air[0] + turn[3 + k] * air[1] + turn[6 + k] * air[2];
+    }
+    aero_wrench(a, airspeed, d->qvel + dof + 3, force, moment, 0);
+    if (a->effects[0] != STILL_AIR) add_rotor_effects(m, d, a, body, airspeed, force, moment);
+    for (int k = 0; k < 3; ++k) {
+      d->qfrc_passive[dof + k] +=
+          turn[3 * k] * force[0] + turn[3 * k + 1] * force[1] + turn[3 * k + 2] * force[2];
+    }
+    for (int k = 0; k < 3; ++k) d->qfrc_passive[dof + 3 + k] += moment[k];
+  }
+}
+
+// MuJoCo reads the clock at both ends of every stage, for mjData.timer: a quarter of a step of so
+// small a model. This clock stands still.
+QUADRL_EXPORT mjtNum quadrl_time(void) { return 0; }

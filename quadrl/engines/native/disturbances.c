@@ -1,0 +1,88 @@
+// What disturbs many aircraft at a control step: errors of the estimated state, and pushes.
+//
+// Random numbers are those of quadrl/engines/rng.py: a stream of each episode, BLOCKS of four words for each
+// control step. The numbers of quadrl/conditions/disturbances.py and quadrl/core/observer.py say which.
+#include <math.h>
+#include <stdint.h>
+
+#include "export.h"
+#include "philox.h"
+
+enum { ERRORS = 12, NOISE_BLOCKS = 6, PUSH_BLOCKS = 2 };
+
+// Where the rows are. Filled by quadrl/core/observer.py.
+typedef struct {
+  const int64_t *keys, *episodes, *steps;
+  const double *qpos, *qvel, *act;  // of aircraft i at i * stride doubles, act at i * act_stride
+  const double *noise, *bias;       // (12) standard deviations; (12) at i * bias_stride
+  double* estimate;                 // (13 + rotors) at i * estimate_stride
+  int64_t stride, act_stride, bias_stride, estimate_stride, rotors, noisy, stream;
+} Rows;
+
+// The words of a block of a stream.
+static void words(uint32_t w[4], int64_t block, int64_t stream, int64_t episode, int64_t key) {
+  w[0] = (uint32_t)block;
+  w[1] = (uint32_t)stream;
+  w[2] = (uint32_t)episode;
+  w[3] = (uint32_t)(episode >> 32);
+  philox(w, (uint32_t)key, (uint32_t)(key >> 32));
+}
+
+// A number of mean 0 and variance 1 of two words: the sum of four uniform ones of 16 bits.
+static double normal(uint32_t one, uint32_t other) {
+  const int32_t halves = (int32_t)((one & 0xFFFF) + (one >> 16) + (other & 0xFFFF) + (other >> 16));
+  return (halves + (2 - 131072)) * 0x1.bb67ae8584caap-16;  // the root of 3 over 2^16
+}
+
+// The estimate (qpos, qvel, act) of n aircraft: position, attitude, velocity and body rate with
+// three errors each. ids lists them, or is NULL for the first n.
+QUADRL_EXPORT void quadrl_estimate(const Rows* rows, int64_t n, const int64_t* ids) {
+  for (int64_t j = 0; j < n; ++j) {
+    const int64_t i = ids ? ids[j] : j;
+    const double *p = rows->qpos + i * rows->stride, *v = rows->qvel + i * rows->stride;
+    const double *speed = rows->act + i * rows->act_stride, *bias = rows->bias + i * rows->bias_stride;
+    double e[ERRORS], *out = rows->estimate + i * rows->estimate_stride;
+    for (int k = 0; k < ERRORS; ++k) e[k] = bias[k];
+    if (rows->noisy) {
+      for (int b = 0; b < NOISE_BLOCKS; ++b) {
+        uint32_t w[4];
+        words(w, rows->steps[i] * NOISE_BLOCKS + b, rows->stream, rows->episodes[i], rows->keys[i]);
+        e[2 * b] += rows->noise[2 * b] * normal(w[0], w[1]);
+        e[2 * b + 1] += rows->noise[2 * b + 1] * normal(w[2], w[3]);
+      }
+    }
+    for (int k = 0; k < 3; ++k) out[k] = p[k] + e[k];
+    // Turned about the axes of the body by small angles.
+    const double a = e[3] / 2, b = e[4] / 2, c = e[5] / 2, w = p[3], x = p[4], y = p[5], z = p[6];
+    const double q[4] = {w - x * a - y * b - z * c, x + w * a + y * c - z * b,
+                         y + w * b + z * a - x * c, z + w * c + x * b - y * a};
+    const double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+    const int turned = a != 0 || b != 0 || c != 0;  // else not even by rounding
+    for (int k = 0; k < 4; ++k) out[3 + k] = turned ? q[k] / length : p[3 + k];
+    for (int k = 0; k < 6; ++k) out[7 + k] = v[k] + e[6 + k];
+    for (int k = 0; k < rows->rotors; ++k) out[13 + k] = speed[k];
+  }
+}
+
+// Adds a vector of a length, in the direction of two numbers in [0, 1), evenly over the sphere.
+static void add(double* to, double length, uint32_t share, uint32_t turn) {
+  const double height = 2 * (share * 0x1p-32) - 1, level = sqrt(1 - height * height);
+  const double heading = 0x1.921fb54442d18p+2 * (turn * 0x1p-32);
+  to[0] += length * (level * cos(heading));
+  to[1] += length * (level * sin(heading));
+  to[2] += length * height;
+}
+
+// Changes velocity and body rate of the aircraft among n that a push hits at this control step.
+QUADRL_EXPORT void quadrl_push(int64_t n, const int64_t* keys, const int64_t* episodes,
+                               const int64_t* steps, int64_t stream, double chance,
+                               double velocity, double body_rate, double* qvel, int64_t stride) {
+  for (int64_t i = 0; i < n; ++i) {
+    uint32_t w[2 * 4];
+    words(w, steps[i] * PUSH_BLOCKS, stream, episodes[i], keys[i]);
+    if (w[0] * 0x1p-32 >= chance) continue;
+    words(w + 4, steps[i] * PUSH_BLOCKS + 1, stream, episodes[i], keys[i]);
+    add(qvel + i * stride, velocity, w[1], w[2]);
+    add(qvel + i * stride + 3, body_rate, w[3], w[4]);
+  }
+}

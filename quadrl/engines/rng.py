@@ -1,0 +1,126 @@
+"""Keyed random numbers: any number of any stream, the same for one aircraft and for a batch.
+
+Row i of a batch that is seeded with s has the key s + i, whatever its neighbours and the threads
+do, and no generator has a state that would have to be saved. NumPy uses the C of
+`native/random.c`; `quadrl.base.philox` is its definition for every array namespace.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from quadrl.aircraft.parameters import Parameters
+from quadrl.base.philox import START, uniform_array_api
+from quadrl.base.rotation import Array, namespace, quaternion_from_heading_and_tilt, stack
+from quadrl.engines import native
+from quadrl.engines.state import Start
+
+FULL_TURN = 2 * math.pi
+ADVANCE = 16
+"""Numbers that are drawn at once, about as many as a start takes."""
+
+
+def uniform(keys: Array, episodes: Array, stream: int, first: int, count: int) -> Array:
+    """Numbers first..first+count-1 of streams, uniform in [0, 1), a multiple of 2^-32 each.
+
+    Args:
+        keys: (n,) int64, of the rows.
+        episodes: (n,) int64.
+        stream: Which stream of the episode.
+        first: Number of the first one.
+        count: How many.
+
+    Returns:
+        (n, count) float64.
+    """
+    if isinstance(keys, np.ndarray):
+        words = np.array((keys, episodes), dtype=np.int64)
+        out = np.empty((len(keys), count))
+        if out.size:
+            keys, values = native.address(words), native.address(out)
+            episodes = keys + words.strides[0]
+            native.library().quadrl_uniform(
+                words.shape[1], keys, episodes, stream, first, count, values
+            )
+        return out
+    return uniform_array_api(keys, episodes, stream, first, count)
+
+
+class Rng:
+    """The random numbers of one stream of the episodes of n rows, taken one after the other."""
+
+    def __init__(self, keys: Array, episodes: Array, stream: int = START) -> None:
+        """Begin the stream.
+
+        Args:
+            keys: (n,) int64, of the rows.
+            episodes: (n,) int64, numbers of the episodes.
+            stream: START, PARAMETERS, ...
+        """
+        self._keys, self._episodes, self._stream = keys, episodes, stream
+        self._drawn: Array = None  # (n, k) numbers of the stream from `_first` on
+        self._first = self._end = self._used = 0
+
+    def uniform(self, low: float, high: float, size: int | None = None) -> Array:
+        """Uniform numbers in [low, high): (n,), or (n, size)."""
+        count = 1 if size is None else size
+        if self._used + count > self._end:  # more than are asked for: each call costs as much
+            self._first, self._end = self._used, self._used + max(count, ADVANCE)
+            many = self._end - self._first
+            self._drawn = uniform(self._keys, self._episodes, self._stream, self._first, many)
+        at = self._used - self._first
+        self._used += count
+        return low + (high - low) * self._drawn[..., at if size is None else slice(at, at + count)]
+
+    def direction(self) -> Array:
+        """Unit vectors (n, 3), evenly over the sphere."""
+        height = self.uniform(-1.0, 1.0)
+        heading = self.uniform(0.0, FULL_TURN)
+        xp = namespace(height)
+        level = xp.sqrt(1 - height * height)
+        return stack(level * xp.cos(heading), level * xp.sin(heading), height)
+
+    def level_direction(self) -> Array:
+        """Unit vectors (n, 3), evenly around the horizon."""
+        bearing = self.uniform(0.0, FULL_TURN)
+        xp = namespace(bearing)
+        return stack(xp.cos(bearing), xp.sin(bearing), xp.zeros_like(bearing))
+
+    def vector(self, length: float, shortest: float = 0.0) -> Array:
+        """Vectors (n, 3) of any direction, their length uniform in [shortest, length)."""
+        return self.uniform(shortest, length)[..., None] * self.direction()
+
+    def attitude(self, tilt: float, heading: float = FULL_TURN) -> Array:
+        """Unit quaternions (n, 4): a heading up to `heading`, a tilt up to `tilt` [rad]."""
+        return quaternion_from_heading_and_tilt(
+            heading=self.uniform(0.0, heading),
+            tilt=self.uniform(0.0, tilt),
+            direction=self.uniform(0.0, FULL_TURN),
+        )
+
+    def level_start(
+        self, position: Array, parameters: Parameters, velocity: Array | None = None
+    ) -> Start:
+        """A start at a position: level, any heading, the rotors at hover speed.
+
+        Args:
+            position: (n, 3) [m], task frame.
+            parameters: Of the aircraft.
+            velocity: (n, 3) [m/s], world frame; None for at rest.
+        """
+        xp = namespace(position)
+        rest = xp.zeros_like(position)
+        return Start(
+            position=position,
+            quaternion=self.attitude(tilt=0.0),
+            velocity=rest if velocity is None else velocity,
+            body_rate=rest,
+            rotor_speed=hovering(position, parameters),
+        )
+
+
+def hovering(like: Array, parameters: Parameters) -> Array:
+    """Hover speeds of the rotors (n, R) [rad/s], a row per row of another array."""
+    return parameters.rotor.hover_speed + namespace(like).zeros_like(like[..., :1])

@@ -1,0 +1,1 @@
+"""Policies in flight: rollouts, their figures, robustness cards, and checks before a flight."""

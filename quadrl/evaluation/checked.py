@@ -1,0 +1,170 @@
+"""Check an aircraft before anything is trained: what its numbers leave to a policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from quadrl import tasks
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import resolve, with_effects
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.validation import choice
+from quadrl.conditions.draw import Draw
+from quadrl.conditions.randomization import Randomized
+from quadrl.control.feasibility import (
+    MARGIN,
+    Reach,
+    angular_acceleration,
+    attitude_bandwidth,
+    held_wind,
+    samples,
+    unreached,
+)
+from quadrl.control.modes import CONTROL_MODES
+from quadrl.core.task import Task
+from quadrl.evaluation.evaluate import html_table
+
+OK = "ok"
+DRIFT = 0.5  # [m], chosen: how far a tilted aircraft may go until it is level
+TILT = 0.2  # [rad], with which hover starts
+SLOWEST = math.sqrt(GRAVITY * TILT / DRIFT)
+"""Bandwidth w of the attitude [rad/s] below which it goes farther: about g tilt / w^2."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One quantity of an aircraft."""
+
+    quantity: str
+    value: float
+    unit: str
+    verdict: str = OK
+    """What is wrong, and what to do about it."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Check:
+    """What was found about an aircraft; a table in a notebook."""
+
+    vehicle: Vehicle
+    rows: tuple[Row, ...]
+
+    def __repr__(self) -> str:
+        wrong = [row.quantity for row in self.rows if row.verdict != OK]
+        return f"{self.vehicle!r}: {'; '.join(wrong) or 'every row is ok'}"
+
+    def _repr_html_(self) -> str:
+        return html_table(self.table)
+
+    @property
+    def table(self) -> list[tuple[str, ...]]:
+        """The rows as text; the first one is the head."""
+        lines = ((r.quantity, f"{r.value:.4g} {r.unit}".strip(), r.verdict) for r in self.rows)
+        return [("quantity", "value", "verdict"), *lines]
+
+
+def check(
+    vehicle: Vehicle | str | None = None,
+    *,
+    vehicle_options: Mapping[str, Any] | None = None,
+    task: str | Task = "hover",
+    randomization: Randomized = None,
+    control_mode: str = "rotor",
+    aerodynamics: str | Aerodynamics | None = None,
+    **task_options: Any,
+) -> Check:
+    """Check what an aircraft leaves to a policy: thrust, moments, steps and delays.
+
+    Args:
+        vehicle: The aircraft or its name; None for the paper's.
+        vehicle_options: Numbers that differ from it, such as {"action_scale": 90}.
+        task: A task or its name; it may ask for a turn of the heading within its time.
+        randomization: What is drawn for each aircraft; the worst ones are checked as well.
+        control_mode: Meaning of the actions; all but "rotor" answer at every physics step.
+        aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them.
+        **task_options: Options of the task.
+
+    Raises:
+        QuadrlError: Something is unknown, out of range, or does not fit together.
+    """
+    vehicle = with_effects(resolve(vehicle, vehicle_options), aerodynamics)
+    choice("control_mode", control_mode, CONTROL_MODES)
+    draw, task = Draw(randomization, vehicle), tasks.make(task, **task_options)
+    rows = (*_thrust(vehicle, draw), *_moments(vehicle, task), *_steps(vehicle, draw, control_mode))
+    return Check(vehicle, rows)
+
+
+def _thrust(vehicle: Vehicle, draw: Draw) -> Iterator[Row]:
+    """What carries it, and the action scale that follows."""
+    reach, scale = Reach(vehicle), vehicle.action_scale
+    drawn = Reach(vehicle, np.concatenate(samples(vehicle, draw)))
+    needed, room = drawn.scale(), reach.room
+    hover = vehicle.hover_speed / vehicle.max_speed
+    yield Row("hover speed", float(vehicle.hover_speed.max()), "rad/s")
+    yield Row("hover over largest speed", 100 * float(hover.max()), "%")
+    commanded = 100 * float((hover + scale / vehicle.max_speed).max())
+    beyond = f"actions over {room / scale:.2g} are cut to the largest speed"
+    yield Row("action 1 over largest speed", commanded, "%", OK if scale <= room else beyond)
+    load, limit = (float(reach.loads(most)[1][0]) for most in (scale, reach.most))
+    weak = f"under {MARGIN:g}: it needs less weight or stronger rotors"
+    short = f"under {MARGIN:g}: action_scale={needed:.3g}" if scale < needed else weak
+    yield Row("thrust over weight, action 1", load, "", OK if load >= MARGIN else short)
+    yield Row("thrust over weight, limits", limit, "", OK if limit >= MARGIN else weak)
+    if draw.given.per_row:
+        worst = float(drawn.loads(scale)[1].min())
+        less = f"{short}, or draw less"
+        yield Row("thrust over weight, worst drawn", worst, "", OK if worst >= MARGIN else less)
+        share, lack, _ = unreached(vehicle, draw)
+        yield Row("drawn that cannot hover", 100 * share, "%", lack if share else OK)
+    yield Row("steady wind held, action 1", held_wind(vehicle, load), "m/s")
+    wanted = max(needed, min(scale, room))
+    carried = float(drawn.loads(wanted)[1].min())
+    reason = f"then the worst has {carried:.2f} times its weight"
+    reason += ", and no command is cut" if wanted <= room else ""
+    yield Row("suggested action_scale", wanted, "rad/s", OK if wanted == scale else reason)
+
+
+def _moments(vehicle: Vehicle, task: Task) -> Iterator[Row]:
+    """What turns it; from rest half round takes 2 sqrt(pi / acceleration)."""
+    ends = {"action 1": vehicle.action_scale, "limits": Reach(vehicle).most}
+    for end, scale in ends.items():
+        for axis, most in zip("xyz", angular_acceleration(vehicle, scale), strict=True):
+            verdict = OK
+            time, turn = task.time_limit - task.settle_time, 2 * math.sqrt(math.pi / most)
+            if axis == "z" and task.heading_matters and turn > time:
+                verdict = f"half a turn takes {turn:.2g} s, and {task.name} leaves {time:.2g} s"
+            name = {"x": "roll", "y": "pitch", "z": "yaw"}[axis]
+            yield Row(f"{name} acceleration, {end}", float(most), "rad/s^2", verdict)
+
+
+def _steps(vehicle: Vehicle, draw: Draw, control_mode: str) -> Iterator[Row]:
+    """What the steps resolve, and how soon the aircraft answers; what does not is refused."""
+    table = np.concatenate(samples(vehicle, draw))
+    rotor = table["rotor"][:, : vehicle.rotor_count]
+    rates = np.stack([rotor["lag_up"], rotor["lag_down"]])
+    step, control = vehicle.physics_timestep, vehicle.control_timestep
+    yield Row("fastest rotor rate times step", float(rates.max() * step), "")
+    yield Row("resolved speed", float(table["resolved_speed"].min()), "m/s")
+    yield Row("resolved body rate", float(table["resolved_turn"].min()), "rad/s")
+    # The loops of the other modes see the true state at every physics step.
+    looped = CONTROL_MODES[control_mode].has_loops
+    late = draw.given.command_delay[1] + (0.0 if looped else draw.given.observation_delay[1])
+    held = step if looped else control
+    lag = float(1 / rates.min())
+    slow = f"over the lag of the rotors: control_timestep={lag:.2g} or less"
+    yield Row("slowest rotor lag", 1000 * lag, "ms")
+    yield Row("time between two commands", 1000 * held, "ms", OK if held <= lag else slow)
+    seen = math.ceil(round(late / control, 6))  # actions
+    verdict = f"a policy must know what is under way: --observe action_history={seen}"
+    yield Row("longest delay", 1000 * late, "ms", verdict if seen and not looped else OK)
+    bandwidth = attitude_bandwidth(lag, late + held / 2)
+    drift = GRAVITY * TILT / bandwidth**2
+    slow = f"under {SLOWEST:.2g}: tilted by {TILT:g} rad it goes {drift:.2g} m until it is level"
+    verdict = OK if bandwidth >= SLOWEST else slow
+    yield Row("attitude bandwidth", bandwidth, "rad/s", verdict)

@@ -1,0 +1,128 @@
+"""Results of flights that are kept in a file until they stand in a card.
+
+A result is found again by a digest over all that it depends on, so that none is ever taken for
+another one's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import inspect
+import json
+import os
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from quadrl import __version__
+from quadrl.base.errors import QuadrlWarning
+from quadrl.base.files import write_whole
+from quadrl.core.task import Task
+
+FILE = "flown.json"
+FORMAT = "quadrl-flown-1"
+
+
+class Kept:
+    """Calls functions that fly; what they gave is in a file, and is taken from there."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """Read what is kept in a folder; None keeps nothing."""
+        self._file = None if folder is None else folder / FILE
+        self._found: dict[str, Any] = {}
+        self._used: set[str] = set()
+        if self._file is None or not self._file.exists():
+            return
+        try:
+            content = json.loads(self._file.read_bytes())
+            if content["format"] != FORMAT or content["digest"] != digest(content["flown"]):
+                raise ValueError
+            self._found = content["flown"]
+        except (OSError, ValueError, LookupError, TypeError, RecursionError):
+            aside = self._file.with_suffix(".unused")
+            os.replace(self._file, aside)
+            warnings.warn(
+                f"{self._file} is damaged or something else, so nothing is taken from it; "
+                f"it is now {aside}",
+                QuadrlWarning,
+                stacklevel=3,
+            )
+
+    def __call__(self, fly: Callable[..., Any], *given: Any, **conditions: Any) -> Any:
+        """What `fly` gives for these arguments, as JSON has it."""
+        key = self._key(fly, given, conditions)
+        if key not in self._found:
+            flown = json.dumps(fly(*given, **conditions), default=np.ndarray.tolist)
+            if key is None:
+                return json.loads(flown)
+            self._found[key] = json.loads(flown)
+            self._write(self._found)
+        self._used.add(key)
+        return self._found[key]
+
+    def forget(self) -> None:
+        """Keep nothing of what was asked for any longer."""
+        if self._used:
+            self._write({k: v for k, v in self._found.items() if k not in self._used})
+
+    def _key(self, *what: Any) -> str | None:
+        """A digest over what is flown; None where nothing is kept, or what flies cannot be told."""
+        if self._file is None:
+            return None
+        try:
+            return digest([*what, __version__, mujoco.__version__, np.__version__])
+        except (OSError, TypeError):
+            return None
+
+    def _write(self, found: dict[str, Any]) -> None:
+        assert self._file
+        if not found:
+            self._file.unlink(missing_ok=True)
+            return
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        content = {"format": FORMAT, "digest": digest(found), "flown": found}
+        write_whole(self._file, json.dumps(content).encode())
+
+
+def digest(thing: Any) -> str:
+    """A digest over the whole content of a thing.
+
+    Raises:
+        TypeError: It is a function or an object whose content does not tell what it does.
+        OSError: The source of a task cannot be read.
+    """
+    return hashlib.sha256(json.dumps(_told(thing), sort_keys=True).encode()).hexdigest()
+
+
+def _told(thing: Any) -> Any:
+    """The content of a thing as JSON."""
+    if isinstance(thing, np.generic):
+        return thing.item()
+    if thing is None or isinstance(thing, (bool, int, float, str)):
+        return thing
+    if isinstance(thing, np.ndarray):
+        data = hashlib.sha256(thing.tobytes()).hexdigest()
+        return [thing.dtype.str, list(thing.shape), data]
+    if isinstance(thing, Mapping):
+        return {str(name): _told(value) for name, value in thing.items()}
+    if isinstance(thing, (list, tuple)):
+        return [_told(item) for item in thing]
+    kind = thing if isinstance(thing, FunctionType) else type(thing)
+    told: list[Any] = [kind.__module__, kind.__qualname__]
+    own = kind.__module__.startswith("quadrl.") and "<" not in kind.__qualname__  # no closures
+    if not own:
+        if not isinstance(thing, Task):
+            raise TypeError(f"{kind.__qualname__} may do anything")
+        told.append(hashlib.sha256(Path(inspect.getfile(kind)).read_bytes()).hexdigest())
+    if not isinstance(thing, FunctionType):
+        # What an object of a dataclass has beside its fields it has computed from them.
+        data_only = dataclasses.is_dataclass(thing)
+        names = [f.name for f in dataclasses.fields(thing)] if data_only else vars(thing)
+        told.append({name: _told(getattr(thing, name)) for name in names})
+    return told

@@ -1,0 +1,97 @@
+"""What a policy remembers: a gated recurrent unit in NumPy, and a policy in flight with one."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+PREFIX = "memory_"
+"""Of the arrays of a unit in the file of its policy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GRU:
+    """A gated recurrent unit (Cho et al. 2014), with the equations of `torch.nn.GRUCell`.
+
+    Rows of the weights: of the reset gate, then of the update gate, then of the candidate.
+    """
+
+    input_weight: np.ndarray  # (3 width, size)
+    state_weight: np.ndarray  # (3 width, width)
+    input_bias: np.ndarray  # (3 width,)
+    state_bias: np.ndarray  # (3 width,)
+
+    @property
+    def width(self) -> int:
+        """Numbers in a state."""
+        return self.state_bias.size // 3
+
+    def step(self, inputs: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """The next state (..., width), from inputs (..., size) and the present one."""
+        seen = np.split(inputs @ self.input_weight.T + self.input_bias, 3, axis=-1)
+        kept = np.split(state @ self.state_weight.T + self.state_bias, 3, axis=-1)
+        reset, update = (_sigmoid(a + b) for a, b in zip(seen[:2], kept[:2], strict=True))
+        candidate = np.tanh(seen[2] + reset * kept[2])
+        return candidate + update * (state - candidate)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """By their names in a file."""
+        return {PREFIX + field.name: getattr(self, field.name) for field in FIELDS}
+
+    def is_sound(self, size: int, largest: float) -> bool:
+        """Whether the arrays fit together and no input makes a state that is not finite.
+
+        Args:
+            size: Numbers in an input.
+            largest: Bound of an input's magnitude; a state's is 1.
+        """
+        arrays = tuple(self.arrays().values())
+        shapes = [(3 * self.width, size), (3 * self.width, self.width)] + 2 * [(3 * self.width,)]
+        if self.width == 0 or [array.shape for array in arrays] != shapes:
+            return False
+        if not all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays):
+            return False
+        inputs, states = (
+            bound * np.abs(weight, dtype=np.float64).sum(axis=1) + np.abs(bias)
+            for bound, weight, bias in ((largest, *arrays[::2]), (1.0, *arrays[1::2]))
+        )
+        return bool((inputs + states < np.finfo(np.float32).max / 2).all())
+
+
+FIELDS = dataclasses.fields(GRU)
+NAMES = tuple(PREFIX + field.name for field in FIELDS)
+
+
+class Flyer:
+    """A policy in flight: a function of observations that keeps what the policy remembers."""
+
+    def __init__(self, policy: Any, count: int | None, seed: int | None) -> None:
+        """Begin with the state of a policy at an episode's begin; see `Policy.flying`."""
+        self.policy, self.control_mode = policy, policy.control_mode
+        self.conditions = policy.conditions
+        self.state = policy.initial_state(count)
+        self._generator = None if seed is None else np.random.default_rng(seed)
+
+    def reset(self, rows: np.ndarray | None = None) -> None:
+        """Forget, before the first observation of an episode.
+
+        Args:
+            rows: The aircraft whose episodes begin, a mask (n,) or indices; None for all.
+        """
+        self.state = self.state.copy()  # whoever has the old one keeps it
+        self.state[... if rows is None else rows] = 0.0
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Actions (n, k) for observations (n, size), in [-1, 1]; it remembers them.
+
+        Raises:
+            QuadrlError: The observations are of another number of aircraft, or of another size.
+        """
+        action, self.state = self.policy.step(observation, self.state, self._generator)
+        return action
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 0.5 + 0.5 * np.tanh(0.5 * x)  # without the overflow of exp(-x)

@@ -1,0 +1,377 @@
+"""A trained policy as numbers: NumPy in, NumPy out, no torch.
+
+The file is safetensors: arrays and a table of strings, nothing that could run. The network is the
+paper's: hidden layers of tanh, then the mean and the log-variance of a normal distribution over the
+actions. Observations are normalised with the mean and the deviation of the training. A policy with
+a memory has a gated recurrent unit beside that: its state joins the observation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from safetensors.numpy import load as of_bytes
+from safetensors.numpy import save as to_bytes
+
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import VEHICLES, with_effects
+from quadrl.aircraft.presets import resolve as resolve_vehicle
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.files import read_safetensors, read_sealed_json, write_safetensors
+from quadrl.base.validation import choice, number
+from quadrl.conditions.observing import resolve
+from quadrl.evaluation.memory import GRU, NAMES, PREFIX, Flyer
+
+if TYPE_CHECKING:
+    from quadrl.core.environment import Environment
+
+CONDITIONS = ("weather", "randomization", "observe")
+FORMAT, RECURRENT_FORMAT = "quadrl-policy-3", "quadrl-policy-gru-2"
+UNSEALED, RECURRENT_UNSEALED = "quadrl-policy-2", "quadrl-policy-gru-1"
+"""Formats of files without a digest."""
+FILE, RUN, RUN_FORMAT = "policy.safetensors", "config.json", "quadrl-run-2"
+"""In the folder of a run: its policy, and its settings."""
+CLIP = 10.0
+"""Normalised observations are clipped to +-CLIP."""
+LOG_VARIANCE = (-12.0, 2.0)
+"""Bounds of the log-variance of the actions."""
+SHIPPED = Path(__file__).parents[1] / "assets" / "policies"
+"""The policies that come with the package: TASK_ALGO.safetensors, or TASK_VARIANT.safetensors for a
+variant of the training, with a .json beside each."""
+SHIPPED_AS = {"vpg": "gae"}
+"""Algorithms that the file names call otherwise: the paper's word for the policy gradient."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Policy:
+    """The mean action of a trained network."""
+
+    weights: tuple[np.ndarray, ...]
+    """Of each layer, (outputs, inputs); the last gives k means and k log-variances, (2 k, ...)."""
+    biases: tuple[np.ndarray, ...]
+    """Of each layer, (outputs,)."""
+    mean: np.ndarray
+    """Of the observations in training, (size,)."""
+    deviation: np.ndarray
+    """Of the observations in training, (size,)."""
+    task: str
+    """The task that it was trained for."""
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """How it was made: algo, seed, variant, steps, vehicle, rotors, control_mode, task_options; and
+    the other conditions of `TrainConfig.conditions`, where they differ from the usual."""
+    memory: GRU | None = None
+    """What it remembers with: its state after an observation joins the normalised observation."""
+
+    def __repr__(self) -> str:
+        layers = "-".join(str(x) for x in (self.size, *(len(bias) for bias in self.biases)))
+        known = ", ".join(f"{k} {self.metadata[k]}" for k in REPR if k in self.metadata)
+        memory = f"; memory of {self.state_size}" if self.memory else ""
+        return f"Policy for {self.task} ({known or 'made by hand'}; layers {layers}{memory})"
+
+    @property
+    def control_mode(self) -> str:
+        """What its actions mean."""
+        return str(self.metadata.get("control_mode", "rotor"))
+
+    @property
+    def conditions(self) -> dict[str, Any]:
+        """What its training flew in and saw, for `Environment`, where it is not the usual."""
+        return {name: self.metadata[name] for name in CONDITIONS if name in self.metadata}
+
+    def make_vehicle(self, aerodynamics: str | Aerodynamics | None = None) -> Vehicle:
+        """The aircraft of its training.
+
+        Args:
+            aerodynamics: Effects of the air, as `with_effects` takes them; None for those of the
+                training.
+        """
+        own = self.metadata
+        vehicle = resolve_vehicle(own.get("vehicle"), own.get("vehicle_options"))
+        if aerodynamics is None:
+            aerodynamics = own.get("aerodynamics")
+        return with_effects(vehicle, aerodynamics)
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """Keywords with which each API makes an environment that it fits.
+
+        They are the aircraft, the control mode, the observation and the options of the task of its
+        training: `gymnasium.make("quadrl/Hover-v0", **policy.keywords)`. Its training's weather
+        and randomization are in `conditions`.
+        """
+        seen = self.conditions.get("observe", {})
+        needed = {"vehicle": self.make_vehicle(), "control_mode": self.control_mode}
+        return needed | {"observe": seen} | self.metadata.get("task_options", {})
+
+    @property
+    def size(self) -> int:
+        """Numbers in an observation."""
+        return len(self.mean)
+
+    @property
+    def action_size(self) -> int:
+        """Numbers in an action, k."""
+        return len(self.biases[-1]) // 2
+
+    @property
+    def state_size(self) -> int:
+        """Numbers that it remembers of an aircraft; 0 without a memory."""
+        return self.memory.width if self.memory else 0
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """The mean action of a policy without a memory; `flying` is for every policy.
+
+        Args:
+            observation: Flat vectors (..., size), in the order of the task's terms.
+
+        Returns:
+            Actions (..., k), within [-1, 1].
+
+        Raises:
+            QuadrlError: The observation has another size, or the policy has a memory, which it
+                would lose with every call.
+        """
+        return self._act(observation, self._without_memory(), None)[0]
+
+    def sampled(self, seed: int) -> Callable[[np.ndarray], np.ndarray]:
+        """As the policy itself, with actions drawn as in training; `flying` takes a seed too."""
+        state, generator = self._without_memory(), np.random.default_rng(seed)
+        return lambda observation: self._act(observation, state, generator)[0]
+
+    def initial_state(self, n: int | None = None) -> np.ndarray:
+        """What it remembers as an episode begins: (n, state_size); (state_size,) without n."""
+        rows = () if n is None else (int(number("n", n, 1, whole=True)),)
+        return np.zeros((*rows, self.state_size), dtype=np.float32)
+
+    def step(
+        self,
+        observation: np.ndarray,
+        state: np.ndarray,
+        generator: np.random.Generator | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions, and what to remember until the next observation.
+
+        Args:
+            observation: (n, size), or (size,) of one aircraft.
+            state: What the last step gave, (n, state_size) or (state_size,); `initial_state` in the
+                rows whose episode begins.
+            generator: Of the draws of the stochastic policy; None for the mean action.
+
+        Returns:
+            Actions (n, k) or (k,), within [-1, 1]; the next state, of the shape of the present one.
+
+        Raises:
+            QuadrlError: The observation or the state has another shape.
+        """
+        state = np.asarray(state, dtype=np.float32)
+        if state.shape != (needed := (*np.shape(observation)[:-1], self.state_size)):
+            raise QuadrlError(name="state shape", value=state.shape, allowed=f"{needed}")
+        return self._act(observation, state, generator)
+
+    def flying(self, n: int | None = None, seed: int | None = None) -> Flyer:
+        """Any policy as a function of observations that remembers; its `reset` makes it forget.
+
+        Args:
+            n: Aircraft that it flies: observations are (n, size). None for one, (size,).
+            seed: Of the draws of the stochastic policy; None for the mean action.
+        """
+        return Flyer(self, n, seed)
+
+    def check_fits(self, environment: Environment) -> None:
+        """Refuse an environment in which observations or actions mean something else.
+
+        `keywords` make one that fits.
+
+        Raises:
+            QuadrlError: The policy observes or commands another number of values or with other
+                options, or in another control mode; or it commands rotors, and those of the vehicle
+                stand or turn otherwise, or an action of 1 is another change of their speed.
+        """
+        vehicle, name = environment.vehicle, self.metadata.get("vehicle")
+        # One that is not known here is taken for the one that it is to fly.
+        known = name if name in VEHICLES else vehicle
+        trained = resolve_vehicle(known, self.metadata.get("vehicle_options"))
+        needed, seen = (
+            resolve(self.conditions.get("observe")).for_policy(),
+            environment.observing.for_policy(),
+        )
+        if needed != seen:
+            allowed = f"{needed}, as in the training of the policy for {self.task}"
+            raise QuadrlError(name="observe", value=seen, allowed=allowed)
+        own_sizes, there = (
+            (self.size, self.action_size),
+            (environment.size, environment.action_size),
+        )
+        for what, own, needed in zip(("observation", "action"), own_sizes, there, strict=True):
+            if own != needed:
+                name = f"{what} size of the policy for {self.task}"
+                where = f"{environment.task.name} with the vehicle {vehicle.name}"
+                raise QuadrlError(name=name, value=own, allowed=f"{needed} for {where}")
+        if (mode := environment.control_mode.name) != self.control_mode:
+            allowed = f"{self.control_mode!r}, as in the training of the policy for {self.task}"
+            raise QuadrlError(name="control_mode", value=mode, allowed=allowed)
+        if self.control_mode != "rotor":
+            return
+        if not np.array_equal(trained.layout, vehicle.layout):
+            allowed = f"one with the rotor layout of {trained.name}, which the policy has learned"
+            raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
+        if trained.action_scale != vehicle.action_scale:
+            allowed = f"{trained.action_scale:g}, as in the training of the policy for {self.task}"
+            reason = "make the environment with **policy.keywords, or its aircraft with that scale"
+            scale = vehicle.action_scale
+            raise QuadrlError(reason, name="action_scale", value=scale, allowed=allowed)
+
+    def _without_memory(self) -> np.ndarray:
+        """The state of a policy that has none.
+
+        Raises:
+            QuadrlError: It has one.
+        """
+        if self.memory:
+            raise QuadrlError(
+                f"the policy for {self.task} has a memory, which a single call would lose: fly "
+                "with policy.flying(n), or keep the state with policy.step(observation, state)"
+            )
+        return self.initial_state()
+
+    def _act(
+        self, observation: np.ndarray, state: np.ndarray, generator: np.random.Generator | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions (..., k) and the next state."""
+        observation = np.asarray(observation, dtype=np.float32)
+        if observation.shape[-1:] != self.mean.shape:
+            allowed = f"(..., {self.size}) for the policy for {self.task}"
+            reason = "an environment that is made with **policy.keywords gives that"
+            raise QuadrlError(
+                reason, name="observation shape", value=observation.shape, allowed=allowed
+            )
+        hidden = np.clip((observation - self.mean) / self.deviation, -CLIP, CLIP)
+        if self.memory:
+            state = self.memory.step(hidden, state)
+            hidden = np.concatenate([hidden, state], axis=-1)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = np.tanh(hidden @ weight.T + bias)
+        output = hidden @ self.weights[-1].T + self.biases[-1]
+        action, log_variance = output[..., : self.action_size], output[..., self.action_size :]
+        if generator is not None:
+            deviation = np.exp(0.5 * np.clip(log_variance, *LOG_VARIANCE))
+            action = action + deviation * generator.standard_normal(action.shape)
+        return np.clip(action, -1.0, 1.0), state
+
+    def save(self, path: str | Path) -> None:
+        """Write the file, whole or not at all."""
+        arrays = {"mean": self.mean, "deviation": self.deviation}
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
+        arrays |= self.memory.arrays() if self.memory else {}
+        arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
+        written = RECURRENT_FORMAT if self.memory else FORMAT
+        header = {"format": written, "task": self.task, "metadata": self.metadata}
+        write_safetensors(Path(path), arrays, header, to_bytes)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Policy:
+        """Read a policy; nothing in the file is run.
+
+        A policy in the folder of a run that it is not of is read with a `QuadrlWarning`.
+
+        Args:
+            path: A .safetensors file, or a run folder that holds policy.safetensors.
+
+        Raises:
+            QuadrlError: The file is missing, damaged or not a policy of quadrl.
+        """
+        path = Path(path)
+        file = path / FILE if path.is_dir() else path
+        if not file.is_file():
+            if (path / RUN).is_file():
+                raise QuadrlError(
+                    f"the run in {path} has no policy yet, since it was stopped before its first "
+                    f"checkpoint; continue it: quadrl train --resume {path}"
+                )
+            raise QuadrlError(
+                f"there is no policy at {file}; give a run folder (quadrl train ... --out FOLDER "
+                "makes one) or a .safetensors file"
+            )
+        unsealed = UNSEALED, RECURRENT_UNSEALED
+        arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), unsealed, of_bytes)
+        task, metadata = header.get("task"), header.get("metadata")
+        options = metadata.get("task_options", {}) if isinstance(metadata, dict) else None
+        if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
+            raise QuadrlError(f"{file} does not say what its policy was trained for")
+        own = NAMES if header["format"] in (RECURRENT_FORMAT, RECURRENT_UNSEALED) else ()
+        layers = max(1, (len(arrays) - len(own)) // 2 - 1)
+        names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS), *own)
+        if set(arrays) != set(names):
+            raise QuadrlError(f"{file} is damaged: its arrays are {', '.join(sorted(arrays))}")
+        weights, biases = (tuple(arrays[f"{p}_{k}"] for k in range(layers)) for p in PARTS)
+        memory = GRU(**{k.removeprefix(PREFIX): arrays[k] for k in own}) if own else None
+        mean, deviation = arrays["mean"], arrays["deviation"]
+        policy = cls(weights, biases, mean, deviation, task, metadata, memory)
+        if not _is_network(policy):
+            raise QuadrlError(f"{file} is damaged: its arrays do not make a policy network")
+        if path.is_dir() and (path / RUN).is_file():
+            policy._warn_of_another_run(path)
+        return policy
+
+    def _warn_of_another_run(self, folder: Path) -> None:
+        """Say so where a policy is not of the run in whose folder it is."""
+        run, own = read_sealed_json(folder / RUN, RUN_FORMAT), self.metadata | {"task": self.task}
+        for name in ("task", "algo", "seed", "run"):
+            if name in own and name in run and own[name] != run[name]:
+                text = f"the policy in {folder} is not of the run there: its {name} is "
+                text += f"{own[name]}, that of the run {run[name]}"
+                warnings.warn(text, QuadrlWarning, stacklevel=3)
+                return
+
+    @classmethod
+    def pretrained(cls, task: str, algo: str = "ppo", variant: str = "ideal") -> Policy:
+        """A policy that comes with the package; the .json beside it says how it was made.
+
+        Args:
+            task: The task that it was trained for, or the name of its file, such as hover_robust.
+            algo: The algorithm that it was trained with: ppo, trpo or vpg (or gae, its alias).
+            variant: The variant of the training: ideal, or robust, for an uncertain aircraft.
+
+        Raises:
+            QuadrlError: There is no such policy; the message lists those that there are.
+        """
+        name, known = task, [file.stem for file in shipped()]
+        if task not in known:
+            name = f"{task}_{SHIPPED_AS.get(algo, algo) if variant == 'ideal' else variant}"
+        return cls.load(SHIPPED / f"{choice('pretrained policy', name, known)}.safetensors")
+
+
+PARTS = ("weight", "bias")
+REPR = ("algo", "seed", "vehicle")  # what a policy says of itself
+
+
+def _is_network(policy: Policy) -> bool:
+    """Whether the arrays fit together and no observation makes an output that is not finite."""
+    arrays = (*policy.weights, *policy.biases, policy.mean, policy.deviation)
+    width = policy.mean.size
+    sound = policy.mean.shape == policy.deviation.shape == (width,)
+    sound = sound and all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays)
+    largest: Any = CLIP
+    if sound and policy.memory:
+        sound = policy.memory.is_sound(width, CLIP)
+        largest = np.repeat([CLIP, 1.0], [width, policy.state_size])
+        width += policy.state_size
+    for weight, bias in zip(policy.weights, policy.biases, strict=True):
+        if not sound or weight.shape != (bias.size, width) or bias.shape != (bias.size,):
+            return False
+        sums = (largest * np.abs(weight, dtype=np.float64)).sum(axis=1) + np.abs(bias)
+        sound = bool((sums < np.finfo(np.float32).max / 2).all())
+        width, largest = bias.size, 1.0  # the largest output of tanh
+    return sound and width > 0 and width % 2 == 0 and bool((policy.deviation > 0).all())
+
+
+def shipped() -> list[Path]:
+    """The files of the policies that come with the package, by name."""
+    return sorted(SHIPPED.glob("*.safetensors"))

@@ -1,0 +1,210 @@
+"""Fly a controller through fresh episodes, in calm air or in wind, and summarize them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base import machine
+from quadrl.base.errors import QuadrlError
+from quadrl.conditions.observing import Observed
+from quadrl.conditions.randomization import Randomized
+from quadrl.conditions.weather import Weathered
+from quadrl.core.environment import Environment
+from quadrl.core.snapshot import Rollout
+from quadrl.core.task import Task
+from quadrl.engines.engine import EngineName
+from quadrl.evaluation.memory import Flyer
+from quadrl.evaluation.policy import Policy
+
+Controller = Callable[[np.ndarray], np.ndarray]
+"""Flat observations (N, size) float32 to actions (N, k); its attribute `control_mode`, if it has
+one, says what they mean, and `conditions` what it has to see and what it was trained in."""
+
+EVALUATION_SEED = 1 << 53
+"""Beyond the seeds of every training (2^32 * 2^20), so that evaluation episodes are fresh ones."""
+MAX_SEED, MAX_EPISODES = (1 << 32) - 1, 100_000
+FINAL_STRETCH = 2.0  # [s], over which position_error_m is the mean
+HISTORY = ("position", "quaternion", "velocity", "body_rate", "rotor_speed", "goal", "action",
+           "error", "reward", "wind")  # fmt: skip
+
+
+def fly(
+    controller: Controller,
+    task: str | Task,
+    *,
+    episodes: int,
+    seed: int = EVALUATION_SEED,
+    vehicle: Vehicle | str | None = None,
+    control_mode: str | None = None,
+    weather: Weathered = None,
+    randomization: Randomized = None,
+    observe: Observed = None,
+    engine: EngineName = "mujoco",
+) -> Rollout:
+    """Fly one episode of each of N aircraft.
+
+    Args:
+        controller: A `Policy`, or any function of observations.
+        task: A task or its name.
+        episodes: N.
+        seed: Aircraft i has the seed `seed + i`.
+        vehicle: The aircraft; None for that of the controller's training, or the paper's.
+        control_mode: What actions mean; None for what the controller says, or "rotor".
+        weather: A `Weather` or its name; None for that of the controller's training, or calm air.
+            Each aircraft flies in a wind of its own, from its seed, and does not observe it.
+        randomization: What is drawn for each aircraft and disturbs it; None for what the controller
+            was trained with, or nothing.
+        observe: Options of the observation; None for those that the controller needs.
+        engine: "mujoco", or "free_flight" wherever there is nothing to touch.
+
+    Raises:
+        QuadrlError: The controller's actions have another meaning or another size, or an argument
+            is out of range.
+    """
+    environment, controller = prepared(
+        *(controller, task, episodes, seed, vehicle, control_mode, engine),
+        {"weather": weather, "randomization": randomization, "observe": observe},
+    )
+    task, timestep = environment.task, environment.vehicle.control_timestep
+    steps, numbers = environment.time_limit_steps, 21 + len(environment.vehicle.rotors)
+    machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
+    observation = environment.flatten(environment.reset())
+    history: dict[str, list[np.ndarray]] = {name: [] for name in HISTORY}
+    alive = np.ones(episodes, dtype=bool)
+    length = np.zeros(episodes, dtype=int)
+    ends = {name: np.zeros(episodes, bool) for name in ("terminated", "is_success", "diverged")}
+    markers = []
+    while alive.any():
+        taken = np.clip(controller(observation), -1.0, 1.0)
+        now = environment.step(taken)
+        observation = environment.flatten(now.observation)
+        markers.append(environment.markers())
+        state, goal = environment.snapshot.state, task.goal(environment.snapshot)
+        moment = {"goal": goal, "action": taken, "error": now.error, "reward": now.reward}
+        moment["wind"] = environment.engine.wind
+        for name, values in history.items():
+            value = np.array(moment[name] if name in moment else getattr(state, name), dtype=float)
+            value[~alive] = np.nan
+            values.append(value)
+        length += alive
+        for name, flag in ends.items():
+            flag |= alive & getattr(now, name)
+        alive &= ~(now.terminated | now.truncated)
+    return Rollout(
+        **{name: np.stack(values) for name, values in history.items()},
+        length=length,
+        **ends,
+        markers=tuple(markers),
+        origin=np.array(environment.origin),
+        control_timestep=timestep,
+        task=task,
+    )
+
+
+def prepared(
+    controller: Controller,
+    task: str | Task,
+    episodes: int,
+    seed: int,
+    vehicle: Vehicle | str | None,
+    control_mode: str | None,
+    engine: EngineName,
+    conditions: Mapping[str, Any],
+) -> tuple[Environment, Controller]:
+    """An environment for a controller, and the controller with nothing remembered.
+
+    Args:
+        controller: As `fly` takes it, as well as the arguments before `conditions`.
+        task: What is flown.
+        episodes: N.
+        seed: Of the first aircraft.
+        vehicle: The aircraft.
+        control_mode: What actions mean.
+        engine: Its name.
+        conditions: Weather, randomization and options of the observation; None for the
+            controller's own.
+
+    Raises:
+        QuadrlError: As `fly`.
+    """
+    own = getattr(controller, "control_mode", None)
+    if None not in (control_mode, own) and control_mode != own:
+        raise QuadrlError(name="control_mode", value=control_mode, allowed=f"{own!r}, as trained")
+    policy = controller if isinstance(controller, Policy) else getattr(controller, "policy", None)
+    if vehicle is None and isinstance(policy, Policy):
+        vehicle = policy.make_vehicle()
+    given = {name: value for name, value in conditions.items() if value is not None}
+    environment = Environment(
+        task,
+        num_envs=episodes,
+        seed=seed,
+        vehicle=vehicle,
+        control_mode=control_mode or own or "rotor",
+        engine=engine,
+        **getattr(controller, "conditions", {}) | given,
+    )
+    if isinstance(controller, Policy):
+        controller = controller.flying(episodes)
+    if isinstance(controller, Flyer):
+        controller.policy.check_fits(environment)
+        controller.reset()
+    return environment, controller
+
+
+def flights(rollout: Rollout) -> dict[str, np.ndarray]:
+    """What each flight of a rollout reached, arrays (N,).
+
+    Returns:
+        success, survived and diverged (bool); position_error_m: mean error over the last 2 s [m];
+        where the heading matters heading_error_deg: mean of |yaw| over the same time; return;
+        length_s.
+    """
+    steps = max(1, round(FINAL_STRETCH / rollout.control_timestep))
+    index = np.arange(len(rollout.error))[:, None]
+    last = (index >= rollout.length - steps) & (index < rollout.length)
+    w, x, y, z = np.moveaxis(rollout.quaternion, -1, 0)
+    yaw = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
+    heading = {"heading_error_deg": _means(np.abs(yaw), last)}
+    return {
+        "success": rollout.is_success,
+        "survived": ~(rollout.terminated & ~rollout.is_success),
+        "diverged": rollout.diverged,
+        "position_error_m": _means(rollout.error, last),
+        **(heading if rollout.task.heading_matters else {}),
+        "return": np.nansum(rollout.reward, 0),
+        "length_s": rollout.length * rollout.control_timestep,
+    }
+
+
+def summarize(rollout: Rollout) -> dict[str, Any]:
+    """The metrics of an evaluation.
+
+    Returns:
+        episodes; success_rate and survival_rate (shares); position_error_m and
+        position_error_std_m: mean and deviation over the flights [m]; where the heading matters
+        heading_error_deg; return_mean and return_std; length_mean_s; diverged (count); and the
+        task's own metrics. `flights` says what each of them is of one flight.
+    """
+    flown = flights(rollout)
+    heading = {k: float(v.mean()) for k, v in flown.items() if k == "heading_error_deg"}
+    return {
+        "episodes": len(flown["return"]),
+        "success_rate": float(flown["success"].mean()),
+        "survival_rate": float(flown["survived"].mean()),
+        "position_error_m": float(flown["position_error_m"].mean()),
+        "position_error_std_m": float(flown["position_error_m"].std()),
+        **heading,
+        "return_mean": float(flown["return"].mean()),
+        "return_std": float(flown["return"].std()),
+        "length_mean_s": float(flown["length_s"].mean()),
+        "diverged": int(flown["diverged"].sum()),
+    } | rollout.task.metrics(rollout)
+
+
+def _means(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Mean of values (T, N) over the chosen steps, (N,)."""
+    return np.sum(np.where(chosen, values, 0.0), 0) / chosen.sum(0)

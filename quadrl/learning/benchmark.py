@@ -1,0 +1,324 @@
+"""The speed of every layer, measured in one process.
+
+The yardstick is bare `mj_step`: the same lean model with the same callbacks under random commands,
+which move it as random actions do (a step at rest is an eighth shorter). Everything is counted in
+control steps per second.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import itertools
+import operator
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from quadrl import suite, tasks
+from quadrl.aircraft.presets import in_real_air
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.machine import cores, machine
+from quadrl.conditions.draw import Draw
+from quadrl.conditions.randomization import FACTORS, RANDOMIZATIONS, Randomization
+from quadrl.core.environment import Environment
+from quadrl.core.task import Task
+from quadrl.engines import mjcf
+from quadrl.engines.mujoco import BatchEngine
+
+Work = Iterator[int]
+"""Flies some control steps each time, and says how many."""
+
+ALL_CORES, ONE_CORE = "all cores", "one core"
+CHUNK = 200  # control steps of one aircraft between two looks at the clock
+FLIGHT = 16  # control steps from hover under random commands, until bare aircraft are put back
+HEIGHT = 3.0  # [m], where the aircraft of bare mj_step begin; in a FLIGHT they come near nothing
+LOW = 0.5  # [m], where they feel the ground
+FULL = RANDOMIZATIONS["full"]
+DIFFERENT = Randomization(**{name: getattr(FULL, name) for name in (*FACTORS, "rotors")})
+"""Aircraft that differ, and nothing else."""
+FREE_FLIGHT_ENVS = 4096
+FREE_FLIGHT = "free flight"  # Environment of FREE_FLIGHT_ENVS
+KERNEL = "kernel"  # free flight of FREE_FLIGHT_ENVS on one core and nothing else
+
+
+class Layer(NamedTuple):
+    """One thing that is measured."""
+
+    what: str
+    of: str  # the yardstick: bare mj_step on ALL_CORES or ONE_CORE, or another layer
+    work: Work
+    target: float | None = None  # share of the yardstick that it should reach
+    bare: bool = False  # a candidate for the yardstick itself; the fastest one is
+
+
+def benchmark(
+    task: str, *, num_envs: int = 1024, seconds: float = 0.2, repeats: int = 30
+) -> dict[str, Any]:
+    """Measure every layer, in turn and several times over, so that drift affects all alike.
+
+    Args:
+        task: Name of a task.
+        num_envs: Aircraft in the batches.
+        seconds: Length of each measurement; short, since the speed of a machine drifts.
+        repeats: Measurements of each. The fastest is the rate: other work only slows it down.
+
+    Returns:
+        `rates`: for each layer `what`, `rate` [control steps/s], all `repeats` of it, `share` of
+        `of` (the median of the ratios within one turn), and its `target` (None: none is set). `of`
+        is bare mj_step on all cores or on one, or another layer. `machine`, and the settings. The
+        TorchRL layer is left out where TorchRL is not installed.
+    """
+    with contextlib.ExitStack() as stack:
+        layers = _layers(tasks.make(task), num_envs, stack)
+        rates = _measure([layer.work for layer in layers], seconds, repeats)
+    yardsticks = {}
+    for layer, measured in zip(layers, rates, strict=True):
+        yardsticks |= {of: measured for of in (FREE_FLIGHT, KERNEL) if layer.what.endswith(of)}
+    for of in (ALL_CORES, ONE_CORE):
+        bare = [r for layer, r in zip(layers, rates, strict=True) if layer.bare and layer.of == of]
+        yardsticks[of] = max(bare, key=statistics.median)
+    return {
+        "task": task,
+        "num_envs": num_envs,
+        "seconds": seconds,
+        "rates": [
+            {
+                "what": layer.what,
+                "rate": max(measured),
+                "repeats": measured,
+                "share": statistics.median(map(operator.truediv, measured, yardsticks[layer.of])),
+                "of": layer.of,
+                "target": layer.target,
+            }
+            for layer, measured in zip(layers, rates, strict=True)
+        ],
+        "machine": machine(),
+    }
+
+
+def rows(measured: dict[str, Any]) -> list[tuple[str, ...]]:
+    """What `benchmark` returned, to be read: what, fastest and median rate, share, of, target."""
+    written = []
+    for row in measured["rates"]:
+        what, rate = row["what"], row["rate"]
+        if what.startswith(KERNEL):
+            what += f": {1e9 / (rate * Vehicle().substeps):,.0f} ns a physics step"
+        speeds = (f"{rate:,.0f}" for rate in (rate, statistics.median(row["repeats"])))
+        target = "" if row["target"] is None else f"{row['target']:.2f}"
+        of = "mj_step" if row["of"] in (ALL_CORES, ONE_CORE) else row["of"]
+        written.append((what, *speeds, f"{row['share']:.2f}", of, target))
+    return written
+
+
+def summary(measured: dict[str, Any]) -> str:
+    """The machine in a line."""
+    computer = dict(measured["machine"])
+    cpu, cores, system = (computer.pop(name) for name in ("cpu", "cores", "system"))
+    versions = ", ".join(f"{name} {version}" for name, version in computer.items())
+    return f"{cpu}, {cores} core{'s' * (cores > 1)}, {system}, {versions}"
+
+
+def _measure(works: list[Work], seconds: float, repeats: int) -> list[list[float]]:
+    """Control steps per second of each, `repeats` times over."""
+    for work in works:
+        next(work)  # the first time is slower
+    rates: list[list[float]] = [[] for _ in works]
+    for _ in range(repeats):
+        for work, measured in zip(works, rates, strict=True):
+            steps, began, elapsed = 0, time.perf_counter(), 0.0
+            while elapsed < seconds:
+                steps += next(work)
+                elapsed = time.perf_counter() - began
+            measured.append(steps / elapsed)
+    return rates
+
+
+def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Layer]:
+    """Everything that is measured; what has to be closed goes to the stack."""
+    gymnasium_id = f"quadrl/{task.name.title().replace('_', '')}-v0"
+    vehicle, size = Vehicle(), f"{num_envs:,}"
+    model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.scene)
+    pool = stack.enter_context(ThreadPoolExecutor(cores()))
+    alone, loaded = gym.make(gymnasium_id), suite.make(task, random=0)
+    vectors: Any = gym.make_vec(gymnasium_id, num_envs=num_envs)
+    for env in (alone, loaded, vectors):
+        stack.callback(env.close)
+    batch, free = _batched_mj_step(vehicle, model, num_envs), f"{FREE_FLIGHT_ENVS:,}"
+    air = in_real_air(vehicle)
+    many: list[tuple[Any, ...]] = [
+        ("mj_step, a loop on each core", _mj_step(vehicle, model, pool, cores()), None, True),
+        (f"mj_step, mujoco.batch of {size}", batch, None, True),
+        ("the same with mujoco's own stage clock", _with_clock(batch)),
+        (f"Environment of {size}", _environment(task, num_envs=num_envs), 0.90),
+        (f"Environment of {free}, {FREE_FLIGHT}", _in_free_flight(task), 20.0),
+        (f"Gymnasium make_vec of {size}", _vectors(vectors)),
+    ]
+    if importlib.util.find_spec("torchrl"):
+        collector = _collector(task, num_envs, stack)
+        many.append((f"TorchRL collector of {size} with a policy", collector, 0.75))
+    one: list[tuple[Any, ...]] = [
+        ("mj_step, a loop on one core", _mj_step(vehicle, model, pool, 1), None, True),
+        ("Gymnasium make, one aircraft", _single(alone, model.nu, lambda x: x[2] or x[3]), 0.35),
+        ("dm_control load, one aircraft", _single(loaded, model.nu, lambda x: x.last())),
+        (KERNEL, _free_flight(vehicle, HEIGHT)),
+    ]
+    disturbed: list[tuple[Any, ...]] = [
+        (
+            "the same in real air and wind",
+            _in_free_flight(task, vehicle=air, weather="light"),
+            1 / 3,
+        ),
+        ("the same, different aircraft", _in_free_flight(task, randomization=DIFFERENT), 0.90),
+        ("the same, all that is drawn", _in_free_flight(task, randomization=FULL)),
+    ]
+    kernels: list[tuple[Any, ...]] = [
+        (f"{KERNEL} in air", _free_flight(air, HEIGHT), 1 / 3),
+        (f"{KERNEL} near the ground", _free_flight(air, LOW), 1 / 3),
+        (f"{KERNEL}, different aircraft", _free_flight(vehicle, HEIGHT, DIFFERENT), 0.90),
+    ]
+    # The order of the table: what is disturbed follows what is not.
+    after = [layer[0] for layer in many].index(f"Environment of {free}, {FREE_FLIGHT}") + 1
+    groups = (
+        *((ALL_CORES, many[:after]), (FREE_FLIGHT, disturbed), (ALL_CORES, many[after:])),
+        *((ONE_CORE, one), (KERNEL, kernels)),
+    )
+    return [Layer(what, of, *rest) for of, group in groups for what, *rest in group]
+
+
+def _actions(*shape: int) -> Iterator[np.ndarray]:
+    """Random actions (*shape) float32, over and over; drawing them is not measured."""
+    drawn = np.random.default_rng(0).uniform(-1, 1, (64, *shape))
+    return itertools.cycle(drawn.astype(np.float32))
+
+
+def _commands(vehicle: Vehicle, *shape: int) -> Iterator[np.ndarray]:
+    """The rotor commands (*shape, R) [rad/s] of random actions, over and over."""
+    shape = (64, *shape, vehicle.rotor_count)
+    return itertools.cycle(vehicle.rotor_command(np.random.default_rng(0).uniform(-1, 1, shape)))
+
+
+def _mj_step(vehicle: Vehicle, model: mujoco.MjModel, pool: ThreadPoolExecutor, cores: int) -> Work:
+    """As `mj_step` can be at its best: an aircraft per core, and a command per flight."""
+    aircraft, commands = [mujoco.MjData(model) for _ in range(cores)], _commands(vehicle)
+
+    def fly(data: mujoco.MjData) -> None:
+        for _ in range(8):
+            mujoco.mj_resetData(model, data)
+            data.qpos[2], data.act[:] = HEIGHT, vehicle.hover_speed
+            data.ctrl[:] = next(commands)
+            mujoco.mj_step(model, data, FLIGHT * vehicle.substeps)
+
+    while True:
+        list(pool.map(fly, aircraft))
+        yield 8 * FLIGHT * cores
+
+
+def _batched_mj_step(vehicle: Vehicle, model: mujoco.MjModel, num_envs: int) -> Work:
+    """MuJoCo's native batch on all cores."""
+    batch, commands = Batch(model, num_envs), _commands(vehicle, num_envs)
+    batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+    batch.bind("qpos")[:, 2] = HEIGHT
+    batch.bind("act")[:] = vehicle.hover_speed
+    hovering, ctrl = batch.state.copy(), batch.bind("ctrl")
+    while True:
+        batch.state[:] = hovering
+        for _ in range(FLIGHT):
+            ctrl[:] = next(commands)
+            batch.step(nstep=vehicle.substeps)
+            yield num_envs
+
+
+def _with_clock(work: Work) -> Work:
+    """The same as mujoco comes: it reads the clock at every stage of a step."""
+    while True:
+        ours = mujoco.get_mjcb_time()
+        mujoco.set_mjcb_time(None)
+        try:
+            steps = next(work)
+        finally:
+            mujoco.set_mjcb_time(ours)
+        yield steps
+
+
+def _free_flight(
+    vehicle: Vehicle, height: float, randomization: Randomization | None = None
+) -> Work:
+    """From hover at a height [m]."""
+    count, draw = FREE_FLIGHT_ENVS, Draw(randomization, vehicle)
+    settings: Any = {"engine": "free_flight", "num_threads": 1, "per_row": draw.given.per_row}
+    engine = BatchEngine(vehicle, count, altitude=height, **settings)
+    if draw.given.per_row:
+        drawn = draw.of(np.random.default_rng(0).random((count, len(draw.names))))
+        engine.write_parameters(np.arange(count), draw.table(drawn))
+    commands = _commands(vehicle, count)
+    while True:
+        engine.qpos[:], engine.qvel[:] = (0, 0, height, 1, 0, 0, 0), 0.0
+        engine.act[:] = vehicle.hover_speed
+        for _ in range(FLIGHT):
+            engine.ctrl[:] = next(commands)
+            engine.advance(vehicle.substeps)
+            yield count
+
+
+def _in_free_flight(task: Task, **settings: Any) -> Work:
+    return _environment(task, num_envs=FREE_FLIGHT_ENVS, engine="free_flight", **settings)
+
+
+def _environment(task: Task, **settings: Any) -> Work:
+    environment = Environment(task, seed=0, **settings)
+    environment.flatten(environment.reset())
+    for action in _actions(num_envs := environment.num_envs, environment.action_size):
+        now = environment.step(action)
+        observation = environment.flatten(now.observation)
+        over = np.asarray(now.terminated | now.truncated)
+        if over.any():
+            observation[over] = environment.flatten(environment.reset(over))
+        yield num_envs
+
+
+def _vectors(envs: Any) -> Work:
+    envs.reset(seed=0)
+    for action in _actions(*envs.action_space.shape):
+        envs.step(action)
+        yield envs.num_envs
+
+
+def _single(env: Any, size: int, over: Callable[[Any], bool]) -> Work:
+    """One aircraft, reset when its episode is over."""
+    actions = _actions(size)
+    env.reset()
+    while True:
+        for _ in range(CHUNK):
+            if over(env.step(next(actions))):
+                env.reset()
+        yield CHUNK
+
+
+def _collector(task: Task, num_envs: int, stack: contextlib.ExitStack) -> Work:
+    """The collector and the policy as a training has them."""
+    import torch
+
+    from quadrl.envs.torchrl import QuadrotorEnv
+    from quadrl.learning.config import TrainConfig
+    from quadrl.learning.environments import make_collector
+    from quadrl.learning.networks import make_actor_critic
+
+    config = TrainConfig(task.name)
+    env = QuadrotorEnv(task, num_envs, seed=0)
+    actor, _, _ = make_actor_critic(env.environment.size, env.environment.action_size, config)
+    collector = make_collector(env, actor, frames := num_envs * config.rollout)
+    stack.callback(collector.shutdown)
+    stack.callback(torch.set_num_threads, torch.get_num_threads())
+    batches = iter(collector)
+    while True:
+        torch.set_num_threads(1)  # as in a training
+        next(batches)
+        yield frames

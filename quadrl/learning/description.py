@@ -1,0 +1,70 @@
+"""What a task is, in words and numbers: for the command line and the documentation."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.docstrings import docstrings
+from quadrl.core.environment import Environment
+from quadrl.core.task import Task
+from quadrl.learning.defaults import own_settings
+
+
+def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]:
+    """All that there is to know of a task before it is flown, as JSON can hold it.
+
+    Args:
+        task: The task.
+        vehicle: The aircraft; None for the paper's.
+
+    Returns:
+        name, asks, starts, ends, solved (texts); time_limit [s]; training: settings that have other
+        defaults with this task and PPO; observation: name, first, last, unit and meaning of each
+        term of the flat vector; action (text); reward: name, weight (None without an option of that
+        name) and meaning of each term; options: name, value and meaning of the others.
+    """
+    vehicle, texts = resolve(vehicle), docstrings(type(task))
+    environment = Environment(task, vehicle=vehicle, seed=0)
+    terms = zip(environment.layout.items(), task.observation.values(), strict=True)
+    values = dataclasses.asdict(task)
+    return {
+        **{name: getattr(task, name) for name in ("name", "asks", "starts", "ends", "solved")},
+        "time_limit": task.time_limit,
+        "training": own_settings(task),
+        "observation": [
+            {"name": name, "first": where.start, "last": where.stop - 1, "unit": term.unit,
+             "meaning": term.meaning}
+            for (name, where), term in terms
+        ],
+        "action": describe_action(vehicle),
+        "reward": [
+            {"name": term, "weight": values.get(f"{term}_weight"),
+             "meaning": texts.get(f"{term}_weight", "")}
+            for term in environment.term_names
+        ],
+        "options": [
+            {"name": name, "value": value, "meaning": texts.get(name, "")}
+            for name, value in values.items()
+            if name != "time_limit" and not name.endswith("_weight")
+        ],
+    }  # fmt: skip
+
+
+def describe_action(vehicle: Vehicle) -> str:
+    """What the numbers of an action mean with the control mode "rotor", in words."""
+    hover, fastest = (_span(speeds) for speeds in (vehicle.hover_speed, vehicle.max_speed))
+    return (
+        f"{vehicle.rotor_count} numbers in [-1, 1], one per rotor: the change of its speed command "
+        f"from hover ({hover} rad/s), {vehicle.action_scale:g} rad/s at 1; commands stay between 0 "
+        f"and {fastest} rad/s"
+    )
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = f"{values.min():.1f}", f"{values.max():.1f}"
+    return low if low == high else f"{low} to {high}"

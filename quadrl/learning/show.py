@@ -1,0 +1,110 @@
+"""Pictures and videos that show themselves in a notebook."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError
+from quadrl.base.media import Media
+from quadrl.base.progress import ProgressBar
+from quadrl.conditions.randomization import Randomized
+from quadrl.conditions.weather import Weathered
+from quadrl.core.task import Task
+from quadrl.engines import mjcf
+from quadrl.evaluation.evaluate import Evaluation, evaluate
+from quadrl.learning.folder import METRICS, read_config
+
+
+def render(
+    controller: Any,
+    task: str | Task | None = None,
+    *,
+    seed: int = 0,
+    vehicle: Vehicle | str | None = None,
+    aerodynamics: str | Aerodynamics | None = None,
+    weather: Weathered = None,
+    kind: str = "mp4",
+    progress: bool = True,
+    task_options: dict[str, Any] | None = None,
+    randomization: Randomized = None,
+    **options: Any,
+) -> Media:
+    """Draw a flight of a policy or a controller as a video; `quadrl render` in Python.
+
+    Args:
+        controller: What flies, as `quadrl.evaluate` takes it.
+        task: A task or its name; by default the one that the policy was trained for.
+        seed: Of the episode.
+        vehicle: The aircraft or its name; by default the one that the policy was trained with.
+        aerodynamics: Effects of the air; by default those of the training.
+        weather: A `Weather` or its name; by default that of the training.
+        kind: "mp4", "gif", or "png" for a sheet of frames.
+        progress: Whether to show a progress bar.
+        task_options: Options of the task that differ from the training's.
+        randomization: What is drawn for the flight and disturbs it; by default that of the
+            training.
+        **options: `camera`, `width`, `height` [pixels], `fps`; see `quadrl.rendering.write_video`.
+
+    Raises:
+        QuadrlError: Something is unknown, out of range, or does not fit together.
+        RenderingUnavailable: There is no graphics library.
+    """
+    from quadrl.rendering import write_contact_sheet, write_video
+
+    chosen: dict[str, Any] = {"seed": seed, "vehicle": vehicle, "weather": weather}
+    chosen |= {"aerodynamics": aerodynamics, "randomization": randomization}
+    flown = evaluate(controller, task, episodes=1, **chosen, **(task_options or {}))
+    model = mjcf.compile_model(flown.vehicle, contact=flown.task.contact, scene=flown.task.scene)
+    flight = flown.rollout.trajectory(flown.vehicle)
+    with ProgressBar() as bar, tempfile.TemporaryDirectory() as folder:
+        if progress:
+            options["on_frame"] = lambda done, total: bar.update(done, total, "drawing")
+        write = write_contact_sheet if kind == "png" else write_video
+        path = write(flight, model, Path(folder, f"flight.{kind}"), **options)
+        return Media(path.read_bytes(), kind)
+
+
+def plot(*what: Any) -> Media:
+    """Draw the learning curves of a run or of several, or the flights of an evaluation.
+
+    Args:
+        *what: What `quadrl.train` returned, or run folders; or one thing that `quadrl.evaluate`
+            returned. Several runs must be of one task; there is a curve for each algorithm, with
+            the spread over its runs.
+
+    Raises:
+        QuadrlError: There is nothing to draw, or the runs are of several tasks.
+    """
+    from quadrl.learning import figures
+
+    if not what:
+        raise QuadrlError("give runs, run folders, or an evaluation")
+    evaluations = [one for one in what if isinstance(one, Evaluation)]
+    if evaluations and len(what) > 1:
+        raise QuadrlError("give one evaluation at a time")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "plot.png")
+        if evaluations:
+            figures.trajectory(evaluations[0].rollout, repr(evaluations[0]), path)
+        else:
+            folders = [Path(getattr(one, "folder", one)) for one in what]
+            if len(folders) == 1:
+                figures.learning_curve(folders[0], path)
+            else:
+                groups: dict[str, list[figures.Metrics]] = {}
+                names = set()
+                for one in folders:
+                    config = read_config(one)
+                    names.add(config["task"])
+                    groups.setdefault(config["algo"], []).append(
+                        figures.read_metrics(one / METRICS)
+                    )
+                if len(names) > 1:
+                    allowed = "one for all runs of a picture"
+                    raise QuadrlError(name="task", value=sorted(names), allowed=allowed)
+                figures.learning_curves(groups, names.pop(), path)
+        return Media(path.read_bytes(), "png")

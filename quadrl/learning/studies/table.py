@@ -1,0 +1,158 @@
+"""What a study found: a table with intervals over the seeds, its files and its pictures."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quadrl.base.files import write_whole
+from quadrl.evaluation.evaluate import html_table
+from quadrl.learning.folder import EVALUATION, METRICS, write_json
+from quadrl.learning.studies.plan import Plan, PlannedRun, fields
+
+FIGURES = {"success_rate": (0.0, 1.0), "position_error_m": (0.0, math.inf),
+           "training_s": (0.0, math.inf)}  # fmt: skip
+"""What is compared, and the range in which it lies."""
+TABLE, STUDY = "table.csv", "study.json"
+GROUP = ("task", "algo", "variant")
+CONFIDENCE = 0.95
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class StudyResult:
+    """The trainings of a study that are done, and what they reached over their seeds."""
+
+    folder: Path
+    """Holds the run folders, table.csv, study.json and the pictures."""
+    runs: tuple[dict[str, Any], ...]
+    """Of each training that is done: name, task, algo, variant, seed, and its metrics."""
+    rows: tuple[dict[str, Any], ...]
+    """Of each task, algorithm and variant: seeds, and of `success_rate`, `position_error_m` over
+    the last 2 s and `training_s` the mean over the seeds, with its 95 % interval `_low`, `_high`
+    (None with one seed)."""
+    failed: dict[str, str]
+    """Why trainings failed, by name."""
+
+    @property
+    def table(self) -> list[tuple[str, ...]]:
+        """Rows of text, the head first."""
+        head = (*GROUP, "seeds", "successful", "error over the last 2 s", "training")
+        lines = []
+        for row in self.rows:
+            shown = (
+                _between(row, name, factor, unit)
+                for name, factor, unit in (
+                    ("success_rate", 100, "%"),
+                    ("position_error_m", 100, "cm"),
+                    ("training_s", 1, "s"),
+                )
+            )
+            lines.append((*(str(row[name]) for name in GROUP), str(row["seeds"]), *shown))
+        return [head, *lines]
+
+    def __repr__(self) -> str:
+        many = f"{len(self.runs)} trainings in {self.folder}"
+        return f"{many}, {len(self.failed)} failed" if self.failed else many
+
+    def _repr_html_(self) -> str:
+        return html_table(self.table)
+
+    def save(self) -> list[Path]:
+        """Write table.csv, study.json, and the learning curves of each task.
+
+        Returns:
+            The files.
+        """
+        text = io.StringIO(newline="")
+        rows = csv.DictWriter(text, [*GROUP, "seeds", *_columns()])
+        rows.writeheader()
+        rows.writerows(self.rows)
+        write_whole(self.folder / TABLE, text.getvalue().encode())
+        content = {"rows": self.rows, "runs": self.runs, "failed": self.failed}
+        write_json(self.folder / STUDY, json.loads(json.dumps(content), parse_constant=_nothing))
+        return [self.folder / TABLE, self.folder / STUDY, *self._draw()]
+
+    def _draw(self) -> list[Path]:
+        """A picture for each task, with a curve for each algorithm and variant."""
+        from quadrl.learning.figures import learning_curves, read_metrics
+
+        tasks: dict[str, dict[str, list[Any]]] = {}
+        for run in self.runs:
+            label = f"{run['algo']} {run['variant']}".strip()
+            metrics = read_metrics(self.folder / run["name"] / METRICS)
+            tasks.setdefault(run["task"], {}).setdefault(label, []).append(metrics)
+        drawn = []
+        for task, groups in tasks.items():
+            # In the shortest trainings no episode ends: there is no curve to draw.
+            if any(np.isfinite(m["return"]).any() for runs in groups.values() for m in runs):
+                path = self.folder / f"learning_curves_{task}.png"
+                drawn.append(learning_curves(groups, task, path))
+        return drawn
+
+
+def summed_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
+    """What the trainings that are done reached."""
+    done = [run for run in plan.runs if run.done]
+    folder = plan.runs[0].folder.parent
+    runs = tuple(_known(run) for run in done)
+    groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for run in runs:
+        groups.setdefault(tuple(run[name] for name in GROUP), []).append(run)
+    rows = []
+    for key, members in groups.items():
+        row = dict(zip(GROUP, key, strict=True)) | {"seeds": len(members)}
+        for name, span in FIGURES.items():
+            values = [run["metrics"][name] for run in members]
+            row |= dict(zip(_columns(name), interval(values, *span), strict=True))
+        rows.append(row)
+    return StudyResult(folder, runs, tuple(rows), failed)
+
+
+def interval(
+    values: Sequence[float | None], low: float = -math.inf, high: float = math.inf
+) -> tuple[float | None, float | None, float | None]:
+    """The mean of the seeds and its 95 % interval by Student's t, within a range.
+
+    Values that are missing or not finite are left out; with a single one there is no interval.
+    """
+    from scipy.stats import t
+
+    known = np.array([x for x in values if x is not None and math.isfinite(x)], dtype=float)
+    if not len(known):
+        return None, None, None
+    mean = float(known.mean())
+    if len(known) == 1:
+        return mean, None, None
+    half = t.ppf((1 + CONFIDENCE) / 2, len(known) - 1) * known.std(ddof=1) / math.sqrt(len(known))
+    return mean, max(low, mean - float(half)), min(high, mean + float(half))
+
+
+def _known(run: PlannedRun) -> dict[str, Any]:
+    config = run.config
+    known = {"name": run.name, "task": config.task, "algo": config.algo, "variant": run.variant}
+    metrics = json.loads((run.folder / EVALUATION).read_text())
+    return known | {"seed": config.seed, "metrics": metrics, "settings": fields(config)}
+
+
+def _columns(*names: str) -> list[str]:
+    return [f"{name}{end}" for name in names or FIGURES for end in ("", "_low", "_high")]
+
+
+def _between(row: dict[str, Any], name: str, factor: float, unit: str) -> str:
+    mean, low, high = (row[column] for column in _columns(name))
+    if mean is None:
+        return "none"
+    around = "" if low is None else f" ({factor * low:.3g} to {factor * high:.3g})"
+    return f"{factor * mean:.3g} {unit}{around}"
+
+
+def _nothing(constant: str) -> None:
+    """JSON has no NaN."""
