@@ -17,7 +17,7 @@ class Media:
     content: bytes
     """Of the file."""
     kind: str
-    """The file's ending: png, mp4 or gif."""
+    """The file's ending: png, mp4, gif, pdf or svg."""
 
     def __repr__(self) -> str:
         return f"{self.kind}, {len(self.content) // 1024} kB; save(path) writes it"
@@ -26,7 +26,10 @@ class Media:
         data = base64.b64encode(self.content).decode()
         if self.kind == "mp4":
             return f'<video controls loop src="data:video/mp4;base64,{data}"></video>'
-        return f'<img style="max-width:100%" src="data:image/{self.kind};base64,{data}"/>'
+        if self.kind == "pdf":
+            return f'<embed type="application/pdf" src="data:application/pdf;base64,{data}"/>'
+        kind = "svg+xml" if self.kind == "svg" else self.kind
+        return f'<img style="max-width:100%" src="data:image/{kind};base64,{data}"/>'
 
     def save(self, path: str | Path) -> Path:
         """Write the file, whole or not at all.

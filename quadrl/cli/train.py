@@ -217,7 +217,8 @@ def _list_files(run: Run) -> None:
 
 def _compare(runs: list[Run], folder: Path) -> None:
     """Print the results of several seeds in a table, and draw their curves in one picture."""
-    from quadrl.learning.figures import learning_curves, read_metrics
+    from quadrl.evaluation.plotting import save
+    from quadrl.learning.show import curves
 
     head = ("run", "successful", "error over the last 2 s", "return", "training")
     rows = []
@@ -234,6 +235,6 @@ def _compare(runs: list[Run], folder: Path) -> None:
         )
     console.print("", make_table(head, rows, numbers=4))
     config = runs[0].config
-    curves = {config.algo: [read_metrics(run.folder / names.METRICS) for run in runs]}
     path = folder / f"{config.task}-{config.algo}-seeds.png"
-    say(f"\nwrote {learning_curves(curves, config.task, path)}")
+    (figure,) = curves([run.folder for run in runs]).values()
+    say(f"\nwrote {save(figure, path)}")

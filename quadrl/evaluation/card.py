@@ -108,9 +108,9 @@ class Card:
     @property
     def figure(self) -> Media:
         """Success and error over every disturbance."""
-        from quadrl.evaluation import card_figures
+        from quadrl.evaluation import card_figures, plotting
 
-        return Media(card_figures.content(card_figures.card(self.found), "png"), "png")
+        return Media(plotting.content(card_figures.card(self.found), "png"), "png")
 
     @property
     def maps(self) -> Media:
@@ -119,18 +119,18 @@ class Card:
         Raises:
             QuadrlError: None were flown.
         """
-        from quadrl.evaluation import card_figures
+        from quadrl.evaluation import card_figures, plotting
 
         if not self.found["recovery"]:
             raise QuadrlError("there are no recovery maps: recovery was False")
-        return Media(card_figures.content(card_figures.maps(self.found), "png"), "png")
+        return Media(plotting.content(card_figures.maps(self.found), "png"), "png")
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write numbers (.json, .csv) and pictures (.png, .pdf) into a folder; returns the paths.
 
         The pictures of the recovery maps are called recovery.png and recovery.pdf.
         """
-        from quadrl.evaluation import card_figures
+        from quadrl.evaluation import card_figures, plotting
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -141,7 +141,7 @@ class Card:
             pictures["recovery"] = card_figures.maps(self.found)
         for name, picture in pictures.items():
             for kind in ("png", "pdf"):
-                contents[f"{name}.{kind}"] = card_figures.content(picture, kind)
+                contents[f"{name}.{kind}"] = plotting.content(picture, kind)
         for name, content in contents.items():
             write_whole(folder / name, content)
         if self.kept:

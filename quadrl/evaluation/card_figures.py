@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #e69f00 #56b4e9 #000000".split()
-"""Of those that fly (Okabe and Ito): readers who confuse red and green tell them apart."""
-MARKS, DASHES = "osD^vPX", ("-", "--", "-.", ":", "-", "--", "-.")
+from quadrl.evaluation.plotting import COLOURS, GREY, LEAST_ERROR, head, styled, tidy
+
+MARKS, DASHES = "osD^vPX*", ("-", "--", "-.", ":", "-", "--", "-.", ":")
 COLUMNS = 5
 PANEL, GAP = (2.45, 3.1), 1.1  # [inches]
-DPI = 150
-TEXT: Any = {"font.size": 9, "axes.titlesize": 9.5, "axes.labelsize": 9, "legend.fontsize": 9.5}
-FONTS: Any = {"pdf.fonttype": 42, "svg.fonttype": "none"}  # text stays text
-GREY = "#6b7280"
 HATCHED: Any = {"fc": "none", "hatch": "////", "lw": 0.0, "alpha": 0.45}
 NEAR = 0.5  # of the span of the levels: so far beyond them it is drawn where actions end
 BANDS = 3  # as many can be told apart
-LEAST_ERROR = 1e-4  # [m], that is drawn
 SHADES = "cividis"
 
 
+@styled
 def card(found: Mapping[str, Any]) -> Figure:
     """Success with its interval over error with its quartiles, a column for each disturbance.
 
@@ -40,32 +33,29 @@ def card(found: Mapping[str, Any]) -> Figure:
     axes, flown = found["axes"], found["flown"]
     columns = min(COLUMNS, len(axes))
     rows = math.ceil(len(axes) / columns)
-    with matplotlib.rc_context(TEXT):
-        size = max(columns * PANEL[0], 2 * PANEL[0]), rows * PANEL[1] + GAP
-        figure = Figure(figsize=size, layout="constrained")
-        grid: Any = figure.subplots(
-            2 * rows, columns, squeeze=False, height_ratios=[1.25, 1] * rows
-        )
-        for k, axis in enumerate(axes.values()):
-            row, column = divmod(k, columns)
-            upper, lower = grid[2 * row, column], grid[2 * row + 1, column]
-            _panels(upper, lower, axis, flown)
-            for panel, label in ((upper, "success [%]"), (lower, "error [m]")):
-                if column == 0:
-                    panel.set_ylabel(label)
-                else:
-                    panel.tick_params(labelleft=False)
-        for panel in grid.flat:
-            panel.set_visible(panel.has_data())
-        for row in range(rows):
-            bottom = [panel for panel in grid[2 * row + 1] if panel.get_visible()]
-            low = min(panel.get_ylim()[0] for panel in bottom)
-            high = max(panel.get_ylim()[1] for panel in bottom)
-            for panel in bottom:
-                panel.set_ylim(low, high)
-        words = f"{found['task']}, aircraft {found['vehicle']}, {found['episodes']} flights a level"
-        hatched = any(_beyond(axis, name) for axis in axes.values() for name in flown)
-        _head(figure, words, hatched, *grid[0, 0].get_legend_handles_labels())
+    size = max(columns * PANEL[0], 2 * PANEL[0]), rows * PANEL[1] + GAP
+    figure = Figure(figsize=size, layout="constrained")
+    grid: Any = figure.subplots(2 * rows, columns, squeeze=False, height_ratios=[1.25, 1] * rows)
+    for k, axis in enumerate(axes.values()):
+        row, column = divmod(k, columns)
+        upper, lower = grid[2 * row, column], grid[2 * row + 1, column]
+        _panels(upper, lower, axis, flown)
+        for panel, label in ((upper, "success [%]"), (lower, "error [m]")):
+            if column == 0:
+                panel.set_ylabel(label)
+            else:
+                panel.tick_params(labelleft=False)
+    for panel in grid.flat:
+        panel.set_visible(panel.has_data())
+    for row in range(rows):
+        bottom = [panel for panel in grid[2 * row + 1] if panel.get_visible()]
+        low = min(panel.get_ylim()[0] for panel in bottom)
+        high = max(panel.get_ylim()[1] for panel in bottom)
+        for panel in bottom:
+            panel.set_ylim(low, high)
+    words = f"{found['task']}, aircraft {found['vehicle']}, {found['episodes']} flights a level"
+    hatched = any(_beyond(axis, name) for axis in axes.values() for name in flown)
+    _head(figure, words, hatched, *grid[0, 0].get_legend_handles_labels())
     return figure
 
 
@@ -105,8 +95,7 @@ def _panels(upper: Any, lower: Any, axis: Mapping[str, Any], flown: list[str]) -
     lower.set_xlabel(f"[{axis['unit']}]" if "of" not in axis["unit"] else f"{axis['unit']}")
     for panel in (upper, lower):
         panel.set_xlim(*_view(axis))
-        panel.grid(alpha=0.22, lw=0.6)
-        panel.spines[["top", "right"]].set_visible(False)
+        tidy(panel)
         if axis["usual"] != levels[0]:
             panel.axvline(axis["usual"], color=GREY, lw=0.7, zorder=0)
     upper.tick_params(labelbottom=False)
@@ -149,34 +138,32 @@ def _unknown(levels: np.ndarray, known: np.ndarray) -> list[tuple[float, float]]
     return [(start, end) for start, end in spans if end > start]
 
 
+@styled
 def maps(found: Mapping[str, Any]) -> Figure:
     """Share of flights that recover: a row for each that flew, a column for each map."""
     charts, flown = found["recovery"], found["flown"]
-    with matplotlib.rc_context(TEXT):
-        size = 3.4 * len(charts) + 0.8, 2.75 * len(flown) + 0.5
-        figure = Figure(figsize=size, layout="constrained")
-        grid: Any = figure.subplots(len(flown), len(charts), squeeze=False)
-        shown: Any = None
-        for row, name in zip(grid, flown, strict=True):
-            for axis, chart in zip(row, charts.values(), strict=True):
-                x, y = (np.array(chart[side]["levels"]) for side in "xy")
-                share = 100 * np.array(chart["flown"][name])
-                shown = axis.pcolormesh(
-                    x, y, share, vmin=0, vmax=100, cmap=SHADES, shading="nearest"
-                )
-                if share.min() < 50 < share.max():
-                    axis.contour(x, y, share, levels=[50], colors="white", linewidths=1.6)
-                x_side, y_side = chart["x"], chart["y"]
-                axis.set_ylabel(f"{y_side['label']} [{y_side['unit']}]")
-                axis.set_xlabel(f"{x_side['label']} [{x_side['unit']}]")
-                axis.set_title(name, loc="left", fontweight="bold")
-                if x_side["unit"] == "deg":
-                    axis.set_xticks(range(0, 181, 45))
-        bar = figure.colorbar(shown, ax=grid, shrink=min(1.0, 1.2 / len(flown) + 0.3), pad=0.015)
-        bar.set_label("flights that recover [%]; white line: half")
-        bar.outline.set_visible(False)
-        words = f"Recovery on {found['task']}, aircraft {found['vehicle']}"
-        figure.suptitle(words, x=0.01, ha="left", fontweight="bold", fontsize=11)
+    size = 3.4 * len(charts) + 0.8, 2.75 * len(flown) + 0.5
+    figure = Figure(figsize=size, layout="constrained")
+    grid: Any = figure.subplots(len(flown), len(charts), squeeze=False)
+    shown: Any = None
+    for row, name in zip(grid, flown, strict=True):
+        for axis, chart in zip(row, charts.values(), strict=True):
+            x, y = (np.array(chart[side]["levels"]) for side in "xy")
+            share = 100 * np.array(chart["flown"][name])
+            shown = axis.pcolormesh(x, y, share, vmin=0, vmax=100, cmap=SHADES, shading="nearest")
+            if share.min() < 50 < share.max():
+                axis.contour(x, y, share, levels=[50], colors="white", linewidths=1.6)
+            x_side, y_side = chart["x"], chart["y"]
+            axis.set_ylabel(f"{y_side['label']} [{y_side['unit']}]")
+            axis.set_xlabel(f"{x_side['label']} [{x_side['unit']}]")
+            axis.set_title(name, loc="left", fontweight="bold")
+            if x_side["unit"] == "deg":
+                axis.set_xticks(range(0, 181, 45))
+    bar = figure.colorbar(shown, ax=grid, shrink=min(1.0, 1.2 / len(flown) + 0.3), pad=0.015)
+    bar.set_label("flights that recover [%]; white line: half")
+    bar.outline.set_visible(False)
+    words = f"Recovery on {found['task']}, aircraft {found['vehicle']}"
+    head(figure, words)
     return figure
 
 
@@ -193,13 +180,3 @@ def _head(figure: Figure, words: str, hatched: bool, handles: list[Any], names: 
     columns = max(1, min(4, round(figure.get_figwidth() / PANEL[0]) - 1))
     legend: dict[str, Any] = {"loc": "outside lower left", "ncols": columns, "frameon": False}
     figure.legend([*handles, *marks], [*names, *texts], **legend)
-
-
-def content(figure: Figure, kind: str) -> bytes:
-    """The file of a picture; the same numbers make the same bytes."""
-    FigureCanvasAgg(figure)
-    picture = io.BytesIO()
-    undated = {"pdf": {"CreationDate": None}}.get(kind)
-    with matplotlib.rc_context(TEXT | FONTS):
-        figure.savefig(picture, dpi=DPI, format=kind, metadata=undated)
-    return picture.getvalue()

@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import NO_LOCKS, lock, read_sealed_json, write_sealed_json, write_whole
 from quadrl.base.machine import processor_kind
@@ -36,6 +38,8 @@ FREE = ("num_threads", "checkpoint_seconds")
 """Settings that change no result."""
 CHANGEABLE = (*FREE, "steps", "device")
 """Settings that a run may be continued with other values of."""
+DRAWN = {"steps", "seconds", "return", "success", "error", "survival"}
+"""Columns of the metrics that a plot needs."""
 
 
 def free_folder(wanted: Path) -> Path:
@@ -177,6 +181,30 @@ def read_config(folder: Path) -> dict[str, Any]:
     if missing := {"task", "algo", "seed"} - set(config):
         raise QuadrlError(f"{file} is not the configuration of a run: it lacks {min(missing)}")
     return config
+
+
+def read_metrics(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a metrics.csv, (iterations,) each; missing values are NaN.
+
+    Raises:
+        QuadrlError: The file is missing, empty or malformed.
+    """
+    if not path.is_file():
+        raise QuadrlError(f"nothing to plot: there is no {path}")
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        raise QuadrlError(f"nothing to plot yet: {path} has no rows")
+    try:
+        metrics = {
+            name: np.array([float(row[name]) if row[name] else np.nan for row in rows])
+            for name in rows[0]
+        }
+    except (TypeError, ValueError) as error:
+        raise QuadrlError(f"{path} is malformed: {error}") from error
+    if missing := DRAWN - set(metrics):
+        raise QuadrlError(f"{path} has no column {', '.join(sorted(missing))}")
+    return metrics
 
 
 class Log:

@@ -58,12 +58,13 @@ class Run:
         Raises:
             RenderingUnavailable: There is no graphics library to draw the video with.
         """
-        from quadrl.learning import figures  # it takes a second, and the result comes first
+        from quadrl.evaluation import plotting  # it takes a second, and the result comes first
+        from quadrl.learning.show import curve
 
         flown = self.evaluation
-        yield figures.learning_curve(self.folder, self.folder / LEARNING_CURVE)
+        yield plotting.save(curve(self.folder), self.folder / LEARNING_CURVE)
         title = f"{flown.task.name}: mean action of the policy"
-        yield figures.trajectory(flown.rollout, title, self.folder / TRAJECTORY)
+        yield plotting.save(plotting.trajectory(flown.rollout, title), self.folder / TRAJECTORY)
         if video:
             from quadrl.rendering import write_video
 

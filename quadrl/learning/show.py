@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.vehicle import Vehicle
@@ -16,7 +17,10 @@ from quadrl.conditions.weather import Weathered
 from quadrl.core.task import Task
 from quadrl.engines import mjcf
 from quadrl.evaluation.evaluate import Evaluation, evaluate
-from quadrl.learning.folder import METRICS, read_config
+from quadrl.learning.folder import METRICS, read_config, read_metrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def render(
@@ -68,43 +72,71 @@ def render(
         return Media(path.read_bytes(), kind)
 
 
-def plot(*what: Any) -> Media:
+def plot(*what: Any, kind: str = "png") -> Media:
     """Draw the learning curves of a run or of several, or the flights of an evaluation.
 
     Args:
         *what: What `quadrl.train` returned, or run folders; or one thing that `quadrl.evaluate`
             returned. Several runs must be of one task; there is a curve for each algorithm, with
             the spread over its runs.
+        kind: Of the picture: "png", "pdf", "svg" or another that matplotlib knows.
 
     Raises:
-        QuadrlError: There is nothing to draw, or the runs are of several tasks.
+        QuadrlError: There is nothing to draw, the runs are of several tasks, or the kind is
+            unknown.
     """
-    from quadrl.learning import figures
+    from quadrl.evaluation import plotting
 
     if not what:
         raise QuadrlError("give runs, run folders, or an evaluation")
-    evaluations = [one for one in what if isinstance(one, Evaluation)]
-    if evaluations and len(what) > 1:
+    flown = [one for one in what if isinstance(one, Evaluation)]
+    if flown and len(what) > 1:
         raise QuadrlError("give one evaluation at a time")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "plot.png")
-        if evaluations:
-            figures.trajectory(evaluations[0].rollout, repr(evaluations[0]), path)
-        else:
-            folders = [Path(getattr(one, "folder", one)) for one in what]
-            if len(folders) == 1:
-                figures.learning_curve(folders[0], path)
-            else:
-                groups: dict[str, list[figures.Metrics]] = {}
-                names = set()
-                for one in folders:
-                    config = read_config(one)
-                    names.add(config["task"])
-                    groups.setdefault(config["algo"], []).append(
-                        figures.read_metrics(one / METRICS)
-                    )
-                if len(names) > 1:
-                    allowed = "one for all runs of a picture"
-                    raise QuadrlError(name="task", value=sorted(names), allowed=allowed)
-                figures.learning_curves(groups, names.pop(), path)
-        return Media(path.read_bytes(), "png")
+    figures = {repr(one): plotting.trajectory(one.rollout, repr(one)) for one in flown}
+    folders = [Path(getattr(one, "folder", one)) for one in what if not flown]
+    figures |= curves(folders) if len(folders) > 1 else {str(one): curve(one) for one in folders}
+    if len(figures) > 1:
+        allowed = "one for all runs of a picture"
+        raise QuadrlError(name="task", value=sorted(figures), allowed=allowed)
+    (figure,) = figures.values()
+    return Media(plotting.content(figure, kind), kind)
+
+
+def curve(folder: Path) -> Figure:
+    """The learning curve of a run.
+
+    Raises:
+        QuadrlError: The folder holds no run that has begun.
+    """
+    from quadrl.evaluation import plotting
+
+    config, metrics = read_config(folder), read_metrics(folder / METRICS)
+    title = f"{config['task']}, {str(config['algo']).upper()}, seed {config['seed']}"
+    return plotting.learning_curve(metrics, title)
+
+
+def curves(
+    folders: Iterable[Path], on_missing: Callable[[QuadrlError], None] | None = None
+) -> dict[str, Figure]:
+    """The learning curves of several runs: a figure for each task, a curve for each algorithm.
+
+    Args:
+        folders: Of the runs.
+        on_missing: Is told of a folder without a run that has begun, which is then left out.
+
+    Raises:
+        QuadrlError: A folder holds no such run, and `on_missing` is None.
+    """
+    from quadrl.evaluation import plotting
+
+    runs: dict[str, dict[str, list[plotting.Metrics]]] = {}
+    for folder in folders:
+        try:
+            config, metrics = read_config(folder), read_metrics(folder / METRICS)
+        except QuadrlError as error:
+            if on_missing is None:
+                raise
+            on_missing(error)
+            continue
+        runs.setdefault(config["task"], {}).setdefault(config["algo"], []).append(metrics)
+    return {task: plotting.learning_curves(groups, task) for task, groups in runs.items()}

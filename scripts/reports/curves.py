@@ -8,8 +8,8 @@ from typing import Any
 import tyro
 
 from quadrl.base.errors import QuadrlError
-from quadrl.learning.figures import learning_curves, read_metrics
-from quadrl.learning.folder import EVALUATION, METRICS, read_config
+from quadrl.evaluation.plotting import learning_curves, save
+from quadrl.learning.folder import EVALUATION, METRICS, read_config, read_metrics
 from scripts.reports import report
 from scripts.reports.report import say
 
@@ -38,7 +38,7 @@ def main(runs: Path = report.RUNS / "training") -> None:
     for task, algos in found.items():
         groups = {algo: list(by_seed.values()) for algo, by_seed in algos.items()}
         path = report.IMAGES / "curves" / f"{task}.png"
-        learning_curves(groups, task, path, clocks=("steps",))
+        save(learning_curves(groups, task, clocks=("steps",)), path)
     report.save("curves", {
         "tasks": {
             task: {algo: sorted(by_seed) for algo, by_seed in algos.items()}

@@ -13,8 +13,7 @@ from scipy.signal import welch
 from quadrl import tasks
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import FINAL_STRETCH, Rollout, fly, summarize
-from quadrl.learning.figures import read_metrics
-from quadrl.learning.folder import EVALUATION, METRICS
+from quadrl.learning.folder import EVALUATION, METRICS, read_metrics
 from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports.report import Result
 

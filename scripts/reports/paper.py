@@ -21,10 +21,10 @@ from PIL import Image
 
 from quadrl.conditions.weather import WEATHERS
 from quadrl.evaluation.card import wilson
+from quadrl.evaluation.plotting import ALGORITHM_COLOURS, GREY, learning_curves, save, trajectory
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import fly, summarize
-from quadrl.learning.figures import COLOURS, STYLE, learning_curves, read_metrics, save, trajectory
-from quadrl.learning.folder import METRICS
+from quadrl.learning.folder import METRICS, read_metrics
 from quadrl.learning.studies.crew import train_here
 from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports import evaluation, report
@@ -118,12 +118,13 @@ def draw(runs: list[PlannedRun], result: Result, folder: Path) -> None:
                 for a, each in runs_of.items()
             }
             path = folder / f"figure_{figure}_{task}.png"
-            learning_curves(metrics, task, path, clocks=("steps",))
+            save(learning_curves(metrics, task, clocks=("steps",)), path)
     for figure, task, algo in ((6, "static_waypoint", "ppo"), (7, "landing", "trpo")):
         if (task, algo) in groups:
             rollout = fly(Policy.load(groups[task, algo][0].folder), task, episodes=8)
             title = f"{task}, {LABELS[algo]}, first seed: 8 flights, mean action"
-            path = trajectory(rollout, title, folder / f"figure_{figure}_{task}_{algo}.png")
+            path = folder / f"figure_{figure}_{task}_{algo}.png"
+            save(trajectory(rollout, title), path)
             Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
     both = trials(result)
     axes = ("frequency [Hz]", "power of the body rate [rad²/s²/Hz]")
@@ -173,7 +174,7 @@ def lines(
 ) -> None:
     """Figures over something, a panel each, with the range of the seeds; dashed if sampled."""
     figure = Figure(figsize=(3.6 * len(panels), 3.3), layout="constrained")
-    colours = {label: STYLE[COLOURS[algo]] for algo, label in LABELS.items()}
+    colours = {label: ALGORITHM_COLOURS[algo] for algo, label in LABELS.items()}
     drawn = {}
     axes_of = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, (task, panel) in zip(axes_of, panels.items(), strict=True):
@@ -181,7 +182,7 @@ def lines(
             known = values[np.isfinite(values).all(axis=1)]
             if len(known):
                 low, median, high = np.quantile(known, (0.0, 0.5, 1.0), axis=0)
-                colour = colours.get(label.partition(",")[0], STYLE["grey"])
+                colour = colours.get(label.partition(",")[0], GREY)
                 axis.fill_between(x, low, high, color=colour, alpha=0.12, lw=0)
                 dashes = "--" if label.endswith("sampled") else "-"
                 drawn[label] = axis.plot(x, median, dashes, color=colour, lw=1.6)[0]

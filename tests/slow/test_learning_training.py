@@ -18,12 +18,9 @@ import quadrl
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.core.environment import Environment
 from quadrl.engines import native
-from quadrl.evaluation.rollout import fly
 from quadrl.learning import checkpoint
 from quadrl.learning.config import ALGORITHMS
 from quadrl.learning.environments import SEED_STRIDE
-from quadrl.learning.figures import learning_curve, read_metrics
-from quadrl.learning.figures import trajectory as draw_trajectory
 from quadrl.learning.folder import LOCK, WARNINGS
 from quadrl.learning.train import Training
 
@@ -400,29 +397,3 @@ def test_the_metrics_are_those_of_the_episodes(finished):
     assert all(row["survival"] == "1" for row in rows[2::2])
     # 10 points a step for being in the air, and the progress of an episode on top of it.
     assert 0 < float(rows[2]["return"]) < 200
-
-
-# --------------------------------------------------------------------------- figures
-
-
-def test_figures_are_pictures(finished, tmp_path):
-    path = learning_curve(finished, tmp_path / "a" / "b.png")
-    assert path.read_bytes().startswith(b"\x89PNG")
-    rollout = fly(quadrl.Policy.load(finished), "hover", episodes=2)
-    draw_trajectory(rollout, "title", tmp_path / "c.pdf")
-    assert (tmp_path / "c.pdf").read_bytes().startswith(b"%PDF")
-    with refused(value="xyz"):
-        learning_curve(finished, tmp_path / "c.xyz")
-    assert sorted(os.listdir(tmp_path)) == ["a", "c.pdf"]
-
-
-@pytest.mark.parametrize(
-    "text", [None, "", "iteration,steps\n", "iteration,steps\n1,32\n", "iteration,steps\n1,many\n"]
-)
-def test_metrics_that_cannot_be_drawn_are_refused(tmp_path, text):
-    path = tmp_path / "metrics.csv"
-    if text is not None:
-        path.write_text(text)
-    with refused() as caught:
-        read_metrics(path)
-    assert str(path) in str(caught.value)

@@ -383,7 +383,7 @@ def test_the_result_comes_before_the_pictures_and_these_can_be_skipped(
         assert "successful" in capsys.readouterr().out
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("quadrl.learning.figures.learning_curve", skip)
+    monkeypatch.setattr("quadrl.learning.show.curve", skip)
     assert command("train", "hover", *TINY, "--out", tmp_path / "run") == 0
     assert f"quadrl render {tmp_path / 'run'}" in capsys.readouterr().out
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from quadrl.base.files import write_whole
 from quadrl.evaluation.evaluate import html_table
-from quadrl.learning.folder import EVALUATION, METRICS, write_json
+from quadrl.learning.folder import EVALUATION, METRICS, read_metrics, write_json
 from quadrl.learning.studies.plan import Plan, PlannedRun, fields
 
 FIGURES = {"success_rate": (0.0, 1.0), "position_error_m": (0.0, math.inf),
@@ -82,7 +82,7 @@ class StudyResult:
 
     def _draw(self) -> list[Path]:
         """A picture for each task, with a curve for each algorithm and variant."""
-        from quadrl.learning.figures import learning_curves, read_metrics
+        from quadrl.evaluation.plotting import learning_curves, save
 
         tasks: dict[str, dict[str, list[Any]]] = {}
         for run in self.runs:
@@ -94,7 +94,7 @@ class StudyResult:
             # In the shortest trainings no episode ends: there is no curve to draw.
             if any(np.isfinite(m["return"]).any() for runs in groups.values() for m in runs):
                 path = self.folder / f"learning_curves_{task}.png"
-                drawn.append(learning_curves(groups, task, path))
+                drawn.append(save(learning_curves(groups, task), path))
         return drawn
 
 

@@ -1,0 +1,297 @@
+"""Plots in one style: flights and learning curves, in the manner of the paper's figures 3 to 7."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import write_whole
+from quadrl.base.validation import choice
+from quadrl.core.snapshot import Rollout
+
+Metrics = Mapping[str, np.ndarray]
+"""Columns of a metrics.csv, (iterations,) each; missing values are NaN."""
+
+COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #e69f00 #56b4e9 #332288 #882255".split()
+"""Of what is compared (Okabe and Ito, then Tol): readers who confuse red and green tell them
+apart."""
+BLUE, ORANGE, GREEN, VIOLET = COLOURS[:4]
+GREY, BLACK = "#6b7280", "black"
+ALGORITHM_COLOURS = {"ppo": BLUE, "trpo": ORANGE, "vpg": GREEN, "apg": VIOLET}
+"""Others get the remaining ones."""
+DPI = 130
+LEAST_ERROR = 1e-4  # [m], that is drawn
+STYLE: Any = {
+    **{"font.size": 9, "axes.titlesize": 9.5, "axes.labelsize": 9, "legend.fontsize": 9},
+    **{"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "quadrl"},  # text stays text
+}
+PANELS = {
+    "return": ("return of an episode", BLUE),
+    "success": ("share of episodes", GREEN),
+    "error": ("error [m]", ORANGE),
+}
+"""Of a learning curve: column of metrics.csv, label and colour."""
+CLOCKS = {
+    "steps": ("control steps [thousands]", 1e-3),
+    "seconds": ("wall clock of the training [s]", 1.0),
+}
+"""What learning curves are drawn over: column of metrics.csv, label and factor."""
+CURVE_POINTS = 200
+PLACE, MOTION = (
+    ("x east [m]", "y north [m]", "z up [m]"),
+    ("roll [deg]", "pitch [deg]", "yaw [deg]"),
+)
+styled = matplotlib.rc_context(STYLE)
+"""Decorates whatever draws."""
+
+
+@styled
+def content(figure: Figure, kind: str, name: str = "kind") -> bytes:
+    """The file of a figure; the same numbers make the same bytes.
+
+    Args:
+        figure: The figure.
+        kind: The ending of the file, such as png, pdf or svg.
+        name: What an error calls it.
+
+    Raises:
+        QuadrlError: The kind is unknown.
+    """
+    choice(name, kind, sorted(FigureCanvasAgg(figure).get_supported_filetypes()))
+    picture = io.BytesIO()
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    figure.savefig(picture, dpi=DPI, format=kind, metadata=undated)
+    return picture.getvalue()
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure, whole or not at all; its kind is what the name ends in.
+
+    Raises:
+        QuadrlError: The name ends in no kind of picture.
+    """
+    written = content(figure, path.suffix.removeprefix(".").lower(), f"ending of {path}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, written)
+    return path
+
+
+def tidy(axis: Any) -> None:
+    """Draw a light grid, and no frame above and to the right."""
+    axis.grid(alpha=0.25, lw=0.6)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def head(figure: Figure, title: str) -> None:
+    """Write a title over all panels."""
+    figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
+
+
+@styled
+def learning_curve(metrics: Metrics, title: str) -> Figure:
+    """Return, success and error over the steps of a run; figure 3 of the paper."""
+    figure = Figure(figsize=(8.0, 7.2), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True)
+    steps, survived = metrics["steps"] / 1e3, metrics["survival"]
+    for axis, (name, (label, colour)) in zip(axes, PANELS.items(), strict=True):
+        ended = np.isfinite(metrics[name])  # in some batches no episode ends
+        axis.plot(steps[ended], metrics[name][ended], color=colour, lw=2, label=name)
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=0 if name != "return" else None)
+        tidy(axis)
+    ended = np.isfinite(survived)
+    axes[1].plot(steps[ended], survived[ended], color=GREY, lw=1.5, label="survival")
+    axes[1].set_ylim(-0.03, 1.03)
+    axes[1].legend(frameon=False, loc="best")
+    axes[-1].set_xlabel("control steps [thousands], actions sampled from the policy")
+    top = axes[0].secondary_xaxis("top", functions=_steps_to_seconds(steps, metrics["seconds"]))
+    top.set_xlabel("wall clock [s]")
+    head(figure, title)
+    return figure
+
+
+def _steps_to_seconds(steps: np.ndarray, seconds: np.ndarray) -> tuple:
+    """The functions from the lower axis to the upper one and back; both grow with iterations."""
+    x, y = np.concatenate([[0.0], steps]), np.concatenate([[0.0], seconds])
+    slope = (y[-1] / x[-1]) if x[-1] else 1.0
+    forward = lambda s: np.where(s > x[-1], s * slope, np.interp(s, x, y))  # noqa: E731
+    backward = lambda s: np.where(s > y[-1], s / slope, np.interp(s, y, x))  # noqa: E731
+    return forward, backward
+
+
+@styled
+def learning_curves(
+    groups: Mapping[str, Sequence[Metrics]], title: str, clocks: Sequence[str] = tuple(CLOCKS)
+) -> Figure:
+    """Return and success of several trainings in one figure; figures 3 to 5 of the paper.
+
+    Of each algorithm it shows the median over its runs, and the band from the worst to the best.
+
+    Args:
+        groups: The metrics of the runs of each algorithm.
+        title: Of the figure.
+        clocks: Of CLOCKS, a row each.
+
+    Raises:
+        QuadrlError: No episode has ended in any of the runs.
+    """
+    panels = {"return": "return of an episode", "success": "success [share]"}
+    figure = Figure(figsize=(9.2, 0.6 + 2.6 * len(clocks)), layout="constrained")
+    axes: Any = figure.subplots(len(clocks), len(panels), squeeze=False)
+    spare = itertools.cycle(c for c in COLOURS if c not in ALGORITHM_COLOURS.values())
+    for algo, runs in groups.items():
+        colour = ALGORITHM_COLOURS.get(algo) or next(spare)
+        label = f"{algo.upper()}, {len(runs)} seed{'s' * (len(runs) > 1)}"
+        for (clock, panel), axis in zip(itertools.product(clocks, panels), axes.flat, strict=True):
+            axis.set(xlabel=CLOCKS[clock][0], ylabel=panels[panel])
+            if (band := spread(runs, panel, clock)) is None:
+                continue
+            x, (low, median, high) = band[0] * CLOCKS[clock][1], band[1]
+            axis.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
+            axis.plot(x, median, color=colour, lw=1.8, label=label)
+    for axis in axes.flat:
+        tidy(axis)
+        axis.set_xlim(left=0)
+    for axis in axes[:, 1]:
+        axis.set_ylim(-0.03, 1.03)
+    if not axes[0, 0].lines:
+        raise QuadrlError(f"nothing to plot yet for {title}: no episode has ended")
+    axes[0, 0].legend(frameon=False, loc="best")
+    head(figure, title)
+    return figure
+
+
+def spread(runs: Sequence[Metrics], name: str, clock: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Worst, median and best (3, n) of a column over runs, and where (n,); None without any.
+
+    The points lie where every run has been; between the batches in which episodes ended a run is
+    interpolated.
+    """
+    curves = []
+    for run in runs:
+        ended = np.isfinite(run[name])
+        if ended.any():
+            curves.append((run[clock][ended], run[name][ended]))
+    if not curves:
+        return None
+    low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+    if high < low:  # one was stopped before another's first episode ended
+        return None
+    points = np.linspace(low, high, CURVE_POINTS)
+    values = np.array([np.interp(points, x, y) for x, y in curves])
+    return points, np.quantile(values, (0.0, 0.5, 1.0), axis=0)
+
+
+@styled
+def trajectory(rollout: Rollout, title: str, episodes: int = len(COLOURS)) -> Figure:
+    """Flights in space and over time; figure 6 of the paper, and what led to it.
+
+    Each flight has a colour. Goals are dashed: black where all flights have the same one that
+    stays, else each in the colour of its flight. Flights in wind show it, and the airspeed. At most
+    `episodes` flights are drawn.
+    """
+    shown = min(episodes, rollout.position.shape[1])
+    goals = rollout.goal[:, :shown]
+    shared = bool(np.all(np.isnan(goals) | (np.abs(goals - goals[:1, :1]) < 1e-9)))
+    figure = Figure(figsize=(14.0, 9.6), layout="constrained")
+    upper, lower = cast(Any, figure.subfigures(2, 1, height_ratios=(1.75, 1)))
+    left, right = _quantities(rollout, shown)
+    grid = upper.add_gridspec(len(left), 3, width_ratios=(1.35, 1, 1))
+    _space(upper.add_subplot(grid[:, 0], projection="3d"), rollout, goals, shared)
+    for n, values in enumerate((left, right)):
+        axes = [upper.add_subplot(grid[k, n + 1]) for k in range(len(values))]
+        for axis, (name, value) in zip(axes, values.items(), strict=True):
+            _flights(axis, rollout, value)
+            axis.set_ylabel(name)
+            axis.tick_params(labelbottom=axis is axes[-1])
+            if name in PLACE:
+                goal = goals[..., PLACE.index(name)]
+                dashed = {"lw": 1.0, "ls": "--"} | ({"color": BLACK} if shared else {})
+                _flights(axis, rollout, goal[:, :1] if shared else goal, **dashed)
+        axes[-1].set_xlabel("time [s]")
+        axes[-1].set_yscale("linear" if n else "log")  # the error
+        upper.align_ylabels(axes)
+    _commands(lower, rollout, shown)
+    head(figure, title)
+    return figure
+
+
+def _quantities(rollout: Rollout, shown: int) -> tuple[dict[str, np.ndarray], ...]:
+    """Values (T, n) over time by their labels: place, wind and error; attitude and speeds."""
+    wind, velocity = rollout.wind[:, :shown], rollout.velocity[:, :shown]
+    windy = bool(np.nan_to_num(wind).any())
+    attitude = _attitude(rollout.quaternion[:, :shown])
+    left = {name: rollout.position[:, :shown, k] for k, name in enumerate(PLACE)}
+    right = {name: attitude[..., k] for k, name in enumerate(MOTION)}
+    if windy:
+        left["wind [m/s]"] = np.linalg.norm(wind, axis=-1)
+        right["airspeed [m/s]"] = np.linalg.norm(velocity - wind, axis=-1)
+    left["error [m]"] = np.maximum(rollout.error[:, :shown], LEAST_ERROR)
+    right["speed [m/s]"] = np.linalg.norm(velocity, axis=-1)
+    return left, right
+
+
+def _flights(axis: Any, rollout: Rollout, values: np.ndarray, **style: Any) -> None:
+    """Draw values (T, n) over time, a colour each."""
+    time = np.arange(1, len(values) + 1) * rollout.control_timestep
+    for value, colour in zip(values.T, itertools.cycle(COLOURS), strict=False):
+        axis.plot(time, value, **({"color": colour, "lw": 1.2, "alpha": 0.85} | style))
+    tidy(axis)
+
+
+def _space(space: Any, rollout: Rollout, goals: np.ndarray, shared: bool) -> None:
+    """Draw the paths of flights and their goals (T, n, 3) in space."""
+    for i, colour in zip(range(goals.shape[1]), itertools.cycle(COLOURS), strict=False):
+        flown, goal = (path[: rollout.length[i], i] for path in (rollout.position, goals))
+        ended = "successful" if rollout.is_success[i] else "not successful"
+        space.plot(*flown.T, color=colour, lw=1.4, alpha=0.9, label=f"flight {i + 1}, {ended}")
+        space.scatter(*flown[:1].T, color=colour, s=18, marker="o")
+        if not shared:
+            space.plot(*goal.T, color=colour, lw=1.0, ls="--", alpha=0.8)
+        if not shared or i == 0:
+            mark = BLACK if shared else colour
+            space.scatter(*goal[-1:].T, color=mark, marker="*", s=110, label=None)
+    dashes, words = (BLACK, "goal") if shared else (GREY, "goal of each flight")
+    space.plot([], [], [], color=dashes, lw=1.0, ls="--", marker="*", ms=9, label=words)
+    space.set(xlabel=PLACE[0], ylabel=PLACE[1], box_aspect=(1, 1, 1))
+    space.set_zlabel(PLACE[2], labelpad=-30)  # inside, clear of the next axes
+    space.set_aspect("equal", adjustable="datalim")
+    space.legend(frameon=False, loc="upper left", fontsize=8, ncols=2, bbox_to_anchor=(0, 1.07))
+
+
+def _commands(lower: Any, rollout: Rollout, shown: int) -> None:
+    """Draw rotor speeds over actions, a column for each."""
+    parts = ("rotor", rollout.rotor_speed), ("action", rollout.action)
+    many = max(value.shape[-1] for _, value in parts)
+    rows: Any = lower.subplots(2, many, sharex=True, sharey="row", squeeze=False)
+    for axes, (name, value) in zip(rows, parts, strict=True):
+        for k, axis in enumerate(axes):
+            axis.set_visible(k < value.shape[-1])
+            if k < value.shape[-1]:
+                _flights(axis, rollout, value[:, :shown, k], lw=0.9)
+                axis.set_title(f"{name} {k + 1}", loc="left", fontsize=9)
+    rows[0][0].set_ylabel("speed [rad/s]")
+    rows[1][0].set(ylabel="action", ylim=(-1.05, 1.05))
+    for axis in rows[1]:
+        axis.set_xlabel("time [s]")
+
+
+def _attitude(quaternion: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw (..., 3) [deg] of (T, ..., 4); right wing down and nose up are positive.
+
+    Yaw is counted from east to north, and does not jump.
+    """
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x**2 + y**2))
+    pitch = np.arcsin(np.clip(2 * (x * z - w * y), -1, 1))
+    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)), axis=0)
+    return np.degrees(np.stack([roll, pitch, yaw], axis=-1))
