@@ -209,22 +209,6 @@ def observed(environment):
 FLAGS = ("terminated", "truncated", "is_success", "diverged")
 
 
-def vehicle_of_row(vehicle, row):
-    """The aircraft that a row of parameters describes."""
-    rotors = tuple(
-        dataclasses.replace(
-            r,
-            position=tuple(row["rotor"]["position"][k].tolist()),
-            **{n: float(row["rotor"][n][k]) for n in ROTOR_PARAMETERS},
-        )
-        for k, r in enumerate(vehicle.rotors)
-    )
-    own = {name: row[name].tolist() for name in PARAMETERS}
-    air = {name: float(row[name]) for name in ("rotor_drag", "flapping_moment", "blade_lift")}
-    own["aerodynamics"] = dataclasses.replace(vehicle.aerodynamics, **air)
-    return dataclasses.replace(vehicle, rotors=rotors, **own | {"inertia": tuple(own["inertia"])})
-
-
 EVERYTHING = Randomization(
     mass=(0.9, 1.1),
     inertia=(0.9, 1.1),

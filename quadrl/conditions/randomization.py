@@ -1,7 +1,7 @@
-"""The aircraft that is not quite the one: what is drawn for each row at the start of an episode.
+"""Randomizations: what differs from the specified flight, drawn at the start of each episode.
 
-Aircraft are drawn around the one that is specified, by factors, so that a preset fits all of them.
-`quadrl.conditions.draw` makes the aircraft, `quadrl.conditions.disturbances` flies them.
+Aircraft are drawn around the specified one, by factors, so that a preset fits every vehicle.
+`quadrl.conditions.sampler` makes the aircraft, `quadrl.conditions.randomizer` applies the rest.
 """
 
 from __future__ import annotations
@@ -20,7 +20,25 @@ Range = tuple[float, float]
 LEAST, MOST = 0.01, 100.0  # of a factor
 LONGEST_DELAY = 10.0  # [s]
 LONGEST_SHIFT = 1.0  # [m]
+OFF = (1.0, 1.0)  # a factor that changes nothing
+AFFECTS: dict[str, tuple[str, ...]] = {
+    "mass": ("mass",),
+    "inertia": ("inertia",),
+    "thrust": ("rotor.thrust_coefficient",),
+    "torque": ("rotor.torque_coefficient",),
+    "lag": ("rotor.lag_up", "rotor.lag_down"),
+    "drag": ("drag_coefficient", "moment_coefficient", "rotor_drag", "flapping_moment"),
+    "inflow": ("blade_lift",),
+    "max_speed": ("rotor.max_speed",),
+    "rotors": (
+        *("rotor.thrust_coefficient", "rotor.torque_coefficient", "rotor.lag_up", "rotor.lag_down"),
+    ),
+    "one_rotor": ("rotor.thrust_coefficient", "rotor.torque_coefficient"),
+    "centre_of_mass": ("rotor.position",),
+}
+"""What a field of `Randomization` changes in a row of parameters (`aircraft/parameters.py`)."""
 FACTORS = ("mass", "inertia", "thrust", "torque", "lag", "drag", "inflow", "max_speed")
+"""Those of them that are one factor for the whole aircraft."""
 DELAYS = ("command_delay", "observation_delay")
 
 
@@ -65,20 +83,14 @@ class Pushes:
             object.__setattr__(self, name, number(f"pushes {name}", value, 0, MAX))
 
 
-def _record(name: str, given: Any, kind: type) -> Any:
-    """A record of a kind, from one or from some of its fields."""
+def _record(name: str, given: Any, kind: type, also: str = "") -> Any:
+    """A record of a kind, from one or from some of its fields; `also` says what else is allowed."""
     if isinstance(given, kind):
         return given
     if not isinstance(given, Mapping):
-        names = (
-            f", or a name of {', '.join(RANDOMIZATIONS)}"
-            if kind is not Errors and kind is not Pushes
-            else ""
-        )
-        allowed = f"a {kind.__name__}, or a mapping of its fields{names}"
+        allowed = f"a {kind.__name__}, or a mapping of its fields{also}"
         raise QuadrlError(name=name, value=given, allowed=allowed)
-    fields = [field.name for field in dataclasses.fields(kind)]
-    keys(f"field of {name}", given, fields)
+    keys(f"field of {name}", given, [field.name for field in dataclasses.fields(kind)])
     return kind(**given)
 
 
@@ -137,11 +149,11 @@ class Randomization:
         """Validate what can be judged without an aircraft."""
         for field in dataclasses.fields(self):
             name, given = field.name, getattr(self, field.name)
-            if field.name == "centre_of_mass":
+            if name == "centre_of_mass":
                 value: Any = number(name, given, 0, LONGEST_SHIFT)
-            elif field.name in ("noise", "bias", "pushes"):
+            elif name in ("noise", "bias", "pushes"):
                 value = _record(name, given, Pushes if name == "pushes" else Errors)
-            elif field.name in DELAYS:
+            elif name in DELAYS:
                 value = _pair(name, given, 0, LONGEST_DELAY)
             else:
                 least = 0.0 if name in ("drag", "wind") else LEAST
@@ -159,9 +171,7 @@ class Randomization:
     @property
     def per_row(self) -> bool:
         """Whether parameters of the aircraft are drawn."""
-        return self.centre_of_mass > 0 or any(
-            getattr(self, name) != (1.0, 1.0) for name in (*FACTORS, "rotors", "one_rotor")
-        )
+        return any(getattr(self, name) != getattr(NONE, name) for name in AFFECTS)
 
 
 NONE = Randomization()
@@ -218,4 +228,5 @@ def resolve(given: Randomized) -> Randomization:
         return given or NONE
     if isinstance(given, str):
         return RANDOMIZATIONS[choice("randomization", given, RANDOMIZATIONS)]
-    return _record("randomization", given, Randomization)
+    names = f", or a name of {', '.join(RANDOMIZATIONS)}"
+    return _record("randomization", given, Randomization, names)

@@ -22,8 +22,8 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.philox import PARAMETERS
 from quadrl.base.rotation import Array
-from quadrl.conditions.draw import WHICH, Draw
-from quadrl.conditions.randomization import Randomization, Randomized
+from quadrl.conditions.randomization import AFFECTS, Randomization, Randomized
+from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control.allocation import Allocation
 from quadrl.engines.rng import uniform
@@ -39,7 +39,7 @@ SURE = 1e-9
 """Share of a bound by which rounding may exceed it."""
 BISECTIONS = 24
 PHASE_MARGIN = math.pi / 4  # [rad]
-BY_HOVER = {"mass", "thrust", "torque", "rotors", "one_rotor", "max_speed", "centre_of_mass"}
+BY_HOVER = AFFECTS.keys() - {"inertia", "drag", "inflow", "lag"}
 """Fields of a randomization that change how fast rotors turn in hover, or may turn."""
 
 
@@ -125,15 +125,15 @@ class Reach:
         return max(high, min(math.ceil(high / digit - SURE) * digit, self.room))
 
 
-def samples(vehicle: Vehicle, draw: Draw) -> tuple[np.ndarray, np.ndarray]:
+def samples(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[np.ndarray, np.ndarray]:
     """Rows of parameters of aircraft that are drawn, and of some at corners of the ranges."""
     keys = np.arange(SAMPLES)
-    shares = uniform(keys, np.zeros_like(keys), PARAMETERS, 0, len(draw.names))
+    shares = uniform(keys, np.zeros_like(keys), PARAMETERS, 0, len(sampler.names))
     corners = np.where(shares[:CORNERS] < 0.5, 0.0, 1 - SURE)
-    return draw.table(draw.of(shares)), draw.table(draw.of(corners))
+    return sampler.table(sampler.sample(shares)), sampler.table(sampler.sample(corners))
 
 
-def unreached(vehicle: Vehicle, draw: Draw) -> tuple[float, str, float]:
+def unreached(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[float, str, float]:
     """How many of the drawn aircraft cannot hover level and still.
 
     From a sample that is always the same; exact where nothing is drawn.
@@ -143,9 +143,9 @@ def unreached(vehicle: Vehicle, draw: Draw) -> tuple[float, str, float]:
         which each has the MARGIN, in the corners of the ranges too, or all that the rotors give.
         With a share of 0 there are no words, and the action scale is the vehicle's.
     """
-    if not draw.given.per_row:
+    if not sampler.randomization.per_row:
         return 0.0, "", vehicle.action_scale
-    drawn, corners = samples(vehicle, draw)
+    drawn, corners = samples(vehicle, sampler)
     reach, scale = Reach(vehicle, drawn), vehicle.action_scale
     share = 1 - float(reach.carries(scale).mean())
     if share == 0:
@@ -168,7 +168,7 @@ def warn_of_unreached(vehicle: Vehicle, randomization: Randomized) -> None:
     Raises:
         QuadrlError: The randomization does not fit the aircraft.
     """
-    share, lack, enough = unreached(vehicle, Draw(randomization, vehicle))
+    share, lack, enough = unreached(vehicle, AircraftSampler(randomization, vehicle))
     if share > FEW:
         said = (
             f"{100 * share:.0f} % of the drawn aircraft cannot hover level and still, whatever the "
@@ -195,12 +195,12 @@ def limit(
 
     def able(given: Any) -> bool:
         try:
-            draw = Draw(given, vehicle)
+            sampler = AircraftSampler(given, vehicle)
         except QuadrlError:  # even at their limits the rotors do not carry it
             return False
-        drawn = np.tile(draw.low, (vehicle.rotor_count, 1))
-        draw.columns(drawn, WHICH)[:, 0] = np.arange(vehicle.rotor_count)
-        return bool(Reach(vehicle, draw.table(drawn)).carries(vehicle.action_scale).any())
+        drawn = np.tile(sampler.low, (vehicle.rotor_count, 1))
+        sampler.columns(drawn, DAMAGED)[:, 0] = np.arange(vehicle.rotor_count)
+        return bool(Reach(vehicle, sampler.table(drawn)).carries(vehicle.action_scale).any())
 
     if end == usual or not BY_HOVER.intersection(getattr(at(end), "given", dict)()):
         return None

@@ -20,8 +20,8 @@ from quadrl.base import machine, records, validation
 from quadrl.base.philox import Seed, seeds_of_rows
 from quadrl.base.rotation import Array
 from quadrl.conditions import observing
-from quadrl.conditions.draw import Draw
 from quadrl.conditions.randomization import Randomized
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather, Weathered, WeatherProcess
 from quadrl.control import modes
 from quadrl.core import catalogue, observer, saving, transition
@@ -72,12 +72,13 @@ class Environment(saving.Copied):
         """
         self.task = catalogue.make(task)
         self.vehicle = engine.vehicle if isinstance(engine, Engine) else resolve(vehicle)
-        draw, self.observing = Draw(randomization, self.vehicle), observing.resolve(observe)
-        self.randomization = draw.given
-        world: Any = {"num_threads": num_threads, "per_row": draw.given.per_row}
+        sampler = AircraftSampler(randomization, self.vehicle)
+        self.observing = observing.resolve(observe)
+        self.randomization = sampler.randomization
+        world: Any = {"num_threads": num_threads, "per_row": self.randomization.per_row}
         if not isinstance(engine, Engine):
             validation.number("num_envs", num_envs, 1, mujoco.MAX_ENVS, whole=True)
-            per_row = row_memory(self.task, self.vehicle, draw, self.observing)
+            per_row = row_memory(self.task, self.vehicle, sampler, self.observing)
             machine.check_memory(f"num_envs = {num_envs}", num_envs * per_row)
         engine = mujoco.of_task(engine, self.task, self.vehicle, num_envs, **world)
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
@@ -86,18 +87,18 @@ class Environment(saving.Copied):
         timestep = self.vehicle.control_timestep
         self._clock = Clock.of(self.task, timestep)
         self.time_limit_steps = self._clock.time_limit_steps
-        self._true = self.task.true_parameters and draw.given.per_row
+        self._true = self.task.true_parameters and self.randomization.per_row
         nominal = parameters.rows(self.vehicle)
         self._rows = engine.parameters if self._true else nominal  # those that the task sees
         self._parameters, seen = (Parameters.of(k, timestep) for k in (self._rows, nominal))
         self.term_names = transition.check_task(self.task, seen, self.action_size, self.origin[2])
         """Names of the reward's terms, in their order."""
-        given = draw, self.observing, self.task, engine, self.action_size
-        self.disturbances, self.observer, terms = observer.make(*given)
+        given = sampler, self.observing, self.task, engine, self.action_size
+        self.randomizer, self.observer, terms = observer.make(*given)
         self.layout = layout(terms, self.vehicle.rotor_count)
         """Where each named term of the observation stands in the flat vector."""
         self.size = max(part.stop for part in self.layout.values())
-        self.stepwise = self.control_mode.has_loops or self.disturbances.late
+        self.stepwise = self.control_mode.has_loops or self.randomizer.late
         """Whether the rotors get a command at each physics step, from `control`."""
         self.weather = Weather.of(weather)
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
@@ -169,19 +170,17 @@ class Environment(saving.Copied):
             return {name: np.zeros((0, at.stop - at.start)) for name, at in self.layout.items()}
         seeds = (self._keys, self._episodes) if seed is None else self._seeded(seed, rows)
         place = seeds[0][rows], seeds[1][rows]
-        drawn, table, seen = self.disturbances.of_episodes(*place), None, self._parameters
-        if drawn is not None and self.disturbances.draw.given.per_row:
-            table = self.disturbances.draw.table(drawn)
-            if self._true:
-                seen = Parameters.of(table, self._clock.control_timestep)
+        (drawn, table), seen = self.randomizer.sample(*place), self._parameters
+        if table is not None and self._true:
+            seen = Parameters.of(table, self._clock.control_timestep)
         begun, task_state = self.task.begin(Rng(*place), seen)
         # Up to here nothing is written, and `place` refuses before it writes.
         begun = begun.replaced(start or {}, rows, self.num_envs)
         state = self.engine.place(rows, begun, table)
         self._keys, self._episodes = seeds
-        self.disturbances.begin(rows, *place, drawn)
+        self.randomizer.begin(rows, *place, drawn)
         if self.blowing:
-            self.blowing.begin(rows, *place, self.disturbances.wind_speed(rows, self.weather))
+            self.blowing.begin(rows, *place, self.randomizer.wind_speed(rows, self.weather))
         now, episode = transition.begin(self.task, state, task_state, seen, self.action_size)
         self._episodes[rows] += 1
         if len(rows) == self.num_envs:
@@ -257,8 +256,8 @@ class Environment(saving.Copied):
             self.blowing.advance()
         self.engine.check_air()
         self._setpoint = self.control_mode.setpoint(self.engine.state, self._action)
-        if self.disturbances.active:
-            self.disturbances.begin_step()
+        if self.randomizer.active:
+            self.randomizer.begin_step()
         self._flown, self._diverged[:] = 0, False
         if self.control_mode.has_loops:
             self._command[:] = 0.0
@@ -281,7 +280,7 @@ class Environment(saving.Copied):
             self._flown += 1
             if self.observer:
                 self.observer.follow(command, self.vehicle.physics_timestep)
-        self.engine.ctrl[:] = self.disturbances.passed_on(command)
+        self.engine.ctrl[:] = self.randomizer.delayed(command)
 
     def finish(self) -> Transition:
         """Second half of a step, after the engine has advanced."""
@@ -339,10 +338,12 @@ class Environment(saving.Copied):
         return see.again(now) if see else self.task.observe(now)
 
 
-def row_memory(task: Task, vehicle: Vehicle, draw: Draw, seen: observing.Observing) -> float:
+def row_memory(
+    task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: observing.Observing
+) -> float:
     """Memory that one more aircraft takes at least [bytes]; measured, and the histories counted."""
-    rotors, (commands, observations) = vehicle.rotor_count, draw.delays
+    rotors, (commands, observations) = vehicle.rotor_count, sampler.delays
     single = sum(term.width(rotors) for term in task.observation.values())
     kept = single * (1 + observations[1] + seen.observation_history) + rotors * commands[1]
     flat = single * (1 + seen.observation_history) + rotors * seen.action_history
-    return 3_000 + 5_000 * draw.given.per_row + 8 * (kept + 2 * flat)
+    return 3_000 + 5_000 * sampler.randomization.per_row + 8 * (kept + 2 * flat)

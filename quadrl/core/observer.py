@@ -12,10 +12,10 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.philox import NOISE
 from quadrl.base.rotation import Array, to_body, to_world
-from quadrl.conditions.disturbances import Disturbances
-from quadrl.conditions.draw import Draw
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import NONE
+from quadrl.conditions.randomizer import Randomizer
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import ObservationTerm, Task, layout
 from quadrl.core.transition import Transition, observe
@@ -26,22 +26,22 @@ from quadrl.engines.state import State
 
 
 def make(
-    draw: Draw, options: Observing, task: Task, engine: Engine, actions: int
-) -> tuple[Disturbances, Observer | None, Mapping[str, ObservationTerm]]:
+    sampler: AircraftSampler, options: Observing, task: Task, engine: Engine, actions: int
+) -> tuple[Randomizer, Observer | None, Mapping[str, ObservationTerm]]:
     """What disturbs aircraft, what sees them otherwise than the task says, and the entries.
 
     Args:
-        draw: What is drawn.
+        sampler: Samples what is drawn.
         options: Of the observation.
         task: The task.
         engine: Flies the aircraft.
         actions: Numbers in an action.
     """
-    given, observes = draw.given, options != Observing()
-    disturbances = Disturbances(draw, engine, active=observes or given != NONE)
-    observes |= (given.noise, given.bias) != (NONE.noise, NONE.bias) or draw.delays[1][1] > 0
-    observer = Observer(options, task, engine, actions, disturbances) if observes else None
-    return disturbances, observer, observer.terms if observer else task.observation
+    given, observes = sampler.randomization, options != Observing()
+    randomizer = Randomizer(sampler, engine, active=observes or given != NONE)
+    observes |= (given.noise, given.bias) != (NONE.noise, NONE.bias) or sampler.delays[1][1] > 0
+    observer = Observer(options, task, engine, actions, randomizer) if observes else None
+    return randomizer, observer, observer.terms if observer else task.observation
 
 
 class Observer:
@@ -53,7 +53,7 @@ class Observer:
         task: Task,
         engine: Engine,
         actions: int,
-        disturbances: Disturbances,
+        randomizer: Randomizer,
     ) -> None:
         """Lay out what is seen.
 
@@ -62,12 +62,13 @@ class Observer:
             task: The task.
             engine: Flies the aircraft.
             actions: Numbers in an action.
-            disturbances: Of those aircraft.
+            randomizer: Of those aircraft.
         """
         self._options, self._task = options, task
-        self._engine, self._disturbances = engine, disturbances
+        self._engine, self._randomizer = engine, randomizer
         vehicle, count = engine.vehicle, engine.num_envs
-        rotors, given, draw = vehicle.rotor_count, disturbances.draw.given, disturbances.draw
+        rotors, sampler = vehicle.rotor_count, randomizer.sampler
+        given = sampler.randomization
         self._rows = np.arange(count)
         terms = dict(task.observation)
         if options.rotor_speed == "none":
@@ -91,7 +92,9 @@ class Observer:
         """Where each of them stands in it."""
         self._size = sum(term.width(rotors) for term in terms.values())
         # The newest observation first: as many as the oldest that is looked at asks for.
-        self._seen = np.zeros((1 + draw.delays[1][1] + options.observation_history, count, single))
+        self._seen = np.zeros(
+            (1 + sampler.delays[1][1] + options.observation_history, count, single)
+        )
         self._actions = np.zeros((count, options.action_history * actions))
         self._noise, self._noisy = given.noise.sizes, given.noise != NONE.noise
         self._feels = options.disturbance
@@ -119,8 +122,10 @@ class Observer:
         self._specified = Parameters.of(nominal, vehicle.control_timestep)
         self._disturbance = np.zeros((count, 3))  # [m/s^2], world frame
         self._motion = np.zeros((count, 6))  # velocity, and acceleration by thrust, world frame
-        self._scaled = np.zeros((count, len(draw.spread)))
-        width = sum(term.width(rotors) for term in task.observation.values()) + len(draw.spread) + 3
+        self._scaled = np.zeros((count, len(sampler.spread)))
+        width = (
+            sum(term.width(rotors) for term in task.observation.values()) + len(sampler.spread) + 3
+        )
         self.privileged = np.zeros((count, width)) if options.privileged else None
         """(N, p) for the critic alone, where the options ask for it."""
 
@@ -140,9 +145,9 @@ class Observer:
             return None
         ids = None if rows is None else rows.ctypes.data
         count = len(self._rows) if rows is None else len(rows)
-        source, own, engine = self._disturbances, self._coordinates, self._engine
+        source, own, engine = self._randomizer, self._coordinates, self._engine
         speed = self._rotor_speed if self._estimated else engine.act
-        bias = source.draw.columns(source.drawn, "position_bias_x", 12)
+        bias = source.sampler.columns(source.drawn, "position_bias_x", 12)
         arrays = (*source.place, source.steps, engine.qpos, engine.qvel, speed, self._noise, bias)
         strided = (engine.qpos, speed, bias, own)
         # As `Rows` in native/disturbances.c.
@@ -211,8 +216,8 @@ class Observer:
 
     def _present(self) -> Array:
         """The flat observation (N, size): as late as it is, with what is remembered."""
-        source = self._disturbances
-        delay = source.draw.columns(source.drawn, "observation_delay")[:, 0]
+        source = self._randomizer
+        delay = source.sampler.columns(source.drawn, "observation_delay")[:, 0]
         age = np.rint(delay / self._engine.vehicle.control_timestep).astype(np.int64)
         many = range(1 + self._options.observation_history)
         now, *before = (self._seen[age + k, self._rows] for k in many)
@@ -225,8 +230,8 @@ class Observer:
         if self.privileged is None:
             return
         if drawn:
-            source = self._disturbances
-            self._scaled[rows] = source.draw.scaled(source.drawn[rows])
+            source = self._randomizer
+            self._scaled[rows] = source.sampler.scaled(source.drawn[rows])
         wind = to_body(state.rotation, self._engine.wind[rows])
         fresh = np.concatenate([*truth.values(), self._scaled[rows], wind], axis=-1)
         if len(rows) < len(self._rows):

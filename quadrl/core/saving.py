@@ -61,8 +61,8 @@ def save(environment: Any) -> dict[str, np.ndarray]:
 def _parts(environment: Any) -> dict[str, Any]:
     """What remembers something of its own, by the name that its arrays begin with."""
     parts: dict[str, Any] = {}
-    if environment.disturbances.active:
-        parts["disturbances"] = environment.disturbances
+    if environment.randomizer.active:
+        parts["randomizer"] = environment.randomizer
     if environment.observer is not None:
         parts["observer"] = environment.observer
     return parts
@@ -76,15 +76,15 @@ def _check_sound(
     Raises:
         QuadrlError: The message names the array.
     """
-    table, disturbances = "engine.parameters", environment.disturbances
+    table, randomizer = "engine.parameters", environment.randomizer
     for name in own:
-        begins = name.startswith(("disturbances.", "observer.", "episode."))
+        begins = name.startswith(("randomizer.", "observer.", "episode."))
         if (begins or name in ("engine.rows", *MOMENT)) and not np.isfinite(saved[name]).all():
             raise QuadrlError(name=name, value=saved[name], allowed="finite")
     _check_counters(environment, saved)
-    if disturbances.active:
-        disturbances.check_saved(saved)
-    drawn = disturbances.draw.given.per_row and disturbances.draw.holds(saved[table])
+    if randomizer.active:
+        randomizer.check_saved(saved)
+    drawn = environment.randomization.per_row and randomizer.sampler.explains(saved[table])
     if not (drawn or np.array_equal(saved[table], own[table])):
         reason = "the state was saved with another aircraft"
         raise QuadrlError(reason, name=table, value=saved[table], allowed="this aircraft's")
@@ -96,7 +96,7 @@ def _check_counters(environment: Any, saved: dict[str, np.ndarray]) -> None:
     Raises:
         QuadrlError: The message names the array.
     """
-    for name in ("keys", "episodes", "disturbances.place", "weather.streams"):
+    for name in ("keys", "episodes", "randomizer.place", "weather.streams"):
         if name in saved and not ((saved[name] >= 0) & (saved[name] <= MAX_SEED)).all():
             allowed = f"whole numbers from 0 to {MAX_SEED}"
             raise QuadrlError(name=name, value=saved[name], allowed=allowed)
@@ -104,7 +104,7 @@ def _check_counters(environment: Any, saved: dict[str, np.ndarray]) -> None:
     if not ((steps >= 0) & (steps <= MOST_STEPS) & (steps % 1 == 0)).all():
         allowed = f"whole numbers from 0 to {MOST_STEPS:.0f}"
         raise QuadrlError(name="episode.steps", value=steps, allowed=allowed)
-    counted = {"time": steps * environment.vehicle.control_timestep, "disturbances.steps": steps}
+    counted = {"time": steps * environment.vehicle.control_timestep, "randomizer.steps": steps}
     for name, expected in counted.items():
         if name in saved and not np.array_equal(saved[name], expected):
             allowed = "that of episode.steps, which was saved beside it"

@@ -95,7 +95,7 @@ def told(environment: Environment) -> dict[str, np.ndarray]:
         drawn: what was drawn for each aircraft, with names; privileged: for the critic alone.
     """
     values: dict[str, np.ndarray] = {}
-    if environment.disturbances.active and (shown := environment.disturbances.shown()):
+    if environment.randomizer.active and (shown := environment.randomizer.shown()):
         values["drawn"] = Named(shown)
     if environment.observer and (privileged := environment.privileged) is not None:
         values["privileged"] = privileged.astype(np.float32)

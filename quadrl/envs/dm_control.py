@@ -195,7 +195,7 @@ def make(
         aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them.
         weather: What the wind is like, as `quadrl.conditions.weather.Weather.of` takes it.
         randomization: What is drawn at each reset and disturbs the flight, as
-            `conditions.randomization.resolve` takes it; `task.environment.disturbances.shown()`
+            `conditions.randomization.resolve` takes it; `task.environment.randomizer.shown()`
             has what was drawn.
         observe: Options of the observation, as `quadrl.conditions.observing.resolve` takes them;
             `task.environment.privileged` is the observation for the critic alone.

@@ -15,8 +15,8 @@ from quadrl.aircraft.presets import resolve, with_effects
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.validation import choice
-from quadrl.conditions.draw import Draw
 from quadrl.conditions.randomization import Randomized
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.control.feasibility import (
     MARGIN,
     Reach,
@@ -95,15 +95,19 @@ def check(
     """
     vehicle = with_effects(resolve(vehicle, vehicle_options), aerodynamics)
     choice("control_mode", control_mode, CONTROL_MODES)
-    draw, task = Draw(randomization, vehicle), tasks.make(task, **task_options)
-    rows = (*_thrust(vehicle, draw), *_moments(vehicle, task), *_steps(vehicle, draw, control_mode))
+    sampler, task = AircraftSampler(randomization, vehicle), tasks.make(task, **task_options)
+    rows = (
+        *_thrust(vehicle, sampler),
+        *_moments(vehicle, task),
+        *_steps(vehicle, sampler, control_mode),
+    )
     return Check(vehicle, rows)
 
 
-def _thrust(vehicle: Vehicle, draw: Draw) -> Iterator[Row]:
+def _thrust(vehicle: Vehicle, sampler: AircraftSampler) -> Iterator[Row]:
     """What carries it, and the action scale that follows."""
     reach, scale = Reach(vehicle), vehicle.action_scale
-    drawn = Reach(vehicle, np.concatenate(samples(vehicle, draw)))
+    drawn = Reach(vehicle, np.concatenate(samples(vehicle, sampler)))
     needed, room = drawn.scale(), reach.room
     hover = vehicle.hover_speed / vehicle.max_speed
     yield Row("hover speed", float(vehicle.hover_speed.max()), "rad/s")
@@ -116,11 +120,11 @@ def _thrust(vehicle: Vehicle, draw: Draw) -> Iterator[Row]:
     short = f"under {MARGIN:g}: action_scale={needed:.3g}" if scale < needed else weak
     yield Row("thrust over weight, action 1", load, "", OK if load >= MARGIN else short)
     yield Row("thrust over weight, limits", limit, "", OK if limit >= MARGIN else weak)
-    if draw.given.per_row:
+    if sampler.randomization.per_row:
         worst = float(drawn.loads(scale)[1].min())
         less = f"{short}, or draw less"
         yield Row("thrust over weight, worst drawn", worst, "", OK if worst >= MARGIN else less)
-        share, lack, _ = unreached(vehicle, draw)
+        share, lack, _ = unreached(vehicle, sampler)
         yield Row("drawn that cannot hover", 100 * share, "%", lack if share else OK)
     yield Row("steady wind held, action 1", held_wind(vehicle, load), "m/s")
     wanted = max(needed, min(scale, room))
@@ -143,9 +147,9 @@ def _moments(vehicle: Vehicle, task: Task) -> Iterator[Row]:
             yield Row(f"{name} acceleration, {end}", float(most), "rad/s^2", verdict)
 
 
-def _steps(vehicle: Vehicle, draw: Draw, control_mode: str) -> Iterator[Row]:
+def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Iterator[Row]:
     """What the steps resolve, and how soon the aircraft answers; what does not is refused."""
-    table = np.concatenate(samples(vehicle, draw))
+    table = np.concatenate(samples(vehicle, sampler))
     rotor = table["rotor"][:, : vehicle.rotor_count]
     rates = np.stack([rotor["lag_up"], rotor["lag_down"]])
     step, control = vehicle.physics_timestep, vehicle.control_timestep
@@ -154,7 +158,8 @@ def _steps(vehicle: Vehicle, draw: Draw, control_mode: str) -> Iterator[Row]:
     yield Row("resolved body rate", float(table["resolved_turn"].min()), "rad/s")
     # The loops of the other modes see the true state at every physics step.
     looped = CONTROL_MODES[control_mode].has_loops
-    late = draw.given.command_delay[1] + (0.0 if looped else draw.given.observation_delay[1])
+    given = sampler.randomization
+    late = given.command_delay[1] + (0.0 if looped else given.observation_delay[1])
     held = step if looped else control
     lag = float(1 / rates.min())
     slow = f"over the lag of the rotors: control_timestep={lag:.2g} or less"

@@ -15,8 +15,8 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.progress import ProgressBar
 from quadrl.base.validation import choice, number
-from quadrl.conditions.draw import Draw
 from quadrl.conditions.randomization import Randomization
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control.feasibility import limit
 from quadrl.core.task import Task
@@ -140,7 +140,7 @@ def measured(
     windy = isinstance(disturbed, Weather)
     weather, randomization = (disturbed, Randomization()) if windy else (Weather(), disturbed)
     try:
-        Draw(randomization, vehicle)
+        AircraftSampler(randomization, vehicle)
     except QuadrlError:  # the aircraft cannot exist, or hardly fly
         return None
     given: dict[str, Any] = {"weather": weather, "randomization": randomization}

@@ -26,8 +26,8 @@ from quadrl import suite, tasks
 from quadrl.aircraft.presets import in_real_air
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.machine import cores, machine
-from quadrl.conditions.draw import Draw
 from quadrl.conditions.randomization import FACTORS, RANDOMIZATIONS, Randomization
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.core.environment import Environment
 from quadrl.core.task import Task
 from quadrl.engines import mjcf
@@ -252,12 +252,13 @@ def _free_flight(
     vehicle: Vehicle, height: float, randomization: Randomization | None = None
 ) -> Work:
     """From hover at a height [m]."""
-    count, draw = FREE_FLIGHT_ENVS, Draw(randomization, vehicle)
-    settings: Any = {"engine": "free_flight", "num_threads": 1, "per_row": draw.given.per_row}
+    count, sampler = FREE_FLIGHT_ENVS, AircraftSampler(randomization, vehicle)
+    per_row = sampler.randomization.per_row
+    settings: Any = {"engine": "free_flight", "num_threads": 1, "per_row": per_row}
     engine = BatchEngine(vehicle, count, altitude=height, **settings)
-    if draw.given.per_row:
-        drawn = draw.of(np.random.default_rng(0).random((count, len(draw.names))))
-        engine.write_parameters(np.arange(count), draw.table(drawn))
+    if per_row:
+        drawn = sampler.sample(np.random.default_rng(0).random((count, len(sampler.names))))
+        engine.write_parameters(np.arange(count), sampler.table(drawn))
     commands = _commands(vehicle, count)
     while True:
         engine.qpos[:], engine.qvel[:] = (0, 0, height, 1, 0, 0, 0), 0.0

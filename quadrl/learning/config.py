@@ -15,10 +15,10 @@ from quadrl.aircraft.presets import with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, keys, number
-from quadrl.conditions.draw import Draw
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.observing import resolve as resolve_observing
 from quadrl.conditions.randomization import Randomization, resolve
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control.modes import CONTROL_MODES
 from quadrl.core.task import Task
@@ -214,7 +214,7 @@ class TrainConfig:
             raise QuadrlError(name="device", value=self.device, allowed="a device of torch")
         self.make_task()
         self.make_practice()
-        Draw(self.randomization, self.make_vehicle())
+        AircraftSampler(self.randomization, self.make_vehicle())
         Weather.of(self.weather)
         resolve_observing(self.observe)
         if self.algo == "apg":

@@ -20,7 +20,7 @@ from quadrl.aircraft.parameters import rows
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.cli import main
-from quadrl.conditions.draw import Draw
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.core.environment import Environment
 from quadrl.core.rules import import_own
@@ -85,17 +85,18 @@ def test_only_the_usual_level_disturbs_nothing(axis):
 
 
 def test_one_rotor_is_weaker_and_it_may_be_any():
-    draw, paper = Draw(Randomization(one_rotor=(0.8, 0.8)), Vehicle()), rows(Vehicle())
-    shares = np.random.default_rng(0).random((200, len(draw.names)))
-    drawn = draw.of(shares)
-    table, before = draw.table(drawn), paper["rotor"]["thrust_coefficient"]
+    sampler = AircraftSampler(Randomization(one_rotor=(0.8, 0.8)), Vehicle())
+    paper = rows(Vehicle())
+    shares = np.random.default_rng(0).random((200, len(sampler.names)))
+    drawn = sampler.sample(shares)
+    table, before = sampler.table(drawn), paper["rotor"]["thrust_coefficient"]
     factor = table["rotor"]["thrust_coefficient"][:, :4] / before[:, :4]
     assert set(np.round(np.sort(factor, axis=1), 9).ravel()) == {0.8, 1.0}
     assert (np.isclose(factor, 0.8).sum(axis=1) == 1).all()
     assert set(np.argmin(factor, axis=1)) == {0, 1, 2, 3}
     np.testing.assert_array_equal(np.argmin(factor, axis=1), drawn[:, -1])
     with refused("rotors"):
-        Draw(Randomization(one_rotor=(0.01, 0.01)), Vehicle())
+        AircraftSampler(Randomization(one_rotor=(0.01, 0.01)), Vehicle())
 
 
 def test_all_fly_the_same_episodes(card):

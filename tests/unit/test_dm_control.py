@@ -109,7 +109,7 @@ def test_task_options_vehicle_and_randomization_arrive():
     assert len(fly(environment)) < len(fly(quadrl.load("hover", {"random": 0})))
     drawn = quadrl.load("hover", {"random": 0, "randomization": {"mass": (1.1, 1.2)}})
     drawn.reset()
-    assert 1.1 < drawn.task.environment.disturbances.shown()["mass"][0] < 1.2
+    assert 1.1 < drawn.task.environment.randomizer.shown()["mass"][0] < 1.2
     assert drawn.step(np.zeros(4)).observation["velocity"].any()
 
 

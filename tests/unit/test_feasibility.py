@@ -18,7 +18,7 @@ from quadrl.aircraft.presets import VEHICLES, resolve
 from quadrl.aircraft.rotors import GRAVITY, mixer
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlWarning
-from quadrl.conditions.draw import Draw
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.control import feasibility
 from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
 from quadrl.evaluation import card_figures
@@ -84,7 +84,7 @@ def test_an_action_of_1_lifts_what_is_in_reach_and_no_more():
     masses = {"mass": (1.30, 1.37)}
     environment = helpers.flying(count=8, engine="free_flight", randomization=masses)
     assert MOST == pytest.approx(1.334, abs=1e-3)
-    drawn = environment.disturbances.shown()["mass"]
+    drawn = environment.randomizer.shown()["mass"]
     climb = before = np.zeros(8)  # [m/s]
     for _ in range(16):  # 0.8 s, over four times the lag
         environment.step(np.ones((8, 4)))
@@ -138,17 +138,17 @@ def test_evaluate_says_what_no_policy_can_do():
 
 def test_the_scale_that_is_named_is_enough():
     for drawn in (WEAK, {"mass": (0.5, 1.0)}, {"mass": (1.0, 1.5)}):
-        share, lack, enough = unreached(PAPER, Draw(drawn, PAPER))
+        share, lack, enough = unreached(PAPER, AircraftSampler(drawn, PAPER))
         wide = resolve("paper", {"action_scale": enough})
-        assert unreached(wide, Draw(drawn, wide))[0] == 0
-        table = np.concatenate(feasibility.samples(wide, Draw(drawn, wide)))
+        assert unreached(wide, AircraftSampler(drawn, wide))[0] == 0
+        table = np.concatenate(feasibility.samples(wide, AircraftSampler(drawn, wide)))
         assert Reach(wide, table).loads(enough)[1].min() >= MARGIN * (1 - 1e-6)
         if drawn == {"mass": (0.5, 1.0)}:  # too light: -1 asks for too much
             assert "an action of -1 commands 190.7" in lack and share > feasibility.FEW
 
 
 def test_the_share_is_that_of_the_masses_out_of_reach():
-    share, _, _ = unreached(PAPER, Draw({"mass": (1.0, 1.5)}, PAPER))
+    share, _, _ = unreached(PAPER, AircraftSampler({"mass": (1.0, 1.5)}, PAPER))
     assert share == pytest.approx((1.5 - MOST) / 0.5, abs=0.03)
 
 
@@ -168,7 +168,7 @@ def test_what_ships_can_hover_wherever_it_was_trained(name):
     vehicle = policy.make_vehicle()
     given = policy.conditions.get("randomization")
     assert ("mass" in (given or {})) == robust
-    assert unreached(vehicle, Draw(given, vehicle))[0] == 0
+    assert unreached(vehicle, AircraftSampler(given, vehicle))[0] == 0
 
 
 def test_the_variant_robust_and_the_preset_light_are_flown_without_a_warning():
@@ -179,7 +179,7 @@ def test_the_variant_robust_and_the_preset_light_are_flown_without_a_warning():
         feasibility.warn_of_unreached(vehicle, "light")
     # A corner of one in a hundred is no reason; a quarter is.
     racer = VEHICLES["racer"]
-    assert 0 < unreached(racer, Draw("full", racer))[0] < feasibility.FEW
+    assert 0 < unreached(racer, AircraftSampler("full", racer))[0] < feasibility.FEW
     feasibility.warn_of_unreached(racer, "full")
     with pytest.warns(QuadrlWarning, match="28 %"):
         feasibility.warn_of_unreached(VEHICLES["crazyflie"], "full")

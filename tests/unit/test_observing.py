@@ -71,7 +71,7 @@ def test_histories_are_those_of_the_flight_the_newest_first():
 def test_observations_are_as_late_as_is_drawn_for_each_row():
     usual, _ = seen(None)
     found, environment = seen(None, randomization={"observation_delay": (0.0, 0.15)})
-    late = np.rint(environment.disturbances.shown()["observation_delay"] / 0.05).astype(int)
+    late = np.rint(environment.randomizer.shown()["observation_delay"] / 0.05).astype(int)
     assert len(set(late)) > 1
     for t, one in enumerate(found):
         for row, steps in enumerate(late):
@@ -136,7 +136,7 @@ def test_the_privileged_observation_is_the_truth_what_was_drawn_and_the_wind():
     settings = {"randomization": "full", "weather": "light"}
     found, environment = seen({"privileged": True}, **settings)
     privileged, state = environment.privileged, environment.engine.state
-    shown = environment.disturbances.shown()
+    shown = environment.randomizer.shown()
     true = flat(environment.task.observe(environment.snapshot), environment.task.observation)
     np.testing.assert_array_equal(privileged[:, :22], true)
     assert (flat(found[-1], environment.task.observation) != true).any()
@@ -178,7 +178,7 @@ def test_every_api_observes_alike_and_tells_what_was_drawn(api):
         np.testing.assert_array_equal(found, core.flatten(now.observation))
     np.testing.assert_array_equal(flown.core.privileged, core.privileged)
     if api.__name__ in ("Gymnasium", "Vector"):
-        info, shown = given[-1], core.disturbances.shown()
+        info, shown = given[-1], core.randomizer.shown()
         mass = np.reshape(info["drawn"]["mass"], -1)
         np.testing.assert_array_equal(mass, shown["mass"])
         assert info["drawn"].names == tuple(shown)
@@ -207,7 +207,7 @@ def test_a_vector_tells_what_was_drawn_for_the_present_episode(mode):
         *_, info = environment.step(np.zeros((3, 4)))
     if mode == "DISABLED":
         _, info = environment.reset(options={"reset_mask": np.array([True, True, True])})
-    now = environment.environment.disturbances.shown()["mass"]
+    now = environment.environment.randomizer.shown()["mass"]
     np.testing.assert_array_equal(info["drawn"]["mass"], now)
     assert (now != first).all()
 

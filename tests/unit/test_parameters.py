@@ -9,12 +9,14 @@ import pytest
 from helpers import EVERYTHING, drawn, flying
 
 from quadrl import tasks
+from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES, in_real_air
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import PARAMETERS
-from quadrl.conditions.draw import EACH_ROTOR
+from quadrl.conditions import sampler
 from quadrl.conditions.randomization import FACTORS
+from quadrl.conditions.sampler import EACH_ROTOR, AircraftSampler, vehicle_of
 from quadrl.core.environment import Environment
 from quadrl.engines import mjcf
 from quadrl.engines import mujoco as engines
@@ -51,7 +53,7 @@ def test_a_row_flies_as_the_aircraft_that_is_built_with_its_numbers(task, name, 
     environment = flying(task, vehicle=vehicle, engine=engine, randomization=randomization)
     copies = []
     for i, row in enumerate(environment.engine.parameters):
-        own = helpers.vehicle_of_row(vehicle, row)
+        own = vehicle_of(vehicle, row)
         np.testing.assert_allclose(row["rotor"]["hover_speed"][: own.rotor_count], own.hover_speed)
         np.testing.assert_allclose(row["resolved_turn"], own.resolved_turn)
         np.testing.assert_allclose(row["resolved_speed"], own.resolved_speed)
@@ -128,7 +130,7 @@ def test_the_fields_of_a_row_are_those_that_mujoco_compiles():
         engine = flying(randomization=drawn).engine
         for name in compared:
             for row, field in zip(engine.parameters, engine.batch.expand(name), strict=True):
-                model = mjcf.compile_model(helpers.vehicle_of_row(PAPER, row), drawn=False)
+                model = mjcf.compile_model(vehicle_of(PAPER, row), drawn=False)
                 np.testing.assert_allclose(field, getattr(model, name), rtol=1e-14, err_msg=name)
 
 
@@ -137,7 +139,7 @@ def test_the_fields_of_a_row_are_those_that_mujoco_compiles():
 
 def test_what_is_drawn_lies_in_its_range_and_differs_by_rotor_row_and_episode():
     environment = flying(count=200)
-    shown, table = environment.disturbances.shown(), environment.engine.parameters.copy()
+    shown, table = environment.randomizer.shown(), environment.engine.parameters.copy()
     ends = {name: getattr(EVERYTHING, name) for name in FACTORS}
     ends |= {f"{name}_{k}": EVERYTHING.rotors for name in EACH_ROTOR for k in range(1, 5)}
     ends |= {f"centre_of_mass_{axis}": (-0.002, 0.002) for axis in "xyz"}
@@ -298,3 +300,46 @@ def test_a_randomization_that_holds_what_cannot_be_is_refused(randomization, nam
     error = caught.value
     assert error.name == name and allowed in error.allowed
     assert value is ... or error.value == value
+
+
+def hovers(vehicle, low, high):
+    """Whether aircraft hover with every combination of weak and strong rotors."""
+    sampled, count = AircraftSampler("none", vehicle), vehicle.rotor_count
+    ends = np.indices((2,) * (2 * count)).reshape(2 * count, -1).T
+    drawn = np.tile(sampled.low, (len(ends), 1))
+    sampled.columns(drawn, "thrust_1", 2 * count)[:] = np.where(ends, high, low)
+    rotor = sampled.table(drawn)["rotor"][:, :count]
+    return bool(((rotor["hover_speed"] > 0) & (rotor["hover_speed"] < rotor["max_speed"])).all())
+
+
+@pytest.mark.parametrize("name", [k for k, v in helpers.LAYOUTS.items() if v.rotor_count < 7])
+def test_unlike_rotors_are_refused_if_any_combination_of_them_cannot_hover(name):
+    vehicle, refused = helpers.LAYOUTS[name], []
+    for width in (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.8):
+        ends = (1 - width, 1 + width)
+        try:
+            AircraftSampler({"rotors": ends}, vehicle)
+        except QuadrlError:
+            refused.append(width)
+        assert hovers(vehicle, *ends) == (width not in refused)
+    assert refused
+
+
+def test_eight_rotors_are_drawn_without_building_every_combination(monkeypatch):
+    built, refresh = [], parameters.refresh
+    counted = lambda table, step: (built.append(len(table)), refresh(table, step))  # noqa: E731
+    monkeypatch.setattr(parameters, "refresh", counted)
+    whole = flying(count=3, seed=7, vehicle=helpers.LAYOUTS["eight"], randomization="light")
+    assert sum(built) < 2000  # 4^8 combinations are 65,536
+    single = flying(count=1, seed=8, vehicle=helpers.LAYOUTS["eight"], randomization="light")
+    np.testing.assert_array_equal(drawn(whole)[1], drawn(single)[0])
+    assert len(np.unique(whole.engine.parameters["rotor"]["thrust_coefficient"][:, :8])) == 24
+    assert not helpers.idle(whole).terminated.any()
+
+
+def test_a_drawn_aircraft_that_cannot_hover_is_refused_and_changes_nothing(monkeypatch):
+    monkeypatch.setattr(sampler, "EXCHANGES", 0)  # so that it is not found before
+    environment = Environment("hover", num_envs=200, seed=0, randomization={"rotors": (0.4, 1.6)})
+    with pytest.raises(QuadrlError, match="rotors = .* narrower range"):
+        environment.reset()
+    assert (environment.engine.parameters["mass"] == 0.65).all() and not environment._episodes.any()

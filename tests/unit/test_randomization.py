@@ -41,11 +41,11 @@ def test_row_i_is_disturbed_as_the_single_aircraft_of_seed_plus_i(engine, mode):
     settings |= {"randomization": WILD, "observe": SEEN}
     actions = helpers.random_actions(20, 3)
     whole = helpers.flying(task, count=3, seed=40, **settings)
-    drawn, records = whole.disturbances.drawn, helpers.fly(whole, actions)
+    drawn, records = whole.randomizer.drawn, helpers.fly(whole, actions)
     told = whole.privileged
     for i in range(3):
         single = helpers.flying(task, count=1, seed=40 + i, **settings)
-        np.testing.assert_array_equal(single.disturbances.drawn[0], drawn[i])
+        np.testing.assert_array_equal(single.randomizer.drawn[0], drawn[i])
         helpers.assert_records(helpers.fly(single, actions[:, i : i + 1]), records, [i])
         np.testing.assert_array_equal(single.privileged[0], told[i])
 
@@ -54,14 +54,14 @@ def test_presets_fit_every_aircraft():
     for vehicle in VEHICLES:
         for name in RANDOMIZATIONS:
             environment = helpers.begun("hover", 2, vehicle=vehicle, randomization=name)
-            assert (environment.disturbances.shown() == {}) == (name == "none")
+            assert (environment.randomizer.shown() == {}) == (name == "none")
             assert np.isfinite(helpers.idle(environment).reward).all()
 
 
 def test_none_is_the_usual_flight_and_remembers_nothing():
     for given in (None, "none", {}, {"mass": 1.0}, Randomization()):
         environment = helpers.begun("hover", 2, randomization=given)
-        assert environment.observer is None and not environment.disturbances.active
+        assert environment.observer is None and not environment.randomizer.active
         assert not any(name.startswith("disturbances") for name in environment.save())
 
 
@@ -111,7 +111,7 @@ def test_the_commands_of_loops_are_late_too():
 
 def test_each_row_has_a_delay_of_its_own_and_every_one_is_drawn_as_often():
     environment = helpers.begun("hover", 500, randomization={"command_delay": (0.01, 0.04)})
-    drawn = environment.disturbances.shown()["command_delay"]
+    drawn = environment.randomizer.shown()["command_delay"]
     values, counts = np.unique(drawn.round(9), return_counts=True)
     np.testing.assert_allclose(values, [0.01, 0.02, 0.03, 0.04])
     # 125 of each; a binomial of 500 and 1/4 has a deviation of 9.7.
@@ -146,7 +146,7 @@ def test_the_noise_is_white_of_the_sizes_that_are_given_and_the_bias_lasts():
     for _ in range(6):
         found.append(errors(environment))
         helpers.idle(environment)
-    found, shown = np.array(found), environment.disturbances.shown()
+    found, shown = np.array(found), environment.randomizer.shown()
     lasting = np.stack([shown[f"{name}_bias_{axis}"] for name in vars(bias) for axis in "xyz"], 1)
     assert (np.abs(lasting) <= bias.sizes).all()
     assert (np.ptp(lasting, axis=0) > 1.9 * bias.sizes).all()
@@ -162,14 +162,14 @@ def test_the_noise_is_white_of_the_sizes_that_are_given_and_the_bias_lasts():
     assert np.abs(related - np.eye(24)).max() < 5 / math.sqrt(2000)
     first = lasting.copy()
     environment.reset()
-    again = environment.disturbances.shown()["position_bias_x"]
+    again = environment.randomizer.shown()["position_bias_x"]
     assert (again != first[:, 0]).all()
 
 
 def test_the_noise_is_the_definition_bit_for_bit():
     environment = helpers.begun("hover", 3, seed=2**40, randomization={"noise": SIZES})
     for step in range(4):
-        keys, episodes = environment.disturbances.place
+        keys, episodes = environment.randomizer.place
         words = uniform_array_api(keys, episodes, NOISE, 24 * step, 24) * 2.0**32
         halves = np.floor(words / 65536) + words % 65536
         normal = (halves[:, ::2] + halves[:, 1::2] - 131070) * (math.sqrt(3) / 65536)
@@ -245,7 +245,7 @@ def test_the_pushes_are_the_definition():
     # Eight numbers a control step: whether it hits, two directions by height and heading.
     pushes = Pushes(rate=20.0, velocity=0.5, body_rate=1.0)
     environment = helpers.begun("hover", 20, seed=2**40, randomization={"pushes": pushes})
-    disturbances, qvel, hits = environment.disturbances, environment.engine.qvel, 0
+    disturbances, qvel, hits = environment.randomizer, environment.engine.qvel, 0
     for step in range(5):
         keys, episodes = disturbances.place
         u = uniform_array_api(keys, episodes, PUSHES, 8 * step, 8)
@@ -283,7 +283,7 @@ def test_each_row_has_a_share_of_the_weather():
         "hover", num_envs=200, seed=0, weather="light", randomization={"wind": (0.0, 1.0)}
     )
     environment.reset()
-    share = environment.disturbances.shown()["wind"]
+    share = environment.randomizer.shown()["wind"]
     mean = np.zeros((200, 2))
     for _ in range(40):
         helpers.idle(environment)

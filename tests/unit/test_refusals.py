@@ -107,8 +107,8 @@ def test_parameters_that_are_not_finite_end_in_a_line(count, drawn):
 COUNTERS = {
     "keys": (-1, 2**62),
     "episodes": (-1, 2**62),
-    "disturbances.place": (-1, 2**62),
-    "disturbances.steps": (-1, 2, 2**62),
+    "randomizer.place": (-1, 2**62),
+    "randomizer.steps": (-1, 2, 2**62),
     "weather.streams": (-1, 2**62),
     "weather.table": (-1.0, 2.0, np.nan),
     "episode.steps": (-1.0, 0.5, 2.0**62, np.nan),

@@ -1,7 +1,7 @@
 // What disturbs many aircraft at a control step: errors of the estimated state, and pushes.
 //
 // Random numbers are those of quadrl/engines/rng.py: a stream of each episode, BLOCKS of four words for each
-// control step. The numbers of quadrl/conditions/disturbances.py and quadrl/core/observer.py say which.
+// control step. The numbers of quadrl/conditions/randomizer.py and quadrl/core/observer.py say which.
 #include <math.h>
 #include <stdint.h>
 

@@ -1,0 +1,155 @@
+"""Apply a randomization to rows of aircraft: their parameters, late commands, and pushes.
+
+Everything that the next steps depend on stands in arrays that are saved and restored, and every
+random number follows from the seed of its row, the episode and the control step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.philox import PARAMETERS, PUSHES
+from quadrl.base.rotation import Array
+from quadrl.conditions.sampler import AircraftSampler
+from quadrl.conditions.weather import Weather
+from quadrl.engines import native
+from quadrl.engines.engine import Engine
+from quadrl.engines.rng import uniform
+
+SAVED = ("drawn", "place", "steps", "queue", "newest")
+
+
+class Randomizer:
+    """Randomizes N aircraft."""
+
+    def __init__(self, sampler: AircraftSampler, engine: Engine, *, active: bool) -> None:
+        """Set up the arrays.
+
+        Args:
+            sampler: Samples what is drawn.
+            engine: Flies the aircraft.
+            active: Whether anything follows from what is drawn; nothing is drawn otherwise.
+        """
+        self.sampler, self._engine, self.active = sampler, engine, active
+        count, rotors = engine.ctrl.shape
+        given, vehicle = sampler.randomization, engine.vehicle
+        self._rows = np.arange(count)
+        self.drawn = np.tile(sampler.low, (count, 1))
+        """Numbers of the present episodes, (N, k), by `sampler.names`; replaced, never changed."""
+        self.place = np.zeros((2, count), np.int64)
+        """Seeds and numbers of the present episodes."""
+        self.steps = np.zeros(count, np.int64)
+        """Control steps since their start."""
+        self._pushes = given.pushes
+        self._chance = -math.expm1(-given.pushes.rate * vehicle.control_timestep)
+        longest = sampler.delays[0][1]
+        self.late = longest > 0
+        """Whether commands pass a queue; the rotors then get one at each physics step."""
+        self.queue = np.zeros((longest + 1, count, rotors))  # [rad/s]
+        self.newest = np.zeros(1, np.int64)  # where in the queue
+        self._delay = np.zeros(count, np.int64)  # [physics steps]
+
+    def sample(
+        self, keys: np.ndarray, episodes: np.ndarray
+    ) -> tuple[Array | None, np.ndarray | None]:
+        """What episodes (n,) draw, which changes nothing yet.
+
+        Returns:
+            Numbers (n, k), None where nothing follows from them, and rows of parameters (n,), None
+            where all aircraft are the specified one.
+
+        Raises:
+            QuadrlError: One of the aircraft cannot hover.
+        """
+        if not self.active:
+            return None, None
+        sampler = self.sampler
+        drawn = sampler.sample(uniform(keys, episodes, PARAMETERS, 0, len(sampler.names)))
+        if not sampler.randomization.per_row:
+            return drawn, None
+        table = sampler.table(drawn)
+        sampler.check_hover(table)
+        return drawn, table
+
+    def begin(
+        self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray, drawn: Array | None
+    ) -> None:
+        """Begin episodes (n,) with the numbers that `sample` gave, the aircraft in their place.
+
+        Until the first command arrives, the rotors keep their speed.
+        """
+        if drawn is None:
+            return
+        self.place[:, rows], self.steps[rows] = (keys, episodes), 0
+        self.drawn = self.drawn.copy()
+        self.drawn[rows] = drawn
+        self._set_delay()
+        if self.late:
+            self.queue[:, rows] = self._engine.act[rows]
+
+    def column(self, name: str) -> Array:
+        """A number of the present episodes by its name, (N,)."""
+        return self.sampler.columns(self.drawn, name)[:, 0]
+
+    def shown(self) -> dict[str, Array]:
+        """What differs from aircraft to aircraft, (N,) by name."""
+        return {self.sampler.names[k]: self.drawn[:, k] for k in self.sampler.spread}
+
+    def _set_delay(self) -> None:
+        steps = self.column("command_delay") / self._engine.vehicle.physics_timestep
+        self._delay = np.rint(steps).astype(np.int64)
+
+    def wind_speed(self, rows: np.ndarray, weather: Weather) -> Array | None:
+        """Wind speed of some aircraft (n,) [m/s]; None where it is the weather's."""
+        if self.sampler.randomization.wind == (1.0, 1.0):
+            return None
+        return weather.wind_speed * self.column("wind")[rows]
+
+    def delayed(self, command: Array) -> Array:
+        """What the rotors get for a physics step, after a command, both (N, R) [rad/s]."""
+        if not self.late:
+            return command
+        length = len(self.queue)
+        self.newest[0] = newest = (self.newest[0] + 1) % length
+        self.queue[newest] = command
+        return self.queue[(newest - self._delay) % length, self._rows]
+
+    def begin_step(self) -> None:
+        """Count a control step that begins, and push the aircraft that chance hits."""
+        if self._chance > 0:
+            keys, episodes = (array.ctypes.data for array in self.place)
+            place = keys, episodes, self.steps.ctypes.data, PUSHES
+            hit = self._chance, self._pushes.velocity, self._pushes.body_rate
+            qvel = self._engine.qvel
+            rows = qvel.ctypes.data, qvel.strides[0] // 8
+            native.library().quadrl_push(len(self.steps), *place, *hit, *rows)
+        self.steps += 1
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Copies of the arrays."""
+        return {name: np.array(getattr(self, name)) for name in SAVED}
+
+    def check_saved(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Refuse what `save` cannot have given, under its names in a saved environment.
+
+        Raises:
+            QuadrlError: The message names the array.
+        """
+        drawn, newest = saved["randomizer.drawn"], saved["randomizer.newest"]
+        for name, value, within in (
+            ("drawn", drawn, self.sampler.contains(drawn)),
+            ("newest", newest, ((newest >= 0) & (newest < len(self.queue))).all()),
+        ):
+            if not within:
+                allowed = "of an environment with the same randomization"
+                raise QuadrlError(name=f"randomizer.{name}", value=value, allowed=allowed)
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Restore what `save` returned."""
+        for name, value in saved.items():
+            setattr(self, name, np.array(value))
+        self._set_delay()

@@ -1,0 +1,231 @@
+"""Sample aircraft parameters: the rows that a randomization makes of a specified aircraft."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from typing import Any
+
+import numpy as np
+
+from quadrl.aircraft import parameters
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
+from quadrl.base.validation import number
+from quadrl.conditions.randomization import (
+    AFFECTS,
+    DELAYS,
+    FACTORS,
+    NONE,
+    OFF,
+    Randomized,
+    Range,
+    resolve,
+)
+
+EACH_ROTOR = ("thrust", "torque", "lag")
+"""Factors that each rotor has once more on its own, within `Randomization.rotors`."""
+DAMAGED = "damaged_rotor"
+"""Number of the rotor, from 0 on, that `Randomization.one_rotor` is about."""
+ROUNDING = 1e-9
+EXCHANGES = 3
+"""Rounds that suffice: in layouts of four to eight rotors, more find no worse aircraft."""
+WHOLE = 1e-6  # of a step, within which a delay is a whole number of them
+
+
+class AircraftSampler:
+    """The numbers that episodes draw from a randomization, and the aircraft that they make."""
+
+    def __init__(self, randomization: Randomized, vehicle: Vehicle) -> None:
+        """Validate for a vehicle.
+
+        Raises:
+            QuadrlError: It is what `resolve` refuses, a delay is not a multiple of the time step,
+                or an aircraft at the ends of the ranges cannot exist or cannot hover.
+        """
+        self.randomization = randomization = resolve(randomization)
+        self._vehicle, self._specified = vehicle, parameters.rows(vehicle)
+        timesteps = (vehicle.physics_timestep, vehicle.control_timestep)
+        self.delays = [
+            _steps(name, getattr(randomization, name), timestep)
+            for name, timestep in zip(DELAYS, timesteps, strict=True)
+        ]
+        """Fewest and most steps: physics steps of commands, control steps of observations."""
+        ends = {name: getattr(randomization, name) for name in (*FACTORS, *DELAYS, "wind")}
+        shift = randomization.centre_of_mass
+        ends |= {f"centre_of_mass_{axis}": (-shift, shift) for axis in "xyz"}
+        for name, size in vars(randomization.bias).items():
+            ends |= {f"{name}_bias_{axis}": (-size, size) for axis in "xyz"}
+        rotors = range(1, vehicle.rotor_count + 1)
+        ends |= {f"{name}_{k}": randomization.rotors for name in EACH_ROTOR for k in rotors}
+        # New numbers stand at the end, so that those before them keep their random numbers.
+        last = vehicle.rotor_count - 1 if randomization.one_rotor != OFF else 0
+        ends |= {"one_rotor": randomization.one_rotor, DAMAGED: (0, last)}
+        self.names = tuple(ends)
+        """Of the numbers; all are drawn, so that a range has no effect on the others."""
+        whole = zip((*DELAYS, DAMAGED), (*self.delays, (0, last)), (*timesteps, 1.0), strict=True)
+        self._whole = [(self.names.index(name), ends, unit) for name, ends, unit in whole]
+        self.low, self._high = np.array([*ends.values()]).T
+        self._width = self._high - self.low
+        self.spread = np.flatnonzero(self._width)
+        """Which of them differ from aircraft to aircraft."""
+        if randomization != NONE:
+            self._check_ends()
+        if randomization.per_row:
+            self.check_hover(self.table(self._corners()))
+
+    def sample(self, shares: Array) -> Array:
+        """Numbers (n, k), a column for each of `names`, from shares in [0, 1) of the ranges."""
+        drawn = self.low + self._width * shares
+        for k, (fewest, most), unit in self._whole:
+            drawn[:, k] = (fewest + np.floor((most - fewest + 1) * shares[:, k])) * unit
+        return drawn
+
+    def contains(self, drawn: Array) -> bool:
+        """Whether numbers (n, k) lie in their ranges."""
+        room = ROUNDING * np.maximum(np.abs(self.low), np.abs(self._high))
+        return bool(((drawn >= self.low - room) & (drawn <= self._high + room)).all())
+
+    def columns(self, drawn: Array, name: str, count: int = 1) -> Array:
+        """Columns (n, count) of drawn numbers, from the one of a name on."""
+        first = self.names.index(name)
+        return drawn[:, first : first + count]
+
+    def scaled(self, drawn: Array) -> Array:
+        """Those that differ, (n, ...), from -1 at the lowest to 1 at the highest."""
+        low, width = self.low[self.spread], self._width[self.spread]
+        return 2 * (drawn[:, self.spread] - low) / width - 1
+
+    def table(self, drawn: Array) -> np.ndarray:
+        """Rows of parameters (n,) of aircraft with some numbers (n, k)."""
+        count = self._vehicle.rotor_count
+        table = np.repeat(self._specified, len(drawn))
+        for name in (*FACTORS, "one_rotor"):
+            factor = self.columns(drawn, name)
+            if name in EACH_ROTOR:
+                factor = factor * self.columns(drawn, f"{name}_1", count)
+            elif name == "one_rotor":
+                factor = np.where(np.arange(count) == self.columns(drawn, DAMAGED), factor, 1.0)
+            # The lag is a time and the parameter a rate.
+            apply = np.divide if name == "lag" else np.multiply
+            for field in AFFECTS[name]:
+                numbers = self._field(table, field)
+                apply(numbers, factor, out=numbers)
+        # The origin of the body is the centre of mass: what moves are the rotors.
+        shift = self.columns(drawn, "centre_of_mass_x", 3)
+        self._field(table, *AFFECTS["centre_of_mass"])[:] -= shift[:, None]
+        parameters.refresh(table, self._vehicle.physics_timestep)
+        return table
+
+    def _field(self, table: np.ndarray, name: str) -> np.ndarray:
+        """A view of a field of rows, as `AFFECTS` names it: (n, 1), (n, 3), (n, R), (n, R, 3)."""
+        if name.startswith("rotor."):
+            return table["rotor"][name.removeprefix("rotor.")][:, : self._vehicle.rotor_count]
+        return table[name].reshape(len(table), -1)
+
+    def explains(self, saved: np.ndarray) -> bool:
+        """Whether rows of parameters differ from the specified ones only in what may be drawn."""
+        table = saved.copy().view(parameters.AIRCRAFT)[:, 0]
+        own = np.repeat(self._specified, len(table))
+        for name in self.randomization.given().keys() & AFFECTS.keys():
+            for field in AFFECTS[name]:
+                self._field(own, field)[:] = self._field(table, field)
+        parameters.refresh(own, self._vehicle.physics_timestep)
+        return np.array_equal(own.view(np.float64).reshape(saved.shape), saved)
+
+    # ------------------------------------------------------------------- what cannot fly
+
+    def _at(self, count: int, **columns: Any) -> Array:
+        """Numbers (count, k): some columns, each from a name on, and the lowest of the others."""
+        drawn = np.tile(self.low, (count, 1))
+        for name, values in columns.items():
+            self.columns(drawn, name, np.atleast_1d(values).shape[-1])[:] = values
+        return drawn
+
+    def _check_ends(self) -> None:
+        """Build the aircraft at the ends of the ranges, which must be sound vehicles."""
+        given, count = self.randomization, self._vehicle.rotor_count
+        for heavy, inertia, drag in itertools.product((0, 1), repeat=3):
+            # Its mass at one end, what its rotors give at the other.
+            weak = 1 - heavy
+            ends = {"mass": heavy, "inertia": inertia, "drag": drag, "inflow": 1, "lag": 0}
+            ends |= {"thrust": weak, "torque": weak, "max_speed": weak}
+            columns: Any = {name: getattr(given, name)[end] for name, end in ends.items()}
+            columns |= {f"{name}_1": [given.rotors[ends[name]]] * count for name in EACH_ROTOR}
+            columns |= {"one_rotor": 1.0, "centre_of_mass_x": (0.0, 0.0, 0.0)}
+            try:
+                made = vehicle_of(self._vehicle, self.table(self._at(1, **columns))[0])
+                number("pushes velocity", given.pushes.velocity, 0, made.resolved_speed)
+                number("pushes body_rate", given.pushes.body_rate, 0, made.resolved_turn)
+            except QuadrlError as error:
+                where = f"in the {('lightest', 'heaviest')[heavy]} aircraft of this randomization"
+                reason = f"{error.reason}; {where}".removeprefix("; ")
+                raise QuadrlError(**vars(error) | {"reason": reason}) from error
+
+    def _corners(self) -> Array:
+        """Numbers (n, k) of the aircraft in which a rotor turns fastest, or slowest, in hover.
+
+        Thrust and torque of each rotor and the centre of mass lie at one end of their ranges; ends
+        are exchanged as long as that makes it faster, or slower.
+        """
+        given, count = self.randomization, self._vehicle.rotor_count
+        first, second = (self.names.index(name) for name in ("thrust_1", "centre_of_mass_x"))
+        places = np.r_[first : first + 2 * count, second : second + 2]
+        both = (self.low + self._high)[places]
+        damaged = range(count if given.one_rotor != OFF else 1)
+        cases = np.array([*itertools.product(range(count), (-1, 1), damaged)])
+        columns: Any = {"mass": given.mass[1], DAMAGED: cases[:, 2:], "centre_of_mass_z": 0.0}
+        drawn = self._at(len(cases), **columns)
+        for _ in range(EXCHANGES):
+            # Each aircraft as it is, and with one end exchanged after the other.
+            tried = np.repeat(drawn[:, None], 1 + len(places), axis=1)
+            each = np.arange(len(places))
+            tried[:, 1 + each, places] = both - tried[:, 1 + each, places]
+            rotor = self.table(tried.reshape(-1, tried.shape[-1]))["rotor"][:, :count]
+            load = (rotor["hover_speed"] / rotor["max_speed"]).reshape(*tried.shape[:2], -1)
+            load = np.take_along_axis(load, cases[:, :1, None], axis=-1)[..., 0] * cases[:, 1:2]
+            worse = load[:, 1:] > load[:, :1]
+            drawn[:, places] = np.where(worse, both - drawn[:, places], drawn[:, places])
+        return drawn
+
+    def check_hover(self, table: np.ndarray) -> None:
+        """Refuse rows of parameters (n,) of which one cannot hover.
+
+        Raises:
+            QuadrlError: The message has the coefficients of its rotors.
+        """
+        rotor = table["rotor"][:, : self._vehicle.rotor_count]
+        hover = rotor["hover_speed"]
+        unable = ((hover <= 0) | (hover >= rotor["max_speed"])).any(axis=-1)
+        if unable.any():
+            reason = "each rotor is drawn alone, and with such rotors it cannot hover"
+            names = ("thrust_coefficient", "torque_coefficient")
+            worst = {name: rotor[name][unable][0].tolist() for name in names}
+            raise QuadrlError(reason, name="rotors", value=worst, allowed="a narrower range")
+
+
+def vehicle_of(vehicle: Vehicle, row: np.void) -> Vehicle:
+    """A vehicle like another one, with the numbers of a row that a randomization can change."""
+    affected = {field.rpartition(".")[2] for fields in AFFECTS.values() for field in fields}
+
+    def made(part: Any, numbers: np.void, **own: Any) -> Any:
+        names = affected & {field.name for field in dataclasses.fields(part)}
+        return dataclasses.replace(part, **{n: numbers[n].tolist() for n in names}, **own)
+
+    rotors = tuple(made(*pair) for pair in zip(vehicle.rotors, row["rotor"], strict=False))
+    return made(vehicle, row, rotors=rotors, aerodynamics=made(vehicle.aerodynamics, row))
+
+
+def _steps(name: str, delay: Range, timestep: float) -> tuple[int, int]:
+    """A delay [s] in steps.
+
+    Raises:
+        QuadrlError: It is not a multiple of the time step.
+    """
+    fewest, most = (round(end / timestep) for end in delay)
+    if any(abs(end / timestep - round(end / timestep)) > WHOLE for end in delay):
+        kind = "physics" if name == DELAYS[0] else "control"
+        allowed = f"a whole number of {kind} steps of {timestep:g} s"
+        raise QuadrlError(name=name, value=delay, allowed=allowed)
+    return fewest, most
