@@ -38,8 +38,8 @@ class Hover(Task):
         "ppo": {"learning_rate": 1e-2, "beta2": 0.99},
     }
     training_with = {
-        # Flights from the edge of what was practised fail more often.
-        "ppo": {"practice": {"tilt": 0.3, "spin": 0.6}},
+        # Flights from the edge of what was trained on fail more often.
+        "ppo": {"training_options": {"tilt": 0.3, "spin": 0.6}},
         # Chosen by `scripts/report search`.
         "vpg": {
             "num_envs": 32,
@@ -58,7 +58,7 @@ class Hover(Task):
             "apg": {"step": 0.4},
         },
     }
-    variants = {"robust": {"steps": 4_096_000, "practice": {"tilt": 0.2, "spin": 0.3}}}
+    variants = {"robust": {"steps": 4_096_000, "training_options": {"tilt": 0.2, "spin": 0.3}}}
     heading_matters = True
 
     radius: float = 0.5

@@ -58,7 +58,7 @@ class Landing(Task):
     training = {"gamma": 0.98, "steps": 2_621_440}
     training_with = {
         # With the task's own weight, two of four policies come down before they have turned east.
-        "ppo": {"practice": {"attitude_weight": 60.0}, "ppo": {"beta2": 0.99}},
+        "ppo": {"training_options": {"attitude_weight": 60.0}, "ppo": {"beta2": 0.99}},
         # Chosen by `scripts/report search`.
         "vpg": {
             "num_envs": 128,

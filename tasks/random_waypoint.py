@@ -32,13 +32,13 @@ class RandomWaypoint(Task):
         Target("success_rate", "successful", 0.99, True),
         Target("position_error_m", "error over the last 2 s", 0.06, unit="cm"),
     )
-    training = {"steps": 3_276_800, "holds_goal": True, "practice": {"farthest": 3.0}}
+    training = {"steps": 3_276_800, "holds_goal": True, "training_options": {"farthest": 3.0}}
     training_with = {
-        "ppo": {"practice": IN_MOTION, "ppo": {"beta2": 0.99}},
-        "trpo": {"practice": IN_MOTION},
+        "ppo": {"training_options": IN_MOTION, "ppo": {"beta2": 0.99}},
+        "trpo": {"training_options": IN_MOTION},
         "apg": {"steps": 102_400, "holds_goal": False},
     }
-    variants = {"robust": {"steps": 4_096_000, "practice": {"farthest": 2.5, **AT_REST}}}
+    variants = {"robust": {"steps": 4_096_000, "training_options": {"farthest": 2.5, **AT_REST}}}
 
     nearest: float = 1.0
     """Smallest distance of the waypoint from the start [m]."""

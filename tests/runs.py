@@ -28,7 +28,7 @@ TINY = TrainConfig(
 
 
 def changed(**settings) -> TrainConfig:
-    other = {"practice": {}} if "task" in settings else {}  # hover's is no other task's
+    other = {"training_options": {}} if "task" in settings else {}  # hover's is no other task's
     return dataclasses.replace(TINY, **other | settings)
 
 

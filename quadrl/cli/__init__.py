@@ -27,7 +27,7 @@ from tyro.conf import (
 from quadrl import __version__
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.signals import IN_ORDER, Stopped, handling
-from quadrl.cli import choices, console
+from quadrl.cli import choices, console, train
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
 from quadrl.cli.evaluate import Evaluate
@@ -116,6 +116,8 @@ def main(arguments: list[str] | None = None) -> None:
 def parse(words: list[str], *, enforced: bool = False) -> Quadrl:
     """What the words of a command line ask for; prints what is wrong with them and exits with 2."""
     rules = choices.registry(enforced)
+    if words[:1] == ["train"] and {"-h", "--help"} & {*words}:
+        train.show_defaults(words[1:])
     return tyro.cli(Quadrl, args=words, prog="quadrl", config=(DisallowNone,), registry=rules)
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import dataclasses
+import functools
 import time
 import typing
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,8 +25,9 @@ from quadrl.cli.flown import parse_named, parse_options
 from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
-from quadrl.learning.defaults import PAIRS
+from quadrl.learning.defaults import PAIRS, flat
 from quadrl.learning.studies.plan import parse_seeds
+from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
     from quadrl.learning.run import Run
@@ -31,7 +36,32 @@ if TYPE_CHECKING:
 FEW = 16  # aircraft: with less, most of the time goes into calls from Python
 
 
-def optional(config: type) -> type:
+shown: dict[str, Any] = dict(flat(dataclasses.asdict(TrainConfig())))
+"""The defaults that help shows, by the names of the settings."""
+
+
+def show_defaults(words: Sequence[str]) -> None:
+    """Let help show the defaults of the task, algorithm, aircraft and variant that words name."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("algo", "vehicle", "variant"):
+        parser.add_argument(f"--{name}")
+    known, others = parser.parse_known_args(words)
+    with contextlib.suppress(QuadrlError):  # the parser says what is wrong
+        task = next((word for word in others if word in TASKS), TrainConfig.task)
+        config = TrainConfig(task, **vars(known))
+        shown.clear()
+        shown.update(flat(dataclasses.asdict(config)))
+
+
+def _default(name: str) -> str:
+    """The default of a setting, as help shows it."""
+    options = (f"{k[len(name) + 1 :]}={v}" for k, v in shown.items() if k.startswith(f"{name}."))
+    value = shown.get(name, tuple(options))
+    text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return f"(default: {'none' if text in ('', '{}') else text})"
+
+
+def optional(config: type, prefix: str = "") -> type:
     """A dataclass with the fields of another, all None by default: "not given".
 
     Only after everything is parsed does `TrainConfig` fill in the defaults of the task.
@@ -40,15 +70,14 @@ def optional(config: type) -> type:
     for field in dataclasses.fields(config):
         kind, help_text = choices.SETTINGS.get(field.name, hints[field.name]), texts[field.name]
         if dataclasses.is_dataclass(kind):
-            inner: Any = optional(typing.cast(type, kind))
+            inner: Any = optional(typing.cast(type, kind), f"{field.name}.")
             factory = dataclasses.field(default_factory=inner)
             fields.append((field.name, Annotated[inner, arg(help=help_text)], factory))
             continue
-        default: Any = field.default
-        shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
         if field.name in PAIRS:
-            kind, shown = tuple[str, ...], "none"
-        hint = arg(help=help_text, help_behavior_hint=f"(default: {shown})")
+            kind = tuple[str, ...]
+        hint = functools.partial(lambda name, _: _default(name), prefix + field.name)
+        hint = arg(help=help_text, help_behavior_hint=hint)
         if field.name in choices.SETTINGS:
             word = Positional[kind] if field.name == "task" else kind
             fields.append((field.name, Annotated[word, hint], kind("")))
@@ -64,8 +93,8 @@ Settings: Any = optional(TrainConfig)
 class Train:
     """Train a policy from scratch, evaluate it, and write results and pictures to a run folder.
 
-    The defaults shown are for ppo and the aircraft paper. A task, vpg, apg or another aircraft may
-    have others: quadrl tasks TASK lists those of a task.
+    The defaults shown are those of hover, ppo and the aircraft paper; with a task, --algo,
+    --vehicle or --variant beside --help, of those. --dry-run says where each setting comes from.
     """
 
     settings: Annotated[Settings, arg(name="")]  # pyright: ignore[reportInvalidTypeForm]
@@ -82,6 +111,8 @@ class Train:
     """Episodes of the evaluation at the end."""
     video: bool = True
     """Draw a flight at the end; with --seeds none is drawn."""
+    dry_run: bool = False
+    """Print every setting with its value and the layer of defaults it comes from; train nothing."""
 
     def run(self) -> None:
         """Train, sum up, draw."""
@@ -93,6 +124,11 @@ class Train:
             if name in settings:
                 settings[name] = parse_named(name, settings[name])
         task = settings.pop("task", None)
+        if self.dry_run:
+            config, _ = prepare(task, self.out, self.resume, settings)
+            rows = ((name, str(value), origin) for name, value, origin in config.sources())
+            console.print(make_table(("setting", "value", "from"), rows))
+            return
         if not self.seeds:
             run = self._train(*prepare(task, self.out, self.resume, settings))
             _draw(run, video=self.video)

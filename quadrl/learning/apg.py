@@ -17,8 +17,8 @@ from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
 from quadrl.learning.algorithm import Algorithm, shuffled
-from quadrl.learning.algorithm_config import APGConfig
 from quadrl.learning.environments import RecordingEnv
+from quadrl.learning.settings import APGConfig
 from quadrl.learning.window import Window
 
 FARTHEST = 2.0  # times the usual move of an action

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,16 +25,9 @@ from quadrl.control.modes import CONTROL_MODES
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import ENGINES, MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
-from quadrl.learning.algorithm_config import (
-    ALGORITHM_CONFIGS,
-    APGConfig,
-    PPOConfig,
-    TRPOConfig,
-    VPGConfig,
-)
-from quadrl.learning.defaults import PAIRS, training_defaults
+from quadrl.learning.defaults import CHOSEN, PAIRS, flat, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, free_folder, read_config
-from quadrl.learning.smooth import check_smooth
+from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
 
 ALGORITHMS = ("ppo", "trpo", "vpg", "apg")
 ALIASES = {"gae": "vpg"}
@@ -42,90 +36,13 @@ MAX_BATCH = 1 << 24
 """Most transitions in a batch: some GB."""
 MAX_WIDTH = 1 << 16
 MEMORIES = ("none", "gru")
+OLD_NAMES = {"practice": "training_options"}
+"""Settings that were renamed, as runs from before that have them."""
 
 
 @dataclasses.dataclass(frozen=True, init=False)
-class TrainConfig:
-    """All settings of a training but its folder.
-
-    The defaults below are those of a task that has none of its own in `Task.training`.
-    """
-
-    task: str = "hover"
-    """Name of the task."""
-    algo: str = "ppo"
-    """Algorithm: ppo, trpo, vpg (the plain policy gradient; the paper's name gae works too), or apg
-    (the gradient goes through the physics, which the paper's algorithms do not know)."""
-    seed: int = 0
-    """Seed of the networks, the exploration and the episodes, between 0 and 2^32 - 1."""
-    variant: str = "ideal"
-    """Settings that go together: ideal (the paper's episodes), or robust (an uncertain aircraft in
-    light wind, and a policy that sees what it needs for that)."""
-    vehicle: str = "paper"
-    """Name of the aircraft."""
-    vehicle_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Numbers of the aircraft that differ from it, such as mass=0.7 action_scale=90."""
-    control_mode: str = "rotor"
-    """Meaning of the actions: rotor (the paper's), thrust_body_rate, velocity or position."""
-    engine: str = "free_flight"
-    """Engine of the training: free_flight (MuJoCo only near the ground) or mujoco. Evaluations
-    always fly in mujoco."""
-    task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the task that differ from its defaults, such as time_limit=5."""
-    practice: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the task in the training alone, such as farthest=3: a policy is weakest at the
-    edge of what it practised."""
-    aerodynamics: str = ""
-    """Effects of the air on the rotors: none, full, or names of single ones with commas between
-    them; by default those of the aircraft."""
-    weather: Any = "calm"
-    """Weather of the training: calm, light, moderate or severe; or JSON such as
-    {"wind_speed": 5}, in Python a Weather."""
-    randomization: Any = "none"
-    """What is drawn for each aircraft at each reset and disturbs it: none, light or full; or JSON
-    such as {"mass": [0.8, 1.2]}, in Python a Randomization."""
-    observe: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the observation, such as action_history=2 rotor_speed=estimated."""
-    num_envs: int = 256
-    """Aircraft flown together."""
-    rollout: int = 16
-    """Control steps of each aircraft in a batch."""
-    steps: int = 1_310_720
-    """Control steps of all aircraft in the training."""
-    gamma: float = 0.93
-    """Discount per control step (effective horizon 0.7 s): with a short one a lasting
-    error costs more than one that is corrected."""
-    gae_lambda: float = 0.95
-    """Lambda of the generalised advantage estimation."""
-    reward_scale: float = 0.01
-    """Factor on the rewards, so that the critic's targets are of the order of 1."""
-    hidden: tuple[int, ...] = (128,)
-    """Widths of the policy's hidden layers; the paper has one of 128."""
-    critic_hidden: tuple[int, ...] = (64, 64)
-    """Widths of the critic's hidden layers."""
-    memory: str = "none"
-    """Memory of the policy: none (the paper's), or gru, a gated recurrent unit."""
-    memory_width: int = 64
-    """Numbers that a policy with a memory remembers."""
-    holds_goal: bool = False
-    """Whether the mean action at the goal is to hover, whatever the weights: the network's output
-    less its output there. It sees neither position nor, where the heading is free, yaw."""
-    initial_deviation: float = 1.0
-    """Standard deviation of the actions at the start."""
-    ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
-    """Settings of PPO."""
-    trpo: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
-    """Settings of TRPO."""
-    vpg: VPGConfig = dataclasses.field(default_factory=VPGConfig)
-    """Settings of the plain policy gradient."""
-    apg: APGConfig = dataclasses.field(default_factory=APGConfig)
-    """Settings of the analytic policy gradient."""
-    device: str = "cpu"
-    """Device of the networks, such as cuda; the simulation stays on the CPU."""
-    num_threads: int = 0
-    """Threads of the simulation; 0 for one per core. The results do not depend on it."""
-    checkpoint_seconds: float = 5.0
-    """Least time between two checkpoints [s]."""
+class TrainConfig(TrainSettings):
+    """All settings of a training but its folder; `sources` says where each comes from."""
 
     def __init__(self, task: str = "hover", **settings: Any) -> None:
         """Fill in what is not given: defaults of the task, else of the algorithm, else the above.
@@ -138,12 +55,12 @@ class TrainConfig:
         Raises:
             QuadrlError: A setting is unknown or out of range.
         """
+        settings = _given(renamed(settings))
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
-        settings = _given(settings)
         algo = settings.get("algo", TrainConfig.algo)
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
         named = (settings.get(name, getattr(TrainConfig, name)) for name in ("vehicle", "variant"))
-        values = training_defaults(_base(), task, algo, *named)
+        values, _ = training_defaults(_fields(), task, algo, *named)
         if settings.get("memory", values["memory"]) != "none":
             values["holds_goal"] = False  # what is remembered differs at the goal
         for name, kind in ALGORITHM_CONFIGS.items():
@@ -161,8 +78,8 @@ class TrainConfig:
         if isinstance(given := settings.get("observe"), Observing):
             settings["observe"] = given.given()
         if isinstance(given := settings.get("task_options"), dict):
-            usual = values["practice"]  # not in place of what is asked for
-            values["practice"] = {name: usual[name] for name in usual if name not in given}
+            usual = values["training_options"]  # not in place of what is asked for
+            values["training_options"] = {k: v for k, v in usual.items() if k not in given}
         for name in PAIRS:
             if isinstance(settings.get(name), dict):
                 settings[name] = values[name] | settings[name]
@@ -171,10 +88,28 @@ class TrainConfig:
         self._check()
 
     def __repr__(self) -> str:
-        usual = training_defaults(_base(), self.task, self.algo, self.vehicle, self.variant)
+        usual, _ = self._defaults()
         own = {k: v for k, v in vars(self).items() if v != usual.get(k) or k in ("algo", "seed")}
         given = ", ".join(f"{name}={value!r}" for name, value in own.items() if name != "task")
         return f"TrainConfig({self.task!r}, {given})"
+
+    def _defaults(self) -> tuple[dict[str, Any], dict[str, str]]:
+        return training_defaults(_fields(), self.task, self.algo, self.vehicle, self.variant)
+
+    def sources(self) -> Iterator[tuple[str, Any, str]]:
+        """Name, value and origin of every setting that this training uses.
+
+        The origin is a layer of `quadrl.learning.defaults`, or "given" where the value differs from
+        what the layers say.
+        """
+        usual, layers = self._defaults()
+        usual |= {name: getattr(TrainConfig, name) for name in CHOSEN}
+        others = {*ALGORITHMS} - {self.algo}
+        values = dict(flat(usual | {name: dataclasses.asdict(usual[name]) for name in ALGORITHMS}))
+        for name, value in flat(dataclasses.asdict(self)):
+            if name.partition(".")[0] not in others:
+                same = name in values and tuples(values[name]) == value
+                yield name, value, layers[name] if same else "given"
 
     def _check(self) -> None:
         for name, low, high, rest in (
@@ -213,12 +148,11 @@ class TrainConfig:
         if not isinstance(self.device, str) or not self.device:
             raise QuadrlError(name="device", value=self.device, allowed="a device of torch")
         self.make_task()
-        self.make_practice()
+        self.make_training_task()
         AircraftSampler(self.randomization, self.make_vehicle())
         Weather.of(self.weather)
         resolve_observing(self.observe)
-        if self.algo == "apg":
-            check_smooth(self)
+        getattr(self, self.algo).check(self)
 
     def conditions(self) -> dict[str, Any]:
         """What its aircraft meet that others do not, for whoever flies the policy."""
@@ -242,9 +176,9 @@ class TrainConfig:
         """The task with its options."""
         return tasks.make(self.task, **self.task_options)
 
-    def make_practice(self) -> Task:
+    def make_training_task(self) -> Task:
         """The task as it is trained."""
-        return tasks.make(self.task, **self.task_options | self.practice)
+        return tasks.make(self.task, **self.task_options | self.training_options)
 
     @property
     def iterations(self) -> int:
@@ -255,7 +189,7 @@ class TrainConfig:
         """The settings and everything that their names stand for, as JSON gives them back."""
         packages = ("mujoco", "torch", "torchrl", "numpy")
         whole = dataclasses.asdict(self) | {
-            "resolved_task": dataclasses.asdict(self.make_practice()),
+            "resolved_task": dataclasses.asdict(self.make_training_task()),
             "resolved_vehicle": dataclasses.asdict(self.make_vehicle()),
             "resolved_weather": dataclasses.asdict(Weather.of(self.weather)),
             "resolved_randomization": dataclasses.asdict(resolve(self.randomization)),
@@ -270,7 +204,7 @@ class TrainConfig:
         Raises:
             QuadrlError: The folder holds no run, or what its names stand for has changed since.
         """
-        saved = read_config(folder)
+        saved = renamed(read_config(folder))
         names = [field.name for field in dataclasses.fields(cls)]
         if missing := set(names) - set(saved):
             raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks {sorted(missing)[0]}")
@@ -314,10 +248,16 @@ def prepare(
     return config, free_folder(named) if out is None else Path(out)
 
 
-def _base() -> dict[str, Any]:
-    """The fields' defaults; those of an algorithm follow from the task."""
+def renamed(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings with those that a run was saved with under an old name under the present one."""
+    return {OLD_NAMES.get(name, name): value for name, value in settings.items()}
+
+
+def _fields() -> dict[str, Any]:
+    """The defaults of the fields, as a layer of the defaults."""
     names = [field.name for field in dataclasses.fields(TrainConfig)]
-    return {name: getattr(TrainConfig, name, {}) for name in names}
+    own = {name: dataclasses.asdict(kind()) for name, kind in ALGORITHM_CONFIGS.items()}
+    return {name: getattr(TrainConfig, name, {}) for name in names} | own
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:

@@ -1,8 +1,19 @@
-"""What the settings of a training are where nothing is said."""
+"""What the settings of a training are where nothing is said: three layers, each over the last.
+
+1. field: the default of a field of `TrainConfig` or of an algorithm, with what that algorithm
+   changes of the former (`AlgorithmConfig.training`).
+2. task x algorithm: `Task.training`, and `Task.training_with` for the algorithm.
+3. variant: `VARIANTS`, with the aircraft of `OF_VEHICLE`, and `Task.variants`.
+
+Every layer states the settings of `PER_STEP` for the control rate of the paper's aircraft. An
+aircraft that is controlled more often looks as far ahead in seconds, collects as many seconds in a
+batch, and trains for as many: `at_rate` reads a layer for it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from quadrl import tasks
@@ -10,15 +21,18 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.validation import choice, keys
 from quadrl.conditions.randomization import RANDOMIZATIONS
 from quadrl.core.task import Task
-from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
+from quadrl.learning.settings import ALGORITHM_CONFIGS
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
 """Settings that the defaults follow from, or that have no better default than another."""
-PAIRS = ("task_options", "practice", "vehicle_options", "observe")
+PAIRS = ("task_options", "training_options", "vehicle_options", "observe")
 """Settings that are dicts; what is given is added to the defaults."""
-WIDE = 90.0
-"""Action scale of the paper's aircraft in the variant robust [rad/s]: with its own, 35, the rotors
-carry 1.33 times the specified weight at most, too little for one that is 20 % heavier in wind."""
+PER_STEP: dict[str, Callable[[Any, float], Any]] = {
+    "gamma": lambda gamma, often: round(gamma ** (1 / often), 4),
+    "rollout": lambda steps, often: max(1, round(steps * often)),
+    "steps": lambda steps, often: round(steps * often),
+}
+"""Settings that count control steps, and what they are where there are so many times as many."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "robust": {
@@ -34,29 +48,36 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "observe": {"action_history": 2, "disturbance": True, "privileged": True},
         "holds_goal": False,  # in wind the goal is held with a tilt that the wind gives
         "gae_lambda": 0.95,
-        "gamma": 0.95,  # with a shorter sight heavy aircraft begin to swing, and fall
+        "gamma": 0.95,  # with a shorter horizon heavy aircraft begin to swing, and fall
         "ppo": {"learning_rate": 4e-3, "beta2": 0.999},
         # Without it actions alternate between their ends on aircraft with quick rotors.
         "task_options": {"smoothness_weight": 10.0},
     },
 }
-"""Settings that go together, on top of a task's own."""
+"""Settings that go together."""
+WIDE = 90.0
+"""Action scale of the paper's aircraft in the variant robust [rad/s]: with its own, 35, the rotors
+carry 1.33 times the specified weight at most, too little for one that is 20 % heavier in wind."""
+OF_VEHICLE: dict[tuple[str, str], dict[str, Any]] = {
+    ("robust", "paper"): {"vehicle_options": {"action_scale": WIDE}}
+}
+"""What a variant changes for one aircraft alone."""
 
 
 def training_defaults(
-    base: dict[str, Any], task: str, algo: str, vehicle: str, variant: str
-) -> dict[str, Any]:
-    """The fields of `TrainConfig` that a task is trained with unless something else is said.
-
-    An aircraft that is controlled more often than the paper's looks as far ahead in seconds,
-    collects as many seconds in a batch, and trains for as many.
+    fields: dict[str, Any], task: str, algo: str, vehicle: str, variant: str
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The fields of `TrainConfig` where nothing is given, and the layer that each comes from.
 
     Args:
-        base: The fields, as they are for a task that has none of its own.
+        fields: The fields' own defaults.
         task: Name of the task.
         algo: Name of the algorithm.
         vehicle: Name of the aircraft.
         variant: A name of `VARIANTS`.
+
+    Returns:
+        The values; and a label of the layer by the name of the setting, as in `flat`.
 
     Raises:
         QuadrlError: The task, the vehicle, the variant or a setting in `Task.training`,
@@ -64,21 +85,37 @@ def training_defaults(
     """
     kind = tasks.TASKS[choice("task", task, tasks.TASKS)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
-    own = merged(own_settings(kind, algo), shared, kind.variants.get(variant, {}))
-    keys(f"training default of {task}", own, [name for name in base if name not in CHOSEN])
-    values = merged(base, ALGORITHM_CONFIGS[algo].training, own)
+    choice("vehicle", vehicle, VEHICLES)
+    varied = (shared, OF_VEHICLE.get((variant, vehicle), {}), kind.variants.get(variant, {}))
+    layers = {
+        "field": merged(fields, ALGORITHM_CONFIGS[algo].training),
+        f"{task} x {algo}": own_settings(kind, algo),
+        f"variant {variant}": merged(*varied),
+    }
+    values: dict[str, Any] = {}
+    sources: dict[str, str] = {}
+    for label, layer in layers.items():
+        if values:
+            known = [name for name in fields if name not in CHOSEN]
+            keys(f"training default of {task}", layer, known)
+        read = at_rate(layer, vehicle)
+        values = merged(values, read)
+        sources |= {
+            name: label if layer.get(name) == read.get(name) else f"{label}, at its control rate"
+            for name, _ in flat(read)
+        }
     values |= {"task": task, "algo": algo}
-    for name, config in ALGORITHM_CONFIGS.items():
-        values[name] = config(**own.get(name, {}))
-    aircraft = VEHICLES[choice("vehicle", vehicle, VEHICLES)]
-    if variant == "robust" and vehicle == "paper":
-        values["vehicle_options"] = {"action_scale": WIDE} | values["vehicle_options"]
-    often = round(VEHICLES["paper"].control_timestep / aircraft.control_timestep, 9)
-    if often != 1:
-        values["gamma"] = round(values["gamma"] ** (1 / often), 4)
-        values["rollout"] = max(1, round(values["rollout"] * often))
-        values["steps"] = round(values["steps"] * often)
-    return values
+    values |= {name: config(**values[name]) for name, config in ALGORITHM_CONFIGS.items()}
+    return values, sources
+
+
+def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
+    """A layer's settings as they are for an aircraft: the same in seconds."""
+    timestep = VEHICLES["paper"].control_timestep
+    often = round(timestep / VEHICLES[vehicle].control_timestep, 9)
+    if often == 1:
+        return layer
+    return layer | {name: PER_STEP[name](layer[name], often) for name in PER_STEP if name in layer}
 
 
 def own_settings(task: Task | type[Task], algo: str = "ppo") -> dict[str, Any]:
@@ -96,3 +133,12 @@ def merged(*settings: dict[str, Any]) -> dict[str, Any]:
                 value = old | value
             whole[name] = value
     return whole
+
+
+def flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Names and values of nested settings, as `ppo.learning_rate`; an empty dict is a value."""
+    for name, value in settings.items():
+        if isinstance(value, dict) and value:
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value

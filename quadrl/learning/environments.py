@@ -74,7 +74,7 @@ class RecordingEnv(QuadrotorEnv):
 def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
     """The aircraft of a training."""
     settings: dict[str, Any] = dict(
-        task=config.make_practice(),
+        task=config.make_training_task(),
         num_envs=config.num_envs,
         seed=config.seed * SEED_STRIDE,
         device=device,

@@ -9,8 +9,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 
 from quadrl.learning.algorithm import Algorithm, shuffled
-from quadrl.learning.algorithm_config import PPOConfig
 from quadrl.learning.fused import FusedPPOLoss, make_loss
+from quadrl.learning.settings import PPOConfig
 
 
 class PPO(Algorithm):

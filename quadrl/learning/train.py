@@ -32,7 +32,7 @@ from quadrl.evaluation.policy import Policy
 from quadrl.learning import checkpoint
 from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.apg import APG
-from quadrl.learning.config import TrainConfig
+from quadrl.learning.config import TrainConfig, renamed
 from quadrl.learning.environments import RecordingEnv, make_collector, make_env
 from quadrl.learning.folder import (
     EVALUATION,
@@ -354,7 +354,7 @@ class Training:
         path = self.folder / checkpoint.CHECKPOINT
         tensors, numbers = checkpoint.load(path)
         try:
-            checkpoint.check_same(path, numbers["config"], self.config.resolved())
+            checkpoint.check_same(path, renamed(numbers["config"]), self.config.resolved())
             self.actor.load_state_dict(tensors["actor"])
             self.critic.load_state_dict(tensors["critic"])
             self.algorithm.restore(tensors.get("optimisers", {}))

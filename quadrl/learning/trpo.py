@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
 from quadrl.learning.algorithm import Algorithm
-from quadrl.learning.algorithm_config import TRPOConfig
+from quadrl.learning.settings import TRPOConfig
 from quadrl.learning.trpo_loss import TRPOLoss
 
 SAFETY = 0.95

@@ -11,7 +11,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import A2CLoss
 
 from quadrl.learning.algorithm import Algorithm
-from quadrl.learning.algorithm_config import VPGConfig
+from quadrl.learning.settings import VPGConfig
 
 
 class VPG(Algorithm):

@@ -31,7 +31,8 @@ from quadrl.core import snapshot
 from quadrl.core.markers import Kind, Marker
 from quadrl.engines import state
 from quadrl.engines.rng import Rng
-from quadrl.learning.config import ALGORITHM_CONFIGS, TrainConfig
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.settings import ALGORITHM_CONFIGS
 from scripts.reports.report import Parts, table
 
 FIRST_SOURCE = "gym-aero"

@@ -92,7 +92,9 @@ def planned(
     fixed: dict[str, Any] = {"seed": seed, "num_threads": 1, "holds_goal": False}
     fixed["ppo"] = {"beta2": 0.999}  # as all of Adam is in the other two
     asked = tasks.make(task)
-    fixed["practice"] = {name: getattr(asked, name) for name in TrainConfig(task).practice}
+    fixed["training_options"] = {
+        name: getattr(asked, name) for name in TrainConfig(task).training_options
+    }
     config = TrainConfig(task, algo=algo, **merged({"steps": TASKS[task]}, fixed, chosen))
     words = (task, algo, *filter(None, [name]), str(seed))
     return PlannedRun(config, report.RUNS / where / "-".join(words), name)

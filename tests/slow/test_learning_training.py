@@ -363,7 +363,7 @@ def test_the_critic_sees_the_last_observation_of_an_episode_not_the_next_first(t
     training._learn = lambda batch: (seen.append(batch.clone()), learn(batch))[1]
     training.run()
     environment = Environment(
-        TINY.make_practice(), num_envs=8, seed=TINY.seed * SEED_STRIDE, engine=TINY.engine
+        TINY.make_training_task(), num_envs=8, seed=TINY.seed * SEED_STRIDE, engine=TINY.engine
     )
     observation = environment.flatten(environment.reset())
     ends = 0

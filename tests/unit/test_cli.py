@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import warnings
@@ -151,12 +152,29 @@ def test_help_says_what_each_setting_means(capsys):
     assert command("train", "--help") == 0
     text = " ".join(capsys.readouterr().out.split())
     for words in (
-        "--num-envs INT", "(default: 256)", "--ppo.clip FLOAT", "quadrl tasks TASK",
+        "--num-envs INT", "(default: 256)", "--ppo.clip FLOAT", "--dry-run",
         "{hover,", "--algo {ppo,trpo,vpg,apg,gae}", "--vehicle {paper,", "--import FILE",
         "--memory {none,gru}",
     ):  # fmt: skip
         assert words in text, words
     assert "None}" not in text
+
+
+@pytest.mark.parametrize(
+    "words", [(), ("landing",), ("landing", "--algo=vpg", "--variant", "robust")]
+)
+def test_the_defaults_that_help_and_dry_run_show_are_those_of_the_training(capsys, words):
+    assert command("train", *words, "--help") == 0
+    text = " ".join(capsys.readouterr().out.replace("│", "").split())
+    assert command("train", *words, "--dry-run") == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    used = {row[0]: row[1] for row in rows}
+    for name in ("steps", "gamma", "num_envs", "vpg.learning_rate" if words[1:] else "ppo.beta2"):
+        option = rf"--{name.replace('_', '-')} (?:INT|FLOAT) .*?\(default: (.*?)\)"
+        assert re.findall(option, text) == [used[name]], name
+    if words[1:]:
+        assert ["vpg.learning_rate", "0.00074", "landing", "x", "vpg"] in rows
+        assert ["gamma", "0.97", "variant", "robust"] in rows
 
 
 def test_options_are_read_as_json_where_they_are():

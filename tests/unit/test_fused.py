@@ -12,12 +12,12 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
 from quadrl.evaluation.policy import CLIP, LOG_VARIANCE
-from quadrl.learning.algorithm_config import PPOConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import USUAL, FusedPPOLoss, Terms, make_loss
 from quadrl.learning.networks import make_actor_critic
 from quadrl.learning.plain import BehaviourPolicy, plain_policy
 from quadrl.learning.ppo import PPO
+from quadrl.learning.settings import PPOConfig
 
 ROWS = 60
 CASES = {

@@ -23,8 +23,8 @@ from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import Randomization
 from quadrl.core.environment import Environment
 from quadrl.core.task import Task
-from quadrl.learning.algorithm_config import ALGORITHM_CONFIGS
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.settings import ALGORITHM_CONFIGS
 from quadrl.tasks.hover import Hover
 
 EXAMPLES = 25

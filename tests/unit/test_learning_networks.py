@@ -8,10 +8,10 @@ import torch
 from tensordict import TensorDict
 
 import quadrl
-from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import Normaliser, export, make_actor_critic
 from quadrl.learning.ppo import PPO
+from quadrl.learning.settings import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.trpo import TRPO, flat
 from quadrl.learning.vpg import VPG
 

@@ -20,10 +20,10 @@ from quadrl.evaluation.memory import GRU
 from quadrl.evaluation.policy import RECURRENT_FORMAT, Policy
 from quadrl.evaluation.rollout import fly
 from quadrl.learning import checkpoint, environments
-from quadrl.learning.algorithm_config import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.config import ALGORITHMS, TrainConfig
 from quadrl.learning.networks import BEGINS, STATE, Memory, export, make_actor_critic
 from quadrl.learning.ppo import PPO
+from quadrl.learning.settings import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.train import Training
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
@@ -218,7 +218,7 @@ def test_a_minibatch_holds_as_many_transitions(memory):
 
 @pytest.mark.parametrize("algo", sorted(set(ALGORITHMS) - {"apg"}))
 def test_it_continues_bit_for_bit(tmp_path, algo):
-    config = dataclasses.replace(RECURRENT, algo=algo, task="target_following", practice={})
+    config = dataclasses.replace(RECURRENT, algo=algo, task="target_following", training_options={})
     alone = train(config, tmp_path / "alone")
     # Checkpoints are those of the iteration before: at step 4 of an episode, and where all begin.
     stopped(config, tmp_path / "run", 2)

@@ -7,9 +7,9 @@ from tensordict import TensorDict
 from torch.func import functional_call, jacrev
 from torchrl.modules import set_recurrent_mode
 
-from quadrl.learning.algorithm_config import TRPOConfig
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import BEGINS, STATE, make_actor_critic
+from quadrl.learning.settings import TRPOConfig
 from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
 
 SIZE, ACTIONS, ROWS = 5, 2, 24

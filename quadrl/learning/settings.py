@@ -1,0 +1,241 @@
+"""The settings of a training and of each algorithm, with the first layer of their defaults."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, ClassVar
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import number
+from quadrl.conditions.observing import Observing
+from quadrl.conditions.observing import resolve as resolve_observing
+from quadrl.conditions.randomization import NONE, resolve
+
+LATE_OR_UNSURE = ("command_delay", "observation_delay", "noise", "bias")
+"""What a randomization may not have where a training goes through the physics: the observation must
+follow from the state, and the rotors' commands from the action alone."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AlgorithmConfig:
+    """Numbers of an algorithm: whole ones are counts, the others are positive unless listed."""
+
+    training: ClassVar[dict[str, Any]] = {}
+    """Settings of `TrainConfig` that have other defaults with this algorithm."""
+    may_be_zero: ClassVar[tuple[str, ...]] = ("entropy", "critic", "damping")
+    largest: ClassVar[dict[str, float]] = {"beta2": 0.99999}
+
+    def __post_init__(self) -> None:
+        """Validate the numbers."""
+        prefix = type(self).__name__.removesuffix("Config").lower()
+        for field in dataclasses.fields(self):
+            value, name = getattr(self, field.name), f"{prefix}.{field.name}"
+            if isinstance(field.default, int):
+                checked = number(name, value, 1, whole=True)
+            else:
+                high = self.largest.get(field.name, math.inf)
+                positive = field.name not in self.may_be_zero
+                checked = number(name, value, 0, high, positive=positive)
+            object.__setattr__(self, field.name, checked)
+
+    def check(self, config: Any) -> None:
+        """Refuse the settings of a `TrainConfig` that the algorithm cannot learn with.
+
+        Raises:
+            QuadrlError: The message names the setting.
+        """
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig(AlgorithmConfig):
+    """Settings of PPO."""
+
+    learning_rate: float = 4e-3
+    """Initial rate of Adam; it falls linearly to zero over the training."""
+    beta2: float = 0.999
+    """Share of Adam's mean of the squared gradients that a step leaves; below 1."""
+    epochs: int = 5
+    """Passes over each batch."""
+    minibatch: int = 1024
+    """Transitions in a gradient step: few large ones, since each step costs milliseconds."""
+    clip: float = 0.2
+    """Bound on the change of the probability ratio."""
+    entropy: float = 0.0
+    """Weight of the entropy bonus."""
+    critic: float = 1.0
+    """Weight of the critic's squared error."""
+    max_gradient: float = 1.0
+    """Norm to which the gradients of policy and critic are clipped, each on its own."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TRPOConfig(AlgorithmConfig):
+    """Settings of TRPO."""
+
+    max_kl: float = 0.02
+    """Bound on the mean KL divergence of a step."""
+    damping: float = 0.01
+    """Added to the diagonal of the Fisher matrix."""
+    iterations: int = 10
+    """Iterations of the conjugate gradient method."""
+    backtracks: int = 10
+    """Steps tried in the line search."""
+    shrink: float = 0.7
+    """Factor from a tried step within the bound, but of no gain, to the next one."""
+    critic_rate: float = 3e-3
+    """Initial learning rate of the critic; it falls linearly to zero."""
+    critic_epochs: int = 8
+    """Passes of the critic over each batch."""
+    minibatch: int = 1024
+    """Transitions in a gradient step of the critic."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VPGConfig(AlgorithmConfig):
+    """Settings of the plain policy gradient."""
+
+    training = {"num_envs": 128, "rollout": 8}  # one step per batch: more batches, and smaller
+
+    learning_rate: float = 3e-3
+    """Initial rate of the policy's one step on each batch; it falls linearly to zero."""
+    critic_rate: float = 6e-3
+    """Initial learning rate of the critic; it falls linearly to zero."""
+    critic_epochs: int = 8
+    """Passes of the critic over each batch."""
+    minibatch: int = 1024
+    """Transitions in a gradient step of the critic."""
+    max_gradient: float = 1.0
+    """Norm to which gradients are clipped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class APGConfig(AlgorithmConfig):
+    """Settings of the analytic policy gradient."""
+
+    # Many windows, each of which is one step up the gradient.
+    training = {"num_envs": 64, "rollout": 32, "initial_deviation": 0.5, "steps": 204_800}
+
+    step: float = 0.2
+    """How far the actions of a window are moved up their gradient, where it has its median
+    length; twice as far at most."""
+    learning_rate: float = 5e-3
+    """Initial rate of Adam, with which the policy is fitted to the moved actions; it falls linearly
+    to zero."""
+    epochs: int = 4
+    """Passes of the policy over each window."""
+    critic_rate: float = 5e-3
+    """Initial learning rate of the critic; it falls linearly to zero."""
+    critic_epochs: int = 4
+    """Passes of the critic over each window."""
+    minibatch: int = 1024
+    """Transitions in a gradient step."""
+    max_gradient: float = 1.0
+    """Norm to which gradients are clipped."""
+
+    def check(self, config: Any) -> None:
+        """Refuse the settings with which the derivatives of the flight are not known."""
+        task, drawn = config.make_task(), resolve(config.randomization)
+        unsure = any(getattr(drawn, name) != getattr(NONE, name) for name in LATE_OR_UNSURE)
+        observed = resolve_observing(config.observe) != Observing()
+        for name, value, wrong, allowed in (
+            ("control_mode", config.control_mode, config.control_mode != "rotor", "'rotor'"),
+            ("engine", config.engine, config.engine != "free_flight", "'free_flight'"),
+            ("memory", config.memory, config.memory != "none", "'none'"),
+            ("device", config.device, config.device != "cpu", "'cpu'"),
+            ("task", task.name, task.contact, "a task without contact with the ground"),
+            ("task", task.name, task.true_parameters, "a task that sees the specified parameters"),
+            ("observe", config.observe, observed, "left out"),
+            ("randomization", config.randomization, unsure, f"without {', '.join(LATE_OR_UNSURE)}"),
+        ):
+            if wrong:
+                reason = "apg takes the derivatives of the whole flight, and has none for this"
+                allowed = f"{allowed} with algo apg"
+                raise QuadrlError(reason, name=name, value=value, allowed=allowed)
+
+
+ALGORITHM_CONFIGS = {"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig, "apg": APGConfig}
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainSettings:
+    """The fields of `quadrl.learning.config.TrainConfig`.
+
+    Their defaults are the first layer of those of a task: see `quadrl.learning.defaults`.
+    """
+
+    task: str = "hover"
+    """Name of the task."""
+    algo: str = "ppo"
+    """Algorithm: ppo, trpo, vpg (the plain policy gradient; the paper's name gae works too), or apg
+    (the gradient goes through the physics, which the paper's algorithms do not know)."""
+    seed: int = 0
+    """Seed of the networks, the exploration and the episodes, between 0 and 2^32 - 1."""
+    variant: str = "ideal"
+    """Settings that go together: ideal (the paper's episodes), or robust (an uncertain aircraft in
+    light wind, and a policy that sees what it needs for that)."""
+    vehicle: str = "paper"
+    """Name of the aircraft."""
+    vehicle_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Numbers of the aircraft that differ from it, such as mass=0.7 action_scale=90."""
+    control_mode: str = "rotor"
+    """Meaning of the actions: rotor (the paper's), thrust_body_rate, velocity or position."""
+    engine: str = "free_flight"
+    """Engine of the training: free_flight (MuJoCo only near the ground) or mujoco. Evaluations
+    always fly in mujoco."""
+    task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Options of the task that differ from its defaults, such as time_limit=5."""
+    training_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Options of the task in the training alone, such as farthest=3: a policy is weakest at the
+    edge of what it was trained on."""
+    aerodynamics: str = ""
+    """Effects of the air on the rotors: none, full, or names of single ones with commas between
+    them; by default those of the aircraft."""
+    weather: Any = "calm"
+    """Weather of the training: calm, light, moderate or severe; or JSON such as
+    {"wind_speed": 5}, in Python a Weather."""
+    randomization: Any = "none"
+    """What is drawn for each aircraft at each reset and disturbs it: none, light or full; or JSON
+    such as {"mass": [0.8, 1.2]}, in Python a Randomization."""
+    observe: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Options of the observation, such as action_history=2 rotor_speed=estimated."""
+    num_envs: int = 256
+    """Aircraft flown together."""
+    rollout: int = 16
+    """Control steps of each aircraft in a batch."""
+    steps: int = 1_310_720
+    """Control steps of all aircraft in the training."""
+    gamma: float = 0.93
+    """Discount per control step (effective horizon 0.7 s): with a short one a lasting
+    error costs more than one that is corrected."""
+    gae_lambda: float = 0.95
+    """Lambda of the generalised advantage estimation."""
+    reward_scale: float = 0.01
+    """Factor on the rewards, so that the critic's targets are of the order of 1."""
+    hidden: tuple[int, ...] = (128,)
+    """Widths of the policy's hidden layers; the paper has one of 128."""
+    critic_hidden: tuple[int, ...] = (64, 64)
+    """Widths of the critic's hidden layers."""
+    memory: str = "none"
+    """Memory of the policy: none (the paper's), or gru, a gated recurrent unit."""
+    memory_width: int = 64
+    """Numbers that a policy with a memory remembers."""
+    holds_goal: bool = False
+    """Whether the mean action at the goal is to hover, whatever the weights: the network's output
+    less its output there. It sees neither position nor, where the heading is free, yaw."""
+    initial_deviation: float = 1.0
+    """Standard deviation of the actions at the start."""
+    ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
+    """Settings of PPO."""
+    trpo: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
+    """Settings of TRPO."""
+    vpg: VPGConfig = dataclasses.field(default_factory=VPGConfig)
+    """Settings of the plain policy gradient."""
+    apg: APGConfig = dataclasses.field(default_factory=APGConfig)
+    """Settings of the analytic policy gradient."""
+    device: str = "cpu"
+    """Device of the networks, such as cuda; the simulation stays on the CPU."""
+    num_threads: int = 0
+    """Threads of the simulation; 0 for one per core. The results do not depend on it."""
+    checkpoint_seconds: float = 5.0
+    """Least time between two checkpoints [s]."""
