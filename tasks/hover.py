@@ -40,7 +40,7 @@ class Hover(Task):
     training_with = {
         # Flights from the edge of what was trained on fail more often.
         "ppo": {"training_options": {"tilt": 0.3, "spin": 0.6}},
-        # Chosen by `scripts/report search`.
+        # Chosen by a search: docs/paper.md.
         "vpg": {
             "num_envs": 32,
             "rollout": 8,

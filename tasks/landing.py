@@ -59,7 +59,7 @@ class Landing(Task):
     training_with = {
         # With the task's own weight, two of four policies come down before they have turned east.
         "ppo": {"training_options": {"attitude_weight": 60.0}, "ppo": {"beta2": 0.99}},
-        # Chosen by `scripts/report search`.
+        # Chosen by a search: docs/paper.md.
         "vpg": {
             "num_envs": 128,
             "rollout": 16,

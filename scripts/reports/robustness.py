@@ -1,92 +1,236 @@
-"""Flies every policy that comes with quadrl, and the geometric controller, through disturbances.
+"""Fly policies and the geometric controller through disturbances: `robust` and `robustness`.
 
-Each disturbance alone, at graded levels and at the strength of the presets, and all together.
-`scripts/report tuning` tunes the controller for each of these conditions.
+The controller is the yardstick: its gains are tuned for each task and each disturbance. A
+proportional one leaves a lasting error in a lasting wind or with a mass that it does not know, so
+an integral of the position error is among the gains.
 """
 
 from __future__ import annotations
 
-import tyro
+import dataclasses
+from typing import Any
+
+import numpy as np
 
 import quadrl
 from quadrl import tasks
-from quadrl.evaluation.card import Card
+from quadrl.aircraft.aerodynamics import EFFECTS
+from quadrl.aircraft.presets import resolve, with_effects
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.rotation import Array, norm
+from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Randomization
+from quadrl.conditions.weather import WEATHERS
+from quadrl.control import Gains, GeometricController
+from quadrl.control.reading import Reading
+from quadrl.core.task import Task
+from quadrl.evaluation.card import wilson
 from quadrl.evaluation.evaluate import setting
-from scripts.reports import report, tuning
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import flights, fly
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.defaults import WIDE
+from scripts.reports import report
+from scripts.reports.measure import AIRBORNE, runs_of
 from scripts.reports.report import Result, say, table
 
-CONTROLLER = "geometric"
-TUNED = "tuned controller"
-PICTURES = report.IMAGES / "robustness"
+UNCERTAIN = Randomization(
+    mass=(0.8, 1.2), command_delay=(0.02, 0.02), noise=Errors(1e-3, 1e-3, 2e-3, 2e-3)
+)
+"""Unknown mass, late commands, and an estimate with the noise of the preset "light"."""
+NEAR, MOST = 0.5, 1.0  # [m]: errors within are summed up, a long way is none; the largest sum
+NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
+FRESH = 100_300  # first episode, beyond those that the gains were chosen by
+SEEDS = dict.fromkeys((*AIRBORNE, "landing"), range(242, 247))  # not used for tuning
+SEEDS |= {"hover": range(263, 268), "random_waypoint": range(388, 393)}
 
 
-def main(only: tuple[str, ...] = (), episodes: int = 100, cards: bool = True) -> None:
-    """Fly, draw, and write down after each task.
+class Integrating(GeometricController):
+    """The geometric controller, towards a place beyond the goal by the sum of past errors."""
+
+    def __init__(self, vehicle: Vehicle, task: Task, gains: Gains, integral: float) -> None:
+        """Take the gains, and the rate of the integral [1/s]; it flies one batch of episodes."""
+        super().__init__(vehicle, task, gains)
+        self._rate = integral * vehicle.control_timestep
+        self._sum: Array | float = 0.0  # (N, 3) [m], world frame
+
+    def action(self, reading: Reading, offset: Array, velocity: Array) -> Array:
+        """The action (N, R) towards a place at an offset, which moves at a velocity."""
+        near = (norm(offset) < NEAR)[:, None]
+        self._sum = np.clip(self._sum + self._rate * near * offset, -MOST, MOST)
+        return super().action(reading, offset + self._sum, velocity)
+
+
+@dataclasses.dataclass(frozen=True)
+class Condition:
+    """What flights are disturbed by."""
+
+    weather: str = "calm"
+    randomization: Any = "none"
+    aerodynamics: str = "none"
+    wide: bool = False
+    """Whether the commands are as wide as for the policies for uncertain aircraft."""
+
+    def make_vehicle(self) -> Vehicle:
+        """The aircraft in its air."""
+        wide = {"action_scale": WIDE} if self.wide else None
+        return with_effects(resolve(None, wide), self.aerodynamics)
+
+
+UNSURE = {  # in which the policies for uncertain aircraft are flown
+    "uncertain": Condition("light", UNCERTAIN, wide=True),
+    "uncertain, in full air": Condition("light", UNCERTAIN, "full", True),
+    "nothing": Condition(wide=True),
+    "50 ms of delay": Condition("calm", Randomization(command_delay=0.05), wide=True),
+    "half the lag": Condition("calm", Randomization(lag=0.5), wide=True),
+    "twice the lag": Condition("calm", Randomization(lag=2.0), wide=True),
+    "all together": Condition("light", "full", "full", True),
+}
+
+
+def conditions() -> dict[str, Condition]:
+    """The disturbances by name: each alone, and all together."""
+    found = {"nothing": Condition()}
+    found |= {f"aerodynamics {e}": Condition(aerodynamics=e) for e in (*EFFECTS, "full")}
+    found |= {f"weather {w}": Condition(w) for w in WEATHERS if w != "calm"}
+    full = RANDOMIZATIONS["full"]
+    for name in full.given():
+        if name not in NEEDS_AIR:
+            given: Any = {name: getattr(full, name)}
+            found[f"{name} as in `full`"] = Condition(randomization=Randomization(**given))
+    found |= {f"randomization {n}": Condition(randomization=n) for n in ("light", "full")}
+    return found | {"all together": Condition("light", "full", "full")}
+
+
+def tuned(task: str, condition: str, vehicle: Vehicle | None = None) -> Integrating:
+    """The controller with the gains that were found for a task in a condition; for one flight."""
+    bandwidth, integral = report.load("tuning")["tasks"][task][condition]
+    vehicle = vehicle or conditions()[condition].make_vehicle()
+    made = tasks.make(task)
+    gains = Gains(**{**made.gains, "level": bandwidth, "height": bandwidth})
+    return Integrating(vehicle, made, gains, integral)
+
+
+def engine(task: str) -> Any:
+    """Free flight, unless the task touches the ground."""
+    return "mujoco" if tasks.make(task).contact else "free_flight"
+
+
+def flown(flyer: Any, task: str, condition: Condition, episodes: int) -> Result:
+    """What a policy, a known name or a tuned controller reaches in a condition."""
+    if isinstance(flyer, Integrating):
+        vehicle = flyer.vehicle
+    else:
+        _, flyer, _, vehicle = setting(flyer, task, aerodynamics=condition.aerodynamics)
+    given: Any = {"weather": condition.weather, "randomization": condition.randomization}
+    given |= {"vehicle": vehicle, "engine": engine(task), "seed": FRESH}
+    each = flights(fly(flyer, tasks.make(task), episodes=episodes, **given))
+    error = float(np.median(each["position_error_m"]))
+    return {"success": float(each["success"].mean()), "error_m": error}
+
+
+def robust(only: tuple[str, ...] = (), seeds: int = 5, episodes: int = 1000, jobs: int = 2) -> None:
+    """Train policies for uncertain aircraft in wind, and fly them beside the tuned controller.
+
+    Args:
+        only: Names of tasks, beside what was measured of the others; by default all.
+        seeds: How many of the seeds.
+        episodes: Flights of each seed in each condition.
+        jobs: Trainings at the same time.
+    """
+    rows = []
+    for task in only or SEEDS:
+        configs = [
+            TrainConfig(task, variant="robust", seed=seed, num_threads=1) for seed in SEEDS[task]
+        ]
+        runs = runs_of("robust", configs[:seeds], jobs, 100)
+        flyers: dict[int, Any] = {run.config.seed: Policy.load(run.folder) for run in runs}
+        gains = report.load("tuning")["tasks"][task]
+        for seed in (*flyers, *(["controller"] if "uncertain" in gains else [])):
+            for name, condition in UNSURE.items():
+                flyer = flyers.get(seed) or tuned(task, "uncertain", condition.make_vehicle())
+                found = flown(flyer, task, condition, episodes)
+                rows.append({"task": task, "seed": str(seed), "condition": name} | found)
+            say(f"{task}, {seed}: {rows[-1]}")
+    report.save("robust", {"episodes": episodes} | report.beside("robust", {"rows": rows}, only))
+
+
+def robustness(only: tuple[str, ...] = (), episodes: int = 100) -> None:
+    """Fly every policy that comes with quadrl, and the controllers, through disturbances; draw.
+
+    Each disturbance alone, at graded levels and at the strength of the presets, and all together.
 
     Args:
         only: Names of tasks, beside what was measured of the others; by default all.
         episodes: Flights of each level and of each condition.
-        cards: Whether the cards and maps are measured, too; else they stay as they are.
     """
-    found: Result = {"episodes": episodes, "cards": {}, "conditions": {}}
-    if only or not cards:
-        before = report.load("robustness")
-        found |= {name: before[name] for name in ("cards", "conditions")}
-    for task in only or tasks.TASKS:
+    alone, half = [], []
+    for task in only or report.load("tuning")["tasks"]:
         say(task)
-        found["conditions"][task] = {
-            name: [one(known, task, name, episodes) for known in (*flyers(task).values(), TUNED)]
-            for name in tuning.conditions(task)
-            if name != "uncertain"
-        }
-        if cards:
-            card = quadrl.robustness(flyers(task), task, episodes=episodes, aerodynamics="none")
-            PICTURES.mkdir(parents=True, exist_ok=True)
-            card.figure.save(PICTURES / f"{task}.png")
-            card.maps.save(PICTURES / f"{task}_recovery.png")
-            found["cards"][task] = card.found
-        report.save("robustness", found)
+        flyers = {"policy": task, "robust policy": f"{task}_robust", "controller": "geometric"}
+        for name, condition in conditions().items():
+            row: Result = {"task": task, "condition": name}
+            for label, flyer in (*flyers.items(), ("tuned controller", tuned(task, name))):
+                row[label] = flown(flyer, task, condition, episodes)["success"]
+            alone.append(row)
+        card = quadrl.robustness(flyers, task, episodes=episodes, aerodynamics="none")
+        (pictures := report.IMAGES / "robustness").mkdir(parents=True, exist_ok=True)
+        card.figure.save(pictures / f"{task}.png")
+        card.maps.save(pictures / f"{task}_recovery.png")
+        (_, *names), *levels = card.table
+        half += [{"task": task, "flown": x} | {row[0]: row[k + 1] for row in levels}
+                 for k, x in enumerate(names)]  # fmt: skip
+    rows = report.beside("robustness", {"half": half, "alone": alone}, only)
+    report.save("robustness", {"episodes": episodes} | rows)
 
 
-def flyers(task: str) -> dict[str, str]:
-    """The policies that come with quadrl for a task, and the controller, by their words."""
-    return {"policy": task, "robust policy": f"{task}_robust", "controller": CONTROLLER}
-
-
-def one(known: str, task: str, name: str, episodes: int) -> Result:
-    """What a policy or a controller reaches in one condition; a policy with its own aircraft."""
-    condition = tuning.conditions(task)[name]
-    if known == TUNED:
-        return tuning.flown(tuning.tuned(task, name), task, condition, episodes, tuning.FRESH)
-    _, controller, _, vehicle = setting(known, task, aerodynamics=condition.aerodynamics)
-    return tuning.flown(controller, task, condition, episodes, tuning.FRESH, vehicle)
-
-
-def half() -> str:
+def half_table() -> str:
     """Where half of the flights fail, for each task."""
-    result, rows, head = report.load("robustness"), [], []
-    for task, found in result["cards"].items():
-        first, *rest = Card(found).table
-        head = ["task", "flown", *(row[0] for row in rest)]
-        for k, flown in enumerate(first[1:], start=1):
-            rows.append((task, flown, *(row[k] for row in rest)))
-    return f"{table(head, rows)}\n\n{result['episodes']} flights a level. {report.source(result)}"
-
-
-def alone() -> str:
-    """Success in each condition, a column for each task."""
     result = report.load("robustness")
-    known = result["conditions"]
+    rows = [{k: x for k, x in row.items() if k != "commit"} for row in result["half"]]
+    note = f"{result['episodes']} flights a level. {report.source(result, result['half'])}"
+    return f"{table(rows[0], (row.values() for row in rows))}\n\n{note}"
+
+
+def alone_table() -> str:
+    """Success in each condition, a column for each task."""
+    result, cells = report.load("robustness"), {}
+    for row in result["alone"]:
+        shares = [f"{100 * row[x]:.0f}" for x in row if x not in ("task", "condition", "commit")]
+        cells.setdefault(row["condition"], {})[row["task"]] = " / ".join(shares)
+    known = [*next(iter(cells.values()))]
+    note = "Successful flights [%], policy / robust policy / controller / tuned controller; "
+    note += f"{result['episodes']} flights each. {report.source(result, result['alone'])}"
+    rows = ((name, *(of[task] for task in known)) for name, of in cells.items())
+    return f"{table(('disturbed by', *known), rows)}\n\n{note}"
+
+
+def robust_table() -> str:
+    """Success and error of the policies for uncertain aircraft, over the seeds."""
+    result, groups = report.load("robust"), {}
+    for row in result["rows"]:
+        who = "geometric controller, tuned" if row["seed"] == "controller" else "robust policies"
+        of = groups.setdefault((f"`{row['task']}`", who), {})
+        of.setdefault(row["condition"], []).append((row["success"], row["error_m"]))
     rows = []
-    for name in next(iter(known.values())):
-        shares = ([f"{100 * one['success_rate']:.0f}" for one in of[name]] for of in known.values())
-        rows.append((name, *(" / ".join(pair) for pair in shares)))
-    flown = " / ".join((*flyers(""), TUNED))
-    note = f"Successful flights [%], {flown}; {result['episodes']} flights each."
-    return f"{table(('disturbed by', *known), rows)}\n\n{note} {report.source(result)}"
+    for key, of in groups.items():
+        cells = []
+        for found in of.values():
+            shares, errors = zip(*found, strict=True)
+            total, mean = len(shares) * result["episodes"], np.mean(shares)
+            low, high = wilson(round(mean * total), total)
+            words = f"{100 * mean:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+            if len(shares) > 1:
+                words += f" [{100 * min(shares):.1f}, {100 * max(shares):.1f}]"
+            cells.append(f"{words}, {100 * np.median(errors):.1f} cm")
+        rows.append((*key, *cells))
+    note = (
+        "Successful flights [%] of all seeds with their 95 % interval (Wilson), in brackets the "
+        "worst and the best seed; median of the error over the last 2 s. "
+        f"{result['episodes']} flights for each seed and condition. "
+        f"{report.source(result, result['rows'])}"
+    )
+    return f"{table(('task', 'flown by', *UNSURE), rows)}\n\n{note}"
 
 
-PARTS: report.Parts = {"robustness-half": half, "robustness-alone": alone}
-
-if __name__ == "__main__":
-    tyro.cli(main)
+PARTS: report.Parts = {"robust": robust_table, "robustness-half": half_table,
+                       "robustness-alone": alone_table}  # fmt: skip

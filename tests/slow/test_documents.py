@@ -19,10 +19,11 @@ from pathlib import Path
 import pytest
 
 from quadrl import tasks
+from quadrl.learning.studies.plan import read_plan
 from scripts.reports import pages, report
 
 REPOSITORY = Path(__file__).parents[2]
-PAGES = [*report.pages(), REPOSITORY / "CONTRIBUTING.md"]
+PAGES = [*pages.all_pages(), REPOSITORY / "CONTRIBUTING.md"]
 TEXTS = {str(page.relative_to(REPOSITORY)): page.read_text() for page in PAGES}
 LANGUAGES = {"python", "bash", "bibtex", "diff", "toml", ""}  # the first two are run
 SCRIPTS = ("scripts/quickstart", "scripts/test")
@@ -34,6 +35,8 @@ SHORTER = {
     "robustness": ("--episodes", "2", "--no-recovery"),
     "benchmark": ("--num-envs", "8", "--seconds", "0.01", "--repeats", "1"),
 }
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+STUDIES = sorted((REPOSITORY / "docs" / "studies").glob("*.toml"))
 RUN = "runs/hover"  # what the pages call their run
 REPLACED = ("in free flight .", "one a rotor", "is allowed", "pilot", "door")
 
@@ -66,7 +69,7 @@ VIEWS = [command for command in QUADRL if command.startswith("quadrl view ")]
 
 def run(command, folder):
     done = subprocess.run(
-        command, cwd=folder, env=report.ENVIRONMENT, capture_output=True, text=True, timeout=550
+        command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=550
     )
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -121,7 +124,7 @@ def test_quadrl_view_flies_until_it_is_interrupted(command, folder):
     _, *arguments = shlex.split(command, comments=True)
     program = (sys.executable, "-m", "quadrl", *arguments, "--port", "0")
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen(program, cwd=folder, env=report.ENVIRONMENT, **pipes) as viewer:
+    with subprocess.Popen(program, cwd=folder, env=ENVIRONMENT, **pipes) as viewer:
         assert "http://localhost:" in viewer.stdout.readline()
         time.sleep(2.0)
         viewer.send_signal(signal.SIGINT)
@@ -161,6 +164,14 @@ def test_every_task_has_a_page():
         assert f"<!-- begin task-{name} -->" in TEXTS[f"docs/tasks/{name}.md"]
 
 
+@pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)
+def test_studies_of_the_paper_can_be_trained(file, tmp_path):
+    plan = read_plan(file, tmp_path)
+    assert {run.config.seed for run in plan.runs} == {*range(285, 295)}
+    (name,) = {f"paper_{run.config.task}_{run.config.algo}" for run in plan.runs}
+    assert name == file.stem and f"| `{plan.runs[0].config.task}` |" in TEXTS["docs/paper.md"]
+
+
 def test_quickstart_makes_the_run_folder_that_the_page_lists(trained):
     (table,) = re.findall(
         r"^\| file \|.*?\n\n", TEXTS["docs/training.md"], re.MULTILINE | re.DOTALL
@@ -170,7 +181,7 @@ def test_quickstart_makes_the_run_folder_that_the_page_lists(trained):
 
 
 def test_generated_parts_are_up_to_date():
-    pages.main(check=True)
+    pages.pages(check=True)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=TEXTS)

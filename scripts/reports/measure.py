@@ -1,0 +1,280 @@
+"""Train every task and fly the policies: `training`, `goals`, `ship`, and `speed`.
+
+Run them on a machine that does nothing else. Interrupted at any moment, they continue at the next
+start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import statistics
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from quadrl import VEHICLES, tasks
+from quadrl.engines.mujoco import ENGINES
+from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.policy import FILE, SHIPPED, SHIPPED_AS, Policy
+from quadrl.evaluation.rollout import EVALUATION_SEED, Controller, flights, fly, summarize
+from quadrl.learning import benchmark
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.figures import learning_curves, read_metrics
+from quadrl.learning.folder import EVALUATION, FREE, METRICS, write_json
+from quadrl.learning.studies.crew import train_here
+from quadrl.learning.studies.plan import PlannedRun
+from scripts.reports import report
+from scripts.reports.report import Result, asked, factor, number, say, table
+
+# Seeds are not those that settings were chosen with.
+HOVER_SEEDS, SEEDS = (225, 226, 227, 228, 229), (385, 386, 387)
+EPISODES, LONGEST = 100, 300.0  # of an evaluation; [s] that a training may take
+AIRBORNE = ("hover", "static_waypoint", "random_waypoint", "straight_and_level", "target_following")
+GOALS = {(task, algo): range(305, 310) for algo in ("ppo", "apg") for task in AIRBORNE}
+GOALS |= {  # their settings were changed after the policies of those seeds had been flown
+    ("hover", "ppo"): range(355, 360),
+    ("hover", "apg"): range(340, 345),
+    ("random_waypoint", "ppo"): range(380, 385),
+}
+FLIGHTS, MANY = 1000, {("random_waypoint", "ppo"): 10_000}  # FLIGHTS of them in a batch
+SHIPPED_EPISODES, WORTH_HAVING = 500, 0.9  # least share of successes
+
+
+def trained(run: PlannedRun) -> Result:
+    """What a finished run was: task, vehicle, engine, algorithm, seed, steps, seconds."""
+    config = run.config
+    known = {name: getattr(config, name) for name in ("task", "vehicle", "engine", "algo", "seed")}
+    took = json.loads((run.folder / EVALUATION).read_text())["training_s"]
+    steps = config.iterations * config.num_envs * config.rollout
+    return known | {"steps": steps, "training_s": took}
+
+
+def runs_of(where: str, configs: Iterable[TrainConfig], jobs: int, episodes: int) -> list[Any]:
+    """The trainings in a folder of runs/; those that are missing are made."""
+    name = "{0.task}-{0.vehicle}-{0.engine}-{0.algo}-{0.seed}".format
+    runs = [PlannedRun(config, report.RUNS / where / name(config)) for config in configs]
+    train_here(runs, jobs, episodes, say)
+    return runs
+
+
+def training(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
+    """Train every task with its defaults, hover in both engines and on every aircraft; draw.
+
+    Args:
+        jobs: Trainings at the same time, of those whose wall clock is not compared.
+        only: Names of tasks, beside what was measured of the others; by default all.
+    """
+    wanted = [task for task in tasks.TASKS if not only or task in only]
+    pairs = [
+        (task, vehicle)
+        for task in wanted
+        for vehicle in VEHICLES
+        if (task == "hover") != (vehicle == "paper")
+    ]
+    both = itertools.product(ENGINES, HOVER_SEEDS if "hover" in wanted else ())
+    alone = [TrainConfig("hover", engine=engine, seed=seed) for engine, seed in both]
+    together = [
+        TrainConfig(task, vehicle=vehicle, seed=seed, num_threads=1)
+        for (task, vehicle), seed in itertools.product(pairs, SEEDS)
+    ]
+    runs = runs_of("training", alone, 1, EPISODES) + runs_of("training", together, jobs, EPISODES)
+    found = [
+        trained(run) | flown(Policy.load(run.folder), run.config.task, run.config.vehicle)
+        for run in runs
+    ]
+    yardstick = [
+        flown(make_controller("geometric", *pair), *pair)
+        for pair in dict.fromkeys((run["task"], run["vehicle"]) for run in found)
+    ]
+    for task in wanted:
+        names = runs[0].folder.parent.glob(f"{task}-paper-free_flight-*")
+        metrics = {"ppo": [read_metrics(folder / METRICS) for folder in sorted(names)]}
+        path = report.IMAGES / "curves" / f"{task}.png"
+        learning_curves(metrics, task, path, clocks=("steps",))
+    rows = report.beside("training", {"yardstick": yardstick, "runs": found}, only)
+    report.save("training", {"episodes": EPISODES} | rows)
+
+
+def flown(controller: Controller, task: str, vehicle: str) -> Result:
+    """What a controller, or the mean action of a policy, reaches in MuJoCo."""
+    rollout = fly(controller, task, episodes=EPISODES, vehicle=vehicle)
+    return {"task": task, "vehicle": vehicle, "metrics": summarize(rollout)}
+
+
+def goals(only: tuple[str, ...] = ()) -> None:
+    """Train tasks with PPO and APG with fresh seeds, and count failures of many flights.
+
+    Args:
+        only: Names of tasks, beside what was measured of the others; by default all.
+    """
+    configs = [
+        TrainConfig(task, algo=algo, seed=seed)
+        for (task, algo), seeds in GOALS.items()
+        if not only or task in only
+        for seed in seeds
+    ]
+    found = [trained(run) | counted(run) for run in runs_of("goals", configs, 1, 20)]
+    report.save("goals", report.beside("goals", {"runs": found}, only))
+
+
+def counted(run: PlannedRun) -> Result:
+    """How often the mean action of a finished training fails in free flight, and its errors."""
+    policy, config = Policy.load(run.folder), run.config
+    total, each = MANY.get((config.task, config.algo), FLIGHTS), []
+    for first in range(0, total, FLIGHTS):
+        count, seed = min(FLIGHTS, total - first), EVALUATION_SEED + first
+        rollout = fly(policy, config.task, episodes=count, seed=seed, engine="free_flight")
+        each.append(flights(rollout))
+    reached: Result = {"flights": total, "failed": sum(int((~x["success"]).sum()) for x in each)}
+    for name in ("position_error_m", "heading_error_deg"):
+        if name in each[0]:
+            reached[name] = float(np.concatenate([x[name] for x in each]).mean())
+    say(f"{run.name}: {reached}")
+    return reached
+
+
+def speed() -> None:
+    """Keep a benchmark for the pages: a hundred measurements of each layer."""
+    report.save("speed", benchmark.benchmark("hover", repeats=100, seconds=0.2))
+
+
+def ship(runs: Annotated[tuple[Path, ...], tyro.conf.Positional], out: Path = SHIPPED) -> None:
+    """Copy trained policies into assets/policies, where they come with the package.
+
+    For each task, algorithm and variant it takes the run with the lowest seed, never the best one,
+    and leaves it out if it is not worth having: `scripts/report ship runs/paper/*`.
+
+    Args:
+        runs: Run folders.
+        out: Where the policies go; by default the assets.
+    """
+    found = [(TrainConfig.of_folder(run), run) for run in runs if (run / FILE).is_file()]
+    if not found:
+        sys.exit("none of the folders holds a finished run")
+    chosen: dict[str, tuple[TrainConfig, Path]] = {}
+    for config, run in sorted(found, key=lambda each: each[0].seed):
+        kind = SHIPPED_AS.get(config.algo, config.algo)
+        kind = kind if config.variant == "ideal" else config.variant
+        chosen.setdefault(f"{config.task}_{kind}", (config, run))
+    for name, (config, run) in sorted(chosen.items()):
+        say(f"{name}: {copied(run, config, out / f'{name}.safetensors')}")
+
+
+def copied(run: Path, config: TrainConfig, file: Path) -> str:
+    """Copy a policy with its configuration, its metrics and the command that makes it again."""
+    usual = TrainConfig(
+        config.task, algo=config.algo, vehicle=config.vehicle, variant=config.variant
+    )
+    free = {name: getattr(usual, name) for name in (*FREE, "seed", "engine")}
+    if dataclasses.replace(config, **free) != usual:
+        return f"left out, {run} has other settings than `quadrl train` gives"
+    policy, given = Policy.load(run), {"vehicle": config.make_vehicle()}
+    metrics = summarize(fly(policy, config.make_task(), episodes=SHIPPED_EPISODES, **given))
+    said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {SHIPPED_EPISODES}"
+    if metrics["success_rate"] < WORTH_HAVING:
+        for old in (file, file.with_suffix(".json")):
+            old.unlink(missing_ok=True)
+        return f"left out, not worth having: {said} successful"
+    command = f"quadrl train {config.task} --algo {config.algo} --seed {config.seed}"
+    command += "" if config.engine == usual.engine else f" --engine {config.engine}"
+    command += "" if config.variant == "ideal" else f" --variant {config.variant}"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    policy.save(file)
+    beside = {"command": command, "evaluation": metrics, "config": config.resolved()}
+    write_json(file.with_suffix(".json"), beside)
+    return f"{said} successful"
+
+
+def hover_table() -> str:
+    """Hover, in both engines and on every aircraft."""
+    result = report.load("training")
+    runs, own = ([x for x in result[k] if x["task"] == "hover"] for k in ("runs", "yardstick"))
+    rows = []
+    for run in runs:
+        got = run["metrics"]
+        row = [run["vehicle"], run["engine"], run["seed"], f"{run['steps']:,}"]
+        row += [f"{run['training_s']:.1f} s"]
+        row += [f"{100 * got[name]:.0f} %" for name in ("survival_rate", "success_rate")]
+        row += [f"{1000 * got['position_error_m']:.2f} mm", f"{got['heading_error_deg']:.1f} deg"]
+        rows.append(row)
+    head = ("aircraft", "engine", "seed", "control steps", "training", "flown to the end",
+            "successful", "error", "heading off east")  # fmt: skip
+    error = max(1000 * row["metrics"]["position_error_m"] for row in own)
+    success = min(100 * row["metrics"]["success_rate"] for row in own)
+    note = f"The geometric controller, in the same episodes and with every aircraft: {success:.0f} "
+    note += f"% successful, largest error {number(error)} mm."
+    return f"{table(head, rows)}\n\n{note}  \n{report.source(result, runs)}"
+
+
+def suite_table() -> str:
+    """Every task beside what counts as solved and the geometric controller."""
+    rows = []
+    for name in tasks.TASKS:
+        rows += [(f"`{name}`" if k == 0 else "", *row) for k, row in enumerate(reached(name)[0])]
+    seeds = ("first seed", "second seed", "third seed")
+    return table(("task", "figure", "asked", *seeds, "geometric controller"), rows)
+
+
+def reached_table(name: str) -> str:
+    """What a task asks beside what each seed reached."""
+    rows, seeds = reached(name)
+    controller = ["geometric controller"] if seeds else []
+    return table(("figure", "asked", *(f"seed {seed}" for seed in seeds), *controller), rows)
+
+
+def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
+    """What a task asks and what each seed and the controller reached, and the seeds."""
+    result = report.load("training")
+    runs, known = (
+        [row for row in result[part] if (row["task"], row["vehicle"]) == (name, "paper")]
+        for part in ("runs", "yardstick")
+    )
+    runs = [run for run in runs if run["engine"] == "free_flight"][: len(SEEDS)]
+    rows = []
+    for target in tasks.TASKS[name].targets:
+        metrics = (each["metrics"][target.metric] for each in (*runs, *known))
+        cells = (number(value and factor(target) * value) for value in metrics)
+        rows.append((target.words, asked(target), *cells))
+    seeds = [run["seed"] for run in runs]
+    if runs:
+        words = f"training, {runs[0]['steps']:,} steps, seeds {', '.join(map(str, seeds))}"
+        took = (f"{run['training_s']:.0f} s" for run in runs)
+        rows.append((words, f"at most {LONGEST:.0f} s", *took, ""))
+    return rows, seeds
+
+
+def goals_table() -> str:
+    """Each task and algorithm, its seeds beside each other."""
+    result, rows = report.load("goals"), []
+    for task, algo in GOALS:
+        runs = [run for run in result["runs"] if (run["task"], run["algo"]) == (task, algo)]
+        error = (number(1000 * run["position_error_m"], 2) for run in runs)
+        off = (number(run["heading_error_deg"], 2) for run in runs if "heading_error_deg" in run)
+        took = [run["training_s"] for run in runs]
+        failed = ", ".join(str(run["failed"]) for run in runs)
+        time = f"{statistics.median(took):.1f} s ({min(took):.1f} to {max(took):.1f})"
+        first = runs[0]
+        cells = (f"{first['seed']} to {runs[-1]['seed']}", f"{first['steps']:,}", time,
+                 f"{failed} of {first['flights']:,}", ", ".join(error), ", ".join(off))  # fmt: skip
+        rows.append((f"`{task}`", algo, *cells))
+    head = ("task", "algorithm", "seeds", "control steps", "training, median and range",
+            "failed flights, seed by seed", "error [mm]", "heading error [deg]")  # fmt: skip
+    note = "Errors are means over all flights, also failed ones."
+    return f"{table(head, rows)}\n\n{note} {report.source(result, result['runs'])}"
+
+
+def speed_table() -> str:
+    """Every layer."""
+    result = report.load("speed")
+    head = ("what", "control steps/s", "median", "share", "of", "target")
+    return f"{table(head, benchmark.rows(result))}\n\n{report.source(result)}"
+
+
+PARTS: report.Parts = {"training-hover": hover_table, "training-suite": suite_table,
+                       "goals": goals_table, "speed": speed_table}  # fmt: skip
