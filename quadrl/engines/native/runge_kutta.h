@@ -18,10 +18,9 @@ enum {
   SPEED = 13,       // of the rotors [rad/s]
   ROWS = SPEED + MAX_ROTORS
 };
-// What is the same for all: gravity [m/s^2] points along z. Everything of an aircraft that touches
-// something is below `floor`, or nearer to a solid than `reach` [m].
+// What is the same for all: gravity [m/s^2] points along z.
 typedef struct {
-  double timestep, gravity, floor, reach;
+  double timestep, gravity, floor;
 } World;
 
 // What one call flies in: constants of the steps.
