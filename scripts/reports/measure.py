@@ -21,12 +21,12 @@ import tyro
 from quadrl import VEHICLES, tasks
 from quadrl.engines.mujoco import ENGINES
 from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.plotting import learning_curves, save
 from quadrl.evaluation.policy import FILE, SHIPPED, SHIPPED_AS, Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, Controller, flights, fly, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.figures import learning_curves, read_metrics
-from quadrl.learning.folder import EVALUATION, FREE, METRICS, write_json
+from quadrl.learning.folder import EVALUATION, FREE, METRICS, read_metrics, write_json
 from quadrl.learning.studies.crew import train_here
 from quadrl.learning.studies.plan import PlannedRun
 from scripts.reports import report
@@ -96,7 +96,7 @@ def training(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
         names = runs[0].folder.parent.glob(f"{task}-paper-free_flight-*")
         metrics = {"ppo": [read_metrics(folder / METRICS) for folder in sorted(names)]}
         path = report.IMAGES / "curves" / f"{task}.png"
-        learning_curves(metrics, task, path, clocks=("steps",))
+        save(learning_curves(metrics, task, clocks=("steps",)), path)
     rows = report.beside("training", {"yardstick": yardstick, "runs": found}, only)
     report.save("training", {"episodes": EPISODES} | rows)
 
