@@ -23,6 +23,9 @@ WIND = 3
 AIR = WIND + MAX_ROTORS
 """Numbers of a row of air, in the simulation's `userdata`: the wind [m/s], world frame, and for
 each rotor the noise of its thrust in the vortex ring state, of unit variance."""
+HIT = 2
+"""Numbers behind the air, in a world with solids: 1 + the number of the one that was hit fastest in
+this control step, 0 for none, and how fast [m/s]."""
 MARK = 1903518052.0
 """Tells the actuators and bodies of quadrl from everybody else's: "quad" in ASCII."""
 SETTINGS = (
@@ -148,7 +151,8 @@ def c_structs() -> str:
             lines.append(f"  double {name}{sizes}[LANES];")
         return "\n".join(lines)
 
-    sizes = f"MAX_ROTORS = {MAX_ROTORS}, WIND = {WIND}, AIR = {AIR}, ROW_SIZE = {ROW_SIZE}"
+    sizes = f"MAX_ROTORS = {MAX_ROTORS}, WIND = {WIND}, AIR = {AIR}, HIT = {HIT}"
+    sizes += f", ROW_SIZE = {ROW_SIZE}"
     return (
         "// Written by quadrl/aircraft/parameters.py from Rotor, Vehicle and Aerodynamics.\n"
         f"#define QUADRL_MARK {MARK!r}\n"

@@ -18,6 +18,7 @@ from quadrl.base.rotation import norm
 from quadrl.engines import native
 from quadrl.engines.adjoint import Leg
 from quadrl.engines.free_flight import FreeFlight
+from quadrl.engines.solids import Solids
 from quadrl.engines.state import FIRST, Start, State
 
 EngineName = Literal["mujoco", "free_flight"]
@@ -62,7 +63,12 @@ class Engine(abc.ABC):
         )
         self.air = fields["userdata"][:, : parameters.AIR]
         self.wind = self.air[:, :3]
-        self._free_flight = FreeFlight(self.model, fields, threads) if name != "mujoco" else None
+        self.solids = Solids(self.model, self.num_envs)
+        self.hits = fields["userdata"][:, parameters.AIR :]
+        """(N, HIT) of this control step, live; (N, 0) in a world without solids."""
+        table = self.solids.table
+        flies = name != "mujoco"
+        self._free_flight = FreeFlight(self.model, fields, threads, table) if flies else None
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
         library = native.library()
@@ -189,13 +195,21 @@ class Engine(abc.ABC):
             value = array[row].tolist()
             raise QuadrlError(name=f"engine.{name}[{row}]", value=value, allowed="finite")
 
-    def place(self, rows: np.ndarray, start: Start, table: np.ndarray | None = None) -> State:
+    def place(
+        self,
+        rows: np.ndarray,
+        start: Start,
+        table: np.ndarray | None = None,
+        solids: np.ndarray | None = None,
+    ) -> State:
         """Put aircraft where an episode begins, in calm air.
 
         Args:
             rows: Which aircraft, (n,).
             start: Arrays (n, k).
             table: Parameters (n,) that they get; None for those that they have.
+            solids: Poses (n, K, 7) of the geoms of solids, as `Solids.place` takes them; None for
+                where they are.
 
         Returns:
             The state of those aircraft.
@@ -206,6 +220,8 @@ class Engine(abc.ABC):
         self._check_start(rows, start, table)
         if table is not None:
             self.write_parameters(rows, table)
+        if solids is not None:
+            self.solids.place(rows, solids, self._model_field)
         self.clear(rows)
         self._write(rows, start)
         self._fill(rows)
@@ -242,10 +258,24 @@ class Engine(abc.ABC):
         table = np.ascontiguousarray(saved["parameters"]).view(parameters.AIRCRAFT)[:, 0]
         if not np.array_equal(table, self.parameters):
             self.write_parameters(np.arange(len(table)), table)
+        if "solids" in saved:
+            self.solids.place(np.arange(self.num_envs), saved["solids"], self._model_field)
         self._fill(None)
 
-    def _saved_parameters(self) -> np.ndarray:
-        return parameters.numbers(self.parameters).copy()
+    def _saved(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """What `save` gives, with the rows of the simulation."""
+        saved = {"rows": rows, "parameters": parameters.numbers(self.parameters).copy()}
+        return saved | ({"solids": self.solids.poses(self._model_field)} if self.has_solids else {})
+
+    @property
+    def has_solids(self) -> bool:
+        """Whether there are solids in the world."""
+        return bool(len(self.solids.geoms))
+
+    @property
+    def clearance(self) -> np.ndarray:
+        """What is free about each aircraft at least, (N,) [m]; infinite without solids."""
+        return self.solids.clearance(self.qpos, self.parameters, self.vehicle.rotor_count)
 
     def _write(self, rows: np.ndarray, start: Start | State) -> None:
         self.qpos[rows] = np.concatenate([start.position + self.origin, start.quaternion], axis=-1)

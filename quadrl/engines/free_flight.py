@@ -17,6 +17,7 @@ import numpy as np
 from quadrl.aircraft.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 from quadrl.base.errors import QuadrlError
 from quadrl.engines import native
+from quadrl.engines.solids import geoms_of_solids
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
 """Those of mjData that free flight reads or writes."""
@@ -31,13 +32,16 @@ MARGIN = 0.05
 class FreeFlight:
     """Advances the rows of a simulation in place."""
 
-    def __init__(self, model: mujoco.MjModel, fields: dict[str, np.ndarray], threads: int) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, fields: dict[str, np.ndarray], threads: int, solids: np.ndarray
+    ) -> None:
         """Check the model and take the addresses.
 
         Args:
             model: A model of `quadrl.engines.mjcf`.
             fields: Live arrays (N, k) of FIELDS, all with one stride between aircraft.
             threads: Threads to fly on.
+            solids: Live table (N, K) of `quadrl.engines.solids`.
 
         Raises:
             QuadrlError: The model holds something that free flight knows nothing of.
@@ -48,7 +52,7 @@ class FreeFlight:
         self._fields = fields  # kept alive: the kernel knows their addresses
         self._addresses = [fields[name].ctypes.data for name in FIELDS]
         self._stride = stride
-        self.world = world(model)
+        self.world, self._solids = world(model), solids
         self._near = np.zeros(count, dtype=np.int8)
         parts = max(1, min(threads, count // ROWS_PER_THREAD))
         # Whole groups of lanes to each, so that no group is flown twice.
@@ -65,11 +69,10 @@ class FreeFlight:
             self.parameters = np.empty((-(-len(table) // LANES), block // LANES, LANES))
             self.parameters[:] = numbers(table[:1])[0, : block // LANES, None]
             self.write(np.arange(len(table)), table)
-        last = (self.parameters, self.world, self._near)
+        last = (self.parameters, self.world, self._near, self._solids)
+        sizes = (self._stride, block, rotors, self._solids.shape[1])
         # As `Rows` in native/free_flight.c.
-        self._rows = np.array(
-            [*self._addresses, *(array.ctypes.data for array in last), self._stride, block, rotors]
-        )
+        self._rows = np.array([*self._addresses, *(array.ctypes.data for array in last), *sizes])
         self._address = self._rows.ctypes.data
 
     def write(self, rows: np.ndarray, table: np.ndarray) -> None:
@@ -94,19 +97,20 @@ class FreeFlight:
 
 
 def world(model: mujoco.MjModel) -> np.ndarray:
-    """Physics step [s], gravity along z [m/s^2] and floor [m]: `World` of the kernel."""
-    return np.array([model.opt.timestep, model.opt.gravity[2], _floor(model)])
+    """Physics step [s], gravity along z [m/s^2], floor and reach [m]: `World` of the kernel.
 
-
-def _floor(model: mujoco.MjModel) -> float:
-    """Height of the centre of mass under which something may be touched [m]."""
-    can_touch = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    if not can_touch.any():
-        return -math.inf
-    # Everything of the aircraft lies in a sphere of this radius about its centre of mass.
+    The floor is the height of the centre of mass under which the ground may be touched; within the
+    reach of a solid that solid may be.
+    """
     own = model.geom_bodyid == 1
-    reach = np.linalg.norm(model.geom_pos[own], axis=-1) + model.geom_rbound[own]
-    return float(model.geom_pos[~own, 2].max(initial=0.0) + reach.max(initial=0.0) + MARGIN)
+    # Everything of the aircraft lies in a sphere of this radius about its centre of mass.
+    radii = np.linalg.norm(model.geom_pos[own], axis=-1) + model.geom_rbound[own]
+    reach, floor = radii.max(initial=0.0), -math.inf
+    if ((model.geom_contype != 0) | (model.geom_conaffinity != 0)).any():
+        ground = ~own
+        ground[geoms_of_solids(model)] = False
+        floor = model.geom_pos[ground, 2].max(initial=0.0) + reach + MARGIN
+    return np.array([model.opt.timestep, model.opt.gravity[2], floor, reach + MARGIN])
 
 
 def _check(model: mujoco.MjModel) -> None:
@@ -115,7 +119,7 @@ def _check(model: mujoco.MjModel) -> None:
     rotors = (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_USER).all()
     obstacles = [
         model.geom(k).name or f"number {k}"
-        for k in np.flatnonzero(model.geom_bodyid != 1)
+        for k in np.setdiff1d(np.flatnonzero(model.geom_bodyid != 1), geoms_of_solids(model))
         if (model.geom_contype[k] or model.geom_conaffinity[k])
         and (model.geom_type[k] != mujoco.mjtGeom.mjGEOM_PLANE or model.geom_quat[k, 1:3].any())
     ]

@@ -43,11 +43,15 @@ def spec(
     if drawn:
         _draw(whole, vehicle)
     _add_physics(whole, vehicle)
-    if contact:
-        whole.geom("ground").contype = 1
-        _add_collision(whole.body("aircraft"), vehicle)
     if scene is not None:
         scene(whole)
+    if contact or _has_solids(whole):
+        whole.geom("ground").contype = 1
+        _add_collision(whole.body("aircraft"), vehicle)
+    if _has_solids(whole):
+        whole.nuserdata += parameters.HIT
+        # MuJoCo would look for them where they were compiled.
+        whole.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     if not drawn:  # a step without what is only seen takes a sixth less time
         whole.compiler.discardvisual = True
         for element in (*whole.lights, *whole.cameras):
@@ -77,12 +81,17 @@ def compile_model(
         return model
     model = whole.compile()
     disable = mujoco.mjtDisableBit
+    contact |= _has_solids(whole)
     # No automatic reset: a simulation that diverged must not look like a fresh one.
     unused = disable.mjDSBL_AUTORESET | disable.mjDSBL_SENSOR | disable.mjDSBL_CLAMPCTRL
     if not contact:
         unused |= disable.mjDSBL_CONSTRAINT | disable.mjDSBL_CONTACT
-    model.opt.disableflags = int(unused)
+    model.opt.disableflags |= int(unused)
     return model
+
+
+def _has_solids(whole: mujoco.MjSpec) -> bool:
+    return any(parameters.MARK in geom.userdata for geom in whole.worldbody.geoms)
 
 
 def _add_physics(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:

@@ -77,7 +77,8 @@ class BatchEngine(Engine):
         super().__init__(vehicle, fields, altitude, engine, self.batch.nthread)
 
     def _model_field(self, name: str) -> np.ndarray:
-        return self.batch.expand(name) if self._per_row else getattr(self.model, name)[None]
+        own = self._per_row or name.startswith("geom_")  # solids stand elsewhere in each row
+        return self.batch.expand(name) if own else getattr(self.model, name)[None]
 
     def advance(self, steps: int) -> None:
         """Some physics steps of every aircraft with the commands in `ctrl`.
@@ -105,7 +106,7 @@ class BatchEngine(Engine):
 
     def save(self) -> dict[str, np.ndarray]:
         """Everything that the next step depends on, as arrays."""
-        return {"rows": self.batch.state.copy(), "parameters": self._saved_parameters()}
+        return self._saved(self.batch.state.copy())
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Take up what `save` gave."""
@@ -169,7 +170,7 @@ class DataEngine(Engine):
         spec = mujoco.mjtState.mjSTATE_INTEGRATION
         row = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, self.data, row, spec)
-        return {"rows": row[None], "parameters": self._saved_parameters()}
+        return self._saved(row[None])
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Take up what `save` gave."""

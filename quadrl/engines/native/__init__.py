@@ -39,8 +39,8 @@ from quadrl.engines.air import c_weather
 from quadrl.engines.state import c_rows
 
 SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
-           "disturbances.c", "warnings.c")  # fmt: skip
-HEADERS = ("adjoint.h", "aero.h", "export.h", "philox.h", "runge_kutta.h")
+           "disturbances.c", "solids.c", "warnings.c")  # fmt: skip
+HEADERS = ("adjoint.h", "aero.h", "export.h", "philox.h", "runge_kutta.h", "solids.h")
 MARK_SLOT = 9
 """Entry of an actuator's `dynprm` that holds MARK."""
 # No contraction: a fused multiply-add would round otherwise than NumPy does.
@@ -259,6 +259,8 @@ def load(path: Path) -> ctypes.CDLL:
         kernel.restype = integer
     opened.quadrl_state.argtypes = [_POINTER, integer, _POINTER, _POINTER]
     opened.quadrl_unsound_air.argtypes = [_POINTER, integer]
+    opened.quadrl_clearance.restype = None
+    opened.quadrl_clearance.argtypes = [_POINTER, integer, _POINTER]
     opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
     opened.quadrl_uniform.restype = opened.quadrl_weather.restype = None
     opened.quadrl_write_warnings.restype = None

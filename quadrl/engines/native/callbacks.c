@@ -7,7 +7,10 @@
 //   body_user         its row, an Aircraft
 //   actuator_dynprm   [0] number of the rotor, [MARK_SLOT] mark
 //   actuator_gear     along and about the rotor's axis: 1, aero_reaction
-//   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/aircraft/parameters.py says
+//   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/aircraft/parameters.py says;
+//                     in a world with solids then HIT numbers: 1 + the solid that was hit fastest since
+//                     they were cleared, and how fast [m/s]
+//   geom_user         [0] mark, [1] the number of the solid that a geom is of
 #include <mujoco/mujoco.h>
 #include <stdint.h>
 #include <string.h>
@@ -128,6 +131,35 @@ static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft*
   }
 }
 
+// Writes down the fastest hit of an aircraft on a solid, from the contacts of this moment.
+static void note_hits(const mjModel* m, mjData* d, int body) {
+  const mjtNum *rate = d->qvel + m->body_dofadr[body] + 3, *turn = d->xmat + 9 * body;
+  mjtNum* hit = d->userdata + AIR;
+  for (int c = 0; c < d->ncon; ++c) {
+    const mjContact* contact = d->contact + c;
+    const int first = contact->geom[0], second = contact->geom[1];
+    if (!is_in(first, m->ngeom) || !is_in(second, m->ngeom)) continue;
+    const int own = m->geom_bodyid[second] == body;
+    const int other = own ? first : second;
+    const mjtNum* solid = m->geom_user + (size_t)m->nuser_geom * other;
+    if ((!own && m->geom_bodyid[first] != body) || !is_same(solid[0], QUADRL_MARK)) continue;
+    mjtNum arm[3], spin[3], velocity[3], speed = 0;
+    for (int k = 0; k < 3; ++k) {
+      arm[k] = contact->pos[k] - d->xpos[3 * body + k];
+      spin[k] = turn[3 * k] * rate[0] + turn[3 * k + 1] * rate[1] + turn[3 * k + 2] * rate[2];
+    }
+    for (int k = 0; k < 3; ++k) {
+      const int next = (k + 1) % 3, last = (k + 2) % 3;
+      velocity[k] = d->qvel[m->body_dofadr[body] + k] + spin[next] * arm[last] - spin[last] * arm[next];
+      speed += velocity[k] * contact->frame[k];  // which points from the first geom to the second
+    }
+    speed = own ? -speed : speed;
+    if (hit[0] > 0 && !(speed > hit[1])) continue;
+    hit[0] = 1 + solid[1];
+    hit[1] = speed > 0 ? speed : 0;
+  }
+}
+
 QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
   for (int body = 1; body < m->nbody; ++body) {
     const Aircraft* a = aircraft_of(m, body);
@@ -153,6 +185,7 @@ QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
     }
     aero_wrench(a, airspeed, d->qvel + dof + 3, force, moment, 0);
     if (a->effects[0] != STILL_AIR) add_rotor_effects(m, d, a, body, airspeed, force, moment);
+    if (m->nuser_geom >= 2 && m->nuserdata >= AIR + HIT) note_hits(m, d, body);
     for (int k = 0; k < 3; ++k) {
       d->qfrc_passive[dof + k] +=
           turn[3 * k] * force[0] + turn[3 * k + 1] * force[1] + turn[3 * k + 2] * force[2];

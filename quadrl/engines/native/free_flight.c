@@ -13,6 +13,7 @@
 #include "aero.h"
 #include "export.h"
 #include "runge_kutta.h"
+#include "solids.h"
 
 // With the number of rotors known, the compiler unrolls their loop.
 VECTORISED static void fly(const Aircraft* a, int rotors, const World* world, Setting* s, Lanes* m,
@@ -46,9 +47,9 @@ static void extent(const Aircraft* a, int rotors, double* reach, double* radius,
   }
 }
 
-// Height under which the aircraft of a lane cannot come in `time` [s], whatever it does.
-static double lowest(const Aircraft* a, int rotors, const World* world, const Setting* s,
-                     const Lanes* m, double time, int i) {
+// Largest acceleration that the aircraft of a lane can have in `time` [s], whatever it does.
+static double strongest_pull(const Aircraft* a, int rotors, const World* world, const Setting* s,
+                             const Lanes* m, double time, int i) {
   double lift = 0, squares = 0, speeds = 0;
   for (int k = 0; k < rotors; ++k) {
     const double speed = m[SPEED + k][i], wanted = s->command[k][i];
@@ -68,8 +69,25 @@ static double lowest(const Aircraft* a, int rotors, const World* world, const Se
     pull += (aero_largest_lift(a, i) - 1) * lift / a->mass[i];
     pull += aero_largest_push(a, speeds, sqrt(squares) + aero_length(r) * reach + pull * time, i);
   }
+  return pull;
+}
+
+// Height under which it cannot come in that time.
+static double lowest(const Lanes* m, double pull, double time, int i) {
   const double sink = m[VELOCITY + 2][i] < 0 ? -m[VELOCITY + 2][i] : 0;
   return m[POSITION + 2][i] - (sink + pull * time) * time;
+}
+
+// Whether it may touch a solid in that time; everything of it is within `reach` [m].
+static int may_touch(const Solid* solids, int64_t count, double reach, const Lanes* m, double pull,
+                     double time, int i) {
+  const double p[3] = {m[POSITION][i], m[POSITION + 1][i], m[POSITION + 2][i]};
+  const double v[3] = {m[VELOCITY][i], m[VELOCITY + 1][i], m[VELOCITY + 2][i]};
+  const double way = (aero_length(v) + pull * time) * time + reach;
+  for (int64_t k = 0; k < count; ++k) {
+    if (!(solid_distance(solids + k, p) > way)) return 1;
+  }
+  return 0;
 }
 
 // The kernel of the aircraft that stay above a height each (`low`): the effects that they have, but
@@ -92,8 +110,8 @@ static int effects_of(const Aircraft* a, int rotors, const double low[LANES]) {
 // MuJoCo's warm start, cleared) and air (AIR: wind [m/s, world], noise of the rotors' thrust) of
 // aircraft i stand at i * stride doubles. parameters: with block = 0 a row for all, an Aircraft of
 // one lane; else those of aircraft i..i+LANES-1 side by side at i / LANES * block doubles, an
-// Aircraft as far as there are rotors. rotors: how many all have, at most MAX_ROTORS. Filled by
-// quadrl/engines.
+// Aircraft as far as there are rotors. rotors: how many all have, at most MAX_ROTORS. solids: those
+// of aircraft i, `count` of them, at i * count. Filled by quadrl/engines.
 typedef struct {
   double *qpos, *qvel, *act;
   const double* ctrl;
@@ -101,7 +119,8 @@ typedef struct {
   const double *air, *parameters;
   const World* world;
   char* near;  // one per aircraft
-  int64_t stride, block, rotors;
+  const Solid* solids;
+  int64_t stride, block, rotors, count;
 } Rows;
 
 // Advances aircraft first..last-1 by a number of steps, in place, except those that may touch
@@ -143,11 +162,16 @@ QUADRL_EXPORT int64_t quadrl_free_flight(const Rows* rows, int64_t first, int64_
       for (int k = 0; k < air; ++k) s.air[k][i] = r.air[place + k];
       if (!is_sound(a, rotors, i)) m[POSITION][i] = m[POSITION + 2][i] = NAN;
     }
-    double low[LANES];
+    double low[LANES], pull[LANES];
     int touching = 0;
-    for (int i = 0; i < LANES; ++i) low[i] = lowest(a, rotors, world, &s, m, time, i);
+    for (int i = 0; i < LANES; ++i) {
+      pull[i] = strongest_pull(a, rotors, world, &s, m, time, i);
+      low[i] = lowest(m, pull[i], time, i);
+    }
     for (int i = 0; i < filled; ++i) {
-      r.near[row + i] = low[i] < world->floor;
+      r.near[row + i] = low[i] < world->floor ||
+                        may_touch(r.solids + (row + i) * r.count, r.count, world->reach, m, pull[i],
+                                  time, i);
       touching += r.near[row + i];
     }
     marked += touching;

@@ -18,9 +18,10 @@ enum {
   SPEED = 13,       // of the rotors [rad/s]
   ROWS = SPEED + MAX_ROTORS
 };
-// What is the same for all: gravity [m/s^2] points along z.
+// What is the same for all: gravity [m/s^2] points along z. Everything of an aircraft that touches
+// something is below `floor`, or nearer to a solid than `reach` [m].
 typedef struct {
-  double timestep, gravity, floor;
+  double timestep, gravity, floor, reach;
 } World;
 
 // What one call flies in: constants of the steps.

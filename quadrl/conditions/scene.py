@@ -1,0 +1,249 @@
+"""Solids in the world of a task: what stands there, and where in each episode.
+
+A task declares its solids (`Task.solids`) and places them at each reset (`Task.place`), each row
+for itself. Aircraft collide with them in both engines; free flight hands whoever comes near one to
+MuJoCo. What is free, and what was hit, stands in the `Surroundings` of a snapshot.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from quadrl.aircraft.parameters import MARK
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, namespace
+from quadrl.base.validation import number
+
+Vector = tuple[float, float, float]
+HIDDEN = 3
+"""Group of the geoms: pictures have the solids as markers, where they stand in the episode."""
+ELSEWHERE = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
+"""Pose that the geoms are compiled with. At the origin, upright, MuJoCo would take them to stay
+there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A geom of a solid."""
+
+    kind: mujoco.mjtGeom
+    size: Vector
+    """As MuJoCo has it: radius; radius and half the height; halves of the edges [m]."""
+    offset: Vector = (0.0, 0.0, 0.0)
+    """Of its centre from the solid's, in the solid's frame [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Solid(abc.ABC):
+    """Something that an aircraft can hit."""
+
+    name: str
+    """By which the task places it."""
+    position: Vector = dataclasses.field(default=(0.0, 0.0, 0.0), kw_only=True)
+    """Of its centre where `Task.place` says nothing, task frame [m]."""
+    rgba: tuple[float, float, float, float] = dataclasses.field(
+        default=(0.55, 0.58, 0.62, 1.0), kw_only=True
+    )
+    """Colour and opacity, each between 0 and 1."""
+
+    def __post_init__(self) -> None:
+        """Validate the name and the lengths."""
+        if not isinstance(self.name, str) or not self.name.isidentifier():
+            raise QuadrlError(name="solid", value=self.name, allowed="a name such as 'post'")
+        for field in dataclasses.fields(self):
+            if field.type == "float":
+                number(f"{self.name} {field.name}", getattr(self, field.name), positive=True)
+
+    @property
+    @abc.abstractmethod
+    def parts(self) -> tuple[Part, ...]:
+        """The geoms that it is made of."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sphere(Solid):
+    """A ball."""
+
+    radius: float = 0.2
+    """[m]"""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """One sphere."""
+        return (Part(mujoco.mjtGeom.mjGEOM_SPHERE, (self.radius, 0.0, 0.0)),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cylinder(Solid):
+    """A post, a tree, or, lower than wide, a pad; upright unless it is turned."""
+
+    radius: float = 0.1
+    """[m]"""
+    height: float = 2.0
+    """[m]"""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """One cylinder."""
+        size = (self.radius, self.height / 2, 0.0)
+        return (Part(mujoco.mjtGeom.mjGEOM_CYLINDER, size),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Box(Solid):
+    """A block, a wall or a floor."""
+
+    length: float = 1.0
+    """Along x [m]."""
+    width: float = 1.0
+    """Along y [m]."""
+    height: float = 1.0
+    """Along z [m]."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """One box."""
+        size = (self.length / 2, self.width / 2, self.height / 2)
+        return (Part(mujoco.mjtGeom.mjGEOM_BOX, size),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gate(Solid):
+    """A square frame to fly through, along its x axis."""
+
+    opening: float = 1.0
+    """Edge of what is free [m]."""
+    frame: float = 0.1
+    """Width and depth of its bars [m]."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Four bars."""
+        half, reach = self.frame / 2, (self.opening + self.frame) / 2
+        box, whole = mujoco.mjtGeom.mjGEOM_BOX, self.opening / 2 + self.frame
+        level, upright = (half, whole, half), (half, half, self.opening / 2)
+        return (
+            Part(box, level, (0.0, 0.0, reach)),
+            Part(box, level, (0.0, 0.0, -reach)),
+            Part(box, upright, (0.0, reach, 0.0)),
+            Part(box, upright, (0.0, -reach, 0.0)),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """Where a solid stands in each episode."""
+
+    position: Array  # (n, 3) [m] of its centre, task frame
+    quaternion: Array = None  # (n, 4) (w, x, y, z); None for upright, its x axis to the east
+
+
+@dataclasses.dataclass(slots=True)
+class Surroundings:
+    """What is about aircraft in a world with solids, arrays (N, ...)."""
+
+    position: dict[str, Array]  # (N, 3) [m] of each solid's centre by its name, task frame
+    clearance: Array  # (N,) [m], free at least between the aircraft and the nearest solid
+    hit: dict[str, Array]  # (N,) bool, whether each solid was touched in this control step
+    hit_speed: Array  # (N,) [m/s], of the fastest touch towards the solid; 0 without one
+
+
+def heading(angle: Array) -> Array:
+    """Quaternions (n, 4) of solids turned by angles (n,) [rad] from the east to the north."""
+    xp = namespace(angle)
+    none = xp.zeros_like(angle)
+    return xp.stack([xp.cos(angle / 2), none, none, xp.sin(angle / 2)], axis=-1)
+
+
+class Scene:
+    """The solids of a task, in the order of their geoms."""
+
+    def __init__(self, solids: Sequence[Solid]) -> None:
+        """Check the names.
+
+        Raises:
+            QuadrlError: Two solids have the same name, or something is none.
+        """
+        self.solids = tuple(solids)
+        for solid in self.solids:
+            if not isinstance(solid, Solid):
+                allowed = "Sphere, Cylinder, Box and Gate of quadrl.conditions.scene"
+                raise QuadrlError(name="solids", value=solid, allowed=allowed)
+        names = [solid.name for solid in self.solids]
+        if len(set(names)) < len(names):
+            raise QuadrlError(name="solids", value=names, allowed="a name of its own for each")
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add the geoms to a world; where they stand is a row's own."""
+        position, quaternion = ELSEWHERE
+        for index, solid in enumerate(self.solids):
+            for k, part in enumerate(solid.parts):
+                geom = spec.worldbody.add_geom(
+                    name=f"{solid.name}_{k}", type=part.kind, size=part.size, pos=position,
+                    quat=quaternion, rgba=solid.rgba, contype=1, conaffinity=0, group=HIDDEN,
+                )  # fmt: skip
+                geom.userdata = [MARK, index]
+        if self.solids:
+            spec.nuser_geom = 2
+
+    def poses(self, placed: Mapping[str, Pose], count: int, origin: np.ndarray) -> np.ndarray:
+        """Poses (n, K, 7) of the geoms in the world, as engines take them.
+
+        Args:
+            placed: Poses of solids by name; the others stand where they are declared.
+            count: n.
+            origin: (3,) [m], of the task frame in the world frame.
+
+        Raises:
+            QuadrlError: There is no such solid, or an array has the wrong shape.
+        """
+        names = [solid.name for solid in self.solids]
+        if unknown := set(placed) - set(names):
+            raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(names))
+        made = []
+        for solid in self.solids:
+            pose = placed.get(solid.name) or Pose(np.tile(solid.position, (count, 1)))
+            turn = pose.quaternion
+            turn = heading(np.zeros(count)) if turn is None else np.asarray(turn, dtype=float)
+            position = np.asarray(pose.position, dtype=float)
+            for array, size in ((position, 3), (turn, 4)):
+                if array.shape != (count, size) or not np.isfinite(array).all():
+                    allowed = f"finite arrays, position ({count}, 3) and quaternion ({count}, 4)"
+                    raise QuadrlError(name=f"pose of {solid.name}", value=array, allowed=allowed)
+            turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
+            for part in solid.parts:
+                offset = np.broadcast_to(part.offset, (count, 3)).copy()
+                moved = position + origin + _rotated(turn, offset)
+                made.append(np.concatenate([moved, turn], axis=-1))
+        return np.stack(made, axis=1) if made else np.zeros((count, 0, 7))
+
+    def surroundings(self, engine: Any) -> Surroundings:
+        """What is about the aircraft of an `Engine` now; arrays of their own."""
+        first = np.cumsum([0, *(len(solid.parts) for solid in self.solids)])
+        table = engine.solids.table
+        centre = {
+            solid.name: self._centre(solid, table[:, k]) - engine.origin
+            for k, solid in zip(first, self.solids, strict=False)
+        }
+        which, speed = engine.hits.T
+        hit = {solid.name: which == 1 + k for k, solid in enumerate(self.solids)}
+        return Surroundings(centre, engine.clearance.copy(), hit, speed.copy())
+
+    @staticmethod
+    def _centre(solid: Solid, part: np.ndarray) -> np.ndarray:
+        """Centre (N, 3) of a solid [m], world frame, from where its first part stands."""
+        turn = part["turn"].reshape(-1, 3, 3)
+        return part["position"] - turn @ np.asarray(solid.parts[0].offset)
+
+
+def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors (n, 3) turned by unit quaternions (n, 4)."""
+    w, axis = quaternion[:, :1], quaternion[:, 1:]
+    twice = 2 * np.cross(axis, vector)
+    return vector + w * twice + np.cross(axis, twice)

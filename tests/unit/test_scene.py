@@ -1,0 +1,172 @@
+"""Solids in the world: how far they are, what they stop, and that both engines agree."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import rotation_matrix
+from quadrl.conditions.scene import Box, Cylinder, Gate, Pose, Scene, Sphere, heading
+from quadrl.engines.mujoco import make
+from quadrl.engines.state import Start
+
+PAPER = VEHICLES["paper"]
+EVERY = Scene(
+    [
+        Sphere("ball", radius=0.3),
+        Cylinder("post", radius=0.1, height=4.0),
+        Box("wall", length=0.2, width=3.0, height=2.0),
+        Gate("gate", opening=1.2, frame=0.1),
+    ]
+)
+
+
+def flown(scene, poses, velocity, steps=12, engine="mujoco", vehicle=PAPER):
+    """Engine and track (steps + 1, N, 3) [m] of aircraft at hover speed, from the origin on."""
+    count = len(velocity)
+    made = make(engine, vehicle, count, altitude=3.0, scene=scene.add_to if scene else None)
+    rest, hover = np.zeros((count, 3)), np.tile(vehicle.hover_speed, (count, 1))
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    start = Start(rest, level, np.asarray(velocity, dtype=float), rest, hover)
+    solids = scene.poses(poses, count, made.origin) if scene else None
+    made.place(np.arange(count), start, solids=solids)
+    made.ctrl[:] = hover
+    track, hits = [made.state.position.copy()], np.zeros((count, 2))
+    for _ in range(steps):
+        made.hits[:] = 0.0
+        made.advance(10)
+        made.read()
+        track.append(made.state.position.copy())
+        if scene:
+            hits = np.where(made.hits[:, 1:] > hits[:, 1:], made.hits, hits)
+    return made, np.array(track), hits
+
+
+def test_clearance_is_the_distance_that_mujoco_measures():
+    rng, count = np.random.default_rng(0), 40
+    turns = rng.normal(size=(4, count, 4))
+    names = [solid.name for solid in EVERY.solids]
+    poses = {
+        name: Pose(rng.uniform(-2, 2, (count, 3)), turn / np.linalg.norm(turn, axis=1)[:, None])
+        for name, turn in zip(names, turns, strict=True)
+    }
+    engine, *_ = flown(EVERY, poses, np.zeros((count, 3)), steps=0)
+    found = engine.clearance
+    spec = mujoco.MjSpec()
+    EVERY.add_to(spec)
+    centres = [np.zeros(3)] + [
+        np.array(r.position) + PAPER.rotor_height * np.array(r.axis) for r in PAPER.rotors
+    ]
+    radii = [max(PAPER.hull)] + [rotor.radius for rotor in PAPER.rotors]
+    body = spec.worldbody.add_body(mocap=True)
+    for k, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
+        kind = mujoco.mjtGeom.mjGEOM_SPHERE
+        body.add_geom(name=f"part_{k}", type=kind, size=[radius, 0, 0], pos=centre)
+    model = spec.compile()
+    data, solids = mujoco.MjData(model), engine.solids.geoms - engine.solids.geoms[0]
+    for row in range(count):
+        where = engine.solids.poses(engine._model_field)[row]
+        model.geom_pos[solids], model.geom_quat[solids] = where[:, :3], where[:, 3:]
+        data.mocap_pos[0], data.mocap_quat[0] = engine.qpos[row, :3], engine.qpos[row, 3:]
+        mujoco.mj_kinematics(model, data)
+        parts = [model.geom(f"part_{k}").id for k in range(len(centres))]
+        least = min(
+            mujoco.mj_geomDistance(model, data, solid, part, 100.0, None)
+            for solid in solids
+            for part in parts
+        )
+        if least > 0.01:  # what overlaps MuJoCo measures otherwise
+            assert found[row] == pytest.approx(least, abs=1e-6)
+        else:
+            assert found[row] < 0.02
+
+
+@pytest.mark.parametrize("count", [1, 11])
+def test_both_engines_stop_at_a_post_and_say_how_fast_it_was_hit(count):
+    ahead = np.stack([1.0 + 0.1 * np.arange(count), *np.zeros((2, count))], axis=-1)
+    poses = {"post": Pose(ahead)}
+    scene = Scene([Cylinder("post", radius=0.1, height=4.0)])
+    velocity = np.tile([3.0, 0.0, 0.0], (count, 1))
+    tracks, hits = [], []
+    for engine in ("mujoco", "free_flight"):
+        _, track, hit = flown(scene, poses, velocity, engine=engine)
+        # The rotor ahead is 0.2 m from the centre and 0.1 m wide; contacts give way a little.
+        assert (track[:, :, 0].max(axis=0) < ahead[:, 0] - 0.25).all()
+        np.testing.assert_array_equal(hit[:, 0], 1.0)
+        assert (abs(hit[:, 1] - 2.95) < 0.05).all()  # 3 m/s less the drag
+        tracks.append(track)
+        hits.append(hit)
+    # Free flight turns the attitude by a method of fourth order, which shows after a hit.
+    np.testing.assert_allclose(tracks[0][:7], tracks[1][:7], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(hits[0], hits[1], rtol=1e-6)
+
+
+def test_each_row_has_its_own_and_flies_as_it_does_alone():
+    velocity = np.array([[3.0, 0, 0], [0, 3.0, 0], [0, 0, 0.5]])
+    places = np.array([[1.0, 0, 0], [0, 1.2, 0], [0, 5.0, 0]])
+    scene = Scene([Sphere("ball", radius=0.3)])
+    for engine in ("mujoco", "free_flight"):
+        _, together, _ = flown(scene, {"ball": Pose(places)}, velocity, engine=engine)
+        for row in range(3):
+            pose = {"ball": Pose(places[row : row + 1])}
+            _, alone, _ = flown(scene, pose, velocity[row : row + 1], engine=engine)
+            np.testing.assert_array_equal(together[:, row], alone[:, 0])
+
+
+def test_far_from_every_solid_an_aircraft_flies_bit_for_bit_as_without():
+    velocity = np.array([[3.0, 1.0, 0.5], [0.0, -2.0, 0.0]])
+    far = {solid.name: Pose(np.full((2, 3), 20.0)) for solid in EVERY.solids}
+    for engine in ("mujoco", "free_flight"):
+        _, with_solids, hits = flown(EVERY, far, velocity, engine=engine)
+        _, without, _ = flown(None, {}, velocity, engine=engine)
+        np.testing.assert_array_equal(with_solids, without)
+        assert not hits.any()
+
+
+def test_a_gate_is_open_in_its_middle_and_turns_with_its_pose():
+    scene, ahead = Scene([Gate("gate", opening=1.2, frame=0.1)]), np.array([[1.5, 0.0, 0.0]])
+    north, velocity = heading(np.array([np.pi / 2])), np.array([[4.0, 0.0, 0.0]])
+    aside = ahead + [0.0, 0.65, 0.0]  # the bar stands in the way
+    for pose, hits in ((Pose(ahead), False), (Pose(aside), True), (Pose(ahead, north), True)):
+        _, track, hit = flown(scene, {"gate": pose}, velocity, engine="free_flight", steps=16)
+        assert (track[-1, 0, 0] > 2.0) != hits and hit.any() == hits
+    bars = Scene([Gate("gate")]).poses({"gate": Pose(ahead, north)}, 1, np.zeros(3))
+    # Turned to the north the bars aside stand to the west and to the east of its centre.
+    turned = rotation_matrix(north) @ np.array([0.0, 0.55, 0.0])
+    np.testing.assert_allclose(bars[0, 2, :3], ahead[0] + turned[0], atol=1e-12)
+
+
+def test_what_was_saved_stands_again():
+    scene, velocity = Scene([Sphere("ball", radius=0.3)]), np.array([[3.0, 0, 0]] * 2)
+    poses = {"ball": Pose(np.array([[1.0, 0, 0], [0, 1.2, 0]]))}
+    for engine in ("mujoco", "free_flight"):
+        one, *_ = flown(scene, poses, velocity, steps=1, engine=engine)
+        away = {"ball": Pose(np.full((2, 3), 9.0))}
+        other, *_ = flown(scene, away, velocity, steps=1, engine=engine)
+        other.restore(one.save())
+        for made in (one, other):
+            made.ctrl[:] = PAPER.hover_speed
+            for _ in range(6):
+                made.advance(10)
+                made.read()
+        np.testing.assert_array_equal(one.qpos, other.qpos)
+        np.testing.assert_array_equal(one.clearance, other.clearance)
+
+
+@pytest.mark.parametrize(
+    ("make_it", "name"),
+    [
+        (lambda: Sphere("ball", radius=0.0), "ball radius"),
+        (lambda: Sphere("no name"), "solid"),
+        (lambda: Scene([Sphere("ball"), Box("ball")]), "solids"),
+        (lambda: Scene(["post"]), "solids"),  # pyright: ignore
+        (lambda: EVERY.poses({"bal": Pose(np.zeros((1, 3)))}, 1, np.zeros(3)), "place"),
+        (lambda: EVERY.poses({"ball": Pose(np.zeros(3))}, 1, np.zeros(3)), "pose of ball"),
+        (lambda: EVERY.poses({"ball": Pose(np.full((1, 3), np.nan))}, 1, np.zeros(3)), "pose"),
+    ],
+)
+def test_what_no_world_can_hold_is_refused(make_it, name):
+    with pytest.raises(QuadrlError) as caught:
+        make_it()
+    assert caught.value.name.startswith(name) and caught.value.allowed
