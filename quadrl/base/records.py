@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,23 @@ def mapped(function: Callable[[Any], Any], record: Any) -> Any:
             value = function(value)
         values[field.name] = value
     return type(record)(**values)
+
+
+def leaves(record: Any) -> list[Any]:
+    """A record's arrays, one after the other."""
+    found = []
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if dataclasses.is_dataclass(value):
+            found += leaves(value)
+        elif hasattr(value, "dtype"):
+            found.append(value)
+    return found
+
+
+def filled(like: Any, arrays: Iterator[Any]) -> Any:
+    """A record of the kinds of another, with the next arrays, as `leaves` gives them."""
+    return mapped(lambda _: next(arrays), like)
 
 
 def copied(record: Any) -> Any:

@@ -8,8 +8,9 @@ same bits (but sine and its like, which are the C library's).
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,22 @@ ARRANGING = {
 MAX_OPERATIONS = 2000  # more would take the C compiler longer than they save
 
 
+class NotCompilable(TypeError):
+    """What was called with symbols does more than arithmetic, or looks at what may change."""
+
+
+@contextlib.contextmanager
+def symbolic() -> Generator[None]:
+    """Report whatever functions raise that were not made for symbols as `NotCompilable`."""
+    try:
+        yield
+    except NotCompilable:
+        raise
+    except Exception as error:  # NumPy, other libraries and the caller each have their own
+        reason = f"with symbols it raises {type(error).__name__}: {error}"
+        raise NotCompilable(reason) from error
+
+
 class Symbol:
     """A number that is known when the loop runs; the same operation gives the same symbol."""
 
@@ -58,7 +75,7 @@ class Symbol:
         self.name = f"t{len(trace.known)}"
 
     def __bool__(self) -> bool:
-        raise TypeError("a branch on data cannot be compiled")
+        raise NotCompilable("a branch on data cannot be compiled")
 
     __eq__ = __ne__ = lambda self, other: bool(self)  # of lists, for instance
     __hash__ = object.__hash__
@@ -84,7 +101,7 @@ class Trace:
         """The symbol of a result.
 
         Raises:
-            TypeError: There is no such operation in C.
+            NotCompilable: There is no such operation in C.
         """
         if name == "clip":
             name, values = "minimum", (self.operation("maximum", *values[:2]), values[2])
@@ -93,7 +110,7 @@ class Trace:
         flags = [_is_flag(value) for value in values]
         known = flags[0] if name == "where" else all(flags) == (name in LOGICAL)
         if name not in C or not known or len(self.known) > MAX_OPERATIONS:
-            raise TypeError(f"{name} cannot be compiled")
+            raise NotCompilable(f"{name} cannot be compiled")
         names = tuple(self.name_of(value) for value in values)
         is_flag = name in FLAGS or (name == "where" and all(flags))
         symbol = Symbol(self, C[name].format(*names), names, is_flag)
@@ -134,6 +151,8 @@ class Symbols(np.ndarray):
             return elementwise(ufunc.__name__, *inputs)
         rest = (options[name] for name in options.keys() - {"axis", "keepdims"})
         usual, axes = all(x is None or x is True for x in rest), options.get("axis", 0)
+        if axes is None:
+            raise NotCompilable("a look at all rows at once cannot be compiled")
         axes = axes if isinstance(axes, tuple) else (axes,)
         whole = np.moveaxis(np.asarray(inputs[0]), axes, range(len(axes)))
         parts = whole.reshape(-1, *whole.shape[len(axes) :])
@@ -142,14 +161,14 @@ class Symbols(np.ndarray):
         if method == "reduce" and usual and in_order:
             result = functools.reduce(functools.partial(elementwise, ufunc.__name__), parts)
             return np.expand_dims(result, axes) if options.get("keepdims") else result
-        raise TypeError(f"{ufunc.__name__}.{method} cannot be compiled")
+        raise NotCompilable(f"{ufunc.__name__}.{method} cannot be compiled")
 
     def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
         """Choose between symbols, or arrange them."""
         if function is np.where:
             return elementwise("where", *args)
         if function not in ARRANGING:
-            raise TypeError(f"{function.__name__} cannot be compiled")
+            raise NotCompilable(f"{function.__module__}.{function.__name__} cannot be compiled")
         result = super().__array_function__(function, types, args, options)
         return symbols(result) if isinstance(result, np.ndarray) else result
 

@@ -2,18 +2,17 @@
 
 The functions of a task are called twice, with symbols (`quadrl.base.trace`); what they compute
 becomes a C function, and NumPy's rows fly with it. One aircraft alone would spend more time in
-eighty calls of NumPy than in its simulation. A task whose functions do more than arithmetic cannot
-be compiled and is run as it is written, with the same results.
+eighty calls of NumPy than in its simulation. A task whose functions do more than arithmetic, or
+look at what may change (`core/purity.py`), runs as it is written, with the same results.
 """
 
 from __future__ import annotations
 
 import ctypes
 import dataclasses
-import functools
-import itertools
 import math
-import sys
+import warnings
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -21,22 +20,20 @@ import numpy as np
 
 from quadrl.aircraft.parameters import AIRCRAFT, ROW_SIZE, Parameters
 from quadrl.base import records
+from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.rotation import Array
-from quadrl.base.trace import Trace
+from quadrl.base.trace import NotCompilable, Trace, symbolic
+from quadrl.core.purity import Reads
 from quadrl.core.snapshot import Snapshot
+from quadrl.core.step import Step, WrittenStep
 from quadrl.core.task import Task
-from quadrl.core.transition import Clock, Episode, Transition, finish
+from quadrl.core.transition import Episode, Transition, finish
 from quadrl.engines import native
-from quadrl.engines.engine import Engine, Frame
+from quadrl.engines.engine import padded
 from quadrl.engines.state import State
 
-_ALONE = [object()]
-FREE = sys.getrefcount(_ALONE[0])
-"""References to what only one container holds, from there and from the question."""
-SPARE = 4
-"""Tables that are kept to be written to again."""
-MOMENT = ("action", "rotor_command", "time")
-"""Arrays of a snapshot that are its own."""
+METHODS = ("measure", "terminated", "error", "succeeded", "reward", "update", "observe")
+"""Functions of a task that a step calls."""
 FLAGS = ("terminated", "truncated", "is_success", "diverged")
 POINTERS = (
     *("constants", "parameters", "action", "command", "diverged"),
@@ -65,6 +62,39 @@ __attribute__((visibility("default"))) void step(const Rows* rows, int64_t n) {{
   }}
 }}
 """
+_REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
+"""Tasks of which was said that they are not compiled."""
+
+
+def make(now: Snapshot, episode: Episode, loops: bool, parameters: np.ndarray, *parts: Any) -> Step:
+    """The step of a task, compiled if it can be; a task that cannot is reported once.
+
+    Args:
+        now: Any snapshot of the task.
+        episode: Any of its episodes.
+        loops: Whether the control mode reads the state in the middle of a step.
+        parameters: Rows that the task sees, (N,) or (1,), read live.
+        *parts: As `Step` takes them.
+    """
+    step = WrittenStep(*parts)
+    if not step.task.compiled:
+        step.not_compiled = "the task has `compiled = False`"
+        return step
+    try:
+        return CompiledStep(step, now, episode, loops, parameters, *parts)
+    except NotCompilable as error:
+        return _reported(step, str(error))
+
+
+def _reported(step: WrittenStep, reason: str) -> WrittenStep:
+    """A step that runs as it is written; the first of a task says why."""
+    step.not_compiled, task = reason, type(step.task)
+    if task not in _REPORTED:
+        _REPORTED.add(task)
+        advice = "`compiled = False` in the class says that this is meant"
+        message = f"the step of the task {task.name} is not compiled: {reason}; {advice}"
+        warnings.warn(message, QuadrlWarning, stacklevel=2)
+    return step
 
 
 class _Rows(ctypes.Structure):
@@ -100,200 +130,195 @@ class _Columns:
         ]
 
 
-class CompiledStep:
-    """A task's step for N rows.
+class _Page:
+    """A table of all that a step gives, a row per number, and its named views."""
 
-    All that a step gives stands in a table of its own (rows, N): a row per number of the snapshot
-    (but its state), of the episodes and of the transition; the last row holds flags, a byte each.
+    def __init__(self, step: CompiledStep, now: Snapshot, episode: Episode) -> None:
+        """Lay out a table for records like those."""
+        whole = np.empty((step.flags + 1, step.columns))
+        table = whole[:, : step.count]
+        self.address = native.address(whole)
+        self.kept = step.kept.views(table)
+        parts = iter(self.kept)
+        self.now, self.episode = (records.filled(like, parts) for like in (now, episode))
+        seen = step.seen.views(table)
+        self.observation = dict(zip(step.observed, seen, strict=False))
+        self.truth = dict(zip(step.observed, seen[len(step.observed) :], strict=False))
+        size = sum(array.shape[1] for array in self.observation.values())
+        self.vectors = table[step.kept.end : step.kept.end + size].T
+        self.rest = whole[step.seen.end :]
+        """Terms of the reward, their sum, the error, and the flags, a byte each."""
+
+
+class CompiledStep(Step):
+    """A task's step for N rows, in C.
+
+    What is live stands in one of two tables in turn, as an engine's state does. The rest of a
+    transition is its own: a copy of the table's last rows.
     """
 
     def __init__(
         self,
-        task: Task,
-        clock: Clock,
-        engine: Engine,
-        rows: np.ndarray,
-        inputs: tuple[np.ndarray, np.ndarray, np.ndarray],
+        written: WrittenStep,
         now: Snapshot,
         episode: Episode,
         loops: bool,
-        estimate: Frame | None = None,
+        parameters: np.ndarray,
+        *parts: Any,
     ) -> None:
         """Trace and compile.
 
         Args:
-            task: The task.
-            clock: Of its episodes.
-            engine: Of the aircraft.
-            rows: Of parameters that the task sees, (N,) or (1,), read live.
-            inputs: Buffers of the action (N, k), of the rotor command (N, R) and of whether an
-                aircraft diverged (N,), read live.
+            written: The same step as it is written, to go on with where it must be.
             now: Any snapshot of the task, with those parameters.
             episode: Any of its episodes.
             loops: Whether the control mode reads the state in the middle of a step.
-            estimate: Table of the state that is observed, read live; None for the true one.
+            parameters: Rows that the task sees, (N,) or (1,), read live.
+            *parts: As `Step` takes them.
 
         Raises:
-            Exception: Of any kind: the functions of the task do more than arithmetic.
+            NotCompilable: The functions of the task do more than arithmetic, or there is no
+                compiler.
         """
-        self._engine, self._rows, self._inputs = engine, rows, inputs
-        self._estimate = estimate
-        self._table = self._last = np.empty(0)
-        self._tables: list[tuple[np.ndarray, int]] = []  # with their addresses
-        self.observation: dict[str, np.ndarray] = {}
-        """Of the last step."""
-        self._parameters = now.parameters
-        self._kinds = type(now.potentials), type(now.task)
-        kept = _arrays(now, episode)
+        super().__init__(*parts)
+        self._written, self._parameters = written, now.parameters
+        self.count, self.columns = self._engine.num_envs, padded(self._engine.num_envs)
+        like = dataclasses.replace(now, state=None, parameters=None)  # these have their own tables
+        kept = [*records.leaves(like), *records.leaves(episode)]
         if any(array.dtype != np.float64 for array in kept):
-            raise TypeError("only float64 is compiled")
-        self._kept = _Columns(0, kept)
-        (trace, body), (again, other) = (self._traced(task, clock) for _ in range(2))
-        if (body, trace.constants) != (other, again.constants):
-            raise TypeError("the task gives something else each time")
+            raise NotCompilable("what it remembers is not all float64")
+        self.kept = _Columns(0, kept)
+        kinds = type(now.task), type(now.potentials)
+        self._reads = Reads(self.task, METHODS, kinds)
+        (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
+        if (body, trace.constants) != (other, again.constants) or self._reads.changed:
+            raise NotCompilable("it gives something else each time")
         if loops and "last_state[" in body:
-            raise TypeError("the loops read the state in between, into the same memory")
-        self._load(trace, SOURCE.format(flags=self._flags, body=body))
+            raise NotCompilable("the control mode reads the state in between, into the same memory")
+        try:
+            self._call = native.compile_generated(SOURCE.format(flags=self.flags, body=body)).step
+        except NativeError as error:
+            raise NotCompilable(str(error).partition("\n")[0]) from error
+        self._call.argtypes, self._call.restype = [ctypes.c_void_p, ctypes.c_int64], None
+        self._constants = np.array([*trace.constants, 0.0])
+        inputs = (getattr(self._inputs, f.name) for f in dataclasses.fields(self._inputs))
+        self._arguments = _Rows(
+            *(array.ctypes.data for array in (self._constants, parameters, *inputs)),
+            estimate=self._estimate.address if self._estimate else None,
+            stride=parameters.strides[0] // 8 if len(parameters) > 1 else 0,
+            columns=self.columns,
+        )
+        self._address = ctypes.addressof(self._arguments)
+        self._pages = tuple(_Page(self, like, episode) for _ in range(2))
+        self._observation: dict[str, np.ndarray] = {}
 
-    def _traced(self, task: Task, clock: Clock) -> tuple[Trace, str]:
+    def _traced(self, like: Snapshot, episode: Episode) -> tuple[Trace, str]:
         """The operations of a step, and the body of its loop."""
-        trace, engine = Trace(), self._engine
+        trace = Trace()
 
         def read(place: str) -> Callable[[Array], Array]:
             text = np.frompyfunc(lambda number: place.format(int(number)), 1, 1)
             return lambda numbers: trace.inputs(text(numbers))
 
         # Arrays whose numbers say where they stand, made by what makes the views of real ones.
-        places = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
-        rotors = self._inputs[1].shape[1]
-        own = Parameters.of(places, clock.control_timestep, rotors)
-        states = np.arange(engine.frames[0].table.shape[0])[:, None]
+        own = Parameters.of(
+            np.arange(float(ROW_SIZE)).view(AIRCRAFT),
+            self._clock.control_timestep,
+            self._inputs.command.shape[1],
+        )
+        states = State.of_table(np.arange(len(self._engine.frames[0].table))[:, None])
         state, last_state, estimate = (
-            records.mapped(read(f"{name}[{{}} * columns + i]"), State.of_table(states))
+            records.mapped(read(f"{name}[{{}} * columns + i]"), states)
             for name in ("state", "last_state", "estimate")
         )
-        estimated = (estimate,) if self._estimate else ()
-        kept = self._kept.views(np.arange(self._kept.end)[:, None])
-        before, begun = self._records([read("was[{} * columns + i]")(places) for places in kept])
+        places = iter(self.kept.views(np.arange(self.kept.end)[:, None]))
+        before, begun = (
+            records.mapped(read("was[{} * columns + i]"), records.filled(record, places))
+            for record in (like, episode)
+        )
         before.state, before.parameters = last_state, own.map(read("p[i * stride + {}]"))
         action, command = (
-            read(f"{name}[i * {buffer.shape[1]} + {{}}]")(np.arange(buffer.shape[1])[None])
-            for name, buffer in zip(("action", "command"), self._inputs, strict=False)
+            read(f"{name}[i * {size} + {{}}]")(np.arange(size)[None])
+            for name in ("action", "command")
+            for size in [getattr(self._inputs, name).shape[1]]
         )
         diverged = trace.inputs(np.array(["diverged[i]"], object), is_flag=True)
-        inputs = (state, action, command, diverged, *estimated)
-        after, ended, done = finish(task, clock, begun, before, *inputs)
-        self._observed, self._rewarded = list(done.observation), list(done.reward_terms)
-        given = [*done.observation.values(), *done.reward_terms.values(), done.reward, done.error]
-        given += done.truth.values() if estimated else ()
-        self._given = _Columns(self._kept.end, given)
-        size = sum(array.shape[-1] for array in done.observation.values())
-        self._vectors = slice(self._kept.end, self._kept.end + size)
-        self._flags = self._given.end
-        outputs: dict[str, Any] = {}
-        numbers = np.arange(self._flags)[:, None]
-        for columns, arrays in ((self._kept, _arrays(after, ended)), (self._given, given)):
+        inputs = state, action, command, diverged, estimate if self._estimate else None
+        with symbolic():
+            after, ended, done = finish(self.task, self._clock, begun, before, *inputs)
+            after.state = after.parameters = None  # type: ignore[assignment]
+            kept = [*records.leaves(after), *records.leaves(ended)]
+            return trace, trace.body(self._outputs(kept, done))
+
+    def _outputs(self, kept: list[Array], done: Transition) -> dict[str, Any]:
+        """What is computed, by where it is written to."""
+        self.observed, self._rewarded = list(done.observation), list(done.reward_terms)
+        seen = [*done.observation.values(), *(done.truth.values() if self._estimate else ())]
+        rest = [*done.reward_terms.values(), done.reward, done.error]
+        self.seen = _Columns(self.kept.end, seen)
+        own = _Columns(self.seen.end, rest)
+        self.flags = own.end  # the row of flags, a byte each
+        numbers, outputs = np.arange(self.flags)[:, None], {}
+        for columns, arrays in ((self.kept, kept), (self.seen, seen), (own, rest)):
             for places, array in zip(columns.views(numbers), arrays, strict=True):
                 values = np.broadcast_to(np.asarray(array, dtype=object), places.shape)
                 for place, value in zip(places.ravel(), values.ravel(), strict=True):
                     outputs[f"out[{place} * columns + i]"] = value
         for k, name in enumerate(FLAGS):
             outputs[f"flags[{k} * columns + i]"] = np.asarray(getattr(done, name), dtype=object)[0]
-        return trace, trace.body(outputs)
-
-    def _load(self, trace: Trace, source: str) -> None:
-        """Compile, and note the addresses that stay."""
-        self._constants = np.array([*trace.constants, 0.0])
-        self._step = native.compile_generated(source).step
-        self._step.argtypes, self._step.restype = [ctypes.c_void_p, ctypes.c_int64], None
-        rows = self._rows
-        self._arguments = _Rows(
-            self._constants.ctypes.data,
-            rows.ctypes.data,
-            *(buffer.ctypes.data for buffer in self._inputs),
-            estimate=self._estimate.address if self._estimate else None,
-            stride=rows.strides[0] // 8 if len(rows) > 1 else 0,
-            columns=self._engine.frames[0].columns,
-        )
-        self._address = ctypes.addressof(self._arguments)
+        return outputs
 
     def begin(self, now: Snapshot, episode: Episode) -> None:
-        """Take up a snapshot of all rows."""
-        self.observation = {}
-        self._new_table()
-        own = self._kept.views(self._table[:, : self._engine.num_envs])
-        for into, array in zip(own, _arrays(now, episode), strict=True):
+        """Take a snapshot of all rows as the present one."""
+        moment = dataclasses.replace(now, state=None, parameters=None)
+        arrays = [*records.leaves(moment), *records.leaves(episode)]
+        for into, array in zip(self._pages[0].kept, arrays, strict=True):
             into[:] = array
+        self._show(self._pages[0])
+
+    def hold(self) -> None:
+        """Keep nothing: where the engine is read in between, no step looks back at the state."""
 
     def finish(self) -> Transition:
-        """As `transition.finish`, from the last step's snapshot to the engine's state."""
-        self._new_table()
-        rows, (now, last), observed = self._arguments, self._engine.frames, self._observed
-        rows.state, rows.last_state = now.address, last.address
-        count, columns = self._engine.num_envs, rows.columns
-        self._step(self._address, count)
-        given = self._given.views(self._table[:, :count])
-        flags = self._table[self._flags].view(np.bool_).reshape(-1, columns)
-        self.observation = dict(zip(observed, given, strict=False))
-        terms = dict(zip(self._rewarded, given[len(observed) :], strict=False))
-        reward, error, *true = given[len(observed) + len(terms) :]
+        """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
+        last, page = self._pages
+        self._pages = page, last
+        rows, (now, before) = self._arguments, self._engine.frames
+        rows.state, rows.last_state = now.address, before.address
+        rows.was, rows.out = last.address, page.address
+        self._call(self._address, self.count)
+        self._show(page)
+        self._observation = page.observation.copy()
+        rest, count = page.rest.copy(), self.count
+        *terms, reward, error = rest[:-1, :count]
+        flags = rest[-1].view(np.bool_).reshape(-1, self.columns)[: len(FLAGS), :count]
+        terminated, truncated, is_success, diverged = flags
         return Transition(
-            observation=self.observation,
+            observation=self._observation,
             reward=reward,
-            reward_terms=terms,
-            terminated=flags[0, :count],
-            truncated=flags[1, :count],
-            is_success=flags[2, :count],
-            diverged=flags[3, :count],
+            reward_terms=dict(zip(self._rewarded, terms, strict=True)),
+            terminated=terminated,
+            truncated=truncated,
+            is_success=is_success,
+            diverged=diverged,
             error=error,
-            truth=dict(zip(observed, true, strict=True)) if true else self.observation,
+            truth=page.truth or self._observation,
         )
 
-    def flat(self) -> np.ndarray:
-        """The terms of `observation` as vectors (N, size), float32."""
-        table = self._table[self._vectors, : self._engine.num_envs]
-        return table.T.astype(np.float32, order="C")
+    def _show(self, page: _Page) -> None:
+        """Make a table the present one."""
+        page.now.state, page.now.parameters = self._engine.state, self._parameters
+        self.snapshot, self.episode = page.now, page.episode
 
-    def snapshot(self) -> tuple[Snapshot, Episode]:
-        """The snapshot after the last step, and how far its episodes are; live."""
-        table = self._table[:, : self._engine.num_envs]
-        now, episode = self._records(self._kept.views(table))
-        now.state, now.parameters = self._engine.state, self._parameters
-        return now, episode
+    def renewed(self) -> Step:
+        """The step as it is written, once a number that was read in tracing is another one."""
+        if not (name := self._reads.changed):
+            return self
+        self._written.begin(self.snapshot, self.episode)
+        return _reported(self._written, f"{name}, which it reads, has changed")
 
-    def _new_table(self) -> None:
-        """Write to another table, and read the one of the step before."""
-        # One that nobody holds an array of any more: fresh memory costs as much as the step.
-        free = (each for each in self._tables if sys.getrefcount(each[0]) == FREE)
-        found = next(free, None)
-        if found is None:
-            table = np.empty((self._flags + 1, self._arguments.columns))
-            found = table, native.address(table)
-            self._tables = [*self._tables[1 - SPARE :], found]
-        self._last, self._table = self._table, found[0]  # both are held
-        self._arguments.was, self._arguments.out = self._arguments.out, found[1]
-
-    def _records(self, arrays: list[Any]) -> tuple[Snapshot, Episode]:
-        """What `_arrays` took apart, without state and parameters."""
-        parts = iter(arrays)
-        potentials, task_state = (
-            kind(*itertools.islice(parts, len(_names(kind)))) for kind in self._kinds
-        )
-        moment = itertools.islice(parts, len(MOMENT))
-        now = Snapshot(None, task_state, None, *moment, potentials)  # type: ignore[arg-type]
-        return now, Episode(*parts)
-
-
-def _arrays(now: Snapshot, episode: Episode) -> list[Array]:
-    """The arrays of a snapshot (but its state and its parameters) and of its episodes."""
-    moment = [getattr(now, name) for name in MOMENT]
-    return [*_values(now.potentials), *_values(now.task), *moment, *_values(episode)]
-
-
-def _values(record: Any) -> list[Array]:
-    return [getattr(record, name) for name in _names(type(record))]
-
-
-@functools.cache
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(kind))
+    def flatten(self, observation: dict[str, Array]) -> np.ndarray:
+        """The terms of an observation as vectors (n, size), float32."""
+        if observation is self._observation:
+            return self._pages[0].vectors.astype(np.float32, order="C")
+        return super().flatten(observation)

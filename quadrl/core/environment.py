@@ -24,9 +24,9 @@ from quadrl.conditions.randomization import Randomized
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather, Weathered, WeatherProcess
 from quadrl.control import modes
-from quadrl.core import catalogue, observer, saving, transition
-from quadrl.core.compiled import CompiledStep
+from quadrl.core import catalogue, compiled, observer, saving, transition
 from quadrl.core.markers import Marker
+from quadrl.core.step import Inputs, Step
 from quadrl.core.task import Snapshot, Task, layout
 from quadrl.core.transition import Clock, Episode, Observation, Transition
 from quadrl.engines import mujoco
@@ -104,17 +104,12 @@ class Environment(saving.Copied):
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
         self._all = np.arange(self.num_envs)
         self._keys, self._episodes = np.zeros((2, self.num_envs), np.int64)  # seeds; begun since
-        self._episode: Episode | None = None
-        self._snapshot: Snapshot | None = None
-        self.compiled: CompiledStep | None = None
-        """The task's step in C from the first reset on; None where it cannot be compiled."""
-        self.not_compiled = ""  # why
-        self._action = np.zeros((self.num_envs, self.action_size))
-        self._command = np.zeros((self.num_envs, self.vehicle.rotor_count))  # [rad/s]
+        self._step: Step | None = None  # from the first reset on
+        rotors = self.vehicle.rotor_count
+        self._inputs = Inputs.zeros(self.num_envs, self.action_size, rotors)
         self.transition: Transition | None = None  # what the last step gave
         self._setpoint: Any = None
         self._flown = 0  # physics steps of this control step that the mode's loops have flown
-        self._diverged = np.zeros(self.num_envs, dtype=bool)  # in this control step
         self.seed(seed)
 
     def seed(self, seed: Seed = None, rows: np.ndarray | None = None) -> Seed:
@@ -164,7 +159,7 @@ class Environment(saving.Copied):
         if self.engine.forked:
             self.make_anew()
         rows = self._all if rows is None else validation.rows(rows, self.num_envs)
-        if self._episode is None and len(rows) < self.num_envs:
+        if self._step is None and len(rows) < self.num_envs:
             raise RuntimeError("the first reset must be of every aircraft")
         if not len(rows):
             return {name: np.zeros((0, at.stop - at.start)) for name, at in self.layout.items()}
@@ -187,40 +182,40 @@ class Environment(saving.Copied):
             self._take(now, episode)
         else:
             records.put(self.snapshot, rows, now)
-            records.put(self._episode, rows, episode)
+            records.put(self.episode, rows, episode)
         return self.observer.begin(rows, now) if self.observer else self.task.observe(now)
 
     @property
     def snapshot(self) -> Snapshot:
         """What tasks see now: live, valid until the next step."""
-        if self._snapshot is None:
-            assert self.compiled
-            self._snapshot, self._episode = self.compiled.snapshot()
-        return self._snapshot
+        return self._begun.snapshot
 
     @property
     def episode(self) -> Episode:
         """How far the episodes are: as live as the snapshot."""
-        _ = self.snapshot  # a compiled step hands out both at once
-        assert self._episode is not None
-        return self._episode
+        return self._begun.episode
+
+    @property
+    def _begun(self) -> Step:
+        if self._step is None:
+            raise RuntimeError("call reset before the first step")
+        return self._step
+
+    @property
+    def not_compiled(self) -> str:
+        """Why the task's step is not compiled; empty where it is, from the first reset on."""
+        return self._begun.not_compiled
 
     def _take(self, now: Snapshot, episode: Episode) -> None:
         """Take a snapshot of all rows as the present one."""
         # What a task remembers must not be a view of buffers that the next steps write.
         now.task, now.parameters = records.owned(now.task), self._parameters
-        if self._episode is None and self.task.compiled:
-            inputs = self._action, self._command, self._diverged
-            rows = self.engine, self._rows, inputs, now, episode
-            rows += self.control_mode.has_loops, self.observer and self.observer.frame
-            try:
-                self.compiled = CompiledStep(self.task, self._clock, *rows)
-            except Exception as error:  # whatever the functions of a task raise
-                self.not_compiled = str(error)
-        self._snapshot, self._episode = now, episode
-        if self.compiled:
-            self.compiled.begin(now, episode)
-            self._snapshot = None
+        if self._step is None:
+            estimate = self.observer.frame if self.observer else None
+            parts = self.task, self._clock, self.engine, self._inputs, estimate
+            given = now, episode, self.control_mode.has_loops, self._rows
+            self._step = compiled.make(*given, *parts)
+        self._step.begin(now, episode)
 
     def step(self, action: Array) -> Transition:
         """Fly one control step.
@@ -247,36 +242,34 @@ class Environment(saving.Copied):
 
     def begin(self, action: Array) -> None:
         """First half of a step: the commands to the rotors, or the setpoint of the loops."""
-        if self._episode is None:
-            raise RuntimeError("call reset before the first step")
         if self.engine.forked:
             self.make_anew()
-        self._action[:] = validation.action(action, (self.num_envs, self.action_size))
+        self._step = self._begun.renewed()
+        taken, command = self._inputs.action, self._inputs.command
+        taken[:] = validation.action(action, (self.num_envs, self.action_size))
         if self.blowing:
             self.blowing.advance()
         self.engine.check_air()
-        self._setpoint = self.control_mode.setpoint(self.engine.state, self._action)
+        self._setpoint = self.control_mode.setpoint(self.engine.state, taken)
         if self.randomizer.active:
             self.randomizer.begin_step()
-        self._flown, self._diverged[:] = 0, False
+        self._flown, self._inputs.diverged[:] = 0, False
         if self.control_mode.has_loops:
-            self._command[:] = 0.0
-            if not self.compiled:
-                # The loops read the state past the life of its buffers.
-                self._snapshot = records.copied(self._snapshot)
+            command[:] = 0.0
+            self._step.hold()
         else:
-            self._command[:] = self.engine.ctrl[:] = self._setpoint
+            command[:] = self.engine.ctrl[:] = self._setpoint
             if self.observer:
-                self.observer.follow(self._command, self.vehicle.control_timestep)
+                self.observer.follow(command, self.vehicle.control_timestep)
 
     def control(self) -> None:
         """Command the rotors before a physics step, where they get more than one in a step."""
         command = self._setpoint
         if self.control_mode.has_loops:
             if self._flown and (diverged := self.engine.read()) is not None:
-                self._diverged |= diverged
+                self._inputs.diverged[diverged] = True
             command = self.control_mode.rotor_command(self.engine.state, self._setpoint)
-            self._command += command / self.vehicle.substeps  # their mean counts
+            self._inputs.command[:] += command / self.vehicle.substeps  # their mean counts
             self._flown += 1
             if self.observer:
                 self.observer.follow(command, self.vehicle.physics_timestep)
@@ -285,20 +278,13 @@ class Environment(saving.Copied):
     def finish(self) -> Transition:
         """Second half of a step, after the engine has advanced."""
         if (diverged := self.engine.read()) is not None:
-            self._diverged |= diverged
-        assert self._episode is not None
-        estimate = self.observer.estimate() if self.observer else None
-        if self.compiled:
-            done, self._snapshot = self.compiled.finish(), None
-        else:
-            self._snapshot, self._episode, done = transition.finish(
-                *(self.task, self._clock, self._episode, self.snapshot, self.engine.state),
-                *(self._action.copy(), self._command.copy(), self._diverged.copy(), estimate),
-            )
-            self._snapshot.task = records.owned(self._snapshot.task)
+            self._inputs.diverged[diverged] = True
+        if self.observer:
+            self.observer.estimate()
+        done = self._begun.finish()
         transition.check_reward(self.task, done)
         if self.observer:
-            done.observation = self.observer.observe(done, self._action)
+            done.observation = self.observer.observe(done, self._inputs.action)
         self.transition = done
         return done
 
@@ -306,9 +292,7 @@ class Environment(saving.Copied):
         """The terms of an observation as vectors (n, size), float32."""
         if self.observer and observation is self.observer.observation:
             return self.observer.flat.astype(np.float32)
-        if self.compiled and observation is self.compiled.observation:
-            return self.compiled.flat()
-        return np.concatenate(list(observation.values()), axis=-1, dtype=np.float32)
+        return self._begun.flatten(observation)
 
     @property
     def privileged(self) -> Array | None:

@@ -9,9 +9,10 @@ import numpy as np
 from quadrl.base import records
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import MAX_SEED
-from quadrl.core.compiled import MOMENT
 from quadrl.core.task import Snapshot
 
+MOMENT = ("action", "rotor_command", "time")
+"""Arrays of a snapshot that are its own."""
 MOST_STEPS = 2.0**53
 """Whole numbers up to here are exact in double precision."""
 
@@ -27,7 +28,7 @@ class Copied:
 
     def __getstate__(self: Any) -> tuple[Any, ...]:
         """For pickle and deepcopy: how it was made, and all that the next steps depend on."""
-        return self._made_with, self._keys, self._episodes, self.save() if self._episode else None
+        return self._made_with, self._keys, self._episodes, self.save() if self._step else None
 
     def make_anew(self) -> None:
         """Take the place of itself: all that is live, such as `engine.wind`, is another array."""
@@ -45,11 +46,11 @@ class Copied:
 
 def save(environment: Any) -> dict[str, np.ndarray]:
     """Copies of those arrays by name."""
-    if environment._episode is None:
+    if environment._step is None:
         raise RuntimeError("call reset before save")
     now = environment.snapshot
     saved = {f"engine.{name}": value for name, value in environment.engine.save().items()}
-    saved |= records.arrays("task", now.task) | records.arrays("episode", environment._episode)
+    saved |= records.arrays("task", now.task) | records.arrays("episode", environment.episode)
     saved |= {name: np.array(getattr(now, name)) for name in MOMENT}
     for name, part in _parts(environment).items():
         saved |= {f"{name}.{k}": value for k, value in part.save().items()}
@@ -117,7 +118,7 @@ def restore(environment: Any, saved: dict[str, np.ndarray]) -> Snapshot:
     Raises:
         QuadrlError: It is not of such an environment; nothing has changed then.
     """
-    if fresh := environment._episode is None:
+    if fresh := environment._step is None:
         environment.reset()  # makes the records, which are filled below
         environment._episodes[:] = 0  # this episode does not count
     try:
@@ -131,7 +132,7 @@ def restore(environment: Any, saved: dict[str, np.ndarray]) -> Snapshot:
             raise QuadrlError(reason, name="weather", value=None, allowed="the saved one's")
     except QuadrlError:
         if fresh:
-            environment._episode = None
+            environment._step = None
         raise
     if environment.blowing:
         environment.blowing.restore(saved)
@@ -142,7 +143,7 @@ def restore(environment: Any, saved: dict[str, np.ndarray]) -> Snapshot:
         start = f"{name}."
         mine = {k.removeprefix(start): v for k, v in saved.items() if k.startswith(start)}
         part.restore(mine)
-    episode = records.of_arrays("episode", environment._episode, saved)
+    episode = records.of_arrays("episode", environment.episode, saved)
     task_state = records.of_arrays("task", environment.snapshot.task, saved)
     action, command, time = (np.array(saved[name]) for name in MOMENT)
     now = Snapshot(engine.state, task_state, environment._parameters, action, command, time)

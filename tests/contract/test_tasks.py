@@ -265,6 +265,8 @@ FAULTS = {
 class Faulty(Hover):
     """A hover that is given a fault."""
 
+    compiled = False
+
 
 @pytest.mark.parametrize(("message", "changes"), FAULTS.values(), ids=FAULTS)
 def test_a_fault_is_noticed(message, changes, monkeypatch):

@@ -65,6 +65,7 @@ def test_a_task_that_tensors_cannot_run_is_refused(tmp_path, monkeypatch):
     @dataclasses.dataclass(frozen=True)
     class Numpys(Hover):
         name = "numpys"
+        compiled = False
 
         def error(self, now):
             return np.asarray(norm(now.potentials.to_goal))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.trace import FLAGS, LOGICAL, C, Trace
 from quadrl.core.environment import Environment
 from quadrl.engines import native
@@ -40,7 +41,7 @@ def pair(base=Hover, options=None, members=None, **settings):
         task = variant(base, options, **(members or {}), compiled=compiled)
         made.append(Environment(task, seed=5, **settings))
         made[-1].reset()
-    assert not made[1].compiled
+    assert made[1].not_compiled
     return made
 
 
@@ -77,7 +78,7 @@ def same_flights(one, other, steps=STEPS, seed=0):
 def test_the_same_bits_as_the_functions_of_the_task(task, count, settings):
     options = {"time_limit": 0.5, "settle_time": 0.2}
     one, other = pair(tasks.TASKS[task], options, num_envs=count, **settings)
-    assert one.compiled
+    assert not one.not_compiled
     assert same_flights(one, other) >= count
 
 
@@ -87,7 +88,7 @@ def test_true_parameters_are_read_live():
         "error": lambda self, now: now.potentials.distance * now.parameters.mass,
     }
     one, other = pair(members=members, num_envs=3, randomization={"mass": (0.7, 0.9)})
-    assert one.compiled
+    assert not one.not_compiled
     same_flights(one, other)
 
 
@@ -97,11 +98,13 @@ def test_the_state_and_the_action_before_are_seen():
         turned = now.action[..., 0] - before.action[..., 0]
         return Hover.reward(self, before, now, end) | {"moved": moved, "turned": turned}
 
-    for mode, compiled in (("rotor", True), ("velocity", False)):
-        one, other = pair(members={"reward": reward}, num_envs=3, control_mode=mode)
-        # The loops read the state at every physics step, so that of the step before is gone.
-        assert (one.compiled is not None) == compiled
-        same_flights(one, other)
+    one, other = pair(members={"reward": reward}, num_envs=3)
+    assert not one.not_compiled
+    same_flights(one, other)
+    # The loops read the state at every physics step, so that of the step before is gone.
+    with pytest.warns(QuadrlWarning, match="the control mode reads the state in between"):
+        one, other = pair(members={"reward": reward}, num_envs=3, control_mode="velocity")
+    same_flights(one, other)
 
 
 def noisy(self, now):
@@ -132,22 +135,12 @@ SILENT = [  # what NumPy does with objects that it does not know is not what it 
 def test_what_numpy_would_do_otherwise_with_symbols_is_not_compiled(expression):
     # Not where an episode begins: a task whose episodes end there is refused.
     terminated = eval(f"lambda self, now: ({expression}) & (now.time > 0)", {"np": np})
-    environments = [
-        helpers.begun(variant(terminated=terminated, compiled=compiled), 2)
-        for compiled in (True, False)
-    ]
+    written = helpers.begun(variant(terminated=terminated, compiled=False), 2)
+    with pytest.warns(QuadrlWarning, match="the step of the task hover is not compiled"):
+        environment = helpers.begun(variant(terminated=terminated), 2)
     for _ in range(4):
-        first, second = (helpers.idle(environment) for environment in environments)
+        first, second = (helpers.idle(each) for each in (environment, written))
         np.testing.assert_array_equal(first.terminated, second.terminated)
-    assert environments[0].compiled is None and environments[0].not_compiled
-
-
-def test_a_task_that_takes_the_compiler_long_is_run_as_it_is_written():
-    def rays(self, now):
-        turned = [now.potentials.distance * k for k in range(1500)]
-        return functools.reduce(np.add, turned)
-
-    assert helpers.begun(variant(error=rays), 2).compiled is None
 
 
 def test_a_transition_is_flattened_after_the_next_reset_too():
@@ -158,21 +151,149 @@ def test_a_transition_is_flattened_after_the_next_reset_too():
     np.testing.assert_array_equal(environment.flatten(done.observation), before)
 
 
+def rays(self, now):
+    return functools.reduce(np.add, [now.potentials.distance * k for k in range(1500)])
+
+
+def norm(self, now):
+    return np.linalg.norm(now.potentials.to_goal, axis=-1)
+
+
+def summed(self, now):
+    return np.cumsum(now.potentials.to_goal, axis=-1)[..., 2]
+
+
 @pytest.mark.parametrize(
-    "members",
+    ("name", "function", "reason"),
     [
-        {"error": noisy},
-        {"terminated": branching},
-        {"error": lambda self, now: np.linalg.norm(now.potentials.to_goal, axis=-1)},
-        {"error": lambda self, now: np.cumsum(now.potentials.to_goal, axis=-1)[..., 2]},
+        ("error", noisy, "something else each time"),
+        ("terminated", branching, "all rows at once"),
+        ("error", norm, "numpy.linalg.norm"),
+        ("error", summed, "cumsum"),
+        ("error", rays, "add"),  # the compiler would take long
     ],
-    ids=["random numbers", "a branch", "linear algebra", "an unknown operation"],
 )
-def test_what_is_more_than_arithmetic_is_run_as_it_is_written(members):
-    environment = helpers.begun(variant(**members), 2)
-    assert environment.compiled is None
+def test_what_is_more_than_arithmetic_is_run_as_it_is_written(name, function, reason):
+    task = variant(**{name: function})
+    with pytest.warns(QuadrlWarning, match=reason):
+        environment = helpers.begun(task, 2)
+    assert reason in environment.not_compiled
     for _ in range(3):
         helpers.idle(environment)
+    helpers.begun(task, 2)  # it is said once for a class of tasks
+
+
+def test_a_fault_of_the_task_is_raised_as_if_it_was_not_compiled():
+    def update(self, before, now):
+        raise ZeroDivisionError("mine")
+
+    with pytest.warns(QuadrlWarning, match="with symbols it raises ZeroDivisionError: mine"):
+        environment = helpers.begun(variant(update=update))
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        helpers.idle(environment)
+
+
+def test_without_a_compiler_a_task_is_run_as_it_is_written(monkeypatch):
+    def fail(source):
+        raise NativeError("there is no C compiler\nof any name")
+
+    monkeypatch.setattr(native, "compile_generated", fail)
+    with pytest.warns(QuadrlWarning, match="not compiled: there is no C compiler;"):
+        helpers.idle(helpers.begun(variant()))
+
+
+# --------------------------------------------------------------------- what may change elsewhere
+
+WEIGHT = 1.0
+SETTINGS = {"weight": 1.0}
+FIXED = np.array([1.0])
+FIXED.flags.writeable = False
+
+
+class Curriculum:
+    weight = 1.0
+
+
+class Stage:
+    def __init__(self):
+        self.weight = 1.0
+
+
+STAGE = Stage()
+
+
+def weight_of_default(stage=STAGE):
+    return stage.weight
+
+
+def closed_over(value):
+    def weight():
+        return value
+
+    def put(fresh):
+        nonlocal value
+        value = fresh
+
+    return weight, put
+
+
+CLOSED, PUT = closed_over(1.0)
+FOLLOWED = {  # what a reward reads, how it changes, and what is said of it
+    "a global": (lambda: WEIGHT, lambda w: globals().update(WEIGHT=w), "WEIGHT, which it reads"),
+    "through a function": (
+        lambda: through_a_function(),
+        lambda w: globals().update(WEIGHT=w),
+        "WEIGHT, which it reads",
+    ),
+    "a class": (
+        lambda: Curriculum.weight,
+        lambda w: setattr(Curriculum, "weight", w),
+        "weight, which it reads",
+    ),
+    "a closure": (CLOSED, PUT, "value, which it reads"),
+    "a mapping": (
+        lambda: SETTINGS["weight"],
+        lambda w: SETTINGS.update(weight=w),
+        "it reads SETTINGS",
+    ),
+    "an object": (lambda: STAGE.weight, lambda w: setattr(STAGE, "weight", w), "it reads STAGE"),
+    "a default": (weight_of_default, lambda w: setattr(STAGE, "weight", w), "a default of"),
+    "by name": (lambda: globals()["WEIGHT"], lambda w: globals().update(WEIGHT=w), "globals"),
+}
+
+
+def through_a_function():
+    return [WEIGHT for _ in range(1)][0]
+
+
+@pytest.mark.parametrize("case", FOLLOWED)
+def test_a_reward_follows_what_it_reads_elsewhere(case):
+    weight, change, said = FOLLOWED[case]
+
+    def reward(self, before, now, end):
+        return {"own": weight() * (1 + 0 * now.state.speed)}
+
+    change(1.0)
+    task = variant(reward=reward)
+    with pytest.warns(QuadrlWarning, match=said):
+        environment = helpers.begun(task, 2)
+        other = helpers.begun(variant(compiled=False), 2)
+        for value in (1.0, 2.0, 3.0):
+            change(value)
+            done, expected = (helpers.idle(each) for each in (environment, other))
+            np.testing.assert_array_equal(done.reward, value)
+            np.testing.assert_array_equal(done.error, expected.error)
+    change(1.0)
+
+
+def test_what_cannot_change_is_compiled():
+    def error(self, now):
+        return now.potentials.distance * FIXED * np.pi * self.radius * PAIR[0]
+
+    assert not helpers.begun(variant(error=error), 2).not_compiled
+
+
+PAIR = (1.0, 2.0)
 
 
 def test_options_share_the_compiled_code(monkeypatch, tmp_path):
@@ -180,19 +301,23 @@ def test_options_share_the_compiled_code(monkeypatch, tmp_path):
     native.compile_generated.cache_clear()
     for limit, weight in ((5.0, 17.0), (7.0, 19.0)):
         task = tasks.make("hover", time_limit=limit, progress_weight=weight)
-        assert helpers.begun(task, 1).compiled
+        assert not helpers.begun(task, 1).not_compiled
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_what_somebody_holds_is_not_written_to_again():
+def test_what_a_transition_holds_is_its_own_but_the_observation():
     environment = helpers.begun("hover", 3)
-    held = [helpers.idle(environment) for _ in range(12)]
-    kept = [{name: array.copy() for name, array in arrays(now).items()} for now in held]
-    for _ in range(12):
-        helpers.idle(environment)
-    for now, copies in zip(held, kept, strict=True):
-        for name, array in arrays(now).items():
-            np.testing.assert_array_equal(array, copies[name], err_msg=name)
+    held = [helpers.idle(environment) for _ in range(4)]
+    kept = [arrays(dataclasses.replace(now, observation={}, truth={})) for now in held]
+    copies = [{name: array.copy() for name, array in own.items()} for own in kept]
+    seen = {name: array.copy() for name, array in held[-1].observation.items()}
+    helpers.idle(environment)
+    environment.reset()
+    for own, copied in zip(kept, copies, strict=True):
+        for name, array in own.items():
+            np.testing.assert_array_equal(array, copied[name], err_msg=name)
+    for name, array in seen.items():  # is valid for one more step
+        np.testing.assert_array_equal(held[-1].observation[name], array, err_msg=name)
 
 
 # ------------------------------------------------------------------------------ single operations

@@ -1,0 +1,161 @@
+"""What functions read besides their arguments, found by a look at their code.
+
+A step that is compiled keeps what its functions read when they were traced. Functions, classes and
+modules count as what they are. A number or a text that a name stands for is watched, since anybody
+may give the name another value. Everything else may change where nobody sees it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import reprlib
+import sys
+import types
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from quadrl.base.trace import NotCompilable
+
+TRUSTED = {*sys.stdlib_module_names, "numpy", "array_api_compat", "torch"} - {"abc"}
+"""Packages whose functions are not looked into; tasks that `type` makes call themselves abc's."""
+PLAIN = (int, float, complex, str, bytes, type(None), type(...), np.generic, np.dtype, enum.Enum)
+DESCRIPTORS = (types.MemberDescriptorType, types.GetSetDescriptorType)
+BY_NAME = {"globals", "vars", "eval", "exec", "__import__"}
+"""Built-in functions that read what a look at the code cannot tell."""
+CALLED = {"__new__", "__init__", "__post_init__", "__call__"}
+"""What a call of a class or of an object runs."""
+Place = tuple[Mapping[str, Any], bool]
+"""Names with their values, and whether the values are watched."""
+
+
+class Reads:
+    """All that some methods of an object look up, and the functions that they call."""
+
+    def __init__(self, owner: Any, methods: Iterable[str], kinds: Iterable[type] = ()) -> None:
+        """Look it up.
+
+        Args:
+            owner: A frozen dataclass.
+            methods: Names of its methods; those of its base classes count too.
+            kinds: Classes of what the methods are given, whose properties count too.
+
+        Raises:
+            NotCompilable: Something may change; the message names it.
+        """
+        self._watched: list[tuple[str, Callable[[str], Any], str, Any]] = []
+        self._seen: set[int] = set()
+        self._own = vars(owner)
+        self._places = [p for kind in (type(owner), *kinds) for p in _inside(kind)]
+        self._look(set(methods), [])
+
+    @property
+    def changed(self) -> str:
+        """The first name that stands for something else by now; empty where none does."""
+        for name, read, key, value in self._watched:
+            if read(key) is not value:
+                return name
+        return ""
+
+    def _look(self, names: set[str], places: list[Place]) -> None:
+        """Look names up in some places, and as attributes of the owner and of what is found."""
+        for name in names & self._own.keys():
+            self._judge(f"self.{name}", self._own[name])
+        inherited = names - self._own.keys()  # the class has the defaults of options
+        found: set[int] = set()
+        todo = [*((place, names) for place in places), *((p, inherited) for p in self._places)]
+        for (place, watched), wanted in todo:  # which grows
+            for name in wanted & place.keys():
+                value = place[name]
+                self._judge(name, value)
+                if watched and isinstance(value, (*PLAIN, tuple, frozenset)):
+                    self._watched.append((name, place.get, name, value))
+                if id(value) not in found:
+                    found.add(id(value))
+                    todo += [(inside, names) for inside in _inside(value)]
+
+    def _judge(self, name: str, value: Any) -> None:
+        """Refuse what may change; look into functions, and into what fixed objects are made of."""
+        if isinstance(value, PLAIN) or id(value) in self._seen:
+            return
+        self._seen.add(id(value))
+        if callable(value) and _trusted(value) and not isinstance(value, functools.partial):
+            return
+        if isinstance(value, types.FunctionType):
+            self._look_into(value)
+        elif isinstance(value, type):
+            for member in CALLED & vars(value).keys():
+                self._judge(f"{name}.{member}", vars(value)[member])
+        else:
+            for part in _parts(name, value):
+                self._judge(name, part)
+
+    def _look_into(self, function: types.FunctionType) -> None:
+        """Look up what a function names: globals, attributes, its closure and its defaults."""
+        names, codes = set[str](), [function.__code__]
+        if codes[0].co_filename == "<string>":
+            return  # what `dataclasses` writes
+        for code in codes:  # which grows by the functions in it
+            names |= {*code.co_names}
+            codes += [x for x in code.co_consts if isinstance(x, types.CodeType)]
+        if "getattr" in names:
+            names |= {x for code in codes for x in code.co_consts if isinstance(x, str)}
+        known = function.__globals__
+        if unseen := names & BY_NAME - known.keys():
+            raise NotCompilable(f"{function.__qualname__} calls {min(unseen)}")
+        imported = [sys.modules[name] for name in names - known.keys() if name in sys.modules]
+        self._look(names, [(known, True), *(p for module in imported for p in _inside(module))])
+        cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+        for name, cell in cells:
+            if name != "__class__":  # that of `super()`
+                value = cell.cell_contents
+                self._judge(name, value)
+                self._watched.append((name, cell.__getattribute__, "cell_contents", value))
+        for default in (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()):
+            self._judge(f"a default of {function.__qualname__}", default)
+
+
+def _trusted(value: Any) -> bool:
+    module = getattr(value, "__module__", None) or type(value).__module__
+    return str(module).partition(".")[0] in TRUSTED
+
+
+def _inside(value: Any) -> list[Place]:
+    """Where the attributes of a module, a class or a fixed object stand."""
+    if isinstance(value, types.ModuleType):
+        return [(vars(value), value.__name__.partition(".")[0] not in TRUSTED)]
+    kind = value if isinstance(value, type) else type(value) if _is_fixed(value) else object
+    return [(vars(base), True) for base in kind.__mro__ if not _trusted(base)]
+
+
+def _is_fixed(value: Any) -> bool:
+    settings = getattr(type(value), "__dataclass_params__", None)
+    return settings is not None and settings.frozen
+
+
+def _parts(name: str, value: Any) -> Iterable[Any]:
+    """What is called or read through an object.
+
+    Raises:
+        NotCompilable: It may change.
+    """
+    if isinstance(value, (tuple, frozenset)):
+        return value
+    if _is_fixed(value):
+        return [getattr(value, field.name) for field in dataclasses.fields(value)]
+    read_only = isinstance(value, np.ndarray) and not value.flags.writeable
+    if read_only or isinstance(value, (types.ModuleType, *DESCRIPTORS)):
+        return ()
+    if isinstance(value, functools.partial):
+        return value.func, *value.args, *value.keywords.values()
+    if isinstance(value, types.MethodType):
+        return value.__func__, value.__self__
+    if isinstance(value, (property, functools.cached_property)):
+        return (value.fget if isinstance(value, property) else value.func,)
+    if (wrapped := getattr(value, "__wrapped__", None)) is not None:
+        return (wrapped,)
+    advice = "make it an option of the task"
+    raise NotCompilable(f"it reads {name}, {reprlib.repr(value)}, which may change; {advice}")

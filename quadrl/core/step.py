@@ -1,0 +1,103 @@
+"""What brings the snapshot of N rows forward by a control step: the task's functions, as written.
+
+`core/compiled.py` has the other implementation, and chooses between the two.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+
+import numpy as np
+
+from quadrl.base import records
+from quadrl.core import transition
+from quadrl.core.snapshot import Snapshot
+from quadrl.core.task import Task
+from quadrl.core.transition import Clock, Episode, Observation, Transition
+from quadrl.engines.engine import Engine, Frame
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Inputs:
+    """What a control step of N rows is flown with; the buffers stay where they are."""
+
+    action: np.ndarray  # (N, k)
+    command: np.ndarray  # (N, R) [rad/s], mean over the control step
+    diverged: np.ndarray  # (N,) bool
+
+    @classmethod
+    def zeros(cls, count: int, action_size: int, rotors: int) -> Inputs:
+        """Buffers for some rows."""
+        action, command = np.zeros((count, action_size)), np.zeros((count, rotors))
+        return cls(action, command, np.zeros(count, dtype=bool))
+
+
+class Step(abc.ABC):
+    """The control step of a task for N rows."""
+
+    snapshot: Snapshot
+    """What tasks see now: live, valid until the next step."""
+    episode: Episode
+    """How far the episodes are: as live as the snapshot."""
+    not_compiled = ""
+    """Why it is not compiled; empty where it is."""
+
+    def __init__(
+        self, task: Task, clock: Clock, engine: Engine, inputs: Inputs, estimate: Frame | None
+    ) -> None:
+        """Note where everything is.
+
+        Args:
+            task: The task.
+            clock: Of its episodes.
+            engine: Of the aircraft.
+            inputs: Read live.
+            estimate: Table of the state that is observed, read live; None for the true one.
+        """
+        self.task, self._clock, self._engine = task, clock, engine
+        self._inputs, self._estimate = inputs, estimate
+
+    @abc.abstractmethod
+    def begin(self, now: Snapshot, episode: Episode) -> None:
+        """Take a snapshot of all rows as the present one."""
+
+    @abc.abstractmethod
+    def finish(self) -> Transition:
+        """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
+
+    @abc.abstractmethod
+    def hold(self) -> None:
+        """Keep the snapshot's state while the engine is read in the middle of a step."""
+
+    def renewed(self) -> Step:
+        """The step to go on with: itself, unless something that it is made from has changed."""
+        return self
+
+    def flatten(self, observation: Observation) -> np.ndarray:
+        """The terms of an observation as vectors (n, size), float32."""
+        return np.concatenate(list(observation.values()), axis=-1, dtype=np.float32)
+
+
+class WrittenStep(Step):
+    """Calls the functions of the task."""
+
+    def begin(self, now: Snapshot, episode: Episode) -> None:
+        """Take a snapshot of all rows as the present one."""
+        self.snapshot, self.episode = now, episode
+
+    def hold(self) -> None:
+        """Copy the snapshot, whose buffers the engine reuses."""
+        self.snapshot = records.copied(self.snapshot)
+
+    def finish(self) -> Transition:
+        """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
+        inputs, estimate = records.copied(self._inputs), self._estimate
+        self.snapshot, self.episode, done = transition.finish(
+            *(self.task, self._clock, self.episode, self.snapshot, self._engine.state),
+            *(inputs.action, inputs.command, inputs.diverged),
+            estimate.state if estimate else None,
+        )
+        # What a task remembers must not be a view of buffers that the next steps write.
+        self.snapshot.task = records.owned(self.snapshot.task)
+        return done
