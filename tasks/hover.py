@@ -7,6 +7,7 @@ import math
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
+from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.engines.rng import Rng, hovering
@@ -87,6 +88,18 @@ class Hover(Task):
             rotor_speed=hovering(position, parameters),
         )
         return start, TaskState(goal=namespace(position).zeros_like(position))
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Nearer to the waypoint, level and heading east, slower, at little effort, in the air."""
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "survival": rewards.survival(self.survival_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
+        }
 
     def terminated(self, now: Snapshot) -> Array:
         """Away, on the ground or on its back."""

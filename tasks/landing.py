@@ -11,9 +11,10 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace, norm, square_norm, stack
+from quadrl.core import rewards
 from quadrl.core.contact import stands, strikes_ground
 from quadrl.core.markers import Marker
-from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east, reward_share
+from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import REST_SPEED, Start
 
@@ -152,19 +153,26 @@ class Landing(Task):
         )
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
-        """The common terms, the haste of the approach, and what the end is worth."""
-        terms = super().reward(before, now, end)
+        """Down to the pad, level and heading east, without haste, and what the end is worth."""
         height, last = (abs(shot.potentials.to_goal[..., 2]) for shot in (now, before))
         xp, zero = namespace(height), 0.0 * height
         # Not the speed: exploration gives some in every direction, which would cost most near the
         # ground and keep it in the air.
         sink = (last - height) / now.parameters.control_timestep
         haste = sink - (self.gentle_speed + self.gentle_rate * height)
-        weight = self.haste_weight * reward_share(now.parameters)
-        terms["haste"] = -weight * xp.where(haste > 0, haste, zero)
-        terms["success"] = xp.where(end.succeeded, zero + self.success_weight, zero)
-        terms["failure"] = xp.where(end.failed, zero - self.failure_weight, zero)
-        return terms
+        haste_cost = self.haste_weight * rewards.time_share(now.parameters)
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "survival": rewards.survival(self.survival_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
+            "haste": -haste_cost * xp.where(haste > 0, haste, zero),
+            "success": xp.where(end.succeeded, zero + self.success_weight, zero),
+            "failure": xp.where(end.failed, zero - self.failure_weight, zero),
+        }
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """Over the pad, then down, slower the lower, once it heads east; then it presses on."""

@@ -6,6 +6,7 @@ import dataclasses
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
+from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
@@ -67,6 +68,18 @@ class RandomWaypoint(Task):
             rotor_speed=hovering(origin, parameters),
         )
         return start, TaskState(goal=goal)
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Nearer to the waypoint, level, slower, at little effort, in the air."""
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "survival": rewards.survival(self.survival_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
+        }
 
     def terminated(self, now: Snapshot) -> Array:
         """Far away or on the ground."""

@@ -12,6 +12,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
 from quadrl.base.validation import MAX_OPTION, numbers
+from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
@@ -100,6 +101,18 @@ class StaticWaypoint(Task):
             here = (onward & (task.leg == number - 1))[..., None]
             goal = xp.where(here, self._waypoint(number, goal), goal)
         return Route(goal=goal, leg=xp.where(onward, task.leg + 1, task.leg))
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Nearer to the waypoint, level and heading east, slower, at little effort, in the air."""
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "survival": rewards.survival(self.survival_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
+        }
 
     def terminated(self, now: Snapshot) -> Array:
         """Far away or on the ground."""

@@ -11,6 +11,7 @@ import numpy as np
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace, norm
 from quadrl.base.validation import number
+from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.task import (
@@ -100,6 +101,18 @@ class StraightAndLevel(Task):
         potentials = super().measure(now)
         offset = potentials.to_goal - self.lead * now.task.direction
         return dataclasses.replace(potentials, distance=norm(offset))
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Nearer to the line, level, nearer to its velocity, at little effort, in the air."""
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "survival": rewards.survival(self.survival_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
+        }
 
     def terminated(self, now: Snapshot) -> Array:
         """Off the altitude, off the line or on the ground."""

@@ -12,6 +12,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, norm, stack
 from quadrl.base.validation import number
+from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.task import (
@@ -121,6 +122,18 @@ class TargetFollowing(Task):
         """The distance left is that to the sphere around the target."""
         potentials = super().measure(now)
         return dataclasses.replace(potentials, distance=abs(potentials.distance - self.keep))
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Nearer to the distance to keep, level, with the target, at little effort, in the air."""
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "survival": rewards.survival(self.survival_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
+        }
 
     def terminated(self, now: Snapshot) -> Array:
         """Too far from the target, or on the ground."""

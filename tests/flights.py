@@ -10,8 +10,8 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.control import modes
 from quadrl.core.environment import Environment
+from quadrl.core.rewards import total
 from quadrl.core.snapshot import EpisodeEnd, Snapshot
-from quadrl.core.task import total
 from quadrl.engines import mjcf
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import State

@@ -11,17 +11,16 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import functools
 import itertools
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import Array, norm, square_norm, to_body
+from quadrl.base.rotation import Array, norm, to_body
 from quadrl.base.validation import keys, like, number
+from quadrl.core import rewards
 from quadrl.core.markers import Marker
 from quadrl.core.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
 from quadrl.engines.rng import Rng
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
 
     from quadrl.control.reading import Reading
     from quadrl.core.snapshot import Rollout
-
-REWARD_TIME = 0.05  # [s], the control step of the paper's aircraft
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,22 +221,19 @@ class Task(abc.ABC):
         return terms
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
-        """Named terms (N,) of the reward of one control step; it is their sum, in this order."""
-        was, is_, rotor = before.potentials, now.potentials, now.parameters.rotor
-        share = reward_share(now.parameters)
-        effort = square_norm((now.rotor_command - rotor.hover_speed) / rotor.max_speed)
-        terms = {
-            "progress": self.progress_weight * (was.distance - is_.distance),
-            "attitude": self.attitude_weight * (was.attitude - is_.attitude),
-            "speed": self.speed_weight * (was.speed - is_.speed),
-            "spin": self.spin_weight * (was.angular_speed - is_.angular_speed),
-            "control": (-self.control_weight * share) * effort,
-            "survival": 0.0 * effort + self.survival_weight * share,
+        """Named terms (N,) of the reward of one control step; it is their sum, in this order.
+
+        Those of a flight to a goal, for tasks that have none of their own.
+        """
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "survival": rewards.survival(self.survival_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
         }
-        if self.smoothness_weight > 0:
-            change = (now.rotor_command - before.rotor_command) / rotor.max_speed
-            terms["smoothness"] = (-self.smoothness_weight * share) * square_norm(change)
-        return terms
 
     @abc.abstractmethod
     def terminated(self, now: Snapshot) -> Array:
@@ -286,16 +280,3 @@ class Task(abc.ABC):
 def heads_east(now: Snapshot, tolerance: float) -> Array:
     """Whether the heading is at most `tolerance` [rad] off east, (N,) bool."""
     return now.state.cos_attitude[..., 2] >= math.cos(min(tolerance, math.pi))
-
-
-def reward_share(parameters: Parameters) -> float:
-    """What a control step counts of the 0.05 s that weights of running rewards are for.
-
-    Progress adds up to the same whatever the step is; what is paid by the step is paid by time.
-    """
-    return parameters.control_timestep / REWARD_TIME
-
-
-def total(terms: dict[str, Array]) -> Array:
-    """The sum of reward terms, from the first to the last."""
-    return functools.reduce(operator.add, terms.values())

@@ -10,7 +10,8 @@ import numpy as np
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, square_norm
-from quadrl.core.task import EpisodeEnd, Snapshot, Task, total
+from quadrl.core.rewards import total
+from quadrl.core.task import EpisodeEnd, Snapshot, Task
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start, State
 

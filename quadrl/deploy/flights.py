@@ -31,8 +31,8 @@ from quadrl.control.geometric import GeometricController
 from quadrl.control.reading import Reading
 from quadrl.core.environment import Environment
 from quadrl.core.observer import felt, moving
+from quadrl.core.rewards import total
 from quadrl.core.snapshot import Snapshot
-from quadrl.core.task import total
 from quadrl.core.transition import Clock, Episode, begin, finish
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import FIRST, State

@@ -8,7 +8,7 @@ from helpers import begun, idle
 from quadrl import tasks
 from quadrl.base.errors import QuadrlError
 from quadrl.core.environment import Environment
-from quadrl.core.task import total
+from quadrl.core.rewards import total
 from quadrl.evaluation.controllers import make_controller
 from quadrl.tasks.hover import Hover
 
