@@ -59,7 +59,8 @@ export class Flight {
     kernel.view(slot, "origin").set(this.pair.origin);
     const { rotors } = this.vehicle;
     this.scale[0] = this.vehicle.actionScale;
-    this.#point("flight_rows", "qpos qvel act ctrl warm wind parameters world near", [0, 0, rotors]);
+    const flown = "qpos qvel act ctrl warm wind parameters world near solids";
+    this.#point("flight_rows", flown, [0, 0, rotors, 0]);
     this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, rotors]);
   }
 

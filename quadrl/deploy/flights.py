@@ -40,7 +40,7 @@ from quadrl.engines.state import FIRST, State
 PARTS = {
     "parameters": ROW_SIZE,  # the aircraft's row
     "limits": 2,  # its largest speed [m/s] and spin [rad/s]: as in `Rows` of state.c
-    "world": 3,  # physics step [s], gravity along z [m/s^2], floor [m]: `World` of free_flight.c
+    "world": 4,  # physics step [s], gravity along z [m/s^2], floor and reach [m]: `World` of C
     "origin": 3,  # of the task's frame [m], world
     "drawn": 64,  # random numbers of the start
     "qpos": 7,
@@ -62,7 +62,8 @@ PARTS = {
     "keys": 1,  # of the random numbers, an int64 each
     "episodes": 1,
     "near": 1,  # a byte: as in `Rows` of free_flight.c
-    "flight_rows": 8,  # that `Rows`, for pointers of 32 bits
+    "solids": 1,  # of which there are none
+    "flight_rows": 10,  # that `Rows`, for pointers of 32 bits
     "state_rows": 8,  # `Rows` of state.c
 }
 """Numbers in each part of a flight's memory."""

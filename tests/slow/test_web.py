@@ -4,6 +4,7 @@ Where a tool is missing the tests are skipped; with QUADRL_REQUIRE_WEB=1 they fa
 """
 
 import base64
+import itertools
 import json
 import os
 import re
@@ -20,7 +21,7 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.control.geometric import GeometricController
 from quadrl.core.environment import Environment
 from quadrl.deploy import web
-from quadrl.evaluation.policy import SHIPPED, Policy
+from quadrl.evaluation.policy import SHIPPED, Policy, shipped
 
 FLOWN = [name for name, task in tasks.TASKS.items() if not task.contact]
 PAIRS = [(task, vehicle) for task in FLOWN for vehicle in VEHICLES]
@@ -50,11 +51,11 @@ def page():
 @pytest.fixture(scope="module")
 def node(page):
     """Run jobs of tests/fly.mjs."""
-    command = ["node", web.REPOSITORY / "tests/fly.mjs", web.BUILD / "book.json"]
 
     def run(*jobs):
-        text = json.dumps(jobs)
-        done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=300)
+        command = ["node", web.REPOSITORY / "tests/fly.mjs", web.BUILD / "book.json"]
+        given = dict(input=json.dumps(jobs), capture_output=True, text=True, timeout=300)
+        done = subprocess.run(command, **given)
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)
 
@@ -93,32 +94,27 @@ def test_physics_is_the_native_kernel_bit_for_bit(node):
 
 def test_a_seed_gives_the_same_episode(node):
     jobs, expected = [], []
-    for task, vehicle in PAIRS:
-        for seed in (0, 7, 2**40 + 1):
-            environment, observation = begun(task, vehicle, seed)
-            for episode in range(2):
-                jobs.append(
-                    dict(job="begin", task=task, aircraft=vehicle, seed=seed, episode=episode)
-                )
-                expected.append((coordinates(environment), observation[0]))
-                observation = environment.flatten(environment.reset())
+    for (task, vehicle), seed in itertools.product(PAIRS, (0, 7, 2**40 + 1)):
+        environment, observation = begun(task, vehicle, seed)
+        for episode in range(2):
+            where = dict(task=task, aircraft=vehicle, seed=seed, episode=episode)
+            jobs.append(dict(job="begin", **where))
+            expected.append((coordinates(environment), observation[0]))
+            observation = environment.flatten(environment.reset())
     for found, (place, observation) in zip(node(*jobs), expected, strict=True):
         np.testing.assert_allclose(found["coordinates"], place, rtol=SINES, atol=SINES)
         np.testing.assert_allclose(found["observation"], observation, rtol=1e-6, atol=1e-7)
 
 
 def test_policies_act_as_in_python(node):
-    rng = np.random.default_rng(0)
-    jobs, expected = [], []
-    for file in sorted(SHIPPED.glob("*.safetensors")):
-        policy = Policy.load(file)
+    rng, jobs, expected = np.random.default_rng(0), [], []
+    policies = {file.stem: Policy.load(file) for file in shipped()}
+    for name, policy in policies.items():
         if policy.task in FLOWN:
             scale = rng.uniform(0, 3, (200, 1))  # past where the observations are clipped
-            observation = policy.mean + scale * policy.deviation * rng.normal(
-                size=(200, policy.size)
-            )
-            observation = observation.astype(np.float32)
-            jobs.append(dict(job="act", name=file.stem, observations=observation.tolist()))
+            away = scale * policy.deviation * rng.normal(size=(200, policy.size))
+            observation = (policy.mean + away).astype(np.float32)
+            jobs.append(dict(job="act", name=name, observations=observation.tolist()))
             expected.append(policy(observation))
     assert len(jobs) > 5
     for found, action in zip(node(*jobs), expected, strict=True):
@@ -198,32 +194,29 @@ def test_a_flight_of_the_geometric_controller_is_pythons(node, task, vehicle):
 
 
 def test_gusts_have_the_deviation_that_is_asked_for(node):
-    settings = {"task": "hover", "aircraft": "paper", "seed": 1}
-    events = [{"step": 0, "kind": "wind", "values": [1.0, 0.0, 0.0, 0.3]}]
+    mean, keep = np.array([1.0, 0.0, 0.0]), np.exp(-0.05)
+    events = [{"step": 0, "kind": "wind", "values": [*mean, 0.3]}]
     job = dict(job="fly", controller=TRAINED, steps=200, events=events)
-    jobs = [job | {"settings": settings | {"seed": seed}} for seed in range(30)]
-    wind = np.array([[step["wind"] for step in each["flown"]] for each in node(*jobs)])
+    settings = ({"task": "hover", "aircraft": "paper", "seed": seed} for seed in range(30))
+    flights = node(*(job | {"settings": each} for each in settings))
+    wind = np.array([[step["wind"] for step in each["flown"]] for each in flights])
     # 30 flights of 10 s with a correlation time of 1 s are about 150 numbers: 3 deviations.
-    np.testing.assert_allclose(wind.mean(axis=(0, 1)), [1, 0, 0], atol=0.08)
+    np.testing.assert_allclose(wind.mean(axis=(0, 1)), mean, atol=0.08)
     np.testing.assert_allclose(wind.std(axis=(0, 1)), 0.3, rtol=0.18)
-    keep = np.exp(-0.05)
-    steps = wind[:, 1:] - 1 * np.array([1, 0, 0]) - keep * (wind[:, :-1] - np.array([1, 0, 0]))
+    steps = wind[:, 1:] - mean - keep * (wind[:, :-1] - mean)
     np.testing.assert_allclose(steps.std(), 0.3 * np.sqrt(1 - keep**2), rtol=0.05)
 
 
 def test_files_that_cannot_fly_are_refused(node, tmp_path):
-    content = (SHIPPED / "hover_ppo.safetensors").read_bytes()
-    landing = (SHIPPED / "target_following_ppo.safetensors").read_bytes()
+    hover, other = ((SHIPPED / f"{name}.safetensors").read_bytes()
+                    for name in (TRAINED, "target_following_ppo"))  # fmt: skip
     cases = [
-        (content, "hover", "paper", "^$"),
-        (content, "random_waypoint", "paper", "^$"),
-        (content, "hover", "hexa", "4 rotors"),
-        (content, "hover", "crazyflie", "layout"),
-        (landing, "hover", "paper", "observes"),
-        (content[:1000], "hover", "paper", "damaged"),
-        (content[:-8], "hover", "paper", "damaged"),
-        (b"", "hover", "paper", "damaged"),
-        (b"not a policy at all", "hover", "paper", "damaged"),
+        (hover, "hover", "paper", "^$"),
+        (hover, "random_waypoint", "paper", "^$"),
+        (hover, "hover", "hexa", "4 rotors"),
+        (hover, "hover", "crazyflie", "layout"),
+        (other, "hover", "paper", "observes"),
+        *((part, "hover", "paper", "damaged") for part in (hover[:1000], hover[:-8], b"", b"no")),
         (b"\x02" + bytes(7) + b"{}", "hover", "paper", "no policy"),
     ]
     jobs = [
