@@ -97,6 +97,10 @@ class Trace:
 
         return symbols(np.frompyfunc(read, 1, 1)(expressions))
 
+    def read(self, place: str, numbers: Array) -> Symbols:
+        """Symbols of numbers in memory: a C expression with {} for the place of each."""
+        return self.inputs(np.frompyfunc(lambda number: place.format(int(number)), 1, 1)(numbers))
+
     def operation(self, name: str, *values: Any) -> Symbol:
         """The symbol of a result.
 

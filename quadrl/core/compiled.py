@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import functools
 import math
 import warnings
 import weakref
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -215,11 +215,7 @@ class CompiledStep(Step):
     def _traced(self, like: Snapshot, episode: Episode) -> tuple[Trace, str]:
         """The operations of a step, and the body of its loop."""
         trace = Trace()
-
-        def read(place: str) -> Callable[[Array], Array]:
-            text = np.frompyfunc(lambda number: place.format(int(number)), 1, 1)
-            return lambda numbers: trace.inputs(text(numbers))
-
+        read = functools.partial(functools.partial, trace.read)
         # Arrays whose numbers say where they stand, made by what makes the views of real ones.
         own = Parameters.of(
             np.arange(float(ROW_SIZE)).view(AIRCRAFT),

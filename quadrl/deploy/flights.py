@@ -90,8 +90,7 @@ class _Memory:
     def read(self, part: str, numbers: Array | int, place: str = "m[{}]") -> Array:
         """Symbols of the numbers of a part, by their places in it; a count reads (1, count)."""
         numbers = np.arange(numbers)[None] if isinstance(numbers, int) else numbers
-        text = np.frompyfunc(lambda number: place.format(int(number) + LAYOUT[part]), 1, 1)
-        return self.trace.inputs(text(numbers))
+        return self.trace.read(place, numbers + LAYOUT[part])
 
     def parameters(self) -> Parameters:
         """The aircraft's row; each number says where it stands."""
@@ -230,7 +229,7 @@ def _fitting(part: str, values: Array | Iterable[Any]) -> list[Any]:
 
 def _row(record: Any) -> list[Any]:
     """The numbers of a record's arrays, one after the other."""
-    return [x for field in dataclasses.fields(record) for x in _flat(getattr(record, field.name))]
+    return [x for array in records.leaves(record) for x in _flat(array)]
 
 
 def _flat(values: Array | Iterable[Any]) -> list[Any]:

@@ -155,10 +155,9 @@ def _leaf(arrays: list[np.ndarray]) -> Tensor:
 
 def _joined(parts: list[Any]) -> Any:
     """Records of arrays (N, ...) as one of tensors (T * N, ...)."""
-    kind = type(parts[0])
-    names = [field.name for field in dataclasses.fields(kind)]
-    columns = ([getattr(part, name) for part in parts] for name in names)
-    return kind(*(torch.from_numpy(np.concatenate(column)) for column in columns))
+    columns = zip(*map(records.leaves, parts), strict=True)
+    joined = (torch.from_numpy(np.concatenate(column)) for column in columns)
+    return records.filled(parts[0], joined)
 
 
 def _state(motion: Tensor, origin: np.ndarray) -> State:
