@@ -29,7 +29,7 @@ class Page {
       this.policies.set(name, new Policy(decoded(file).buffer, book.policy));
     }
     const panels = SIDES.map((side) => at(`${side}-view`));
-    this.stage = new Stage(at("world"), panels, COLOURS);
+    this.stage = new Stage(at("world"), panels, COLOURS, book.drawn);
     this.plots = {
       error: new Plot(at("error-plot"), { from: 0, least: 0.05 }),
       left: new Plot(at("left-plot"), { least: 10 }),
@@ -100,7 +100,7 @@ class Page {
       const controller = this.policies.get(settings[side]);
       return new Episode(this.kernel, k, settings, controller, settings.events);
     });
-    this.stage.begin(this.vehicle);
+    this.stage.begin(this.vehicle, this.book.tasks[settings.task].scene);
     this.behind = 0; // [s] that pictures are ahead of the last physics step
     this.poses = this.episodes.map((episode) => [pose(episode), pose(episode)]);
     this.showSettings();

@@ -5,10 +5,7 @@ import { decoded } from "./flight.mjs";
 
 const UP = new THREE.Vector3(0, 0, 1);
 const SKY_TOP = 0x070b12, HAZE = 0x2a4560, GROUND = 0x131c27, LINES = 0x5f7f9d;
-const GOAL = 0x40eb80, WIND = 0xa9c9e8;
 const TRAIL_LENGTH = 600; // physics steps
-const STREAKS = 90, STREAK_ROOM = 5; // [m], of the box that they blow through
-const SPREAD = [0.2731, 0.2236, 0.1832]; // fills that box evenly
 const BLUR = 0.12; // of the real rotor speed, so that the blades are seen to turn
 const FOV = 42; // [deg]
 
@@ -79,12 +76,18 @@ function attitude([w, x, y, z]) {
   return new THREE.Quaternion(x, y, z, w);
 }
 
+// A shape of quadrl's list where it stands; lines are ribbons.
 function solid(shape, meshes) {
-  const color = paint(shape.rgba), { shine = 0.3, glow = 0 } = shape;
-  const surface = { roughness: 0.95 - 0.6 * shine, metalness: 0.1 };
+  const color = paint(shape.rgba), opacity = shape.rgba[3], { shine, glow } = shape;
+  const clear = { opacity, transparent: opacity < 1, depthWrite: opacity === 1 };
   const light = { emissive: color, emissiveIntensity: 0.9 * glow };
-  const material = new THREE.MeshStandardMaterial({ color, ...surface, ...light });
-  return new THREE.Mesh(geometry(shape, meshes), material);
+  const material = glow === 1
+    ? flat({ color, ...clear, side: THREE.FrontSide })
+    : new THREE.MeshStandardMaterial({ color, ...clear, roughness: 0.95 - 0.6 * shine, metalness: 0.1, ...light });
+  const mesh = new THREE.Mesh(geometry(shape, meshes), material);
+  mesh.position.fromArray(shape.position);
+  mesh.quaternion.copy(attitude(shape.quaternion));
+  return mesh;
 }
 
 // A disc as it looks while it turns: clear at the hub, brighter towards the tip.
@@ -103,7 +106,7 @@ function round(stops) {
   return new THREE.CanvasTexture(canvas);
 }
 
-// A strip through points that faces the camera, wider and brighter towards its end.
+// A strip through points that faces the camera, wider and brighter towards its end; half as wide as it is told.
 class Ribbon {
   constructor(length, colour, width, opacity) {
     this.length = length;
@@ -155,9 +158,7 @@ class Aircraft {
       const [, number, part] = /^rotor_(\d+)_(.*)$/.exec(shape.name) ?? [];
       const rotor = number && this.rotors[number - 1];
       const turns = part === "disc";
-      const mesh = turns ? this.#disc(vehicle, number - 1, disc) : solid(shape, vehicle.meshes);
-      mesh.position.fromArray(shape.position);
-      mesh.quaternion.copy(attitude(shape.quaternion));
+      const mesh = turns ? this.#disc(vehicle, number - 1, shape, disc) : solid(shape, vehicle.meshes);
       this.group.add(mesh);
       if (part === "hub") {
         rotor.turning.position.fromArray(shape.position);
@@ -175,8 +176,10 @@ class Aircraft {
     this.vehicle = vehicle;
   }
 
-  #disc(vehicle, k, texture) {
+  #disc(vehicle, k, { position, quaternion }, texture) {
     const radius = vehicle.radius[k], group = new THREE.Group();
+    group.position.fromArray(position);
+    group.quaternion.copy(attitude(quaternion));
     const colour = paint(vehicle.colour[k]), face = flat({ color: colour, map: texture });
     const rim = new THREE.TorusGeometry(0.98 * radius, 0.012 * radius, 6, 64);
     const edge = new THREE.MeshBasicMaterial({ color: colour, transparent: true, opacity: 0.75 });
@@ -209,26 +212,24 @@ class View {
     this.focus = new THREE.Vector3();
   }
 
-  begin(vehicle, textures) {
+  begin(vehicle, textures, trailWidth) {
     if (this.group) this.scene.remove(this.group);
     this.group = new THREE.Group();
     this.aircraft = new Aircraft(vehicle, textures.disc);
-    const wide = Math.max(vehicle.scale, 0.35);
-    this.trail = new Ribbon(TRAIL_LENGTH, this.colour, 0.007 * wide, 0.9);
-    this.path = new Ribbon(TRAIL_LENGTH, GOAL, 0.004 * wide, 0.45);
-    this.drop = new Ribbon(2, this.colour, 0.0025 * wide, 0.35);
-    this.pole = new Ribbon(2, GOAL, 0.006 * wide, 0.7);
-    const radius = 0.08 * wide;
-    const glow = flat({ color: GOAL, opacity: 0.22, side: THREE.FrontSide });
-    this.goal = new THREE.Mesh(new THREE.SphereGeometry(radius, 28, 20), glow);
-    const core = new THREE.SphereGeometry(0.3 * radius, 16, 12);
-    this.goal.add(new THREE.Mesh(core, new THREE.MeshBasicMaterial({ color: GOAL })));
-    const ring = new THREE.RingGeometry(1.44 * radius, 1.6 * radius, 48);
-    this.foot = new THREE.Mesh(ring, flat({ color: GOAL, opacity: 0.6 }));
+    const { wide, goal } = vehicle, goalColour = paint(goal[0].rgba);
+    this.trail = new Ribbon(TRAIL_LENGTH, this.colour, trailWidth * wide, 0.9);
+    this.path = new Ribbon(TRAIL_LENGTH, goalColour, 0.5 * trailWidth * wide, 0.45);
+    this.drop = new Ribbon(2, this.colour, 0.3 * trailWidth * wide, 0.35);
+    this.goal = goal.map((shape) => {
+      const { kind, points, size, rgba } = shape;
+      if (kind !== "line") return { shape, mesh: solid(shape) };
+      const ribbon = new Ribbon(points.length, paint(rgba), size, rgba[3]);
+      return { shape, ribbon, mesh: ribbon.mesh };
+    });
     const below = new THREE.CircleGeometry(1.5 * vehicle.size, 40);
     this.shadow = new THREE.Mesh(below, flat({ color: 0x000000, map: textures.shadow }));
-    const ribbons = [this.trail, this.path, this.drop, this.pole].map((ribbon) => ribbon.mesh);
-    this.group.add(this.aircraft.group, this.goal, this.foot, this.shadow, ...ribbons);
+    const meshes = [this.trail, this.path, this.drop, ...this.goal].map(({ mesh }) => mesh);
+    this.group.add(this.aircraft.group, this.shadow, ...meshes);
     this.group.traverse((object) => object.layers.set(this.layer));
     this.scene.add(this.group);
     this.points = [];
@@ -250,8 +251,6 @@ class View {
     this.aircraft.group.position.fromArray(position);
     this.aircraft.group.quaternion.copy(attitude(quaternion)).normalize();
     this.aircraft.turn(speeds, time);
-    this.goal.position.fromArray(goal);
-    this.foot.position.set(goal[0], goal[1], 0.003);
     this.shadow.position.set(position[0], position[1], 0.002);
     this.shadow.scale.setScalar(1 + 0.15 * position[2]);
     // Looks at the aircraft, and a little towards its goal.
@@ -269,13 +268,19 @@ class View {
     this.trail.show([...this.points, ...position], this.camera);
     this.path.show(this.goals, this.camera);
     this.drop.show([...position, position[0], position[1], 0], this.camera, false);
-    this.pole.show([...goal, goal[0], goal[1], 0], this.camera, false);
+    // It is listed for a goal a metre above the ground.
+    const placed = ([x, y, z]) => [goal[0] + x, goal[1] + y, goal[2] * z];
+    for (const { shape, mesh, ribbon } of this.goal) {
+      if (ribbon) ribbon.show(shape.points.flatMap(placed), this.camera, false);
+      else mesh.position.fromArray(placed(shape.position));
+    }
   }
 }
 
 export class Stage {
-  // canvas: what to draw on; panels: the two elements over it that say where the views are.
-  constructor(canvas, panels, colours) {
+  // canvas: what to draw on; panels: the two elements over it that say where the views are; drawn: of the book.
+  constructor(canvas, panels, colours, drawn) {
+    this.drawn = drawn;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
     this.renderer.setScissorTest(true);
     this.panels = panels;
@@ -293,41 +298,52 @@ export class Stage {
     fill.position.set(3, 4, 1);
     const hemisphere = new THREE.HemisphereLight(0xbcd7ff, 0x26303c, 1.3);
     this.streaks = this.#makeStreaks();
-    for (const object of [ground, this.sky, sun, fill, hemisphere]) this.scene.add(object);
+    this.obstacles = new THREE.Group();
+    for (const object of [ground, this.obstacles, this.sky, sun, fill, hemisphere]) this.scene.add(object);
     for (const light of [sun, fill, hemisphere]) light.layers.enableAll();
     this.views = colours.map((colour, k) => new View(this.scene, k + 1, colour));
   }
 
-  begin(vehicle) {
-    for (const view of this.views) view.begin(vehicle, this.textures);
+  // scene: what stands in the world of the task.
+  begin(vehicle, scene) {
+    this.wide = vehicle.wide;
+    this.obstacles.clear();
+    for (const shape of scene.shapes) this.obstacles.add(solid(shape, scene.meshes));
+    for (const view of this.views) view.begin(vehicle, this.textures, this.drawn.trailWidth);
   }
 
   #makeStreaks() {
-    const made = new THREE.BufferGeometry();
-    const spread = (_, k) => STREAK_ROOM * ((((k - (k % 3)) * SPREAD[k % 3]) % 1) - 0.5);
-    this.places = Float32Array.from({ length: 3 * STREAKS }, spread);
-    made.setAttribute("position", new THREE.BufferAttribute(new Float32Array(6 * STREAKS), 3));
-    const material = new THREE.LineBasicMaterial({ color: WIND, transparent: true });
-    const lines = new THREE.LineSegments(made, material);
+    const made = new THREE.BufferGeometry(), { places, rgba } = this.drawn;
+    const shade = paint(rgba), colours = places.flatMap(() => [0, 1].flatMap(() => [shade.r, shade.g, shade.b, 0]));
+    this.drift = [0, 0, 0]; // [m], how far the air has come
+    made.setAttribute("position", new THREE.BufferAttribute(new Float32Array(6 * places.length), 3));
+    made.setAttribute("color", new THREE.BufferAttribute(new Float32Array(colours), 4));
+    const lines = new THREE.LineSegments(made, flat({ vertexColors: true }));
     lines.frustumCulled = false;
     this.scene.add(lines);
     return lines;
   }
 
-  // Streaks that blow with the wind [m/s] around a place.
+  // Streaks that blow with the wind [m/s] around a place; they fade towards the sides of their box and their tails.
   #blow(wind, place, time) {
-    const speed = Math.hypot(...wind), at = this.streaks.geometry.attributes.position;
-    this.streaks.material.opacity = Math.min(0.45, 0.2 * speed);
-    for (let k = 0; k < STREAKS; ++k) {
-      const from = [0, 1, 2].map((axis) => {
-        const moved = this.places[3 * k + axis] + wind[axis] * time;
-        const wrapped = ((((moved - place[axis]) / STREAK_ROOM + 0.5) % 1) + 1) % 1;
-        return (this.places[3 * k + axis] = place[axis] + STREAK_ROOM * (wrapped - 0.5));
+    const { places, box, seconds, rgba } = this.drawn, wide = Math.sqrt(this.wide);
+    const { position, color } = this.streaks.geometry.attributes;
+    const strength = rgba[3] * Math.min(Math.hypot(...wind), 1);
+    this.drift = this.drift.map((x, axis) => x + wind[axis] * time);
+    places.forEach((from, k) => {
+      const shares = from.map((x, axis) => {
+        const share = x + (this.drift[axis] - place[axis]) / (box[axis] * wide);
+        return share - Math.floor(share) - 0.5;
       });
-      at.setXYZ(2 * k, ...from);
-      at.setXYZ(2 * k + 1, ...from.map((x, axis) => x - 0.07 * wind[axis]));
-    }
-    at.needsUpdate = true;
+      const head = shares.map((x, axis) => place[axis] + x * box[axis] * wide);
+      position.setXYZ(2 * k, ...head.map((x, axis) => x - seconds * wide * wind[axis]));
+      position.setXYZ(2 * k + 1, ...head);
+      const near = shares.map((x) => Math.min(3 * (1 - Math.abs(2 * x)), 1));
+      const opacity = strength * near[0] * near[1] * near[2];
+      color.setW(2 * k, 0.25 * opacity);
+      color.setW(2 * k + 1, opacity);
+    });
+    position.needsUpdate = color.needsUpdate = true;
   }
 
   // shown: for each view { pose, goal, wind }; time since the last picture [s].

@@ -13,10 +13,10 @@ import re
 import subprocess
 import sys
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from quadrl.aircraft import parameters
@@ -25,14 +25,18 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
 from quadrl.base.philox import START
+from quadrl.base.primitives import Primitive
 from quadrl.core.environment import Environment
+from quadrl.core.markers import Marker
 from quadrl.deploy import flights
 from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import world
 from quadrl.engines.state import c_rows
 from quadrl.evaluation.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
+from quadrl.rendering import drawing
 from quadrl.tasks import TASKS
 
+SMALLEST = 0.35  # scale of the aircraft for which goals and trails are drawn, at least
 GUST_TIME = 1.0  # [s], correlation time of the page's gusts
 REPOSITORY = Path(__file__).resolve().parents[2]
 SOURCE, BUILD = REPOSITORY / "docs" / "fly", REPOSITORY / "build" / "web"
@@ -73,6 +77,7 @@ def make_book() -> tuple[dict[str, Any], str]:
     (slots,) = re.findall(r"export const SLOTS = (\d+)", (SOURCE / "flight.mjs").read_text())
     # Those that leave the air's laws alone: contact is MuJoCo's.
     tasks = {name: kind() for name, kind in TASKS.items() if not kind.contact}
+    plain = VEHICLES["paper"]
     pairs, sources = {}, [MEMORY.format(slots=slots, size=flights.SIZE)]
     for task in tasks.values():
         for vehicle in VEHICLES.values():
@@ -87,6 +92,13 @@ def make_book() -> tuple[dict[str, Any], str]:
                 "world": np.nan_to_num(world(environment.engine.model)).tolist(),
             }
     book = {
+        "drawn": {
+            "trailWidth": drawing.TRAIL_WIDTH,
+            "places": _rounded(drawing.PLACES),
+            "box": drawing.STREAK_BOX.tolist(),
+            "seconds": drawing.STREAK_SECONDS,
+            "rgba": drawing.STREAK_RGBA.tolist(),
+        },
         "layout": {name: [flights.LAYOUT[name], size] for name, size in flights.PARTS.items()},
         "flightSize": flights.SIZE,
         "startStream": START,
@@ -96,6 +108,7 @@ def make_book() -> tuple[dict[str, Any], str]:
             name: {
                 **{word: getattr(task, word) for word in ("asks", "starts", "ends", "solved")},
                 "timeLimit": task.time_limit,
+                "scene": shapes(drawing.world(mjcf.compile_model(plain, scene=task.scene))),
             }
             for name, task in tasks.items()
         },
@@ -113,6 +126,8 @@ def make_book() -> tuple[dict[str, Any], str]:
 def describe(vehicle: Vehicle) -> dict[str, Any]:
     """The numbers of an aircraft, and what it looks like."""
     row = parameters.numbers(parameters.rows(vehicle))[0]
+    seen = drawing.parts(mjcf.compile_model(vehicle), body=1)
+    radius = drawing.GOAL_RADIUS * max(vehicle.scale, SMALLEST)
     return {
         "row": row.tolist(),
         "limits": [vehicle.resolved_speed, vehicle.resolved_turn],
@@ -122,7 +137,7 @@ def describe(vehicle: Vehicle) -> dict[str, Any]:
         "controlTimestep": vehicle.control_timestep,
         "layout": vehicle.layout.tolist(),
         "size": vehicle.size,
-        "scale": vehicle.scale,
+        "wide": max(vehicle.scale, SMALLEST),
         "mass": vehicle.mass,
         "hoverSpeed": vehicle.hover_speed.tolist(),
         "actionScale": vehicle.action_scale,
@@ -131,42 +146,27 @@ def describe(vehicle: Vehicle) -> dict[str, Any]:
         "axis": [list(rotor.axis) for rotor in vehicle.rotors],
         "radius": [rotor.radius for rotor in vehicle.rotors],
         "colour": [list(mjcf.rotor_colour(rotor.position)) for rotor in vehicle.rotors],
-        **shapes(mjcf.compile_model(vehicle, drawn=True)),
+        # Discs have edges of their own on the page.
+        **shapes(one for one in seen if not one.name.endswith("_rim")),
+        # Of a goal a metre above the ground; the page moves it.
+        "goal": shapes(drawing.markers([Marker("goal", (0, 0, 1), radius)]))["shapes"],
     }
 
 
-def shapes(model: mujoco.MjModel) -> dict[str, Any]:
-    """What MuJoCo would draw of the aircraft: shapes in the body frame, and their meshes."""
-    geoms, meshes = [], {}
-    for k in np.flatnonzero(model.geom_bodyid == 1):
-        material, name = model.geom_matid[k], model.geom(k).name
-        kind = mujoco.mjtGeom(model.geom_type[k]).name.removeprefix("mjGEOM_").lower()
-        # What only touches is not drawn, and the page has rims of its own.
-        if model.geom_group[k] == 3 or name.endswith("_rim"):
-            continue
-        shape: dict[str, Any] = {
-            "name": name,
-            "kind": kind,
-            "size": _rounded(model.geom_size[k]),
-            "position": _rounded(model.geom_pos[k]),
-            "quaternion": _rounded(model.geom_quat[k]),
-            "rgba": _rounded(model.geom_rgba[k] if material < 0 else model.mat_rgba[material]),
-        }
-        if material >= 0:
-            shape["shine"] = float(model.mat_shininess[material])
-            shape["glow"] = float(model.mat_emission[material])
-        if kind == "mesh":
-            mesh = model.mesh(model.geom_dataid[k])
-            shape["mesh"] = mesh.name
-            parts = []
-            for table, kept, first, count in (
-                (model.mesh_vert, "<f4", mesh.vertadr[0], mesh.vertnum[0]),
-                (model.mesh_face, "<u2", mesh.faceadr[0], mesh.facenum[0]),
-            ):
-                parts.append(_encoded(table[first : first + count].astype(kept).tobytes()))
-            meshes[mesh.name] = dict(zip(("vertices", "faces"), parts, strict=True))
-        geoms.append(shape)
-    return {"shapes": geoms, "meshes": meshes}
+def shapes(primitives: Iterable[Primitive]) -> dict[str, Any]:
+    """Primitives as the page reads them, and their meshes."""
+    listed, meshes = [], {}
+    for one in primitives:
+        shape: dict[str, Any] = {"name": one.name, "kind": one.shape}
+        for name in ("size", "position", "quaternion", "rgba", "points", "glow", "shine"):
+            shape[name] = _rounded(getattr(one, name))
+        if one.mesh is not None:
+            shape["mesh"] = one.mesh.name
+            vertices, faces = one.mesh.vertices.astype("<f4"), one.mesh.faces.astype("<u2")
+            kept = {"vertices": _encoded(vertices.tobytes()), "faces": _encoded(faces.tobytes())}
+            meshes[one.mesh.name] = kept
+        listed.append(shape)
+    return {"shapes": listed, "meshes": meshes}
 
 
 def compile_flights(source: str) -> bytes:
@@ -224,9 +224,10 @@ def _encoded(content: bytes) -> str:
     return base64.b64encode(content).decode()
 
 
-def _rounded(values: np.ndarray) -> list[float]:
+def _rounded(values: Any) -> Any:
     """Numbers that are only drawn, with six digits."""
-    return [float(f"{value:.6g}") for value in values]
+    rounded = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[float])
+    return rounded(np.asarray(values, dtype=float)).tolist()
 
 
 if __name__ == "__main__":

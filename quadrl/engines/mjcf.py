@@ -12,7 +12,7 @@ import numpy as np
 from quadrl.aircraft import parameters
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import DRAWN_SIZE, Vehicle
-from quadrl.engines import landmarks, native
+from quadrl.engines import native
 
 ASSETS = Path(__file__).parents[1] / "assets"
 DRAWN_RADIUS = 0.06  # [m], of the rotor in assets/rotor.xml
@@ -160,11 +160,8 @@ def _draw(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
     for mesh in whole.meshes:
         mesh.scale = np.asarray(mesh.scale) * scale
     # After the scaling: a metre on the ground is a metre for every aircraft.
-    for name, (vertices, faces) in landmarks.meshes().items():
-        shell, kind = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL, mujoco.mjtGeom.mjGEOM_MESH
-        whole.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel(), inertia=shell)
-        seen = dict(type=kind, meshname=name, material=name, contype=0, conaffinity=0)
-        whole.worldbody.add_geom(name=name, **seen)
+    ground = mujoco.MjSpec.from_file(str(ASSETS / "landmarks.xml"))
+    whole.attach(ground, prefix="ground_", frame=whole.worldbody.add_frame())
     for k, rotor in enumerate(vehicle.rotors):
         part = mujoco.MjSpec.from_file(str(ASSETS / "rotor.xml"))
         x, y, z = rotor.position

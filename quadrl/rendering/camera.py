@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from quadrl.aircraft.vehicle import DRAWN_SIZE
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.core.markers import Marker
 
@@ -30,16 +31,20 @@ def aircraft_scale(model: mujoco.MjModel) -> float:
     return float(np.linalg.norm(np.array(sites)[:, :2], axis=1).max()) / DRAWN_SIZE
 
 
-def in_view(goal: Array, markers: Sequence[Marker] = ()) -> Array:
+def in_view(goal: Array, markers: Sequence[Marker | Primitive] = ()) -> Array:
     """What a camera should keep in view, (n, 3) [m]: the goal, spheres, rings, pads and paths.
+
+    Of a primitive, which does not say what it is for, nothing has to be in view.
 
     "chase" stays nearer, and keeps the goal alone in view.
     """
-    return np.vstack([np.asarray(goal, dtype=float)[None], *(_extent(m) for m in markers)])
+    return np.vstack([np.asarray(goal, dtype=float)[None], *map(_extent, markers)])
 
 
-def _extent(marker: Marker) -> Array:
+def _extent(marker: Marker | Primitive) -> Array:
     """Points (n, 3) [m] that are in view where the marker is."""
+    if isinstance(marker, Primitive):
+        return np.empty((0, 3))
     centre = np.asarray(marker.position, dtype=float)
     if marker.kind == "path":
         return np.asarray(marker.points, dtype=float).reshape(-1, 3)

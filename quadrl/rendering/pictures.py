@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.core.markers import Marker
 from quadrl.rendering.camera import (
@@ -19,8 +20,8 @@ from quadrl.rendering.camera import (
     moving_camera,
     moving_views,
 )
-from quadrl.rendering.scene import TRAIL_SECONDS, Renderer
-from quadrl.rendering.streaks import streaks
+from quadrl.rendering.drawing import TRAIL_SECONDS, streaks
+from quadrl.rendering.scene import Renderer
 
 
 class LiveFlight:
@@ -42,7 +43,7 @@ class LiveFlight:
         qpos: Array,
         rotor_speed: Array,
         goal: Array,
-        markers: Sequence[Marker],
+        markers: Sequence[Marker | Primitive],
         wind: Array | None = None,
     ) -> Array:
         """Draw the flight as it is now.

@@ -29,9 +29,9 @@ from quadrl.rendering.camera import (
     headings,
     in_view,
 )
+from quadrl.rendering.drawing import TRAIL_SECONDS, streaks
 from quadrl.rendering.overlay import Panel, flight_lines, grid, require, task_title
-from quadrl.rendering.scene import TRAIL_SECONDS, Renderer
-from quadrl.rendering.streaks import streaks
+from quadrl.rendering.scene import Renderer
 
 T = TypeVar("T")
 OneOrMore = T | Sequence[T]

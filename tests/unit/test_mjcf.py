@@ -9,8 +9,8 @@ import pytest
 
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import DRAWN_ROTOR_HEIGHT
-from quadrl.engines import landmarks, mjcf
-from quadrl.rendering import Renderer
+from quadrl.engines import mjcf
+from quadrl.rendering import Renderer, drawing
 
 PAPER = VEHICLES["paper"]
 layouts = pytest.mark.parametrize("vehicle", helpers.LAYOUTS.values(), ids=helpers.LAYOUTS)
@@ -115,14 +115,23 @@ def test_the_feet_touch_first_and_then_what_must_not(name):
     assert touching(radius - y + 1e-4, math.pi / 2) == set()
 
 
-@pytest.mark.parametrize("vehicle", ["paper", "crazyflie"])
-def test_a_metre_on_the_ground_is_a_metre_for_every_aircraft(vehicle):
-    model = mjcf.compile_model(VEHICLES[vehicle])
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    geom = model.geom("marks")
-    mesh = model.mesh(model.geom_dataid[geom.id])
-    vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
-    placed = data.geom(geom.id).xpos + vertices @ data.geom(geom.id).xmat.reshape(3, 3).T
-    painted = landmarks.meshes()["marks"][0]
-    np.testing.assert_allclose(np.sort(placed, axis=0), np.sort(painted, axis=0), atol=1e-5)
+def test_a_metre_on_the_ground_is_a_metre_for_every_aircraft():
+    painted = []
+    for name in ("paper", "crazyflie"):
+        model = mjcf.compile_model(VEHICLES[name])
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        for part in drawing.PAINTED:
+            corners = vertices(model, data, part)
+            assert model.geom(part).contype == 0 and model.geom(part).conaffinity == 0
+            mesh = model.mesh(model.geom(part).dataid[0])
+            faces = model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]]
+            a, b, c = (corners[faces[:, k]] for k in range(3))
+            assert (np.cross(b - a, c - a)[:, 2] > 0).all()  # seen from above
+            painted.append(corners)
+    for one, other in zip(painted[:2], painted[2:], strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    # The tick at 10 m to the east: 0.035 m wide, 0.07 m and half of that width long each way.
+    tick = np.array([10.0 + 0.035 / 2, 0.07 + 0.035 / 4, 0.001])
+    assert np.abs(painted[0] - tick).max(axis=1).min() < 2e-4
+    assert painted[0][:, 2] == pytest.approx(0.001, abs=1e-6)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from quadrl import cli, tasks
 from quadrl.aircraft.presets import resolve
 from quadrl.base.errors import QuadrlError
+from quadrl.base.primitives import Mesh, Primitive
 from quadrl.cli.view import others
 from quadrl.core.markers import Marker
 from quadrl.engines import mjcf
@@ -22,7 +23,6 @@ from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.policy import Policy
 from quadrl.rendering.live import readout
 from quadrl.rendering.live.flight import Flight, Keyboard
-from quadrl.rendering.live.shapes import sketch
 
 VEHICLE = resolve(None)
 STEP = VEHICLE.control_timestep
@@ -170,34 +170,6 @@ def test_a_controller_that_does_not_fit_changes_nothing():
     flight.step()
 
 
-def test_markers_become_balls_discs_lines_and_words():
-    drawn = sketch(
-        [
-            (Marker("goal", (0, 0, 2), 0.1), np.array([5.0, 0, 0])),
-            (Marker("sphere", (1, 0, 1), 0.2, label="1"), np.zeros(3)),
-            (Marker("ring", (0, 0, 1), 0.5, end=(1, 0, 1)), np.zeros(3)),
-            (Marker("pad", (3, 0, 2), 0.4), np.zeros(3)),
-            (Marker("arrow", (0, 0, 0), 0.01, end=(0, 0, 1)), np.zeros(3)),
-            (Marker("path", points=[(0, 0, 7), (0, 1, 7), (0, 2, 7)]), np.zeros(3)),
-        ]
-    )
-    np.testing.assert_allclose(
-        drawn.balls[:, :4], [[5, 0, 2, 0.1], [5, 0, 2, 0.022], [1, 0, 1, 0.2]]
-    )
-    np.testing.assert_allclose(drawn.discs[0, :8], [3, 0, 0, 1, 0, 0, 0, 0.4])  # on the ground
-    assert [text for text, _ in drawn.labels] == ["1"]
-    ring = drawn.lines[np.isclose(np.linalg.norm(drawn.lines - (0, 0, 1), axis=2), 0.5).all(1)]
-    assert len(ring) == 48
-    np.testing.assert_allclose(ring[..., 0], 0, atol=1e-12)  # it faces east
-    assert (drawn.lines[..., 2] == 7).all(1).sum() == 2
-    assert drawn.lines.shape == drawn.colours.shape
-
-
-def test_nothing_to_draw_is_drawn_too():
-    drawn = sketch([])
-    assert drawn.balls.shape == (0, 8) and drawn.lines.shape == (0, 2, 3)
-
-
 def test_numbers_are_those_of_the_aircraft():
     flight = hover(2)
     flight.step()
@@ -212,15 +184,19 @@ def test_meshes_are_those_of_the_model(vehicle):
     trimesh = pytest.importorskip("trimesh")
     from quadrl.rendering.live import meshes
 
-    model = mjcf.compile_model(resolve(vehicle))
+    def wall(spec):
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.1, 2, 1), pos=(3, 0, 1))
+
+    def corners(glb):
+        return trimesh.load_scene(io.BytesIO(glb), file_type="glb").to_mesh().vertices
+
+    model = mjcf.compile_model(resolve(vehicle), scene=wall)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    solid, clear = meshes.airframe(model)
-    parts = [(solid, np.eye(4)), *(meshes.blades(model, rotor) for rotor in range(model.nu))]
-    points = [mesh.vertices for mesh, _ in clear]
-    for glb, frame in parts:
-        mesh = trimesh.load_scene(io.BytesIO(glb), file_type="glb").to_mesh()
-        points.append(trimesh.transform_points(mesh.vertices, frame))
+    seen = meshes.of_model(model)
+    points = [corners(seen.solid), *(mesh.vertices for mesh, _ in seen.clear)]
+    for blades, (place, attitude) in zip(seen.blades, seen.hubs, strict=True):
+        points.append(place + attitude.apply(corners(blades)))
     drawn = scipy.spatial.KDTree(np.concatenate(points))
     checked = 0
     for geom in range(model.ngeom):
@@ -233,19 +209,14 @@ def test_meshes_are_those_of_the_model(vehicle):
         where = data.geom_xpos[geom] + vertices @ axes.T - data.body("aircraft").xpos
         assert drawn.query(where)[0].max() < 1e-6, model.geom(geom).name
         checked += 1
-    assert sorted(rgba[3] < 1 for _, rgba in clear) == [True] * 3  # the discs: front, side, back
+    assert [rgba[3] < 1 for _, rgba in seen.clear] == [True] * 3  # the discs: front, side, back
     assert checked > 4 * model.nu  # arm, sleeve, two blades and rim of each rotor
-    assert meshes.world(model) is None
-
-
-def test_what_stands_in_the_world_is_drawn():
-    pytest.importorskip("trimesh")
-    from quadrl.rendering.live import meshes
-
-    def wall(spec):
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.1, 2, 1), pos=(3, 0, 1))
-
-    assert meshes.world(mjcf.compile_model(VEHICLE, scene=wall))
+    wall_corners = corners(seen.world)
+    assert (wall_corners.min(0), wall_corners.max(0)) == (
+        pytest.approx([2.9, -2, 0]),
+        pytest.approx([3.1, 2, 2]),
+    )
+    assert meshes.of_model(mjcf.compile_model(resolve(vehicle))).world is None
 
 
 def test_controls_act_on_the_flight(page):
@@ -333,15 +304,37 @@ def test_the_camera_stays_with_its_aircraft(page, camera):
         assert seen[1] == pytest.approx(0.0, abs=1e-6) and seen[0] > 0
 
 
-def test_a_task_with_a_pad_and_one_with_labels_are_drawn():
-    browser = pytest.importorskip("quadrl.rendering.live.browser", exc_type=ModuleNotFoundError)
-    for name in ("landing", "static_waypoint"):
-        task = tasks.make(name)
-        flight = Flight(make_controller("geometric", task, VEHICLE), task, VEHICLE)
-        with contextlib.closing(browser.Page(flight, {}, port=0)) as page:
-            page.frame(STEP)
-            page.show_markers.value = False
-            page.frame(STEP)
+def test_every_marker_and_primitive_is_drawn(page, monkeypatch):
+    shapes = [Primitive(shape) for shape in ("sphere", "ellipsoid", "box", "cylinder", "capsule")]
+    lit = Primitive("box", (1.0, 2.0, 3.0), (0, 0, 5), glow=0.0)
+    mesh = Mesh("roof", np.eye(3), np.array([[0, 1, 2]]))
+    shown = [
+        *(*shapes, lit, Primitive("mesh", mesh=mesh)),
+        Marker("sphere", (1, 0, 1), 0.2, label="1"),
+        Marker("ring", (0, 0, 1), 0.5, end=(1, 0, 1)),
+        Marker("pad", (3, 0, 2), 0.4),
+        Marker("arrow", (0, 0, 1), 0.01, end=(0, 0, 3)),
+        Marker("path", points=[(0, 0, 7), (0, 1, 7), (0, 2, 7)]),
+    ]
+    monkeypatch.setattr(Flight, "markers", lambda flight, row: () if row else shown)
+    page.apart.value = 0.0
+    page.frame(STEP)
+    batches = page.scene._batches
+    kinds = "glowing_sphere ellipsoid box cylinder arrow lit_box roof capsule".split()
+    assert len(batches) == 8 and all(any(kind in name for name in batches) for kind in kinds)
+    np.testing.assert_array_equal(batches["lit_box"].batched_scales, [[1, 2, 3]])
+    np.testing.assert_array_equal(batches["glowing_sphere"].batched_positions[1], [1, 0, 1])
+    np.testing.assert_allclose(batches["glowing_arrow"].batched_scales[0], [0.02, 0.02, 2])
+    np.testing.assert_allclose(batches["glowing_cylinder"].batched_positions[1], [3, 0, 0])
+    points = page.scene._marks.points
+    ring = points[np.isclose(np.linalg.norm(points - (0, 0, 1), axis=2), 0.5).all(1)]
+    assert len(ring) == 48
+    np.testing.assert_allclose(ring[..., 0], 0, atol=1e-6)  # it faces east
+    assert (points[..., 2] == 7).all(1).sum() == 2
+    assert [text for text, _ in page.scene._labelled] == ["1"]
+    page.show_markers.value = False
+    page.frame(STEP)
+    assert not page.scene._batches and not len(page.scene._marks.points)
 
 
 def test_a_port_that_is_taken_is_named(capsys):

@@ -17,7 +17,7 @@ from quadrl.core.task import Task
 from quadrl.evaluation.memory import Flyer
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import Controller
-from quadrl.rendering.scene import GOAL_RADIUS
+from quadrl.rendering.drawing import GOAL_RADIUS
 
 MAX_AIRCRAFT = 256
 LONGEST = 0.25  # [s] of flight at once; a machine that is slower shows slow motion

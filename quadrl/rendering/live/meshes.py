@@ -1,116 +1,135 @@
-"""Parts of a drawn MuJoCo model as meshes for a browser (GLB)."""
+"""Primitives as meshes: of a model for a browser (GLB), and one of each shape to be copied."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
-from quadrl.engines import landmarks
-from quadrl.rendering.live.shapes import blade_ids
+from quadrl.rendering import drawing
 
 SHARPEST = 0.7  # [rad], an edge that is shaded round
-DRAWN_GROUPS = 3  # MuJoCo shows the groups 0 to 2
+SHAFT, HEAD = 0.5, 0.25  # of an arrow: width against its head's, and length of the head
 
 
-def airframe(model: mujoco.MjModel) -> tuple[bytes, list[tuple[Any, Array]]]:
-    """All that is drawn of the aircraft but its blades, body frame.
+class Meshes(NamedTuple):
+    """A drawn model whose aircraft flies and whose blades turn; GLB, body frame."""
 
-    Returns:
-        What is solid, as GLB; and what is transparent: a mesh for each colour (4,), 0 to 1.
-    """
-    body = model.body("aircraft").id
-    blades = {geom for rotor in range(model.nu) for geom in blade_ids(model, rotor)}
+    solid: bytes  # of the aircraft, but for its blades
+    clear: list[tuple[Any, Array]]  # a mesh for each transparent colour (4,), 0 to 1
+    blades: list[bytes]  # of each rotor, in the frame of its hub
+    hubs: list[tuple[Array, Rotation]]  # position (3,) [m] and attitude of each rotor's
+    world: bytes | None  # what stands in the world, world frame
+
+
+def of_model(model: mujoco.MjModel) -> Meshes:
+    """Meshes of all that is drawn but the ground: the page has a grid, each aircraft its place."""
+    blades: list[list[Primitive]] = [[] for _ in range(model.nu)]
+    hubs, solid = np.tile(np.eye(4), (model.nu, 1, 1)), []
     clear: dict[tuple[float, ...], list[trimesh.Trimesh]] = {}
-    solid = []
-    for geom in _drawn(model, body):
-        rgba = _rgba(model, geom)
-        if rgba[3] < 1.0:
-            clear.setdefault(tuple(rgba), []).append(_mesh(model, geom))
-        elif geom not in blades:
-            solid.append(geom)
-    parts = [(trimesh.util.concatenate(same), np.array(rgba)) for rgba, same in clear.items()]
-    return _glb(model, solid), parts
+    for one in drawing.parts(model, model.body("aircraft").id):
+        _, rotor, part, *_ = [*one.name.split("_"), "", ""]  # rotor_1_blade_a
+        if part == "hub":
+            hubs[int(rotor) - 1] = _pose(one)
+        if part == "blade":
+            blades[int(rotor) - 1].append(one)
+        elif one.rgba[3] < 1.0:
+            clear.setdefault(tuple(one.rgba), []).append(_mesh(one))
+        else:
+            solid.append(one)
+    world = drawing.world(model)
+    return Meshes(
+        _glb(solid),
+        [(trimesh.util.concatenate(same), np.array(rgba)) for rgba, same in clear.items()],
+        [_glb(parts, np.linalg.inv(hub)) for parts, hub in zip(blades, hubs, strict=True)],
+        [(hub[:3, 3], Rotation.from_matrix(hub[:3, :3])) for hub in hubs],
+        _glb(world) if world else None,
+    )
 
 
-def blades(model: mujoco.MjModel, rotor: int) -> tuple[bytes, np.ndarray]:
-    """The blades of a rotor as GLB, and their frame (4, 4), which they turn about, body frame."""
-    hub = model.geom(f"rotor_{rotor + 1}_hub").id
-    frame = _pose(model, hub)
-    return _glb(model, blade_ids(model, rotor), np.linalg.inv(frame)), frame
+@functools.cache
+def _units(fine: bool) -> dict[str, Any]:
+    """Shapes of size 1, which scaling gives any size."""
+    make = trimesh.creation
+    ball = make.icosphere(2 + fine, 1.0)
+    shaft = make.cylinder(SHAFT, segment=((0, 0, 0), (0, 0, 1.0 - HEAD)), sections=24)
+    head = make.cone(1.0, HEAD, sections=24).apply_translation((0, 0, 1.0 - HEAD))
+    return {
+        "sphere": ball,
+        "ellipsoid": ball,
+        "box": make.box((2.0, 2.0, 2.0)),
+        "cylinder": make.cylinder(1.0, 2.0, sections=64 if fine else 32),
+        "arrow": trimesh.util.concatenate([shaft, head]),
+    }
 
 
-def world(model: mujoco.MjModel) -> bytes | None:
-    """What stands in the world, as GLB; None where there is nothing beside the ground.
-
-    What is painted on the ground is left out: the page has a grid, and each aircraft its place.
-    """
-    painted = landmarks.meshes().keys()
-    solid = [
-        geom
-        for geom in _drawn(model, 0)
-        if model.geom_type[geom] in _PRIMITIVES and model.geom(geom).name not in painted
-    ]
-    return _glb(model, solid) if solid else None
+def unit(one: Primitive, fine: bool = True) -> trimesh.Trimesh:
+    """The mesh whose copies, `placed`, are primitives like this one."""
+    mesh = _units(fine).get(one.shape)
+    if mesh is not None:
+        return mesh
+    if one.mesh is not None:
+        return trimesh.Trimesh(one.mesh.vertices, one.mesh.faces)
+    radius, half = np.asarray(one.size, dtype=float)[:2]
+    return trimesh.creation.capsule(2 * half, radius)
 
 
-def _drawn(model: mujoco.MjModel, body: int) -> list[int]:
-    """The geoms of a body that are shown."""
-    shown = (model.geom_bodyid == body) & (model.geom_group < DRAWN_GROUPS)
-    return np.flatnonzero(shown).tolist()
+def unit_name(one: Primitive) -> str:
+    """The same for primitives with the same `unit`, lit alike."""
+    lit = "lit" if one.glow < 1.0 else "glowing"
+    own = one.mesh.name if one.mesh else "_".join(f"{x:g}" for x in np.atleast_1d(one.size))
+    return f"{lit}_{one.shape}" + ("" if one.shape in _units(True) else f"_{own}")
 
 
-def _pose(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Pose (4, 4) of a geom in its body's frame."""
-    pose, axes = np.eye(4), np.empty(9)
-    mujoco.mju_quat2Mat(axes, model.geom_quat[geom])
-    pose[:3, :3], pose[:3, 3] = axes.reshape(3, 3), model.geom_pos[geom]
+def placed(one: Primitive, offset: Array | float = 0.0) -> tuple[Array, Array, Array]:
+    """Position (3,) [m], attitude (4,) and scale (3,) of a `unit`, shifted by an offset (3,)."""
+    place, attitude = np.asarray(one.position, dtype=float), np.asarray(one.quaternion, dtype=float)
+    size = np.broadcast_to(np.asarray(one.size, dtype=float), 3)
+    scale = np.ones(3)
+    if one.shape == "arrow":
+        place, end = np.asarray(one.points, dtype=float)
+        attitude = np.empty(4)
+        mujoco.mju_quatZ2Vec(attitude, end - place)
+        scale = np.array([2 * size[0], 2 * size[0], float(np.linalg.norm(end - place))])
+    elif one.shape in _units(True):
+        order = {"sphere": [0, 0, 0], "cylinder": [0, 0, 1]}.get(one.shape, [0, 1, 2])
+        scale = size[order]
+    return place + offset, attitude, scale
+
+
+def _pose(one: Primitive) -> Array:
+    """Pose (4, 4)."""
+    pose = np.eye(4)
+    pose[:3, 3] = one.position
+    pose[:3, :3] = Rotation.from_quat(np.asarray(one.quaternion), scalar_first=True).as_matrix()
     return pose
 
 
-_PRIMITIVES: dict[int, Any] = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): lambda s: trimesh.creation.icosphere(2, s[0]),
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): lambda s: trimesh.creation.icosphere(2).apply_scale(s),
-    int(mujoco.mjtGeom.mjGEOM_BOX): lambda s: trimesh.creation.box(2 * s),
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): lambda s: trimesh.creation.cylinder(s[0], 2 * s[1]),
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): lambda s: trimesh.creation.capsule(2 * s[1], s[0]),
-    int(mujoco.mjtGeom.mjGEOM_MESH): None,
-}
-"""Of a size as MuJoCo gives it."""
+def _mesh(one: Primitive) -> trimesh.Trimesh:
+    """A primitive as it stands, round where its edges are blunt."""
+    shape = unit(one, fine=False).copy().apply_transform(np.diag([*placed(one)[2], 1.0]))
+    return trimesh.graph.smooth_shade(shape, angle=SHARPEST, facet_minarea=None).apply_transform(
+        _pose(one)
+    )
 
 
-def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
-    """A geom in its body's frame, round where its edges are blunt."""
-    make = _PRIMITIVES[int(model.geom_type[geom])]
-    if make is not None:
-        shape = make(model.geom_size[geom])
-    else:
-        mesh = model.mesh(model.geom_dataid[geom])
-        vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
-        shape = trimesh.Trimesh(vertices, model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]])
-    shape = trimesh.graph.smooth_shade(shape, angle=SHARPEST, facet_minarea=None)
-    return shape.apply_transform(_pose(model, geom))
-
-
-def _rgba(model: mujoco.MjModel, geom: int) -> Array:
-    material = int(model.geom_matid[geom])
-    return model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-
-
-def _glb(model: mujoco.MjModel, geoms: Sequence[int], frame: Array | None = None) -> bytes:
-    """Geoms of one body as one mesh with a colour at each vertex, moved into a frame (4, 4)."""
-    meshes = [_mesh(model, geom) for geom in geoms]
+def _glb(parts: Sequence[Primitive], frame: Array | None = None) -> bytes:
+    """Primitives as one mesh with a colour at each vertex, moved into a frame (4, 4)."""
+    meshes = [_mesh(one) for one in parts]
     whole: Any = trimesh.util.concatenate(meshes)
     if frame is not None:
         whole.apply_transform(frame)
-    colours = np.array([_rgba(model, geom) for geom in geoms], dtype=float)
+    colours = np.array([one.rgba for one in parts], dtype=float)
     colours[:, :3] **= 2.2  # those of GLB are linear, those of MuJoCo are the screen's
     colours = np.repeat(255 * colours, [len(mesh.vertices) for mesh in meshes], axis=0)
     whole.visual = TextureVisuals(material=PBRMaterial(roughnessFactor=0.5, metallicFactor=0.1))

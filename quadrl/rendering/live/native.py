@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import time
 import warnings
 
 import glfw
 import mujoco
-import numpy as np
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.engines import mjcf
 from quadrl.engines.mujoco import DataEngine
-from quadrl.rendering.live import shapes
+from quadrl.rendering import drawing, scene
 from quadrl.rendering.live.flight import Flight
 
 FRAME = 1 / 60  # [s]
-LINE = 0.003  # [m], half the width of markers' lines
 SPACE, RESET = 32, ord("R")  # keys, as GLFW numbers them
 
 
@@ -54,7 +53,7 @@ def run(flight: Flight) -> None:
 
     model = mjcf.compile_model(flight.vehicle, contact=flight.task.contact, scene=flight.task.scene)
     shown, pressed = mujoco.MjData(model), queue.SimpleQueue()
-    _place(flight, model, shown)
+    _draw(flight, model, shown)
     try:
         window = viewer.launch_passive(
             model, shown, key_callback=pressed.put, show_left_ui=False, show_right_ui=False
@@ -78,37 +77,22 @@ def run(flight: Flight) -> None:
             flight.advance(now - last)
             last = now
             with window.lock():
-                _place(flight, model, shown)
-                _draw_markers(flight, window.user_scn)
+                _draw(flight, model, shown, window.user_scn)
             window.sync()
             time.sleep(max(0.0, FRAME - (time.perf_counter() - now)))
 
 
-def _place(flight: Flight, model: mujoco.MjModel, shown: mujoco.MjData) -> None:
-    """Put the drawn aircraft where the flight is, with its blades turned."""
+def _draw(
+    flight: Flight,
+    model: mujoco.MjModel,
+    shown: mujoco.MjData,
+    beside: mujoco.MjvScene | None = None,
+) -> None:
+    """Put the drawn aircraft where the flight is, and markers beside it, as many as it takes."""
     pose = flight.drawn()[0]
     shown.qpos[:7] = pose[:7]
-    for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
-        stage(model, shown)
-    for rotor, angle in enumerate(pose[7:]):
-        shapes.turn_blades(model, shown, rotor, float(angle))
-
-
-def _draw_markers(flight: Flight, scene: mujoco.MjvScene) -> None:
-    """Markers as shapes of MuJoCo's, as many as the window takes."""
-    kinds, sketch = mujoco.mjtGeom, shapes.sketch([(m, np.zeros(3)) for m in flight.markers(0)])
-    scene.ngeom = 0
-
-    def add(kind: mujoco.mjtGeom, size: float, place: np.ndarray, rgba: np.ndarray) -> int:
-        if scene.ngeom < scene.maxgeom:
-            geom = scene.geoms[scene.ngeom]
-            flat = np.eye(3).ravel()
-            mujoco.mjv_initGeom(geom, kind, np.full(3, size), place, flat, rgba.astype(np.float32))
-            scene.ngeom += 1
-        return scene.ngeom - 1
-
-    for ball in sketch.balls:
-        add(kinds.mjGEOM_SPHERE, ball[3], ball[:3], ball[4:])
-    for (begin, end), colours in zip(sketch.lines, sketch.colours, strict=True):
-        line = add(kinds.mjGEOM_CAPSULE, LINE, begin, np.append(colours[0], 1.0))
-        mujoco.mjv_connector(scene.geoms[line], kinds.mjGEOM_CAPSULE, LINE, begin, end)
+    scene.place(model, shown, pose[7:])
+    if beside is not None:
+        beside.ngeom = 0
+        with contextlib.suppress(QuadrlError):
+            scene.add(beside, drawing.markers(flight.markers(0)))

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import trimesh
 import viser
 from scipy.spatial.transform import Rotation
 
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.engines import mjcf
-from quadrl.rendering.live import meshes, shapes
+from quadrl.rendering import drawing
+from quadrl.rendering.live import meshes
 from quadrl.rendering.live.flight import Flight
-from quadrl.rendering.scene import TRAIL_NEW, TRAIL_OLD
 
 CAMERAS = ("free", "follow", "chase")
 # Where the camera stands, seen from where it looks, in sizes of what it shows.
@@ -26,9 +27,6 @@ PIECE = 0.1  # [s], of a trail
 SKY = np.array([(78, 128, 196), (232, 240, 247), (214, 222, 229)])  # above, horizon, below
 GROUND, METRES, TENS = (0.30, 0.37, 0.44), (0.43, 0.51, 0.58), (0.58, 0.66, 0.72)
 FOV = math.radians(42)
-BALL = trimesh.creation.icosphere(3, 1.0)
-DISC = trimesh.creation.cylinder(1.0, 1.0, sections=64)
-DISC_HEIGHT = 0.004  # [m]
 UPRIGHT = np.array([(1.0, 0.0, 0.0, 0.0)])
 
 
@@ -43,24 +41,23 @@ class Scene:
         self._home = flight.environment.origin  # where cameras look
         self._centre, self._heading = self._home.copy(), np.array([1.0, 0.0])
         self._shown: Any = None
-        self._labels, self._labelled = [], ()
+        self._labels, self._labelled = [], []
         model = mjcf.compile_model(flight.vehicle, scene=flight.task.scene)
-        self._add_world(meshes.world(model), count)
+        seen = meshes.of_model(model)
+        self._add_world(seen.world, count)
+        self._airframe = self._add_copies("airframe", seen.solid, count)
         places = np.zeros((count, 3)), np.repeat(UPRIGHT, count, axis=0)
-        solid, clear = meshes.airframe(model)
-        self._airframe = self._scene.add_batched_glb("/world/airframe", solid, *places[::-1])
         self._clear = [
             self._scene.add_batched_meshes_simple(
                 f"/world/clear_{k}", mesh.vertices, mesh.faces, *places[::-1],
                 batched_colors=_bytes(rgba[:3]), opacity=rgba[3], cast_shadow=False,
             )
-            for k, (mesh, rgba) in enumerate(clear)
+            for k, (mesh, rgba) in enumerate(seen.clear)
         ]  # fmt: skip
-        self._rotors = []
-        for k in range(model.nu):
-            glb, frame = meshes.blades(model, k)
-            node = self._scene.add_batched_glb(f"/world/rotor_{k + 1}", glb, *places[::-1])
-            self._rotors.append((node, Rotation.from_matrix(frame[:3, :3]), frame[:3, 3]))
+        self._rotors = [
+            (self._add_copies(f"rotor_{k + 1}", blades, count), *hub)
+            for k, (blades, hub) in enumerate(zip(seen.blades, seen.hubs, strict=True))
+        ]
 
     def view(self, camera: str, apart: float) -> None:
         """Place every browser's camera, and that of those to come."""
@@ -81,7 +78,7 @@ class Scene:
         )
         for node in (self._airframe, *self._clear):
             node.batched_positions, node.batched_wxyzs = places, pose[:, 3:7]
-        for (node, frame, hub), angle in zip(self._rotors, pose[:, 7:].T, strict=True):
+        for (node, hub, frame), angle in zip(self._rotors, pose[:, 7:].T, strict=True):
             turned = attitude * frame * Rotation.from_rotvec(angle[:, None] * (0, 0, 1))
             node.batched_positions = places + attitude.apply(hub)
             node.batched_wxyzs = turned.as_quat(scalar_first=True)
@@ -92,30 +89,24 @@ class Scene:
     def draw_paths(self, apart: float, markers: bool, trails: bool) -> None:
         """Send goals, markers and trails."""
         flight, offsets = self._flight, self.offsets(apart)
-        count = len(offsets)
         shown = [
-            (marker, offsets[row])
-            for row in range(count if markers else 0)
-            for marker in flight.markers(row)
+            (one, offset)
+            for row, offset in enumerate(offsets if markers else ())
+            for one in drawing.markers(flight.markers(row))
         ]
-        sketch = shapes.sketch(shown)
-        balls, discs = sketch.balls, sketch.discs
-        upright = np.repeat(UPRIGHT, len(balls), axis=0)
-        size = np.repeat(balls[:, 3:4], 3, axis=1)
-        self._send_batch("balls", BALL, np.hstack([balls[:, :3], upright]), size, balls[:, 4:])
-        size = discs[:, 7:8] * (1, 1, 0) + (0, 0, DISC_HEIGHT)
-        self._send_batch("discs", DISC, discs[:, :7], size, discs[:, 8:])
-        if len(self._marks.points) != len(sketch.lines):
-            self._marks = self._add_lines("marks", len(sketch.lines), 2.0)
-        self._marks.points = sketch.lines.astype(np.float32)
-        self._marks.colors = _bytes(sketch.colours)
-        self._send_labels(sketch.labels)
+        self._send_lines([pair for pair in shown if pair[0].shape == "line"])
+        self._send_labels([pair for pair in shown if pair[0].shape == "label"])
+        batches: dict[str, list[tuple[Primitive, Array]]] = {name: [] for name in self._batches}
+        for one, offset in shown:
+            if one.shape not in ("line", "label"):
+                batches.setdefault(meshes.unit_name(one), []).append((one, offset))
+        for name, batch in batches.items():
+            self._send_batch(name, batch)
         self._trails.visible = trails
         trail = flight.trail[::-1][:: self._every][::-1]
         # As many segments as ever: viser's client draws no more than it was sent first.
         trail = np.where(np.isfinite(trail), trail, flight.pose[:, :3]) + offsets
-        youth = np.linspace(0, 1, len(trail))[:, None, None]
-        colours = (TRAIL_OLD + youth * (TRAIL_NEW - TRAIL_OLD))[..., :3]
+        colours = drawing.trail_colours(len(trail))[:, None, :3]
         for name, values in (("points", trail), ("colors", np.broadcast_to(colours, trail.shape))):
             pairs = np.stack([values[:-1], values[1:]], axis=2).reshape(-1, 2, 3)
             sent = pairs.astype(np.float32) if name == "points" else _bytes(pairs)
@@ -165,8 +156,7 @@ class Scene:
         )  # fmt: skip
         self._obstacles = None
         if obstacles is not None:
-            places = np.zeros((count, 3)), np.repeat(UPRIGHT, count, axis=0)
-            self._obstacles = scene.add_batched_glb("/world/obstacles", obstacles, *places[::-1])
+            self._obstacles = self._add_copies("obstacles", obstacles, count)
         steps, timestep = len(self._flight.trail), self._flight.vehicle.control_timestep
         # Nothing is seen of a line of short pieces: each shorter than a pixel is left out.
         self._every = max(math.ceil(PIECE / timestep), math.ceil(count * steps / SEGMENTS))
@@ -180,32 +170,57 @@ class Scene:
             f"/world/{name}", none, none, thickness=pixels, thickness_units="screen"
         )
 
-    def _send_batch(self, name: str, mesh: Any, poses: Array, scales: Array, rgba: Array) -> None:
-        """Copies of a mesh: poses (n, 7) position and quaternion, scales (n, 3), rgba (n, 4)."""
-        node = self._batches.get(name)
-        if node is not None and len(node.batched_positions) != len(poses):
-            node.remove()
-            node = self._batches[name] = None
-        if node is None and len(poses):
-            node = self._batches[name] = self._scene.add_batched_meshes_simple(
-                f"/world/{name}", mesh.vertices, mesh.faces, poses[:, 3:], poses[:, :3],
-                batched_scales=scales, batched_colors=_bytes(rgba[:, :3]),
-                batched_opacities=rgba[:, 3], opacity=1.0, cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
-        elif node is not None:
-            node.batched_positions, node.batched_wxyzs = poses[:, :3], poses[:, 3:]
-            node.batched_scales, node.batched_opacities = scales, rgba[:, 3]
-            node.batched_colors = _bytes(rgba[:, :3])
+    def _add_copies(self, name: str, glb: bytes, count: int) -> viser.BatchedGlbHandle:
+        attitudes, places = np.repeat(UPRIGHT, count, axis=0), np.zeros((count, 3))
+        return self._scene.add_batched_glb(f"/world/{name}", glb, attitudes, places)
 
-    def _send_labels(self, labels: tuple[tuple[str, tuple[float, float, float]], ...]) -> None:
-        if labels == self._labelled:
+    def _send_lines(self, lines: Sequence[tuple[Primitive, Array]]) -> None:
+        points, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3))]
+        for line, offset in lines:
+            corners = np.asarray(line.points, dtype=float) + offset
+            rgba = np.broadcast_to(line.rgba, (len(corners), 4))[:-1, None, :3]
+            points.append(np.stack([corners[:-1], corners[1:]], axis=1))
+            colours.append(np.repeat(rgba, 2, axis=1))
+        sent = np.concatenate(points).astype(np.float32)
+        if len(self._marks.points) != len(sent):
+            self._marks = self._add_lines("marks", len(sent), 2.0)
+        self._marks.points, self._marks.colors = sent, _bytes(np.concatenate(colours))
+
+    def _send_batch(self, name: str, batch: Sequence[tuple[Primitive, Array]]) -> None:
+        """Show copies of one mesh, as many as there are primitives."""
+        node = self._batches.pop(name, None)
+        if node is not None and len(node.batched_positions) != len(batch):
+            node.remove()
+            node = None
+        if not batch:
+            return
+        placed = [meshes.placed(one, offset) for one, offset in batch]
+        places, attitudes, scales = (np.array(part) for part in zip(*placed, strict=True))
+        rgba = np.array([one.rgba for one, _ in batch], dtype=float)
+        if node is None:
+            mesh, lit = meshes.unit(batch[0][0]), batch[0][0].glow < 1.0
+            node = self._scene.add_batched_meshes_simple(
+                f"/world/{name}", mesh.vertices, mesh.faces, attitudes, places,
+                batched_scales=scales, batched_colors=_bytes(rgba[:, :3]),
+                batched_opacities=rgba[:, 3], opacity=1.0, cast_shadow=lit, receive_shadow=lit,
+            )  # fmt: skip
+        self._batches[name] = node
+        node.batched_positions, node.batched_wxyzs, node.batched_scales = places, attitudes, scales
+        node.batched_opacities, node.batched_colors = rgba[:, 3], _bytes(rgba[:, :3])
+
+    def _send_labels(self, labels: Sequence[tuple[Primitive, Array]]) -> None:
+        shown = [
+            (one.name, tuple(one.position + offset + (0.0, 0.0, 1.5 * float(np.max(one.size)))))
+            for one, offset in labels
+        ]
+        if shown == self._labelled:
             return
         for node in self._labels:
             node.remove()
-        self._labelled = labels
+        self._labelled = shown
         self._labels = [
             self._scene.add_label(f"/world/label_{k}", text, position=place)
-            for k, (text, place) in enumerate(labels)
+            for k, (text, place) in enumerate(shown)
         ]
 
 
