@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from quadrl.evaluation.robustness import robustness
     from quadrl.learning.run import train
     from quadrl.learning.show import plot, render
-    from quadrl.learning.studies import study
+    from quadrl.learning.study import study
 
 __version__ = "0.1.0"
 __all__ = [
@@ -48,7 +48,7 @@ LAZY = {
     "render": "quadrl.learning.show",
     "plot": "quadrl.learning.show",
     "robustness": "quadrl.evaluation.robustness",
-    "study": "quadrl.learning.studies",
+    "study": "quadrl.learning.study",
     "check": "quadrl.evaluation.checked",
 }
 """Functions that are imported on first use, and their modules."""

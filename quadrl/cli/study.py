@@ -30,8 +30,8 @@ class Study:
 
     def run(self) -> None:
         """Train what is missing, print the table, write the files."""
-        from quadrl.learning.studies import study
-        from quadrl.learning.studies.crew import complaint
+        from quadrl.learning.executor import complaint
+        from quadrl.learning.study import study
 
         try:
             found = study(

@@ -26,7 +26,7 @@ from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import PAIRS, flat
-from quadrl.learning.studies.plan import parse_seeds
+from quadrl.learning.plan import parse_seeds
 from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:

@@ -26,9 +26,9 @@ from quadrl.evaluation.policy import FILE, SHIPPED, SHIPPED_AS, Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, Controller, flights, fly, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.executor import Local, complaint, train_all
 from quadrl.learning.folder import EVALUATION, FREE, METRICS, read_metrics, write_json
-from quadrl.learning.studies.crew import train_here
-from quadrl.learning.studies.plan import PlannedRun
+from quadrl.learning.plan import PlannedRun
 from scripts.reports import report
 from scripts.reports.report import Result, asked, factor, number, say, table
 
@@ -59,7 +59,8 @@ def runs_of(where: str, configs: Iterable[TrainConfig], jobs: int, episodes: int
     """The trainings in a folder of runs/; those that are missing are made."""
     name = "{0.task}-{0.vehicle}-{0.engine}-{0.algo}-{0.seed}".format
     runs = [PlannedRun(config, report.RUNS / where / name(config)) for config in configs]
-    train_here(runs, jobs, episodes, say)
+    if failed := train_all(runs, Local(episodes, jobs), say):
+        raise SystemExit(complaint(failed))
     return runs
 
 

@@ -18,10 +18,13 @@ import pytest
 import quadrl
 from quadrl import cli
 from quadrl.base.errors import QuadrlError
+from quadrl.core.rules import import_own
+from quadrl.learning import executor
+from quadrl.learning.cluster import carry_out_here, on_ray
+from quadrl.learning.executor import Process
+from quadrl.learning.folder import lock_folder
+from quadrl.learning.plan import read_plan
 from quadrl.learning.run import train
-from quadrl.learning.studies import crew, worker
-from quadrl.learning.studies.cluster import on_ray
-from quadrl.learning.studies.plan import read_plan
 
 SETTINGS = {
     "num_envs": 8,
@@ -36,6 +39,18 @@ SHORT = SETTINGS | {"steps": 8 * 4 * 6}
 LONG = SETTINGS | {"steps": 8 * 4 * 300}
 """So many iterations that a kill comes in the middle."""
 STUDY = {"tasks": ["hover"], "seeds": "0:2", "episodes": 2, "settings": LONG}
+OWN = """
+import dataclasses
+import quadrl
+from quadrl.tasks.hover import Hover
+
+@dataclasses.dataclass(frozen=True)
+class Near(Hover):
+    name = "near"
+
+quadrl.tasks.TASKS.pop("near", None)
+quadrl.register(Near)
+"""
 PATIENCE = 240.0  # [s] for what takes a few seconds on an idle machine
 
 
@@ -90,15 +105,25 @@ def once_begun(folder, act, awaited="checkpoint.safetensors"):
     assert not errors, errors
 
 
-def test_a_killed_worker_goes_on_and_ends_as_if_alone(alone, tmp_path, monkeypatch):
-    begun, lines, start = [], [], worker.start
+@pytest.fixture
+def begun(monkeypatch):
+    """The processes that trainings are carried out in, as they are begun."""
+    processes = []
 
-    def noted(*given):
-        begun.append(start(*given))
-        return begun[-1]
+    class Noted(Process):
+        def __init__(self, what, log):
+            folder = Path(what["folder"])
+            self.held = (folder / "checkpoint.safetensors").exists()
+            super().__init__(what, log)
+            processes.append(self)
 
-    monkeypatch.setattr(worker, "start", noted)
-    with once_begun(tmp_path / "hover-ppo-0", lambda: begun[0].kill()):
+    monkeypatch.setattr(executor, "Process", Noted)
+    return processes
+
+
+def test_a_killed_worker_goes_on_and_ends_as_if_alone(alone, tmp_path, begun):
+    lines = []
+    with once_begun(tmp_path / "hover-ppo-0", lambda: begun[0]._process.kill()):
         found = quadrl.study(STUDY, out=tmp_path, jobs=1, on_line=lines.append)
     assert len(begun) == 3 and any("attempt 2 of 3" in line for line in lines)
     assert [digest(tmp_path / f"hover-ppo-{seed}") for seed in (0, 1)] == alone
@@ -115,21 +140,15 @@ def test_a_killed_worker_goes_on_and_ends_as_if_alone(alone, tmp_path, monkeypat
     assert again.rows == found.rows
 
 
-def test_a_terminated_worker_loses_no_iteration(alone, tmp_path, monkeypatch):
+def test_a_terminated_worker_loses_no_iteration(alone, tmp_path, begun):
     """It has a checkpoint before it ends, which is the only one, and goes on from that."""
-    begun, held, start, folder = [], [], worker.start, tmp_path / "hover-ppo-0"
-
-    def noted(*given):
-        held.append((folder / "checkpoint.safetensors").exists())
-        begun.append(start(*given))
-        return begun[-1]
-
-    monkeypatch.setattr(worker, "start", noted)
+    folder = tmp_path / "hover-ppo-0"
     lines, settings = [], LONG | {"checkpoint_seconds": 60}
     study = STUDY | {"seeds": [0], "settings": settings}
-    with once_begun(folder, lambda: begun[0].terminate(), "metrics.csv"):
+    with once_begun(folder, lambda: begun[0]._process.terminate(), "metrics.csv"):
         found = quadrl.study(study, out=tmp_path, jobs=1, on_line=lines.append)
-    assert held == [False, True] and any("killed by signal 15" in line for line in lines)
+    assert [one.held for one in begun] == [False, True]
+    assert any("killed by signal 15" in line for line in lines)
     assert not found.failed and digest(folder) == alone[0]
 
 
@@ -153,7 +172,7 @@ def search() -> str:
 
 
 def test_a_failed_training_is_told_at_the_end_and_stops_no_other(tmp_path, monkeypatch):
-    order = worker.order
+    order = executor.order
 
     def broken(run, *rest):
         what = order(run, *rest)
@@ -161,27 +180,34 @@ def test_a_failed_training_is_told_at_the_end_and_stops_no_other(tmp_path, monke
             what["versions"] = what["versions"] | {"torch": "0.1"}
         return what
 
-    monkeypatch.setattr(worker, "order", broken)
+    monkeypatch.setattr(executor, "order", broken)
     found = quadrl.study(STUDY | {"settings": SHORT}, out=tmp_path, jobs=2, on_line=str)
     assert list(found.failed) == ["hover-ppo-0"] and "0.1, as where" in found.failed["hover-ppo-0"]
     assert found.rows[0]["seeds"] == 1 and found.rows[0]["success_rate_low"] is None
 
 
 def test_a_worker_that_always_dies_is_given_up(tmp_path, monkeypatch):
-    def dead(*given):
-        process = worker.start(*given)
-        process.kill()
-        return process
+    class Dying(Process):
+        def __init__(self, what, log):
+            super().__init__(what, log)
+            self._process.kill()
 
-    class Dying(crew.Local):
-        def begin(self, run, log):
-            return crew.LocalWorker(dead(worker.order(run, 2), log), log)
-
-    monkeypatch.setattr("quadrl.learning.studies.Local", Dying)
+    monkeypatch.setattr(executor, "Process", Dying)
     lines = []
     with pytest.raises(QuadrlError, match="killed by signal 9"):
         quadrl.study(STUDY | {"seeds": [0]}, out=tmp_path, on_line=lines.append)
-    assert sum(": begun" in line for line in lines) == crew.ATTEMPTS
+    assert sum(": begun" in line for line in lines) == executor.ATTEMPTS
+
+
+def test_a_training_waits_until_a_lost_one_has_left_its_folder(tmp_path):
+    (run,) = read_plan(STUDY | {"seeds": [0], "settings": SHORT}, tmp_path).runs
+    run.folder.mkdir()
+    unlock = lock_folder(run.folder)
+    process = Process(executor.order(run, 2), tmp_path / "log.txt")
+    with once_begun(run.folder, unlock, awaited="../log.txt"):
+        time.sleep(8)  # it has been imported, and waits
+        assert process.poll() is None
+    assert process.wait() == executor.End() and run.done
 
 
 @pytest.fixture
@@ -235,30 +261,37 @@ def test_a_node_that_dies_changes_no_policy_and_costs_one_attempt(
 @pytest.mark.filterwarnings("ignore")
 def test_what_died_before_it_ran_is_told_from_what_ran(tmp_path):
     """Two trainings on one CPU: the second one waits for it."""
-    ray = pytest.importorskip("ray")
+    pytest.importorskip("ray")
     plan = read_plan(STUDY, tmp_path)
-    with on_ray("local", 2, 1, ()) as crew_of_ray:
-        log = tmp_path / "log.txt"
-        workers = [crew_of_ray.begin(run, log) for run in plan.runs]
+    with on_ray("local", 2, 1, ()) as nodes:
+        first, second = (nodes.begin(run, tmp_path / f"{run.name}.txt") for run in plan.runs)
         checkpoint = plan.runs[0].folder / "checkpoint.safetensors"
-        wait_for(lambda: workers[0].poll() or checkpoint.exists(), "a checkpoint")
-        for worker_of_ray in reversed(workers):
-            ray.kill(worker_of_ray._actor)
-        ends = [wait_for(one.poll, "an end") for one in workers]
+        wait_for(lambda: first.poll() or checkpoint.exists(), "a checkpoint")
+        for one in (second, first):
+            one.stop()
+        ends = [wait_for(one.poll, "an end") for one in (first, second)]
     assert [(end.lost, end.ran) for end in ends] == [(True, True), (True, False)]
 
 
+def test_a_folder_that_the_machines_do_not_share_is_named(tmp_path):
+    (run, _) = read_plan(STUDY, tmp_path / "elsewhere").runs
+    end = carry_out_here(executor.order(run, 2), tmp_path / "log.txt")
+    assert str(run.folder) in end.message and "--out" in end.message and not end.lost
+
+
 @pytest.mark.filterwarnings("ignore")
-def test_ray_on_this_machine(tmp_path):
+def test_ray_on_this_machine_with_a_task_of_ones_own(tmp_path, monkeypatch):
     pytest.importorskip("ray")
-    here = quadrl.study(STUDY | {"settings": SHORT}, out=tmp_path / "here", on_line=str)
-    there = quadrl.study(
-        STUDY | {"settings": SHORT}, out=tmp_path / "ray", ray="local", jobs=1, on_line=str
-    )
-    names = [run["name"] for run in here.runs]
-    assert [run["name"] for run in there.runs] == names
-    for name in names:
-        assert digest(tmp_path / "here" / name) == digest(tmp_path / "ray" / name)
+    own = tmp_path / "own_task.py"
+    own.write_text(OWN)
+    monkeypatch.setitem(quadrl.tasks.TASKS, "near", None)
+    import_own(own)
+    content = STUDY | {"tasks": ["near"], "settings": SHORT}
+    folders = [tmp_path / "here", tmp_path / "ray"]
+    for folder, ray in zip(folders, (None, "local"), strict=True):
+        quadrl.study(content, out=folder, ray=ray, jobs=1, own=(own,), on_line=str)
+    for name in ("near-ppo-0", "near-ppo-1"):
+        assert digest(folders[0] / name) == digest(folders[1] / name)
 
 
 def test_a_cluster_that_is_not_there(tmp_path):

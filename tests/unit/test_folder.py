@@ -10,7 +10,6 @@ import pytest
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.learning.folder import LOCK, lock_folder
-from quadrl.learning.studies import cluster
 
 HERE = socket.gethostname()
 
@@ -71,13 +70,6 @@ def test_only_the_process_that_made_it_removes_it(folder, monkeypatch):
         patch.setattr("os.getpid", lambda: 12)  # as in a child
         unlock()
     assert (folder / LOCK).exists()
-
-
-def test_a_study_on_a_cluster_does_not_send_it_to_its_nodes(folder):
-    unlock = locked(folder)
-    (folder / "config.json").write_text("{}")
-    assert list(cluster._stamps(folder)) == ["config.json"]
-    unlock()
 
 
 def test_another_error_of_the_system_is_told(tmp_path, monkeypatch):

@@ -1,23 +1,29 @@
-"""What a study found: a table with intervals over the seeds, its files and its pictures."""
+"""Studies: trainings of several tasks, algorithms, settings and seeds, and what they reached."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
+from quadrl.base.validation import number
 from quadrl.evaluation.evaluate import html_table
+from quadrl.learning.cluster import on_ray
+from quadrl.learning.executor import Local, complaint, train_all
 from quadrl.learning.folder import EVALUATION, METRICS, read_metrics, write_json
-from quadrl.learning.studies.plan import Plan, PlannedRun, fields
+from quadrl.learning.plan import Plan, PlannedRun, read_plan
 
+MAX_JOBS = 4096
 FIGURES = {"success_rate": (0.0, 1.0), "position_error_m": (0.0, math.inf),
            "training_s": (0.0, math.inf)}  # fmt: skip
 """What is compared, and the range in which it lies."""
@@ -98,10 +104,57 @@ class StudyResult:
         return drawn
 
 
-def summed_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
+def study(
+    what: str | Path | Mapping[str, Any],
+    *,
+    jobs: int | None = None,
+    out: str | Path | None = None,
+    ray: str | None = None,
+    own: tuple[Path, ...] = (),
+    on_line: Callable[[str], None] = print,
+) -> StudyResult:
+    """Carry out all trainings of a study, or those that are missing; `quadrl study` in Python.
+
+    Each training has a process and a run folder of its own, and ends with the same policy, bit for
+    bit, as `quadrl.train` with the same settings. A training whose process or machine dies goes on
+    from its last checkpoint. A study that is stopped goes on when it is called again.
+
+    Args:
+        what: A study file (.toml or .json), or a dict with the same keys: `tasks`, `algorithms`,
+            `seeds`, `episodes`, `settings`, `variants`.
+        jobs: Trainings at a time; by default one per core.
+        out: Folder of the run folders; by default runs/NAME, NAME that of the file. With Ray all
+            machines share it.
+        ray: Address of a Ray cluster that carries out the trainings (HOST:PORT, or "auto" for the
+            one that this machine belongs to), or "local" for Ray on this machine.
+        own: Python files that register tasks and aircraft of your own.
+        on_line: Is called with what happens, a line each.
+
+    Returns:
+        What the trainings reached. One that failed is in its `failed`.
+
+    Raises:
+        QuadrlError: The study cannot be read, a folder holds a run with other settings, or Ray
+            cannot be used; nothing was begun.
+    """
+    plan = read_plan(what, None if out is None else Path(out))
+    if jobs is not None:
+        number("jobs", jobs, 1, MAX_JOBS, whole=True)
+    for run in plan.runs:
+        _ = run.done  # refuses other settings before anything starts
+    here = contextlib.nullcontext(Local(plan.episodes, jobs, own))
+    with on_ray(ray, plan.episodes, jobs, own) if ray else here as executor:
+        failed = train_all(plan.runs, executor, on_line)
+    found = sum_up(plan, failed)
+    if not found.runs:
+        raise QuadrlError(complaint(failed))
+    found.save()
+    return found
+
+
+def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
     """What the trainings that are done reached."""
     done = [run for run in plan.runs if run.done]
-    folder = plan.runs[0].folder.parent
     runs = tuple(_known(run) for run in done)
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for run in runs:
@@ -113,7 +166,7 @@ def summed_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
             values = [run["metrics"][name] for run in members]
             row |= dict(zip(_columns(name), interval(values, *span), strict=True))
         rows.append(row)
-    return StudyResult(folder, runs, tuple(rows), failed)
+    return StudyResult(plan.folder, runs, tuple(rows), failed)
 
 
 def interval(
@@ -139,7 +192,7 @@ def _known(run: PlannedRun) -> dict[str, Any]:
     config = run.config
     known = {"name": run.name, "task": config.task, "algo": config.algo, "variant": run.variant}
     metrics = json.loads((run.folder / EVALUATION).read_text())
-    return known | {"seed": config.seed, "metrics": metrics, "settings": fields(config)}
+    return known | {"seed": config.seed, "metrics": metrics, "settings": dataclasses.asdict(config)}
 
 
 def _columns(*names: str) -> list[str]:

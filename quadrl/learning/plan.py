@@ -1,10 +1,11 @@
-"""What a study trains: a file of tasks, algorithms, settings and seeds; without torch."""
+"""Read what a study trains: a file of tasks, algorithms, settings and seeds; without torch."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 import json
+import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -50,7 +51,9 @@ class PlannedRun:
         Raises:
             QuadrlError: The folder holds a run with other settings.
         """
-        if not (self.folder / CONFIG).exists():
+        # A listing, since a shared file system remembers for a while which files are not there.
+        files = os.listdir(self.folder) if self.folder.is_dir() else []
+        if CONFIG not in files:
             return False
         free = {name: getattr(TrainConfig, name) for name in FREE}
         found = dataclasses.replace(TrainConfig.of_folder(self.folder), **free)
@@ -59,21 +62,21 @@ class PlannedRun:
                 f"{self.folder} holds a run with other settings than this study's: "
                 "choose another folder (--out), or move that run away"
             )
-        return (self.folder / EVALUATION).exists()
+        return EVALUATION in files
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
     """All trainings of a study."""
 
-    name: str
+    folder: Path
     runs: tuple[PlannedRun, ...]
     episodes: int
     """Of the evaluation at the end of each."""
 
 
 def read_plan(what: str | Path | Mapping[str, Any], out: Path | None) -> Plan:
-    """The trainings of a study file (.toml or .json), or of a dict with the same keys.
+    """Expand a study file (.toml or .json), or a dict with the same keys, to its trainings.
 
     Args:
         what: The file, or the dict.
@@ -83,40 +86,37 @@ def read_plan(what: str | Path | Mapping[str, Any], out: Path | None) -> Plan:
         QuadrlError: The file cannot be read, or something in it is unknown, out of range, or does
             not fit together; the line names the file and the key.
     """
-    source = "the study" if isinstance(what, Mapping) else str(what)
-    name = "study" if isinstance(what, Mapping) else Path(what).stem
-    content = dict(what) if isinstance(what, Mapping) else _load(Path(what))
+    given = isinstance(what, Mapping)
+    source, name = ("the study", "study") if given else (str(what), Path(what).stem)
+    content = what if given else _load(Path(what))
     try:
-        return _plan(name, content, out or Path("runs", name))
+        return _plan(content, out or Path("runs", name))
     except QuadrlError as error:
         raise QuadrlError(f"{source}: {error}") from error
 
 
 def parse_seeds(given: Any) -> list[int]:
-    """Seeds from "0:5" for 0 to 4, from "3,5,8", or from a list of numbers.
+    """Read seeds: "0:5" for 0 to 4, "3,5,8", or a list of numbers.
 
     Raises:
         QuadrlError: They are no such numbers.
     """
-    seeds: list[int] = []
+    found, seeds = given if isinstance(given, (list, tuple)) else [], []
     try:
         if isinstance(given, str):
             first, colon, last = given.partition(":")
-            words = given.split(",")
-            if 0 < (int(last) - int(first) if colon else len(words)) <= MAX_SEEDS:
-                seeds = list(range(int(first), int(last)) if colon else map(int, words))
-        elif isinstance(given, (list, tuple)) and all(type(seed) is int for seed in given):
-            seeds = list(given)
-    except ValueError:
-        seeds = []
-    within = 0 < len(seeds) <= MAX_SEEDS and 0 <= min(seeds) and max(seeds) <= MAX_SEED
-    if not within or len(set(seeds)) < len(seeds):
+            found = range(int(first), int(last)) if colon else [*map(int, given.split(","))]
+        seeds = list(found) if len(found) <= MAX_SEEDS else []
+    except (OverflowError, ValueError):
+        pass
+    known = all(type(seed) is int and 0 <= seed <= MAX_SEED for seed in seeds)
+    if not seeds or not known or len(set(seeds)) < len(seeds):
         allowed = f"FIRST:END such as 0:5, or numbers such as 3,5,8; at most {MAX_SEEDS}"
         raise QuadrlError(name="seeds", value=given, allowed=allowed)
     return seeds
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> Mapping[str, Any]:
     """The content of a study file."""
     if path.suffix not in (".toml", ".json"):
         raise QuadrlError(name="study", value=str(path), allowed="a .toml or a .json file")
@@ -133,7 +133,7 @@ def _load(path: Path) -> dict[str, Any]:
     return content
 
 
-def _plan(name: str, content: dict[str, Any], folder: Path) -> Plan:
+def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
     """The trainings of a study's content: seed by seed, so that a stopped one has whole seeds."""
     keys("key", content, KEYS)
     if "tasks" not in content:
@@ -145,26 +145,23 @@ def _plan(name: str, content: dict[str, Any], folder: Path) -> Plan:
     common = _settings("settings", content.get("settings", {}))
     variants = _variants(content.get("variants", []))
     number("trainings", len(tasks) * len(algorithms) * len(seeds) * len(variants), 1, MAX_RUNS)
-    runs = []
+    runs: list[PlannedRun] = []
+    known: dict[str, str] = {}
     for seed, task, algo, variant in itertools.product(seeds, tasks, algorithms, variants):
-        words = [task, algo, *filter(None, [variant]), str(seed)]
-        settings = _merged(common, variants[variant])
+        name = "-".join([task, algo, *filter(None, [variant]), str(seed)])
+        settings = common | variants[variant]
+        for table in common.keys() & variants[variant].keys():  # such as ppo: they are joined
+            if isinstance(common[table], dict) and isinstance(settings[table], dict):
+                settings[table] = common[table] | settings[table]
         try:
             config = TrainConfig(task, algo=algo, seed=seed, num_threads=1, **settings)
         except QuadrlError as error:
-            raise QuadrlError(f"{'-'.join(words)}: {error}") from error
-        runs.append(PlannedRun(config, folder / "-".join(words), variant))
-    known: dict[str, str] = {}
-    for run in runs:
-        other = known.setdefault(json.dumps(fields(run.config), sort_keys=True), run.name)
-        if other != run.name:
-            raise QuadrlError(f"{other} and {run.name} have the same settings: remove one of them")
-    return Plan(name, tuple(runs), episodes)
-
-
-def fields(config: TrainConfig) -> dict[str, Any]:
-    """All settings, as JSON can hold them."""
-    return dataclasses.asdict(config)
+            raise QuadrlError(f"{name}: {error}") from error
+        other = known.setdefault(json.dumps(dataclasses.asdict(config), sort_keys=True), name)
+        if other != name:
+            raise QuadrlError(f"{other} and {name} have the same settings: remove one of them")
+        runs.append(PlannedRun(config, folder / name, variant))
+    return Plan(folder, tuple(runs), episodes)
 
 
 def _names(key: str, given: Any) -> list[str]:
@@ -181,11 +178,10 @@ def _settings(key: str, given: Any) -> dict[str, Any]:
     """A table of settings; `TrainConfig` judges their values."""
     if not isinstance(given, dict):
         raise QuadrlError(name=key, value=given, allowed="a table of settings of a training")
-    known = [field.name for field in dataclasses.fields(TrainConfig)]
-    for name in given:
-        if name in OWN:
-            raise QuadrlError(name=f"{key}.{name}", value=given[name], allowed=OWN[name])
-    keys(f"setting in {key}", given, [name for name in known if name not in OWN])
+    for name in OWN.keys() & given.keys():
+        raise QuadrlError(name=f"{key}.{name}", value=given[name], allowed=OWN[name])
+    known = [field.name for field in dataclasses.fields(TrainConfig) if field.name not in OWN]
+    keys(f"setting in {key}", given, known)
     return given
 
 
@@ -203,12 +199,3 @@ def _variants(given: Any) -> dict[str, dict[str, Any]]:
         rest = {key: value for key, value in one.items() if key != "name"}
         variants[name] = _settings(f"variants.{name}", rest)
     return variants or {"": {}}
-
-
-def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Settings with those of a variant; tables such as ppo are joined."""
-    merged = common | own
-    for name in common.keys() & own.keys():
-        if isinstance(common[name], dict) and isinstance(own[name], dict):
-            merged[name] = common[name] | own[name]
-    return merged

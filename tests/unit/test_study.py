@@ -1,5 +1,6 @@
-"""Study files: what they expand to, and the one line with which a wrong one is refused."""
+"""Studies: what a file expands to or is refused for, and what follows when trainings die."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -7,10 +8,12 @@ import pytest
 
 import quadrl
 from quadrl.base.errors import QuadrlError
+from quadrl.learning import executor
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import write_config
-from quadrl.learning.studies.plan import parse_seeds, read_plan
-from quadrl.learning.studies.table import interval
+from quadrl.learning.executor import End, train_all
+from quadrl.learning.folder import EVALUATION, write_config, write_json
+from quadrl.learning.plan import PlannedRun, parse_seeds, read_plan
+from quadrl.learning.study import interval
 
 STUDY = """
 tasks = ["hover", "landing"]
@@ -55,11 +58,10 @@ def test_every_combination_is_planned(write, tmp_path):
 
 def test_json_and_a_dict_are_the_same(write):
     content = {"tasks": ["hover"], "settings": {"hidden": [8]}}
-    file = read_plan(write(json.dumps(content), "one.json"), None)
-    assert [str(run.folder) for run in file.runs] == ["runs/one/hover-ppo-0"]
-    assert [run.config for run in file.runs] == [
-        run.config for run in read_plan(content, None).runs
-    ]
+    (file,), (given,) = (
+        read_plan(one, None).runs for one in (write(json.dumps(content), "one.json"), content)
+    )
+    assert str(file.folder) == "runs/one/hover-ppo-0" and file.config == given.config
 
 
 @pytest.mark.parametrize(
@@ -138,3 +140,80 @@ def test_the_file_on_the_page(write):
     page = (Path(__file__).parents[2] / "docs" / "study.md").read_text()
     plan = read_plan(write(page.partition("```toml\n")[2].partition("```")[0]), None)
     assert len(plan.runs) == 40 and {run.config.seed for run in plan.runs[:8]} == {0}
+
+
+DIED = End("its machine was lost", lost=True)
+NEVER_RAN = dataclasses.replace(DIED, ran=False)
+DONE = End()
+
+
+class Worker:
+    """Ends at once, in a given way."""
+
+    def __init__(self, run, end):
+        self.run, self.end = run, end
+
+    def poll(self):
+        if self.end == DONE:
+            self.run.folder.mkdir(exist_ok=True)
+            write_config(self.run.folder, self.run.config.resolved())
+            write_json(self.run.folder / EVALUATION, {})
+        return self.end
+
+    def stop(self):
+        pass
+
+
+class Pretended:
+    """One at a time; `ends` has what becomes of each training, begin by begin."""
+
+    def __init__(self, **ends):
+        self.ends, self.begun = ends, []
+
+    def slots(self):
+        return 1
+
+    def begin(self, run, log):
+        self.begun.append(run.name)
+        ends = self.ends[run.name]
+        return Worker(run, ends.pop(0) if len(ends) > 1 else ends[0])
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch):
+    """Trains what ends in these ways; returns what failed, what was begun, and the lines."""
+    monkeypatch.setattr(executor, "POLL_SECONDS", 0.0)
+    monkeypatch.setattr(executor, "PAUSE_SECONDS", 0.01)
+
+    def trained(**ends):
+        runs = [
+            PlannedRun(TrainConfig("hover", seed=k), tmp_path / name) for k, name in enumerate(ends)
+        ]
+        pretended, lines = Pretended(**ends), []
+        return train_all(runs, pretended, lines.append), pretended.begun, lines
+
+    return trained
+
+
+def test_only_what_ran_and_died_is_an_attempt(study):
+    failed, begun, lines = study(one=[NEVER_RAN, DIED, NEVER_RAN, NEVER_RAN, DIED, DONE])
+    assert not failed and len(begun) == 6
+    assert "one: begun (attempt 3 of 3), 0 waiting" in lines
+
+
+def test_after_three_attempts_it_has_failed_whatever_never_ran_in_between(study):
+    failed, begun, _ = study(one=[DIED, NEVER_RAN, DIED, NEVER_RAN, DIED, DONE])
+    assert len(begun) == 5 and failed["one"].startswith("its machine was lost (see ")
+
+
+def test_what_never_runs_is_given_up(study):
+    failed, begun, lines = study(one=[NEVER_RAN])
+    assert len(begun) == executor.BEGINNINGS
+    assert failed["one"].startswith("its machine was lost; begun 10 times, it never ran (see ")
+    assert not [line for line in lines if "attempt" in line]
+
+
+def test_while_one_pauses_the_others_are_trained(study, monkeypatch):
+    monkeypatch.setattr(executor, "PAUSE_SECONDS", 0.3)
+    failed, begun, _ = study(one=[NEVER_RAN, DONE], two=[DONE], three=[DONE])
+    assert not failed and begun == ["one", "two", "three", "one"]

@@ -1,0 +1,293 @@
+"""Carry out trainings side by side, each in a process of its own, and again if one dies.
+
+A process reads its order, a line of JSON, from standard input, and ends as soon as standard input
+ends: whoever ordered it is gone. A run that is killed at any moment can be continued.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.machine import cores
+from quadrl.base.signals import Stopped, heeded, unheeded
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.folder import CONFIG, EVALUATION, METRICS, lock_folder
+from quadrl.learning.plan import PlannedRun
+
+ATTEMPTS = 3
+"""Times that a training is begun or continued before it counts as failed."""
+BEGINNINGS = 10
+"""Times that its machine may be gone before it runs; these are no attempts."""
+PAUSE_SECONDS = 5.0
+"""After each of them. A cluster needs half a minute to see that a machine is gone."""
+LOCKED_SECONDS = 120.0
+"""For which a training waits until a lost one has left its folder, as a shared file system sees."""
+POLL_SECONDS = 0.1
+NEWS_SECONDS = 10.0  # between two lines of progress
+FAILED = 2
+"""Exit code of a process: the training ended with an error that the log tells."""
+
+
+@dataclasses.dataclass(frozen=True)
+class End:
+    """How a training ended."""
+
+    message: str = ""
+    """Why it failed; empty if it did not."""
+    lost: bool = False
+    """Whether its process or its machine died, and another attempt may succeed."""
+    ran: bool = True
+    """Whether it ran at all; if not, its machine was gone before."""
+
+
+def order(run: PlannedRun, episodes: int, own: Iterable[Path] = ()) -> dict[str, Any]:
+    """What a process is to do: train, evaluate in `episodes`, with files that register tasks."""
+    return {
+        "config": dataclasses.asdict(run.config),
+        "versions": run.config.resolved()["versions"],
+        "folder": str(run.folder.absolute()),
+        "episodes": episodes,
+        "own": [str(path.absolute()) for path in own],
+    }
+
+
+def carry_out(what: dict[str, Any]) -> None:
+    """Begin or continue a training, evaluate it, draw its curve and its flights.
+
+    Raises:
+        QuadrlError: It cannot be trained, or other versions are installed here than where it was
+            ordered.
+    """
+    from quadrl.core.rules import import_own
+    from quadrl.learning.run import train_in
+
+    for path in what["own"]:
+        import_own(Path(path))
+    config, folder = TrainConfig(**what["config"]), Path(what["folder"])
+    if (here := config.resolved()["versions"]) != what["versions"]:
+        name = next(name for name in here if here[name] != what["versions"].get(name))
+        allowed = f"{what['versions'].get(name)}, as where the study was started"
+        raise QuadrlError(name=f"version of {name}", value=here[name], allowed=allowed)
+    folder.mkdir(parents=True, exist_ok=True)
+    _await(folder)
+    if PlannedRun(config, folder).done:
+        return
+    given: Any = {"resume": (folder / CONFIG).exists(), "episodes": what["episodes"]}
+    finished = train_in(folder, config, **given, show=lambda progress: None, heed=heeded)
+    for _ in finished.draw(video=False):
+        pass
+
+
+def _await(folder: Path) -> None:
+    """Wait until no other training works in a folder, as one that is lost may for a while.
+
+    Raises:
+        QuadrlError: Another training still does.
+    """
+    until = time.monotonic() + LOCKED_SECONDS
+    while True:
+        try:
+            return lock_folder(folder)()
+        except QuadrlError:
+            if time.monotonic() > until:
+                raise
+        time.sleep(POLL_SECONDS)
+
+
+def main() -> None:
+    """Read the order and carry it out."""
+    what = json.loads(sys.stdin.buffer.readline())
+
+    def watch() -> None:
+        sys.stdin.buffer.raw.read()  # type: ignore[attr-defined] - returns once nobody can write
+        os._exit(FAILED)
+
+    threading.Thread(target=watch, daemon=True).start()
+    signal.signal(signal.SIGUSR1, unheeded)
+    try:
+        carry_out(what)
+    except (QuadrlError, OSError) as error:
+        print(f"quadrl: {error}", flush=True)
+        sys.exit(FAILED)
+    except Stopped as stop:  # its run can be continued, as that of a process that was killed
+        signal.signal(stop.number, signal.SIG_DFL)
+        signal.raise_signal(stop.number)
+    # What hangs at the end of the interpreter must not turn a finished training into a lost one.
+    sys.stdout.flush()
+    os._exit(0 if (Path(what["folder"]) / EVALUATION).exists() else FAILED)
+
+
+class Process:
+    """A process on this machine, in a session of its own: a Ctrl-C does not reach it."""
+
+    def __init__(self, what: dict[str, Any], log: Path) -> None:
+        """Start it; what it prints goes to a file."""
+        self._log = log
+        log.parent.mkdir(parents=True, exist_ok=True)
+        search = os.pathsep.join(path or os.getcwd() for path in sys.path)
+        with open(log, "wb") as file:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-c", f"from {__name__} import main; main()"],
+                env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": search},
+                stdin=subprocess.PIPE,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        with contextlib.suppress(BrokenPipeError):  # it ended at once: the log says why
+            assert self._process.stdin
+            self._process.stdin.write(json.dumps(what).encode() + b"\n")
+            self._process.stdin.flush()
+
+    def poll(self) -> End | None:
+        """How it ended; None while it works."""
+        return None if self._process.poll() is None else self.wait()
+
+    def wait(self) -> End:
+        """Wait for its end."""
+        code = self._process.wait()
+        self.stop()
+        if code < 0:
+            return End(f"its process was killed by signal {-code}", lost=True)
+        lines = self._log.read_text(errors="replace").strip().splitlines() or ["no output"]
+        return End(lines[-1].strip().removeprefix("quadrl: ") if code else "")
+
+    def stop(self) -> None:
+        """Kill it, and wait for that."""
+        self._process.kill()
+        self._process.wait()
+        with contextlib.suppress(BrokenPipeError):
+            assert self._process.stdin
+            self._process.stdin.close()
+
+
+@dataclasses.dataclass(frozen=True)
+class Local:
+    """Processes on this machine."""
+
+    episodes: int
+    jobs: int | None = None
+    """At a time; None for one per core."""
+    own: tuple[Path, ...] = ()
+
+    def slots(self) -> int:
+        """How many at the same time."""
+        return self.jobs or cores()
+
+    def begin(self, run: PlannedRun, log: Path) -> Any:
+        """Begin a training, or continue it; returns what can `poll` and `stop` it."""
+        return Process(order(run, self.episodes, self.own), log)
+
+
+@dataclasses.dataclass(eq=False)
+class _Job:
+    """A training that waits or is at work."""
+
+    run: PlannedRun
+    worker: Any = None
+    attempt: int = 1
+    never_ran: int = 0
+    """Beginnings that were none."""
+    after: float = 0.0
+    """When it may be begun, on the clock `time.monotonic` [s]."""
+
+    @property
+    def log(self) -> Path:
+        """Where its process writes."""
+        return self.run.folder.parent / "logs" / f"{self.run.name}.txt"
+
+    @property
+    def share(self) -> float:
+        """How much of it is done, by the rows that it has written."""
+        try:
+            rows = (self.run.folder / METRICS).read_bytes().count(b"\n") - 1
+        except OSError:
+            rows = 0
+        return max(0, rows) / self.run.config.iterations
+
+    def follows(self, end: End) -> str:
+        """Decide what follows an end that is no success: what is next; empty if it has failed."""
+        self.never_ran += not end.ran
+        if not end.ran and self.never_ran < BEGINNINGS:
+            self.after = time.monotonic() + PAUSE_SECONDS
+            return f"it never ran, and begins again in {PAUSE_SECONDS:g} s"
+        if end.ran and end.lost and self.attempt < ATTEMPTS:
+            self.attempt += 1
+            return "it goes on from its last checkpoint"
+        return ""
+
+
+def train_all(
+    runs: Iterable[PlannedRun], executor: Local, say: Callable[[str], None]
+) -> dict[str, str]:
+    """Train and evaluate the runs that are not done, and continue those that are half done.
+
+    Args:
+        runs: The runs.
+        executor: Where they are carried out.
+        say: Is called with what happens, a line each.
+
+    Returns:
+        Why trainings failed, by name; empty if all are done.
+
+    Raises:
+        QuadrlError: A folder holds a run with other settings; nothing was begun.
+    """
+    given = list(runs)
+    waiting = [_Job(run) for run in given if not run.done]
+    going: list[_Job] = []
+    failed: dict[str, str] = {}
+    news, done = time.monotonic(), len(given) - len(waiting)
+    if done:
+        say(f"{done} of {len(given)} trainings are done already")
+    try:
+        while waiting or going:
+            ready = [job for job in waiting if job.after <= time.monotonic()]
+            for job in ready[: max(0, executor.slots() - len(going))]:
+                job.worker = executor.begin(job.run, job.log)
+                waiting.remove(job)
+                going.append(job)
+                again = f" (attempt {job.attempt} of {ATTEMPTS})" if job.attempt > 1 else ""
+                say(f"{job.run.name}: begun{again}, {len(waiting)} waiting")
+            for job in list(going):
+                if (end := job.worker.poll()) is None:
+                    continue
+                going.remove(job)
+                name, why = job.run.name, end.message or "it left no result"
+                if not end.message and job.run.done:
+                    done += 1
+                    say(f"{name}: done, {done} of {len(given)}")
+                elif follows := job.follows(end):
+                    say(f"{name}: {why}; {follows}")
+                    waiting.insert(0, job)
+                else:
+                    times = "" if end.ran else f"; begun {job.never_ran} times, it never ran"
+                    failed[name] = f"{why}{times} (see {job.log})"
+                    say(f"{name}: failed: {failed[name]}")
+            if time.monotonic() - news > NEWS_SECONDS:
+                news = time.monotonic()
+                at = ", ".join(f"{job.run.name} {100 * job.share:.0f} %" for job in going)
+                say(f"{done} of {len(given)} done; {at}")
+            time.sleep(POLL_SECONDS)
+    finally:
+        for job in going:  # after a Ctrl-C: each run can be continued
+            job.worker.stop()
+    return failed
+
+
+def complaint(failed: dict[str, str]) -> str:
+    """What failed, in one line."""
+    each = "; ".join(f"{name}: {why}" for name, why in failed.items())
+    return f"{len(failed)} of the trainings failed: {each}; the same command tries them again"
