@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import signal
 import sys
@@ -41,7 +40,7 @@ from quadrl.cli.view import View
 from quadrl.core.rules import import_own
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Completion:
     """Print a script that completes commands, options and names with the tab key.
 
@@ -53,7 +52,8 @@ class Completion:
 
     def run(self) -> None:
         """Print the script."""
-        parse(["--tyro-print-completion", self.shell], enforced=True)
+        with choices.enforced():
+            parse(["--tyro-print-completion", self.shell])
 
 
 Command = (
@@ -71,7 +71,7 @@ Command = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Quadrl:
     """Reinforcement learning for quadrotors on MuJoCo. quadrl --version prints the versions."""
 
@@ -113,12 +113,11 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(128 + (stop.number if isinstance(stop, Stopped) else signal.SIGINT))
 
 
-def parse(words: list[str], *, enforced: bool = False) -> Quadrl:
+def parse(words: list[str]) -> Quadrl:
     """What the words of a command line ask for; prints what is wrong with them and exits with 2."""
-    rules = choices.registry(enforced)
     if words[:1] == ["train"] and {"-h", "--help"} & {*words}:
         train.show_defaults(words[1:])
-    return tyro.cli(Quadrl, args=words, prog="quadrl", config=(DisallowNone,), registry=rules)
+    return tyro.cli(Quadrl, args=words, prog="quadrl", config=(DisallowNone,))
 
 
 @contextlib.contextmanager

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from quadrl.base.validation import number
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Benchmark:
     """Measure the speed of every layer in one run, as rates and as shares of others."""
 
@@ -20,7 +18,7 @@ class Benchmark:
     repeats: int = 30
     """Measurements of each layer, in turns. The rate is the fastest; the share is the median of the
     ratios to what it is a share of, within a turn."""
-    task: choices.TaskName = choices.TaskName("hover")
+    task: choices.TaskName = "hover"
     """The task that is flown."""
     json: bool = False
     """Print one JSON object and nothing else."""

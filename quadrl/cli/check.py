@@ -10,22 +10,22 @@ from quadrl.cli.flown import parse_named, parse_options
 from quadrl.evaluation.checked import check
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Check:
     """Check an aircraft: what its thrust, moments, steps and delays leave to a policy."""
 
-    vehicle: choices.VehicleName = choices.VehicleName("paper")
+    vehicle: choices.VehicleName = "paper"
     """The aircraft."""
     vehicle_options: tuple[str, ...] = ()
     """Numbers of the aircraft that differ from it, such as mass=0.7 action_scale=90."""
-    task: choices.TaskName = choices.TaskName("hover")
+    task: choices.TaskName = "hover"
     """The task; some ask for a turn of the heading within their time."""
     task_options: tuple[str, ...] = ()
     """Options of the task that differ from its defaults, such as time_limit=5."""
-    randomization: choices.RandomizationName = choices.RandomizationName("")
+    randomization: choices.RandomizationName = ""
     """What is drawn for each aircraft, of which the worst is checked too: none, light or full, or
     JSON such as '{"mass": [0.8, 1.2]}'."""
-    control_mode: choices.ControlModeName = choices.ControlModeName("rotor")
+    control_mode: choices.ControlModeName = "rotor"
     """Meaning of the actions: rotor, thrust_body_rate, velocity or position."""
     aerodynamics: str = ""
     """Effects of the air on the rotors: none, full, or names of single ones with commas between

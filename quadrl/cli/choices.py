@@ -1,4 +1,4 @@
-"""The words that options choose from, as types: help shows them and completion offers them.
+"""The words that options choose from: help shows them, completion offers them.
 
 The parser takes any word, since files of one's own add tasks and aircraft after it has parsed; what
 is unknown is refused later, in one line that names the nearest.
@@ -6,9 +6,14 @@ is unknown is refused later, in one line that names the nearest.
 
 from __future__ import annotations
 
-from typing import Any
+import contextlib
+import dataclasses
+import typing
+from collections.abc import Generator, Iterable
+from typing import Annotated, Any, TypeVar, dataclass_transform
 
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+from tyro.conf import arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.conditions.randomization import RANDOMIZATIONS
@@ -19,52 +24,35 @@ from quadrl.learning.config import ALGORITHMS, ALIASES, MEMORIES
 from quadrl.learning.defaults import VARIANTS
 from quadrl.tasks import TASKS
 
-
-class TaskName(str):
-    """The name of a task."""
-
-
-class VariantName(str):
-    """A name of `VARIANTS`."""
+Kind = TypeVar("Kind")
+_OFFERED: list[tuple[PrimitiveConstructorSpec[str], tuple[str, ...]]] = []
 
 
-class VehicleName(str):
-    """The name of an aircraft."""
+def words(known: Iterable[str], *others: str) -> PrimitiveConstructorSpec[str]:
+    """A text that is one of the known words, or what help calls the others."""
+    known = tuple(known)
+    spec = PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join((*known, *others))}}}",
+        instance_from_str=lambda given: given[0],
+        is_instance=lambda value: isinstance(value, str),
+        str_from_instance=lambda value: [value],
+    )
+    _OFFERED.append((spec, known))
+    return spec
 
 
-class Algorithm(str):
-    """The name of an algorithm."""
-
-
-class ControllerName(str):
-    """The name of a controller."""
-
-
-class ControlModeName(str):
-    """The name of a control mode."""
-
-
-class EngineName(str):
-    """The name of an engine."""
-
-
-class MemoryName(str):
-    """The name of a memory."""
-
-
-class RandomizationName(str):
-    """The name of a randomization."""
-
-
-class WeatherName(str):
-    """The name of a weather."""
-
-
-class Camera(str):
-    """The name of a camera."""
-
-
-CAMERAS = ("follow", "track", "chase", "onboard", "fixed")
+TaskName = Annotated[str, words(TASKS)]
+VariantName = Annotated[str, words(VARIANTS)]
+VehicleName = Annotated[str, words(VEHICLES)]
+Algorithm = Annotated[str, words((*ALGORITHMS, *ALIASES))]
+ControllerName = Annotated[str, words(CONTROLLERS)]
+ControlModeName = Annotated[str, words(CONTROL_MODES)]
+EngineName = Annotated[str, words(ENGINES)]
+MemoryName = Annotated[str, words(MEMORIES)]
+RandomizationName = Annotated[str, words(RANDOMIZATIONS, "JSON")]
+WeatherName = Annotated[str, words(WEATHERS, "JSON")]
+Camera = Annotated[str, words(("follow", "track", "chase", "onboard", "fixed"))]
 SETTINGS = {
     "task": TaskName,
     "variant": VariantName,
@@ -76,37 +64,37 @@ SETTINGS = {
     "randomization": RandomizationName,
     "memory": MemoryName,
 }
-"""Of the fields of `TrainConfig`."""
+"""Of settings and conditions, by name."""
 
 
-def registry(enforced: bool = False) -> ConstructorRegistry:
-    """What the parser has to know; completion offers the words where they are enforced."""
-    words: dict[Any, tuple[str, ...]] = {
-        TaskName: tuple(TASKS),
-        VariantName: tuple(VARIANTS),
-        VehicleName: tuple(VEHICLES),
-        Algorithm: (*ALGORITHMS, *ALIASES),
-        ControllerName: tuple(CONTROLLERS),
-        ControlModeName: tuple(CONTROL_MODES),
-        EngineName: tuple(ENGINES),
-        RandomizationName: tuple(RANDOMIZATIONS),
-        MemoryName: MEMORIES,
-        WeatherName: tuple(WEATHERS),
-        Camera: CAMERAS,
-    }
-    rules = ConstructorRegistry()
+@contextlib.contextmanager
+def enforced() -> Generator[None]:
+    """Let the parser take no other words, as it must for completion to offer them."""
+    for spec, known in _OFFERED:
+        object.__setattr__(spec, "choices", known)
+    try:
+        yield
+    finally:
+        for spec, _ in _OFFERED:
+            object.__setattr__(spec, "choices", None)
 
-    @rules.primitive_rule
-    def choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
-        if info.type not in words:
-            return None
-        return PrimitiveConstructorSpec(
-            nargs=1,
-            metavar=f"{{{','.join(words[info.type])}}}",
-            instance_from_str=lambda given: given[0],
-            is_instance=lambda value: isinstance(value, str),
-            str_from_instance=lambda value: [value or "none"],
-            choices=words[info.type] if enforced else None,
-        )
 
-    return rules
+@dataclass_transform(frozen_default=True)
+def command(kind: type[Kind]) -> type[Kind]:
+    """Make a class of options a frozen dataclass; help shows a default where there is one."""
+    made = dataclasses.dataclass(frozen=True)(kind)
+    hints = typing.get_type_hints(made, include_extras=True)
+    for name in vars(made).get("__annotations__", {}):
+        hint: Any = hints[name]
+        if hasattr(hint, "__metadata__"):  # a hint of its own comes last, and counts
+            made.__annotations__[name] = Annotated[(hint.__origin__, SHOWN, *hint.__metadata__)]
+        else:
+            made.__annotations__[name] = Annotated[hint, SHOWN]
+    return made
+
+
+def _default(label: str) -> str:
+    return "" if label in ("", "''", "None") else f"(default: {label})"
+
+
+SHOWN = arg(help_behavior_hint=_default)

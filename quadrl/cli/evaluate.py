@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,13 @@ from quadrl.cli.flown import Flown
 from quadrl.evaluation.evaluate import evaluate, shown
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Evaluate(Flown):
     """Evaluate the mean action of a policy, or a controller, in fresh episodes."""
 
     episodes: int = 100
     """Number of episodes."""
-    weather: choices.WeatherName = choices.WeatherName("")
+    weather: choices.WeatherName = ""
     """The weather: calm, light, moderate or severe, or JSON such as '{"wind_speed": 5}'; by default
     that of the policy's training, and calm for a controller."""
     sampled: bool = False

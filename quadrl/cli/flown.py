@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,27 +21,27 @@ from quadrl.evaluation.rollout import Controller
 from quadrl.learning.config import tuples
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Flown:
     """What flies, and what it flies."""
 
     policy: Annotated[Positional[str], arg(metavar="[POLICY]")] = ""
     """A run folder, a .safetensors file, the name of a task, for the policy for it that comes with
     quadrl, or of such a policy, as hover_robust (write ./NAME for a folder of that name)."""
-    algo: choices.Algorithm = choices.Algorithm("")
+    algo: choices.Algorithm = ""
     """The algorithm that trained the policy that comes with quadrl; ppo by default."""
-    controller: choices.ControllerName = choices.ControllerName("")
+    controller: choices.ControllerName = ""
     """A controller instead of a policy: geometric or lqr."""
-    task: choices.TaskName = choices.TaskName("")
+    task: choices.TaskName = ""
     """The task; by default the one that the policy was trained for, and hover for a controller."""
-    vehicle: choices.VehicleName = choices.VehicleName("")
+    vehicle: choices.VehicleName = ""
     """The aircraft; by default the one that the policy was trained with, paper for a controller."""
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
     task_options: tuple[str, ...] = ()
     """Options of the task that differ from the training's, such as time_limit=5."""
 
-    randomization: choices.RandomizationName = choices.RandomizationName("")
+    randomization: choices.RandomizationName = ""
     """What is drawn for each aircraft and disturbs it: none, light or full, or JSON such as
     '{"mass": [0.8, 1.2]}'; by default that of the policy's training, and none for a controller."""
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 from tyro.conf import Positional
 
 from quadrl.base.errors import QuadrlError
+from quadrl.cli import choices
 from quadrl.cli.console import say
 from quadrl.learning.folder import LEARNING_CURVE
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Plot:
     """Draw the learning curve of one run, or the curves of several runs in one picture."""
 

@@ -24,7 +24,7 @@ VIDEO, GIF, SHEET = (848, 480, 20.0), (640, 360, 12.5), (480, 270, 20.0)
 """What a kind of file is drawn with unless it is given: width and height [pixels], frames/s."""
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Render(Flown):
     """Draw a flight of a policy or a controller, or of several side by side."""
 
@@ -38,10 +38,10 @@ class Render(Flown):
     """Output file. Its ending sets the kind: .mp4, .gif, or, for moments of the flight in one
     picture, .png or .jpg. By default flight.mp4 or, where that exists, flight-2.mp4 and so on; a
     file that is named here is overwritten."""
-    weather: choices.WeatherName = choices.WeatherName("")
+    weather: choices.WeatherName = ""
     """The weather: calm, light, moderate or severe, or JSON such as '{"wind_speed": 5}'; by default
     that of the policy's training, and calm for a controller."""
-    camera: choices.Camera = choices.Camera("follow")
+    camera: choices.Camera = "follow"
     """Camera: follow keeps the goal in view, chase is behind the aircraft."""
     width: int | None = None
     """Width of a picture [pixels]; by default 848, 640 for .gif, 480 for .png and .jpg. Each of

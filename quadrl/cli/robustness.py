@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import sys
 from pathlib import Path
@@ -20,7 +19,7 @@ from quadrl.evaluation.evaluate import comes_with_quadrl
 from quadrl.evaluation.robustness import robustness
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Robustness:
     """Fly policies or controllers through graded disturbances, and map where they recover from."""
 
@@ -32,10 +31,10 @@ class Robustness:
         arg(help_behavior_hint="(repeatable)"),
     ] = ()
     """A controller that flies as well: geometric or lqr."""
-    task: choices.TaskName = choices.TaskName("")
+    task: choices.TaskName = ""
     """The task; by default the one that the first policy was trained for, and hover for a
     controller."""
-    vehicle: choices.VehicleName = choices.VehicleName("")
+    vehicle: choices.VehicleName = ""
     """The aircraft; by default the one that the first policy was trained with."""
     aerodynamics: str = ""
     """Effects of the air on the rotors: none, full, or names of single ones with commas between
@@ -48,7 +47,7 @@ class Robustness:
     """Flights of each level; a cell of a recovery map has a tenth of them."""
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
-    engine: choices.EngineName = choices.EngineName("")
+    engine: choices.EngineName = ""
     """free_flight or mujoco; by default free flight, unless the task touches the ground."""
     out: Path = Path("robustness")
     """Folder for the pictures (.png, .pdf), the numbers (.json) and the table (.csv). Until they

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import sys
 from pathlib import Path
@@ -10,11 +9,12 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from quadrl.base.errors import QuadrlError
+from quadrl.cli import choices
 from quadrl.cli import console as shared
 from quadrl.cli.console import console, make_table, say
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Study:
     """Carry out the trainings that a file names, on all cores or on a Ray cluster, and sum up."""
 

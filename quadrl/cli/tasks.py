@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,11 +15,11 @@ from quadrl.learning.defaults import PAIRS
 from quadrl.learning.description import describe
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Tasks:
     """List the tasks, or describe one of them in full."""
 
-    task: Positional[choices.TaskName] = choices.TaskName("")
+    task: Positional[choices.TaskName] = ""
     """Name of a task, to describe it with its options; all tasks by default."""
     json: bool = False
     """Print one JSON object and nothing else."""

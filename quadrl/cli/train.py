@@ -58,7 +58,7 @@ def _default(name: str) -> str:
     options = (f"{k[len(name) + 1 :]}={v}" for k, v in shown.items() if k.startswith(f"{name}."))
     value = shown.get(name, tuple(options))
     text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-    return f"(default: {'none' if text in ('', '{}') else text})"
+    return "" if text in ("", "{}") else f"(default: {text})"
 
 
 def optional(config: type, prefix: str = "") -> type:
@@ -80,7 +80,7 @@ def optional(config: type, prefix: str = "") -> type:
         hint = arg(help=help_text, help_behavior_hint=hint)
         if field.name in choices.SETTINGS:
             word = Positional[kind] if field.name == "task" else kind
-            fields.append((field.name, Annotated[word, hint], kind("")))
+            fields.append((field.name, Annotated[word, hint], ""))
         else:
             fields.append((field.name, Annotated[kind | None, hint], None))
     return dataclasses.make_dataclass(f"{config.__name__}Settings", fields, frozen=True)
@@ -89,7 +89,7 @@ def optional(config: type, prefix: str = "") -> type:
 Settings: Any = optional(TrainConfig)
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class Train:
     """Train a policy from scratch, evaluate it, and write results and pictures to a run folder.
 
@@ -104,7 +104,7 @@ class Train:
     resume: Path | None = None
     """Continue the run in this folder, with its own settings; --steps may ask for more than it was
     begun with."""
-    seeds: Annotated[str, arg(help_behavior_hint="(default: none)")] = ""
+    seeds: str = ""
     """Train several seeds one after another and draw their curves in one picture: 0:5 for 0 to 4,
     or 3,5,8."""
     episodes: int = 100

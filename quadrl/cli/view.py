@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import RenderingUnavailable
+from quadrl.cli import choices
 from quadrl.cli.console import say
 from quadrl.cli.flown import Flown
 from quadrl.control import CONTROLLERS
@@ -18,7 +18,7 @@ from quadrl.evaluation.rollout import Controller
 from quadrl.tasks import TASKS
 
 
-@dataclasses.dataclass(frozen=True)
+@choices.command
 class View(Flown):
     """Watch a policy or a controller fly, live in the browser: push it, let the wind blow, fly."""
 
