@@ -17,7 +17,7 @@ from quadrl.base.validation import number
 
 MAX_SEED = (1 << 62) - 1
 # Streams of an episode. A new purpose takes a new number, so that the others stay as they are.
-START, PARAMETERS = 0, 1
+START, PARAMETERS, SOLIDS = 0, 1, 2
 WEATHER, TURBULENCE = 8, 9  # numbers of an episode; blocks of its control steps
 NOISE, PUSHES = 16, 17  # blocks of its control steps
 MASK = 0xFFFFFFFF

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,8 +19,10 @@ from quadrl.aircraft.parameters import MARK
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
 from quadrl.base.validation import number
+from quadrl.engines.engine import Engine
 
 Vector = tuple[float, float, float]
+FAR = 1000.0  # [m]
 HIDDEN = 3
 """Group of the geoms: pictures have the solids as markers, where they stand in the episode."""
 ELSEWHERE = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
@@ -146,12 +148,13 @@ class Pose:
 
 @dataclasses.dataclass(slots=True)
 class Surroundings:
-    """What is about aircraft in a world with solids, arrays (N, ...)."""
+    """What is about aircraft in a world with K solids, arrays (N, ...)."""
 
-    position: dict[str, Array]  # (N, 3) [m] of each solid's centre by its name, task frame
+    names: tuple[str, ...]  # of the solids
+    position: Array  # (N, K, 3) [m] of their centres, task frame
     clearance: Array  # (N,) [m], free at least between the aircraft and the nearest solid
-    hit: dict[str, Array]  # (N,) bool, whether each solid was touched in this control step
-    hit_speed: Array  # (N,) [m/s], of the fastest touch towards the solid; 0 without one
+    touched: Array  # (N, K) bool, which one was touched fastest in this control step
+    touch_speed: Array  # (N,) [m/s], of that touch towards the solid; 0 without one
 
 
 def heading(angle: Array) -> Array:
@@ -175,9 +178,8 @@ class Scene:
             if not isinstance(solid, Solid):
                 allowed = "Sphere, Cylinder, Box and Gate of quadrl.conditions.scene"
                 raise QuadrlError(name="solids", value=solid, allowed=allowed)
-        names = [solid.name for solid in self.solids]
-        if len(set(names)) < len(names):
-            raise QuadrlError(name="solids", value=names, allowed="a name of its own for each")
+        if len(set(self.names)) < len(self.names):
+            raise QuadrlError(name="solids", value=self.names, allowed="a name of its own for each")
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the geoms to a world; where they stand is a row's own."""
@@ -192,6 +194,16 @@ class Scene:
         if self.solids:
             spec.nuser_geom = 2
 
+    def check(self, engine: Engine) -> None:
+        """Refuse an engine, made already, whose world has other solids.
+
+        Raises:
+            QuadrlError: The message names the solids.
+        """
+        if len(engine.solids.geoms) != sum(len(solid.parts) for solid in self.solids):
+            allowed = f"made with the solids of the task: {', '.join(self.names) or 'none'}"
+            raise QuadrlError(name="engine", value=engine, allowed=allowed)
+
     def poses(self, placed: Mapping[str, Pose], count: int, origin: np.ndarray) -> np.ndarray:
         """Poses (n, K, 7) of the geoms in the world, as engines take them.
 
@@ -203,9 +215,8 @@ class Scene:
         Raises:
             QuadrlError: There is no such solid, or an array has the wrong shape.
         """
-        names = [solid.name for solid in self.solids]
-        if unknown := set(placed) - set(names):
-            raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(names))
+        if unknown := set(placed) - set(self.names):
+            raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(self.names))
         made = []
         for solid in self.solids:
             pose = placed.get(solid.name) or Pose(np.tile(solid.position, (count, 1)))
@@ -223,23 +234,32 @@ class Scene:
                 made.append(np.concatenate([moved, turn], axis=-1))
         return np.stack(made, axis=1) if made else np.zeros((count, 0, 7))
 
-    def surroundings(self, engine: Any) -> Surroundings:
-        """What is about the aircraft of an `Engine` now; arrays of their own."""
-        first = np.cumsum([0, *(len(solid.parts) for solid in self.solids)])
-        table = engine.solids.table
-        centre = {
-            solid.name: self._centre(solid, table[:, k]) - engine.origin
-            for k, solid in zip(first, self.solids, strict=False)
-        }
-        which, speed = engine.hits.T
-        hit = {solid.name: which == 1 + k for k, solid in enumerate(self.solids)}
-        return Surroundings(centre, engine.clearance.copy(), hit, speed.copy())
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the solids, in their order."""
+        return tuple(solid.name for solid in self.solids)
 
-    @staticmethod
-    def _centre(solid: Solid, part: np.ndarray) -> np.ndarray:
-        """Centre (N, 3) of a solid [m], world frame, from where its first part stands."""
-        turn = part["turn"].reshape(-1, 3, 3)
-        return part["position"] - turn @ np.asarray(solid.parts[0].offset)
+    def nothing_near(self, count: int) -> Surroundings:
+        """What is about aircraft (n,) that are far from everything, before there is an engine."""
+        position = np.tile([solid.position for solid in self.solids], (count, 1, 1))
+        touched = np.zeros((count, len(self.solids)), dtype=bool)
+        far = np.full(count, FAR)
+        return Surroundings(self.names, position + 0.0, far, touched, 0.0 * far)
+
+    def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
+        """What is about some aircraft (n,) of an engine now, or about all; arrays of their own."""
+        chosen = np.arange(engine.num_envs) if rows is None else rows
+        table, (which, speed) = engine.solids.table[chosen], engine.hits[chosen].T
+        first = np.cumsum([0, *(len(solid.parts) for solid in self.solids)])
+        centres = [
+            part["position"] - part["turn"].reshape(-1, 3, 3) @ np.asarray(solid.parts[0].offset)
+            for solid, part in zip(self.solids, table.T[first[:-1]], strict=True)
+        ]
+        position = np.stack(centres, axis=1) - engine.origin
+        touched = which[:, None] == 1 + np.arange(len(self.solids))
+        return Surroundings(
+            self.names, position, engine.clearance[chosen].copy(), touched, speed.copy()
+        )
 
 
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:

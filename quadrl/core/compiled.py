@@ -80,6 +80,9 @@ def make(now: Snapshot, episode: Episode, loops: bool, parameters: np.ndarray, *
     if not step.task.compiled:
         step.not_compiled = "the task has `compiled = False`"
         return step
+    if step.scene.solids:
+        step.not_compiled = "there are solids in the world"
+        return step
     try:
         return CompiledStep(step, now, episode, loops, parameters, *parts)
     except NotCompilable as error:

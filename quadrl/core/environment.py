@@ -17,11 +17,12 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.presets import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import machine, records, validation
-from quadrl.base.philox import Seed, seeds_of_rows
+from quadrl.base.philox import SOLIDS, Seed, seeds_of_rows
 from quadrl.base.rotation import Array
 from quadrl.conditions import observing
 from quadrl.conditions.randomization import Randomized
 from quadrl.conditions.sampler import AircraftSampler
+from quadrl.conditions.scene import Scene
 from quadrl.conditions.weather import Weather, Weathered, WeatherProcess
 from quadrl.control import modes
 from quadrl.core import catalogue, compiled, observer, saving, transition
@@ -32,6 +33,7 @@ from quadrl.core.transition import Clock, Episode, Observation, Transition
 from quadrl.engines import mujoco
 from quadrl.engines.engine import Engine, EngineName
 from quadrl.engines.rng import Rng
+from quadrl.engines.state import Start
 
 
 class Environment(saving.Copied):
@@ -80,7 +82,9 @@ class Environment(saving.Copied):
             validation.number("num_envs", num_envs, 1, mujoco.MAX_ENVS, whole=True)
             per_row = row_memory(self.task, self.vehicle, sampler, self.observing)
             machine.check_memory(f"num_envs = {num_envs}", num_envs * per_row)
+        self.scene = Scene(self.task.solids())
         engine = mujoco.of_task(engine, self.task, self.vehicle, num_envs, **world)
+        self.scene.check(engine)
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
         self.control_mode = modes.make(control_mode, self.vehicle)
         self.action_size = self.control_mode.size
@@ -171,12 +175,14 @@ class Environment(saving.Copied):
         begun, task_state = self.task.begin(Rng(*place), seen)
         # Up to here nothing is written, and `place` refuses before it writes.
         begun = begun.replaced(start or {}, rows, self.num_envs)
-        state = self.engine.place(rows, begun, table)
+        state = self.engine.place(rows, begun, table, self._placed(place, begun, task_state))
         self._keys, self._episodes = seeds
         self.randomizer.begin(rows, *place, drawn)
         if self.blowing:
             self.blowing.begin(rows, *place, self.randomizer.wind_speed(rows, self.weather))
-        now, episode = transition.begin(self.task, state, task_state, seen, self.action_size)
+        around = self.scene.surroundings(self.engine, rows) if self.scene.solids else None
+        given = task_state, seen, self.action_size, around
+        now, episode = transition.begin(self.task, state, *given)
         self._episodes[rows] += 1
         if len(rows) == self.num_envs:
             self._take(now, episode)
@@ -184,6 +190,15 @@ class Environment(saving.Copied):
             records.put(self.snapshot, rows, now)
             records.put(self.episode, rows, episode)
         return self.observer.begin(rows, now) if self.observer else self.task.observe(now)
+
+    def _placed(
+        self, place: tuple[Array, Array], start: Start, task_state: Any
+    ) -> np.ndarray | None:
+        """Poses (n, K, 7) of the geoms of solids in episodes; None where there are none."""
+        if not self.scene.solids:
+            return None
+        placed = self.task.place(Rng(*place, SOLIDS), start, task_state)
+        return self.scene.poses(placed, len(place[0]), self.origin)
 
     @property
     def snapshot(self) -> Snapshot:
@@ -212,7 +227,7 @@ class Environment(saving.Copied):
         now.task, now.parameters = records.owned(now.task), self._parameters
         if self._step is None:
             estimate = self.observer.frame if self.observer else None
-            parts = self.task, self._clock, self.engine, self._inputs, estimate
+            parts = self.task, self._clock, self.engine, self._inputs, estimate, self.scene
             given = now, episode, self.control_mode.has_loops, self._rows
             self._step = compiled.make(*given, *parts)
         self._step.begin(now, episode)
@@ -250,6 +265,8 @@ class Environment(saving.Copied):
         if self.blowing:
             self.blowing.advance()
         self.engine.check_air()
+        if self.scene.solids:
+            self.engine.hits[:] = 0.0
         self._setpoint = self.control_mode.setpoint(self.engine.state, taken)
         if self.randomizer.active:
             self.randomizer.begin_step()

@@ -80,7 +80,8 @@ def _check_sound(
     table, randomizer = "engine.parameters", environment.randomizer
     for name in own:
         begins = name.startswith(("randomizer.", "observer.", "episode."))
-        if (begins or name in ("engine.rows", *MOMENT)) and not np.isfinite(saved[name]).all():
+        checked = begins or name in ("engine.rows", "engine.solids", *MOMENT)
+        if checked and not np.isfinite(saved[name]).all():
             raise QuadrlError(name=name, value=saved[name], allowed="finite")
     _check_counters(environment, saved)
     if randomizer.active:
@@ -147,6 +148,8 @@ def restore(environment: Any, saved: dict[str, np.ndarray]) -> Snapshot:
     task_state = records.of_arrays("task", environment.snapshot.task, saved)
     action, command, time = (np.array(saved[name]) for name in MOMENT)
     now = Snapshot(engine.state, task_state, environment._parameters, action, command, time)
+    if environment.scene.solids:
+        now.around = environment.scene.surroundings(engine)
     now.potentials = environment.task.measure(now)
     environment._take(now, episode)
     return now

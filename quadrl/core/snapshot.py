@@ -9,7 +9,10 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
+from quadrl.base.validation import choice
+from quadrl.conditions.scene import Surroundings
 from quadrl.core.trajectory import Trajectory, outcome
 from quadrl.engines.state import State
 
@@ -43,6 +46,34 @@ class Snapshot:
     rotor_command: Array  # (N, R) [rad/s], mean over the control step; the rotor speed at the start
     time: Array  # (N,) [s], since the start of the episode
     potentials: Potentials = None  # type: ignore[assignment] - what `Task.measure` gives
+    around: Surroundings | None = None  # in a world with solids (`Task.solids`)
+
+    @property
+    def clearance(self) -> Array:
+        """What is free between the aircraft and the nearest solid at least, (N,) [m]."""
+        return self._surroundings.clearance
+
+    @property
+    def touched(self) -> Array:
+        """Which of K solids was touched fastest in this control step, (N, K) bool."""
+        return self._surroundings.touched
+
+    @property
+    def touch_speed(self) -> Array:
+        """How fast it was touched, (N,) [m/s]; 0 where none was."""
+        return self._surroundings.touch_speed
+
+    def solid(self, name: str) -> Array:
+        """Centre of a solid, (N, 3) [m], task frame."""
+        around = self._surroundings
+        return around.position[..., around.names.index(choice("solid", name, around.names)), :]
+
+    @property
+    def _surroundings(self) -> Surroundings:
+        if self.around is None:
+            reason = "there is nothing to touch: the task declares no solids"
+            raise QuadrlError(reason, name="solids", value=(), allowed="at least one")
+        return self.around
 
 
 @dataclasses.dataclass(slots=True)

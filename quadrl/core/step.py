@@ -11,6 +11,7 @@ import dataclasses
 import numpy as np
 
 from quadrl.base import records
+from quadrl.conditions.scene import Scene
 from quadrl.core import transition
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import Task
@@ -44,7 +45,13 @@ class Step(abc.ABC):
     """Why it is not compiled; empty where it is."""
 
     def __init__(
-        self, task: Task, clock: Clock, engine: Engine, inputs: Inputs, estimate: Frame | None
+        self,
+        task: Task,
+        clock: Clock,
+        engine: Engine,
+        inputs: Inputs,
+        estimate: Frame | None,
+        scene: Scene,
     ) -> None:
         """Note where everything is.
 
@@ -54,9 +61,10 @@ class Step(abc.ABC):
             engine: Of the aircraft.
             inputs: Read live.
             estimate: Table of the state that is observed, read live; None for the true one.
+            scene: The solids in the world.
         """
         self.task, self._clock, self._engine = task, clock, engine
-        self._inputs, self._estimate = inputs, estimate
+        self._inputs, self._estimate, self.scene = inputs, estimate, scene
 
     @abc.abstractmethod
     def begin(self, now: Snapshot, episode: Episode) -> None:
@@ -97,6 +105,7 @@ class WrittenStep(Step):
             *(self.task, self._clock, self.episode, self.snapshot, self._engine.state),
             *(inputs.action, inputs.command, inputs.diverged),
             estimate.state if estimate else None,
+            self.scene.surroundings(self._engine) if self.scene.solids else None,
         )
         # What a task remembers must not be a view of buffers that the next steps write.
         self.snapshot.task = records.owned(self.snapshot.task)

@@ -20,6 +20,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, norm, to_body
 from quadrl.base.validation import keys, like, number
+from quadrl.conditions.scene import Pose, Scene, Solid
 from quadrl.core import rewards
 from quadrl.core.markers import Marker
 from quadrl.core.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
@@ -252,9 +253,28 @@ class Task(abc.ABC):
         """
         return reading.to_goal, reading.target_velocity
 
+    def solids(self) -> Sequence[Solid]:
+        """What stands in the world; aircraft collide with it in both engines."""
+        return ()
+
+    def place(self, rng: Rng, start: Start, state: TaskState) -> Mapping[str, Pose]:
+        """Where solids stand in episodes (n,), by name; the others stand where they are declared.
+
+        Args:
+            rng: Random numbers of their own.
+            start: Of the episodes, as `begin` gives it.
+            state: What the task remembers, as `begin` gives it.
+        """
+        return {}
+
     def scene(self, spec: mujoco.MjSpec) -> None:
-        """Add what stands in the world; free flight knows level ground alone."""
+        """Add other geoms to the world, which free flight does not know."""
         return
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add to the world what `solids` and `scene` say."""
+        Scene(self.solids()).add_to(spec)
+        self.scene(spec)
 
     def markers(self, now: Snapshot) -> Sequence[Marker]:
         """What to draw of the episode of one aircraft (N = 1); the goal is drawn anyway."""

@@ -9,7 +9,9 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
+from quadrl.base.philox import SOLIDS
 from quadrl.base.rotation import Array, namespace, square_norm
+from quadrl.conditions.scene import Scene, Surroundings
 from quadrl.core.rewards import total
 from quadrl.core.task import EpisodeEnd, Snapshot, Task
 from quadrl.engines.rng import Rng
@@ -75,7 +77,12 @@ class Transition:
 
 
 def begin(
-    task: Task, state: State, task_state: Any, parameters: Parameters, actions: int
+    task: Task,
+    state: State,
+    task_state: Any,
+    parameters: Parameters,
+    actions: int,
+    around: Surroundings | None = None,
 ) -> tuple[Snapshot, Episode]:
     """The snapshot with which episodes begin.
 
@@ -85,11 +92,13 @@ def begin(
         task_state: What the task remembers, (n, ...).
         parameters: Of the aircraft.
         actions: Numbers in an action.
+        around: The solids about the aircraft; None where there are none.
     """
     xp = namespace(state.speed)
     none = [0.0 * state.speed for _ in range(4)]
     action = xp.stack([none[0]] * actions, axis=-1)
     now = Snapshot(state, task_state, parameters, action, state.rotor_speed + 0.0, none[0])
+    now.around = around
     episode = Episode(*none[1:])
     now.potentials = task.measure(now)
     return now, episode
@@ -105,6 +114,7 @@ def finish(
     rotor_command: Array,
     diverged: Array,
     estimate: State | None = None,
+    around: Surroundings | None = None,
 ) -> tuple[Snapshot, Episode, Transition]:
     """The transition to a new state.
 
@@ -118,6 +128,7 @@ def finish(
         rotor_command: (N, R) [rad/s], mean over the control step.
         diverged: (N,) bool, where the simulation broke down.
         estimate: The state that is observed; None for the true one, which all else looks at.
+        around: The solids about the aircraft; None where there are none.
 
     Returns:
         The snapshot after it, how far the episodes are, and the transition.
@@ -126,6 +137,7 @@ def finish(
     steps = episode.steps + 1.0
     time = steps * clock.control_timestep
     now = Snapshot(state, before.task, before.parameters, action, rotor_command, time)
+    now.around = around
     now.potentials = task.measure(now)
     terminated = task.terminated(now) | diverged
     truncated = (steps >= clock.time_limit_steps) & ~terminated
@@ -139,6 +151,7 @@ def finish(
     task_state = task.update(before, now)
     if task_state is not now.task:  # a goal may have moved on
         now = Snapshot(state, task_state, before.parameters, action, rotor_command, time)
+        now.around = around
         now.potentials = task.measure(now)
     truth = task.observe(now)
     transition = Transition(
@@ -158,7 +171,7 @@ def finish(
 def observe(task: Task, now: Snapshot, estimate: State) -> Observation:
     """The task's observation of a moment, of another state than the true one."""
     moment = (now.task, now.parameters, now.action, now.rotor_command, now.time)
-    seen = Snapshot(estimate, *moment)
+    seen = Snapshot(estimate, *moment, around=now.around)
     seen.potentials = task.measure(seen)
     return task.observe(seen)
 
@@ -200,6 +213,9 @@ def check_task(
     if not isinstance(begun, tuple) or not isinstance(begun[0], Start):
         raise QuadrlError(name=f"{task.name} begin", value=begun, allowed="a Start and a TaskState")
     start, task_state = begun
+    scene = Scene(task.solids())
+    scene.poses(task.place(Rng(keys, 0 * keys, SOLIDS), start, task_state), rows, np.zeros(3))
+    around = scene.nothing_near(rows) if scene.solids else None
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "body_rate": 3, "rotor_speed": rotors}
     for name, columns in sizes.items():
         _check_array(task, f"{name} of begin", getattr(start, name), (rows, columns), "f")
@@ -213,7 +229,7 @@ def check_task(
         raise QuadrlError(name=name, value=start.quaternion, allowed="of norm 1")
     start_state = {f.name: getattr(start, f.name) for f in dataclasses.fields(start)}
     state = State.of_coordinates(**start_state, origin_height=origin_height)
-    now, _ = begin(task, state, task_state, parameters, actions)
+    now, _ = begin(task, state, task_state, parameters, actions, around)
     terminated = task.terminated(now)
     _check_array(task, "terminated", terminated, (rows,), "b")
     if terminated.any():

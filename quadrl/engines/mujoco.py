@@ -235,7 +235,7 @@ def of_task(
             raise QuadrlError(name="engine", value=engine, allowed=allowed)
         return engine
     altitude = max(task.altitude, vehicle.ground_clearance)
-    world: Any = {"altitude": altitude, "contact": task.contact, "scene": task.scene}
+    world: Any = {"altitude": altitude, "contact": task.contact, "scene": task.build}
     return make(engine, vehicle, num_envs, **world, **settings)
 
 

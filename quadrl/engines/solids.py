@@ -70,7 +70,7 @@ class Solids:
     def poses(self, field: Callable[[str], np.ndarray]) -> np.ndarray:
         """Where they stand now, (N, K, 7), as `place` takes it."""
         parts = (field(name)[:, self.geoms] for name in ("geom_pos", "geom_quat"))
-        return np.concatenate(list(parts), axis=-1)
+        return np.ascontiguousarray(np.concatenate(list(parts), axis=-1))
 
     def clearance(self, qpos: np.ndarray, parameters: np.ndarray, rotors: int) -> np.ndarray:
         """What is free about each aircraft, (N,) [m]: to the nearest solid, at least.

@@ -158,7 +158,7 @@ class Pictures:
         from quadrl.rendering.overlay import Panel, task_title
 
         vehicle, task = self._environment.vehicle, self._environment.task
-        model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene)
+        model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.build)
         self._renderer = Renderer(model, self._width, self._height)
         if self._overlay:
             with contextlib.suppress(RenderingUnavailable):  # without Pillow

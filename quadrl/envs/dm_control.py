@@ -219,7 +219,7 @@ def make(
         substeps = validation.number("n_sub_steps", substeps, 1, whole=True)
         timestep = substeps * vehicle.physics_timestep
     vehicle = with_timestep(vehicle, timestep)
-    model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene)
+    model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.build)
     # A simulation that diverges must not pass for a fresh one.
     model.opt.disableflags |= int(_mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     physics = Physics.from_model(wrapper.MjModel(model))

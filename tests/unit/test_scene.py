@@ -1,5 +1,7 @@
 """Solids in the world: how far they are, what they stop, and that both engines agree."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -8,8 +10,11 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import rotation_matrix
 from quadrl.conditions.scene import Box, Cylinder, Gate, Pose, Scene, Sphere, heading
+from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import make
 from quadrl.engines.state import Start
+from quadrl.tasks.hover import Hover
+from quadrl.testing import check_task
 
 PAPER = VEHICLES["paper"]
 EVERY = Scene(
@@ -170,3 +175,83 @@ def test_what_no_world_can_hold_is_refused(make_it, name):
     with pytest.raises(QuadrlError) as caught:
         make_it()
     assert caught.value.name.startswith(name) and caught.value.allowed
+
+
+# ---------------------------------------------------------------------------------- in a task
+
+
+@dataclasses.dataclass(frozen=True)
+class Posted(Hover):
+    """Hover beside a post that stands somewhere else in each episode."""
+
+    name = "posted"
+    asks = starts = ends = solved = "as hover, and the post is not touched"
+
+    def solids(self):
+        return [Cylinder("post", radius=0.2, height=8.0), Sphere("ball", position=(0.0, 9.0, 0.0))]
+
+    def place(self, rng, start, state):
+        return {"post": Pose(rng.level_direction() * 1.2)}
+
+    def reward(self, before, now, end):
+        return super().reward(before, now, end) | {"room": 0.1 * now.clearance}
+
+    def terminated(self, now):
+        return super().terminated(now) | now.touched.any(-1)
+
+
+def test_a_task_with_solids_keeps_the_contract_in_every_api():
+    check_task(Posted)
+
+
+def test_tasks_see_the_same_in_both_engines_and_a_touch_ends_the_episode():
+    count, seen = 40, {}
+    for engine in ("mujoco", "free_flight"):
+        environment = Environment(Posted(), num_envs=count, seed=5, engine=engine)
+        rest = dict.fromkeys(("position", "body_rate"), [0.0, 0.0, 0.0])
+        level = {"quaternion": [1.0, 0.0, 0.0, 0.0], "velocity": [1.5, 0.0, 0.0]}
+        environment.reset(start=rest | level)
+        post = environment.snapshot.solid("post")
+        clearance, over, speed = [], np.zeros(count, dtype=bool), np.zeros(count)
+        for _ in range(16):
+            done, now = environment.step(np.zeros((count, 4))), environment.snapshot
+            assert (now.touched.any(-1) | (now.touch_speed == 0)).all()
+            assert not now.touched[:, 1].any()  # the ball is far away
+            speed = np.where(over, speed, np.maximum(speed, now.touch_speed))
+            over |= now.touched[:, 0]
+            assert (done.terminated | ~now.touched[:, 0]).all()
+            clearance.append(np.where(over, 0.0, now.clearance))
+        seen[engine] = post, np.array(clearance), over, speed
+        # Whoever touched it flew towards it; the drag takes 2 % of the speed.
+        assert over.any() and not over.all() and (post[over, 0] > 0.9).all()
+        assert (speed[over] < 1.5).all()
+    one, other = seen.values()
+    for k in range(3):
+        np.testing.assert_allclose(one[k], other[k], rtol=0, atol=1e-6)
+    # What tumbles after its first touch may touch again, faster, in the same control step.
+    np.testing.assert_allclose(one[3], other[3], rtol=0.01)
+
+
+def test_solids_come_from_the_seed_of_the_row_and_stay_with_a_saved_state():
+    batch = Environment(Posted(), num_envs=4, seed=7)
+    batch.reset()
+    places = batch.snapshot.solid("post").copy()
+    for row in range(4):
+        alone = Environment(Posted(), seed=7 + row)
+        alone.reset()
+        np.testing.assert_array_equal(alone.snapshot.solid("post")[0], places[row])
+    saved = batch.save()
+    batch.reset(np.array([1, 3]))
+    moved = batch.snapshot.solid("post")
+    np.testing.assert_array_equal(moved[[0, 2]], places[[0, 2]])
+    assert (abs(moved[[1, 3]] - places[[1, 3]]).max(axis=-1) > 0.01).all()
+    other = Environment(Posted(), num_envs=4, seed=99)
+    other.restore(saved)
+    np.testing.assert_array_equal(other.snapshot.solid("post"), places)
+
+
+def test_a_task_without_solids_says_so_when_one_is_asked_for():
+    environment = Environment("hover", seed=0)
+    environment.reset()
+    with pytest.raises(QuadrlError, match="declares no solids"):
+        environment.snapshot.clearance  # noqa: B018 - it is a property
