@@ -17,7 +17,8 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.presets import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import machine, records, validation
-from quadrl.base.philox import SOLIDS, Seed, seeds_of_rows
+from quadrl.base.errors import QuadrlError
+from quadrl.base.philox import SOLIDS, Seed
 from quadrl.base.rotation import Array
 from quadrl.conditions import observing
 from quadrl.conditions.randomization import Randomized
@@ -107,7 +108,8 @@ class Environment(saving.Copied):
         self.weather = Weather.of(weather)
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
         self._all = np.arange(self.num_envs)
-        self._keys, self._episodes = np.zeros((2, self.num_envs), np.int64)  # seeds; begun since
+        self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
+        """Which episode each row flies."""
         self._step: Step | None = None  # from the first reset on
         rotors = self.vehicle.rotor_count
         self._inputs = Inputs.zeros(self.num_envs, self.action_size, rotors)
@@ -129,15 +131,8 @@ class Environment(saving.Copied):
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         chosen = self._all if rows is None else validation.rows(rows, self.num_envs)
-        self._keys, self._episodes = self._seeded(seed, chosen)
+        self.seeds = self.seeds.renewed(seed, chosen)
         return seed
-
-    def _seeded(self, seed: Seed, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Keys and numbers of the episodes of all (N,), with some rows (n,) seeded anew."""
-        chosen, own = seeds_of_rows(seed, rows, self.num_envs)
-        keys, episodes = self._keys.copy(), self._episodes.copy()
-        keys[chosen], episodes[chosen] = own, 0
-        return keys, episodes
 
     def reset(
         self,
@@ -167,8 +162,8 @@ class Environment(saving.Copied):
             raise RuntimeError("the first reset must be of every aircraft")
         if not len(rows):
             return {name: np.zeros((0, at.stop - at.start)) for name, at in self.layout.items()}
-        seeds = (self._keys, self._episodes) if seed is None else self._seeded(seed, rows)
-        place = seeds[0][rows], seeds[1][rows]
+        seeds = self.seeds if seed is None else self.seeds.renewed(seed, rows)
+        place = seeds.keys[rows], seeds.episodes[rows]
         (drawn, table), seen = self.randomizer.sample(*place), self._parameters
         if table is not None and self._true:
             seen = Parameters.of(table, self._clock.control_timestep)
@@ -176,14 +171,14 @@ class Environment(saving.Copied):
         # Up to here nothing is written, and `place` refuses before it writes.
         begun = begun.replaced(start or {}, rows, self.num_envs)
         state = self.engine.place(rows, begun, table, self._placed(place, begun, task_state))
-        self._keys, self._episodes = seeds
+        self.seeds = seeds
         self.randomizer.begin(rows, *place, drawn)
         if self.blowing:
             self.blowing.begin(rows, *place, self.randomizer.wind_speed(rows, self.weather))
         around = self.scene.surroundings(self.engine, rows) if self.scene.solids else None
         given = task_state, seen, self.action_size, around
         now, episode = transition.begin(self.task, state, *given)
-        self._episodes[rows] += 1
+        self.seeds.episodes[rows] += 1
         if len(rows) == self.num_envs:
             self._take(now, episode)
         else:
@@ -211,9 +206,14 @@ class Environment(saving.Copied):
         return self._begun.episode
 
     @property
+    def has_begun(self) -> bool:
+        """Whether there was a reset."""
+        return self._step is not None
+
+    @property
     def _begun(self) -> Step:
         if self._step is None:
-            raise RuntimeError("call reset before the first step")
+            raise RuntimeError("call reset first: there is no episode yet")
         return self._step
 
     @property
@@ -325,18 +325,34 @@ class Environment(saving.Copied):
         alone = records.mapped(lambda array: array[row : row + 1], self.snapshot)
         return tuple(marker.moved(self.origin) for marker in self.task.markers(alone))
 
+    def _memory(self) -> saving.Memory:
+        begun, parts = self._begun, (self.randomizer, self.observer, self.blowing)
+        return saving.Memory(self.engine, self.seeds, begun.snapshot, begun.episode, *parts)
+
     def save(self) -> dict[str, np.ndarray]:
         """Everything that the next steps depend on, as arrays: `restore` continues bit for bit."""
-        return saving.save(self)
+        return self._memory().save()
 
-    def restore(self, saved: dict[str, np.ndarray]) -> Observation:
-        """Take up what `save` gave; returns the observation of that moment.
+    def restore(self, saved: Mapping[str, np.ndarray]) -> Observation:
+        """Restore a state that `save` gave; returns the observation of that moment.
 
         Raises:
             QuadrlError: It is not of such an environment; nothing has changed then.
         """
-        now, see = saving.restore(self, saved), self.observer
-        return see.again(now) if see else self.task.observe(now)
+        if fresh := not self.has_begun:
+            self.reset()  # makes the records, which are filled below
+            self.seeds.episodes[:] = 0  # this episode does not count
+        try:
+            self._memory().check(saved)
+        except QuadrlError:
+            self._step = None if fresh else self._step
+            raise
+        now, episode = self._memory().restore(saved)
+        if self.scene.solids:
+            now.around = self.scene.surroundings(self.engine)
+        now.potentials = self.task.measure(now)
+        self._take(now, episode)
+        return self.observer.again(now) if self.observer else self.task.observe(now)
 
 
 def row_memory(

@@ -235,7 +235,7 @@ def test_starts_and_parameters_are_drawn_from_streams_of_their_own():
     assert not np.intersect1d(rng.uniform(0.0, 1.0, 8), other.uniform(0.0, 1.0, 8)).size
     environment = flying(randomization={"mass": (0.9, 1.1)}, count=1)
     share = (environment.engine.parameters["mass"] / 0.65 - 0.9) / (1.1 - 0.9)
-    place = environment._keys, environment._episodes - 1
+    place = environment.seeds.keys, environment.seeds.episodes - 1
     np.testing.assert_allclose(share, Rng(*place, PARAMETERS).uniform(0.0, 1.0, 1)[0])
 
 
@@ -342,4 +342,6 @@ def test_a_drawn_aircraft_that_cannot_hover_is_refused_and_changes_nothing(monke
     environment = Environment("hover", num_envs=200, seed=0, randomization={"rotors": (0.55, 1.45)})
     with pytest.raises(QuadrlError, match="rotors = .* narrower range"):
         environment.reset()
-    assert (environment.engine.parameters["mass"] == 0.65).all() and not environment._episodes.any()
+    assert (
+        environment.engine.parameters["mass"] == 0.65
+    ).all() and not environment.seeds.episodes.any()

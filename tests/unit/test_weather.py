@@ -392,7 +392,7 @@ def test_row_i_is_the_single_one_seeded_with_i_more(task, engine, settings, thre
                 assert (one.engine.wind != batch.engine.wind[i]).any()
         if over.any():
             batch.reset(over)
-    assert (batch._episodes > 2).all()
+    assert (batch.seeds.episodes > 2).all()
 
 
 def test_dm_control_steps_its_own_data_in_the_same_wind():
