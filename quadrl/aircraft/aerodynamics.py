@@ -19,6 +19,8 @@ from quadrl.base.validation import number
 
 DENSITIES = (1e-3, 100.0)  # [kg/m^3]
 MAX_BODY_LIFT = 2.0
+STILL_AIR, ROTOR_EFFECTS, GROUND_EFFECT = range(3)
+"""`Aerodynamics.effects`: none, those of the air on rotors, and of the ground beside them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +95,10 @@ class Aerodynamics:
 
     @property
     def effects(self) -> int:
-        """Which copy of the kernels an aircraft needs: 0 none, 1 rotors, 2 and ground effect."""
-        return 2 if self.ground_effect else int(any(getattr(self, name) for name in SWITCHES))
+        """Which copy of the kernels an aircraft needs."""
+        if self.ground_effect:
+            return GROUND_EFFECT
+        return ROTOR_EFFECTS if any(getattr(self, name) for name in SWITCHES) else STILL_AIR
 
 
 SWITCHES = (

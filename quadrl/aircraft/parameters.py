@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR, Aerodynamics
 from quadrl.aircraft.rotors import Rotor, hover_squares, mixer
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
 from quadrl.base.rotation import Array
@@ -151,12 +151,13 @@ def c_structs() -> str:
             lines.append(f"  double {name}{sizes}[LANES];")
         return "\n".join(lines)
 
+    effects = f"{STILL_AIR=}, {ROTOR_EFFECTS=}, {GROUND_EFFECT=}"
     sizes = f"MAX_ROTORS = {MAX_ROTORS}, WIND = {WIND}, AIR = {AIR}, HIT = {HIT}"
     sizes += f", ROW_SIZE = {ROW_SIZE}"
     return (
         "// Written by quadrl/aircraft/parameters.py from Rotor, Vehicle and Aerodynamics.\n"
         f"#define QUADRL_MARK {MARK!r}\n"
-        f"enum {{ {sizes} }};\n"
+        f"enum {{ {sizes} }};\nenum {{ {effects} }};\n"
         f"typedef struct {{\n{fields(ROTOR)}\n}} Rotor;\n"
         f"typedef struct {{\n{fields(AIRCRAFT)}\n}} Aircraft;\n"
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,27 @@ ARRANGING = {
     np.result_type, np.clip, np.max, np.min, np.sum, np.prod, np.any, np.all,
 }  # fmt: skip
 """Functions that move numbers, or call the operations above; others might look at objects."""
+REVERSE: dict[str, Callable[..., tuple[Any, ...]]] = {
+    "add": lambda by, result, x, y: (by, by),
+    "subtract": lambda by, result, x, y: (by, -by),
+    "multiply": lambda by, result, x, y: (by * y, by * x),
+    "divide": lambda by, result, x, y: (by / y, -(by / y) * result),
+    "negative": lambda by, result, x: (-by,),
+    # At zero, where its slope is infinite, nothing: so a length has a derivative everywhere.
+    "sqrt": lambda by, result, x: (np.where(result > 0, 0.5 * by / result, 0.0),),
+    "absolute": lambda by, result, x: (np.where(x < 0, -by, np.where(x > 0, by, 0.0)),),
+    "maximum": lambda by, result, x, y: (np.where(x >= y, by, 0.0), np.where(x >= y, 0.0, by)),
+    "minimum": lambda by, result, x, y: (np.where(x <= y, by, 0.0), np.where(x <= y, 0.0, by)),
+    "where": lambda by, result, flag, x, y: (0.0, np.where(flag, by, 0.0), np.where(flag, 0.0, by)),
+    "sin": lambda by, result, x: (by * np.cos(x),),
+    "cos": lambda by, result, x: (-by * np.sin(x),),
+    "tan": lambda by, result, x: (by * (1 + result * result),),
+    "exp": lambda by, result, x: (by * result,),
+    "log": lambda by, result, x: (by / x,),
+    "tanh": lambda by, result, x: (by * (1 - result * result),),
+    "arctan": lambda by, result, x: (by / (1 + x * x),),
+}
+"""From the derivative of a number by a result, and the result and its operands, those by them."""
 MAX_OPERATIONS = 2000  # more would take the C compiler longer than they save
 
 
@@ -69,9 +90,12 @@ def symbolic() -> Generator[None]:
 class Symbol:
     """A number that is known when the loop runs; the same operation gives the same symbol."""
 
-    def __init__(self, trace: Trace, text: str, operands: tuple[str, ...], is_flag: bool) -> None:
-        """Name the result of a C expression of others."""
-        self.trace, self.text, self.operands, self.is_flag = trace, text, operands, is_flag
+    def __init__(
+        self, trace: Trace, text: str, operation: str, operands: tuple[Any, ...], is_flag: bool
+    ) -> None:
+        """Name the result of a C expression, which is an operation on others or reads memory."""
+        self.trace, self.text, self.is_flag = trace, text, is_flag
+        self.operation, self.operands = operation, operands
         self.name = f"t{len(trace.known)}"
 
     def __bool__(self) -> bool:
@@ -84,16 +108,17 @@ class Symbol:
 class Trace:
     """The operations of one row, in their order."""
 
-    def __init__(self) -> None:
-        """Begin with none."""
+    def __init__(self, max_operations: float = MAX_OPERATIONS) -> None:
+        """Begin with none; more than a largest number of them are refused."""
         self.known: dict[tuple[str, ...], Symbol] = {}
+        self.max_operations = max_operations
         self.constants: list[float] = []
 
     def inputs(self, expressions: Array, is_flag: bool = False) -> Symbols:
         """Symbols of C expressions that read memory, an array of any shape."""
 
         def read(text: str) -> Symbol:
-            return self.known.setdefault((text,), Symbol(self, text, (), is_flag))
+            return self.known.setdefault((text,), Symbol(self, text, "", (), is_flag))
 
         return symbols(np.frompyfunc(read, 1, 1)(expressions))
 
@@ -113,11 +138,11 @@ class Trace:
             name, values = "multiply", (values[0], values[0])
         flags = [_is_flag(value) for value in values]
         known = flags[0] if name == "where" else all(flags) == (name in LOGICAL)
-        if name not in C or not known or len(self.known) > MAX_OPERATIONS:
+        if name not in C or not known or len(self.known) > self.max_operations:
             raise NotCompilable(f"{name} cannot be compiled")
         names = tuple(self.name_of(value) for value in values)
         is_flag = name in FLAGS or (name == "where" and all(flags))
-        symbol = Symbol(self, C[name].format(*names), names, is_flag)
+        symbol = Symbol(self, C[name].format(*names), name, values, is_flag)
         return self.known.setdefault((name, *names), symbol)
 
     def name_of(self, value: Any) -> str:
@@ -133,13 +158,45 @@ class Trace:
             self.constants.append(number)
         return f"c[{k}]"
 
+    def vector_jacobian_product(
+        self, results: Iterable[Any], given: Iterable[Any], arguments: Iterable[Any]
+    ) -> list[Any]:
+        """The derivatives of a number by symbols of the trace.
+
+        A function that is defined piece by piece has the derivative of the piece that counts.
+
+        Args:
+            results: What depends on the arguments, symbols and numbers.
+            given: The derivatives of the number by each result.
+            arguments: Symbols, in any order.
+
+        Raises:
+            NotCompilable: An operation has no derivative here.
+        """
+        by: dict[Any, Symbols] = {}
+
+        def add(values: Iterable[Any], derivatives: Iterable[Any]) -> None:
+            for value, more in zip(values, derivatives, strict=True):
+                if isinstance(value, Symbol) and not value.is_flag:
+                    by[value] = by[value] + more if value in by else symbols(more)
+
+        add(results, given)
+        for symbol in reversed(list(self.known.values())):
+            if symbol in by and symbol.operands:
+                if symbol.operation not in REVERSE:
+                    raise NotCompilable(f"{symbol.operation} has no derivative here")
+                operands = map(symbols, symbol.operands)
+                derivatives = REVERSE[symbol.operation](by[symbol], symbols(symbol), *operands)
+                add(symbol.operands, derivatives)
+        return [by[symbol].item() if symbol in by else 0.0 for symbol in arguments]
+
     def body(self, outputs: Mapping[str, Any]) -> str:
         """C that computes some outputs, by the expressions that name their memory."""
         stores = {place: self.name_of(value) for place, value in outputs.items()}
         used, lines = set(stores.values()), []
         for symbol in reversed(self.known.values()):
             if symbol.name in used:  # in the end, by an output
-                used.update(symbol.operands)
+                used.update(x.name for x in symbol.operands if isinstance(x, Symbol))
                 kind = "int" if symbol.is_flag else "double"
                 lines.append(f"const {kind} {symbol.name} = {symbol.text};")
         lines = lines[::-1] + [f"{place} = {value};" for place, value in stores.items()]

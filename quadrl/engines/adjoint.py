@@ -1,24 +1,89 @@
 """Derivatives of free flight: how where an aircraft will be depends on where it is and its rotors.
 
 `native/adjoint.c` is the reverse of the steps of `native/free_flight.c`, with every force: the
-paper's, wind, and what the air does to rotors. Forces that are defined piece by piece (the largest
-rotor speed, rotors that rise and fall at different rates, the limits of lift, the vortex ring
-state) have the derivative of the piece that they are on; at an edge, where there is none, that of
-one side. The wind counts as given, although its mean depends on the height.
+paper's, wind, and what the air does to rotors. The reverse of the equations is written by
+`quadrl.base.trace` from `dynamics.derivative`, for the effects of the air and the number of rotors
+that are flown. Forces that are defined piece by piece (the largest rotor speed, rotors that rise
+and fall at different rates, the limits of lift, the vortex ring state) have the derivative of the
+piece that they are on; at an edge, where there is none, that of one side. The wind counts as given,
+although its mean depends on the height.
 """
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
+import functools
+import math
+from collections.abc import Callable
 
 import numpy as np
 
-from quadrl.aircraft.parameters import MAX_ROTORS
-from quadrl.engines import native
+from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR
+from quadrl.aircraft.parameters import AIR, AIRCRAFT, MAX_ROTORS, ROW_SIZE, Parameters
+from quadrl.base.rotation import Array
+from quadrl.base.trace import Trace
+from quadrl.engines import dynamics, native
 from quadrl.engines.free_flight import LANES
 
 COORDINATES = 13
 """Numbers of a motion beside its rotor speeds: 7 of qpos, 6 of qvel."""
+PLACES = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
+"""A row whose numbers say where they stand."""
+SOURCE = """enum {{ EFFECTS = {effects}, ROTORS = {rotors} }};
+static const double c[] = {{{constants}}};
+
+// From the derivatives of a number by the rates of change of motions m to those by the motions,
+// which are set, and by the commands, to which it adds. p: the numbers of an Aircraft.
+VECTORISED static void back_derivative(
+    const Lanes* restrict p, const Lanes* restrict m, const Lanes* restrict command,
+    const Lanes* restrict air, const Lanes* restrict rate_, Lanes* restrict m_,
+    Lanes* restrict command_) {{
+  for (int i = 0; i < LANES; ++i) {{
+    {body}
+  }}
+}}
+"""
+
+
+def reverse(effects: int, rotors: int) -> str:
+    """C of the reverse of `dynamics.derivative`, with some effects of the air and rotors."""
+    trace, size = Trace(max_operations=math.inf), COORDINATES + rotors
+
+    def read(name: str, rows: Array) -> Array:
+        return trace.read(f"{name}[{{}}][i]", rows)
+
+    parameters = Parameters.of(PLACES, rotors=rotors).map(functools.partial(read, "p"))
+    sizes = {"m": size, "command": rotors, "air": AIR, "rate_": size}
+    m, command, air, given = (read(name, np.arange(n)[None]) for name, n in sizes.items())
+    parts = m[:, :3], m[:, 3:7], m[:, 7:10], m[:, 10:13], m[:, 13:]
+    motion = dynamics.Motion(*parts)
+    rate = dynamics.derivative(parameters, motion, command, air, 0.0, effects)
+    results = np.concatenate(list(vars(rate).values()), axis=-1)
+    by = trace.vector_jacobian_product(results[0], given[0], [*m[0], *command[0]])
+    sums = read("command_", np.arange(rotors)) + np.array(by[size:], dtype=object)
+    outputs = {f"m_[{k}][i]": value for k, value in enumerate(by[:size])}
+    body = trace.body(outputs | {f"command_[{k}][i]": value for k, value in enumerate(sums)})
+    constants = ", ".join(map(float.hex, trace.constants))
+    return SOURCE.format(effects=effects, rotors=rotors, constants=constants, body=body)
+
+
+@functools.cache
+def kernel(effects: int, rotors: int) -> Callable[[int, int, int], None]:
+    """`quadrl_adjoint` of native/adjoint.c, compiled where the cache does not hold it.
+
+    Args:
+        effects: The most that an aircraft has, as `Aerodynamics.effects`.
+        rotors: How many each has.
+
+    Raises:
+        NativeError: There is no compiler, or it refused the sources.
+    """
+    written = {"reverse.h": reverse(effects, rotors)}
+    function = native.open_library(native.build(("adjoint.c",), "adjoint", written)).quadrl_adjoint
+    function.restype = None
+    function.argtypes = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64]
+    return function
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +101,7 @@ class Leg:
         """Where it led, (N, 13 + R)."""
         return self._run(None)[0]
 
-    def pull(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def vector_jacobian_product(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The derivatives of a number, of each aircraft, by `start` and by `command`.
 
         Args:
@@ -52,12 +117,18 @@ class Leg:
         from_command = np.empty_like(self.command)
         path = np.empty((self.steps, COORDINATES + MAX_ROTORS, LANES))
         taken = (self.start, self.command, self.air, self.parameters)
-        own = (self.world, end, from_start, from_command, path)
+        filled = (self.world, end, from_start, from_command, path)
         block = self.parameters[0].size if self.parameters.ndim > 1 else 0
         # As `Legs` in native/adjoint.c.
         legs = np.array(
             [*(array.ctypes.data for array in taken), 0 if given is None else given.ctypes.data,
-             *(array.ctypes.data for array in own), block, self.command.shape[1]]
+             *(array.ctypes.data for array in filled), block]
         )  # fmt: skip
-        native.adjoint().quadrl_adjoint(legs.ctypes.data, len(end), self.steps)
+        column = int(PLACES["effects"][0])
+        own = self.parameters[:, column] if block else self.parameters["effects"]
+        # A row that names another number is a damaged one, and not a number afterwards.
+        found = (kind for kind in (ROTOR_EFFECTS, GROUND_EFFECT) if (own == kind).any())
+        kernel(max(found, default=STILL_AIR), self.command.shape[1])(
+            legs.ctypes.data, len(end), self.steps
+        )
         return end, from_start, from_command

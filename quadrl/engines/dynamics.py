@@ -2,14 +2,19 @@
 
 Equations 3 to 10 of the paper for rows of aircraft, in NumPy or torch, and what the air does to
 rotors beside them (`quadrl.aircraft.aerodynamics`). `native/aero.h` has the same forces; a force
-term is written there and here, under the same name.
+term is written there and here, under the same name. Its derivatives are generated from here
+(`quadrl.engines.adjoint`).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import operator
+from typing import Any
 
+from quadrl.aircraft.aerodynamics import GROUND_EFFECT, STILL_AIR
 from quadrl.aircraft.parameters import WIND, Parameters
 from quadrl.base.rotation import Array, namespace, norm, rotation_matrix, stack, to_body, to_world
 
@@ -43,7 +48,7 @@ def thrust_wrench(p: Parameters, speed: Array) -> tuple[Array, Array]:
     pull = rotor.axis * thrust[..., None]
     torque = -rotor.spin * rotor.torque_coefficient * speed * speed
     moment = cross(rotor.position, pull) + rotor.axis * torque[..., None]
-    return pull.sum(-2), moment.sum(-2)
+    return total(pull, -2), total(moment, -2)
 
 
 def aero_wrench(p: Parameters, airspeed: Array, body_rate: Array) -> tuple[Array, Array]:
@@ -80,7 +85,7 @@ def lift_change(
     response = inflow * p.blade_lift[..., None] * flow * rotor.disc_radius * induced
     w0 = induced * speed
     k = response / (8 * rotor.thrust_coefficient) * w0
-    v = xp.minimum(xp.maximum(climb, -2 * w0), 3 * w0)  # beyond, the steps would diverge
+    v = clip(climb, -2 * w0, 3 * w0)  # beyond, the steps would diverge
     w = 0.5 * (v - k + xp.sqrt((v - k) ** 2 + 4 * w0 * (w0 + k)))  # exact where p_square is 0
     for _ in range(2):  # Newton's
         through = xp.sqrt(w * w + p_square)
@@ -88,14 +93,14 @@ def lift_change(
         w = w + through * lacking / ((k + through) * through + (w - v) * w + 1e-12)
     over = 1 / (w0 + 1e-6)
     off = (climb * over + 1.4) / 1.2
-    steep = xp.maximum(1 - off * off, 0 * off)
-    ring = steep**3 * xp.maximum(1 - p_square * over * over / 0.95**2, 0 * off)
+    steep = clip(1 - off * off, low=0.0)
+    ring = steep * steep * steep * clip(1 - p_square * over * over / 0.95**2, low=0.0)
     change = (
         flow * k * (w0 - w - p.vortex_ring[..., None] * w0 * ring)
         + inflow * p.translational_lift[..., None] * p_square
         + p.vortex_ring_noise[..., None] * rest * noise * ring
     )
-    return xp.minimum(xp.maximum(change, -rest), 0.6 * rest)  # above, the blades stall
+    return clip(change, -rest, 0.6 * rest)  # above, the blades stall
 
 
 def ground_share(p: Parameters, up: Array, height: Array) -> Array:
@@ -108,20 +113,18 @@ def ground_share(p: Parameters, up: Array, height: Array) -> Array:
     """
     xp, position, radius = namespace(height), p.rotor.position, p.rotor.disc_radius
     over = height[..., None] + (position * up[..., None, :]).sum(-1)
-    z = xp.maximum(over, radius / 2)
+    z = clip(over, low=radius / 2)
 
     def image(radius: Array, distance_square: Array, z: Array) -> Array:
         square = distance_square + 4 * z * z
         return 0.5 * radius * radius * z / (square * xp.sqrt(square))
 
     aside = position[..., None, :, :2] - position[..., :, None, :2]  # (N, R, R, 2)
-    share = image(radius[..., None, :], (aside**2).sum(-1), z[..., :, None]).sum(-1)
+    share = total(image(radius[..., None, :], (aside**2).sum(-1), z[..., :, None]))
     centre = 4 * (position[..., :2] ** 2).sum(-1)
     share = share + 4 * p.body_lift[..., None] * image(radius, centre, z)
-    near = (8 * radius - z) / (2 * radius)
-    near = xp.minimum(xp.maximum(near, 0 * near), 0 * near + 1)
-    level = (p.rotor.axis * up[..., None, :]).sum(-1)
-    cosine = xp.maximum(level, 0 * level)
+    near = clip((8 * radius - z) / (2 * radius), 0.0, 1.0)
+    cosine = clip((p.rotor.axis * up[..., None, :]).sum(-1), low=0.0)
     return p.ground_effect[..., None] * share * cosine**2 * near**2 * (3 - 2 * near)
 
 
@@ -134,6 +137,7 @@ def rotor_wrench(
     up: Array,
     height: Array,
     noise: Array | float = 0.0,
+    effects: int = GROUND_EFFECT,
 ) -> tuple[Array, Array]:
     """What the air does to the rotors beside equation 7, and their inertia.
 
@@ -146,22 +150,24 @@ def rotor_wrench(
         up: (N, 3), the world's vertical in the body frame.
         height: (N,) of the centre of mass over the ground [m].
         noise: (N, R) of each rotor's thrust, of unit variance.
+        effects: `Aerodynamics.effects`, of all rows.
 
     Returns:
         Force (N, 3) [N] and moment (N, 3) [N m], body frame.
     """
-    xp, rotor = namespace(speed), p.rotor
-    turn = body_rate[..., None, :] + 0 * rotor.position  # (N, R, 3)
+    rotor = p.rotor
+    turn = body_rate[..., None, :]  # (N, 1, 3)
     hub = airspeed[..., None, :] + cross(turn, rotor.position)
     climb = (hub * rotor.axis).sum(-1)
     across = hub - climb[..., None] * rotor.axis
     p_square = (across * across).sum(-1)
     change = lift_change(p, speed, climb, p_square, noise)
-    rest = rotor.thrust_coefficient * speed * speed
-    hover = (_disc(p)[1] * speed) ** 2
-    taken = ground_share(p, up, height) * hover / (hover + p_square + 1e-12)
-    most = xp.minimum(taken, 0 * taken + 0.36)
-    change = change + (rest + change) * (most / (1 - most))  # lift / (1 - most)
+    if effects == GROUND_EFFECT:
+        rest = rotor.thrust_coefficient * speed * speed
+        hover = (_disc(p)[1] * speed) ** 2
+        taken = ground_share(p, up, height) * hover / (hover + p_square + 1e-12)
+        most = clip(taken, high=0.36)
+        change = change + (rest + change) * (most / (1 - most))  # lift / (1 - most)
     drag = (p.rotor_drag[..., None] * speed)[..., None] * across
     push = change[..., None] * rotor.axis - drag
     flap = (p.flapping_moment[..., None] * speed)[..., None] * cross(across, rotor.axis)
@@ -169,7 +175,7 @@ def rotor_wrench(
     momentum = (inertia * speed)[..., None] * rotor.axis
     faster = (inertia * rotor_acceleration(p, speed, command))[..., None] * rotor.axis
     moment = cross(rotor.position, push) + flap - cross(turn, momentum) - faster
-    return push.sum(-2), moment.sum(-2)
+    return total(push, -2), total(moment, -2)
 
 
 def _disc(p: Parameters) -> tuple[Array, Array]:
@@ -178,7 +184,14 @@ def _disc(p: Parameters) -> tuple[Array, Array]:
     return flow, namespace(flow).sqrt(p.rotor.thrust_coefficient / flow)
 
 
-def derivative(p: Parameters, motion: Motion, command: Array, air: Array, gravity: float) -> Motion:
+def derivative(
+    p: Parameters,
+    motion: Motion,
+    command: Array,
+    air: Array,
+    gravity: float,
+    effects: int = GROUND_EFFECT,
+) -> Motion:
     """The rate of change of a motion, equations 3 to 6.
 
     Args:
@@ -187,16 +200,20 @@ def derivative(p: Parameters, motion: Motion, command: Array, air: Array, gravit
         command: (N, R) of the rotors [rad/s].
         air: (N, AIR) as `parameters.AIR` has it, or the wind alone (N, 3) [m/s, world frame].
         gravity: Along z [m/s^2], negative.
+        effects: `Aerodynamics.effects`: what of the air is written down at all.
     """
     rate, speed, q = motion.body_rate, motion.rotor_speed, motion.quaternion
     rotation = rotation_matrix(q / norm(q)[..., None])
     force, moment = thrust_wrench(p, speed)
     airspeed = to_body(rotation, motion.velocity - air[..., :WIND])
     drag, damping = aero_wrench(p, airspeed, rate)
-    noise = air[..., WIND : WIND + speed.shape[-1]] if air.shape[-1] > WIND else 0.0
-    up, height = rotation[..., 2, :], motion.position[..., 2]
-    more, twist = rotor_wrench(p, speed, command, airspeed, rate, up, height, noise)
-    push = to_world(rotation, force + drag + more) / p.mass[..., None]
+    force, moment = force + drag, moment + damping
+    if effects != STILL_AIR:
+        noise = air[..., WIND : WIND + speed.shape[-1]] if air.shape[-1] > WIND else 0.0
+        around = airspeed, rate, rotation[..., 2, :], motion.position[..., 2]
+        more, twist = rotor_wrench(p, speed, command, *around, noise, effects)
+        force, moment = force + more, moment + twist
+    push = to_world(rotation, force) / p.mass[..., None]
     spin = p.inertia * rate
     w, x, y, z = (q[..., k] for k in range(4))
     a, b, c = (rate[..., k] for k in range(3))
@@ -206,7 +223,7 @@ def derivative(p: Parameters, motion: Motion, command: Array, air: Array, gravit
         position=motion.velocity,
         quaternion=turn / 2,
         velocity=stack(push[..., 0], push[..., 1], push[..., 2] + gravity),
-        body_rate=(moment + damping + twist - cross(rate, spin)) / p.inertia,
+        body_rate=(moment - cross(rate, spin)) / p.inertia,
         rotor_speed=rotor_acceleration(p, speed, command),
     )
 
@@ -216,3 +233,16 @@ def cross(first: Array, second: Array) -> Array:
     a, b, c = (first[..., k] for k in range(3))
     x, y, z = (second[..., k] for k in range(3))
     return stack(b * z - c * y, c * x - a * z, a * y - b * x)
+
+
+def total(array: Array, axis: int = -1) -> Array:
+    """Sum over an axis, added from the first to the last for any number of rotors."""
+    return functools.reduce(operator.add, namespace(array).moveaxis(array, axis, 0))
+
+
+def clip(x: Array, low: Any = None, high: Any = None) -> Array:
+    """Numbers no smaller than `low` and no larger than `high`, where these are given."""
+    xp = namespace(x)
+    if low is not None:
+        x = xp.where(x < low, low, x)
+    return x if high is None else xp.where(x > high, high, x)

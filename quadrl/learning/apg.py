@@ -62,8 +62,10 @@ class APG(Algorithm):
         flown = batch["action"].transpose(0, 1).reshape(mean.shape)
         # The random numbers stay as they were drawn, whatever the policy.
         action = mean + deviation * ((flown - mean) / deviation).detach()
-        pulled = torch.from_numpy(window.pull(self._earned(window), action, self._gamma)).float()
-        better = (mean + self._moves(pulled.reshape(mean.shape))).detach()
+        earned = self._earned(window)
+        by_action = window.vector_jacobian_product(earned, action, self._gamma)
+        moves = self._moves(torch.from_numpy(by_action).float().reshape(mean.shape))
+        better = (mean + moves).detach()
         aims = seen.detach().update({"better": better, "usual": deviation.log().detach()})
         for _ in range(self.config.epochs):
             for part in shuffled(aims).split(self.config.minibatch):
@@ -78,13 +80,13 @@ class APG(Algorithm):
         value = self._gamma * self.critic(after)["state_value"].sum()
         return self._reward_scale * window.reward.sum() + value
 
-    def _moves(self, pulled: Tensor) -> Tensor:
+    def _moves(self, by_action: Tensor) -> Tensor:
         """How far actions are moved, (n, k): as `config.step` says, where the pull is the median.
 
         The pull at some moments is a thousand times as strong as at others.
         """
-        strength = pulled.norm(dim=-1, keepdim=True)
-        moves = self.config.step * pulled / strength.median().clamp(min=1e-9)
+        strength = by_action.norm(dim=-1, keepdim=True)
+        moves = self.config.step * by_action / strength.median().clamp(min=1e-9)
         farthest = FARTHEST * self.config.step
         return moves * (farthest / moves.norm(dim=-1, keepdim=True).clamp(min=farthest))
 

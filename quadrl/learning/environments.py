@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Unbounded
 
 from quadrl.core.transition import Transition
-from quadrl.engines import native
+from quadrl.engines.adjoint import kernel
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import STATE
@@ -57,7 +57,8 @@ class RecordingEnv(QuadrotorEnv):
     def __init__(self, *given: Any, **settings: Any) -> None:
         """Make the environments, and compile the reverse of their flight where it is missing."""
         super().__init__(*given, **settings)
-        native.adjoint()
+        vehicle = self.environment.vehicle
+        kernel(vehicle.aerodynamics.effects, vehicle.rotor_count)
         self._moments: list[Moment] = []
 
     def taken(self) -> list[Moment]:

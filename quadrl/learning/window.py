@@ -107,7 +107,7 @@ class Window:
         truncated[-1] = ~terminated[-1]
         return truncated.ravel()
 
-    def pull(self, earned: Tensor, action: Tensor, gamma: float) -> np.ndarray:
+    def vector_jacobian_product(self, earned: Tensor, action: Tensor, gamma: float) -> np.ndarray:
         """How what is earned from each step on follows from its action, (T, N, k).
 
         Args:
@@ -122,22 +122,22 @@ class Window:
             self._steps(torch.autograd.grad(one.sum(), self.was, retain_graph=True)[0], self.was)
             for one in action.unbind(-1)
         ]  # k of (T, N, 13 + R)
-        pulled = np.zeros_like(own)
+        by_action = np.zeros_like(own)
         later, later_command = np.zeros_like(was[0]), np.zeros_like(last[0])
         for t, moment in reversed(list(enumerate(self.moments))):
             same = ~(moment.terminated | moment.truncated)[:, None]  # the episode goes on
-            from_start, from_command = moment.leg.pull(
+            from_start, from_command = moment.leg.vector_jacobian_product(
                 np.where(moment.diverged[:, None], 0.0, end[t] + gamma * same * later)
             )
             from_command += command[t] + gamma * same * later_command
-            pulled[t] = own[t] + self._control.slope(moment.action) * from_command
+            by_action[t] = own[t] + self._control.slope(moment.action) * from_command
             later = from_start + was[t]
             for k, row in enumerate(jacobian):
-                later += row[t] * pulled[t, :, k, None]
+                later += row[t] * by_action[t, :, k, None]
             later_command = last[t]
-            lost = ~(np.isfinite(later).all(1) & np.isfinite(pulled[t]).all(1))
-            later[lost], pulled[t, lost] = 0.0, 0.0
-        return pulled
+            lost = ~(np.isfinite(later).all(1) & np.isfinite(by_action[t]).all(1))
+            later[lost], by_action[t, lost] = 0.0, 0.0
+        return by_action
 
     def _steps(self, gradient: Tensor | None, leaf: Tensor) -> np.ndarray:
         """A gradient by a leaf as (T, N, ...)."""

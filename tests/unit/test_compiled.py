@@ -10,7 +10,7 @@ import pytest
 
 from quadrl import tasks
 from quadrl.base.errors import NativeError, QuadrlWarning
-from quadrl.base.trace import FLAGS, LOGICAL, C, Trace
+from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace
 from quadrl.core.environment import Environment
 from quadrl.engines import native
 from quadrl.tasks.hover import Hover
@@ -371,6 +371,33 @@ def test_every_operation_is_that_of_numpy(name):
         np.testing.assert_allclose(found, expected, rtol=1e-15, atol=1e-300)
     else:
         np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("name", sorted(REVERSE))
+def test_every_derivative_is_that_of_differences(name):
+    columns = np.random.default_rng(0).uniform(0.2, 1.4, (1 if name in UNARY else 2, 40))
+
+    def function(*values):
+        if name == "where":
+            return np.where(values[0] < values[1], values[0] * values[0], 3 * values[1])
+        return getattr(np, name)(*values)
+
+    for k in range(len(columns)):
+
+        def derivative(*values, k=k):
+            result, symbol = function(*values).item(), values[k].item()
+            by = symbol.trace.vector_jacobian_product([result], [1.0], [symbol])
+            return np.array(by, object) + 0 * values[k]
+
+        step = 1e-5 * (np.arange(len(columns)) == k)[:, None]
+        ends = function(*(columns + step)) - function(*(columns - step))
+        np.testing.assert_allclose(run(derivative, *columns), ends / 2e-5, rtol=1e-8, atol=1e-9)
+
+
+def test_an_operation_without_a_derivative_is_refused():
+    x = Trace().inputs(np.array(["x[i]"], object))
+    with pytest.raises(TypeError, match="arctan2 has no derivative"):
+        x.item().trace.vector_jacobian_product([np.arctan2(x, 2.0).item()], [1.0], x)
 
 
 def test_sums_and_choices_over_an_axis():

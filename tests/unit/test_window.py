@@ -69,14 +69,14 @@ def test_the_derivatives_by_a_policy_are_those_of_its_flights(name):
     direction = rng.normal(size=weights.shape)
     window, _ = flown(name, weights, shifts)
     action = window.observation @ torch.from_numpy(weights)
-    pulled = window.pull(window.reward.sum(), action, GAMMA)
+    by_action = window.vector_jacobian_product(window.reward.sum(), action, GAMMA)
     # The first action of an episode counts whole, each later one less by gamma.
     over = np.array([m.terminated | m.truncated for m in window.moments])
     share = np.ones((STEPS, COUNT))
     for t in range(1, STEPS):
         share[t] = np.where(over[t - 1], 1.0, GAMMA * share[t - 1])
     seen = window.observation.detach().numpy().reshape(STEPS, COUNT, -1)
-    got = (share[..., None] * pulled * (seen @ direction)).sum()
+    got = (share[..., None] * by_action * (seen @ direction)).sum()
     step = 1e-6
     ends = [flown(name, weights + sign * step * direction, shifts)[1] for sign in (1, -1)]
     assert got == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5)

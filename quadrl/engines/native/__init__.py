@@ -26,7 +26,7 @@ import sys
 import tempfile
 import threading
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -40,7 +40,7 @@ from quadrl.engines.state import c_rows
 
 SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
            "disturbances.c", "solids.c", "warnings.c")  # fmt: skip
-HEADERS = ("adjoint.h", "aero.h", "export.h", "philox.h", "runge_kutta.h", "solids.h")
+HEADERS = ("aero.h", "export.h", "philox.h", "runge_kutta.h", "solids.h")
 MARK_SLOT = 9
 """Entry of an actuator's `dynprm` that holds MARK."""
 # No contraction: a fused multiply-add would round otherwise than NumPy does.
@@ -103,14 +103,18 @@ def compiler() -> str:
 
 
 def build(
-    include: Path | None = None, sources: Sequence[str] = SOURCES, name: str = "mujoco"
+    sources: Sequence[str] = SOURCES,
+    name: str = "mujoco",
+    generated: Mapping[str, str] | None = None,
+    include: Path | None = None,
 ) -> Path:
     """Compile a library unless the cache holds it.
 
     Args:
-        include: Folder with mujoco's headers; None for those of the installed package.
         sources: Files beside this one.
         name: Of the library, with the version of mujoco behind it.
+        generated: Headers that they include besides, by name.
+        include: Folder with mujoco's headers; None for those of the installed package.
 
     Returns:
         The path of the shared library.
@@ -120,14 +124,14 @@ def build(
     """
     include = include or Path(mujoco.__file__).parent / "include"
     digest = hashlib.sha256(" ".join((*flags(), platform.machine(), str(include))).encode())
-    layout = c_structs() + c_rows() + c_weather()
-    digest.update(layout.encode())
+    written = {"layout.h": c_structs() + c_rows() + c_weather()} | dict(generated or {})
+    digest.update("".join(written.values()).encode())
     for file in (*HEADERS, *sources):
         digest.update((_FOLDER / file).read_bytes())
     digest.update((include / "mujoco" / "mujoco.h").read_bytes())
     whole = f"quadrl-{name}-{mujoco.__version__}-{digest.hexdigest()[:16]}"
     paths = [str(_FOLDER / source) for source in sources]
-    return _cached(whole, [f"-I{include}", *paths], {"layout.h": layout})
+    return _cached(whole, [f"-I{include}", *paths], written)
 
 
 @functools.cache
@@ -139,7 +143,7 @@ def compile_generated(source: str) -> ctypes.CDLL:
     """
     digest = hashlib.sha256(" ".join((*flags(), platform.machine(), source)).encode())
     name = digest.hexdigest()[:16]
-    return _open(_cached(f"quadrl-generated-{name}", [], {f"{name}.c": source}))
+    return open_library(_cached(f"quadrl-generated-{name}", [], {f"{name}.c": source}))
 
 
 def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
@@ -223,7 +227,7 @@ def _locked(folder: Path) -> tuple[Path, int | None]:
         os.close(descriptor)
 
 
-def _open(path: Path) -> ctypes.CDLL:
+def open_library(path: Path) -> ctypes.CDLL:
     """Open a compiled library; one for this process alone leaves no file behind.
 
     Raises:
@@ -245,7 +249,7 @@ def load(path: Path) -> ctypes.CDLL:
     Raises:
         NativeError: It was compiled against another version of mujoco.
     """
-    opened = _open(path)
+    opened = open_library(path)
     built, running = opened.quadrl_mujoco_version(), mujoco.mj_version()
     if built != running:
         raise NativeError(
@@ -298,19 +302,6 @@ def library() -> ctypes.CDLL:
 @functools.cache
 def _library() -> ctypes.CDLL:
     return load(build())
-
-
-@functools.cache
-def adjoint() -> ctypes.CDLL:
-    """The reverse of free flight; apart, since it compiles twice as long as all the rest.
-
-    Raises:
-        NativeError: There is no compiler, or it refused the sources.
-    """
-    opened = _open(build(sources=("adjoint.c",), name="adjoint"))
-    opened.quadrl_adjoint.restype = None
-    opened.quadrl_adjoint.argtypes = [_POINTER, ctypes.c_int64, ctypes.c_int64]
-    return opened
 
 
 @functools.cache

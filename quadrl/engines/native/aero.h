@@ -20,10 +20,7 @@ typedef double Lanes[LANES];
 // instructions.
 #define EACH_LANE _Pragma("GCC unroll 1") for (int i = 0; i < LANES; ++i)
 
-// Aerodynamics.effects: the kernels are compiled for each.
-enum { STILL_AIR = 0, ROTOR_EFFECTS = 1, GROUND_EFFECT = 2 };
-
-// Those of an aircraft, or -1 where its row names none: not every number is an int.
+// Aerodynamics.effects of an aircraft, for each of which the kernels are compiled, or -1 where its row names none: not every number is an int.
 AERO int aero_effects(const Aircraft* a, int i) {
   if (a->effects[i] == STILL_AIR) return STILL_AIR;
   if (a->effects[i] == ROTOR_EFFECTS) return ROTOR_EFFECTS;
