@@ -29,6 +29,8 @@ TINY = TrainConfig(
 
 def changed(**settings) -> TrainConfig:
     other = {"training_options": {}} if "task" in settings else {}  # hover's is no other task's
+    if settings.get("memory", "none") != "none":
+        other["ppo"] = dataclasses.replace(TINY.ppo, fused=False)
     return dataclasses.replace(TINY, **other | settings)
 
 

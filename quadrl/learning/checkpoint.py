@@ -66,8 +66,8 @@ def check_same(
     Raises:
         QuadrlError: A setting differs.
     """
-    for name in saved | present:
-        was, now = saved.get(name), present.get(name)
+    for name, was in saved.items():  # a setting that is new since then had its default
+        now = present.get(name)
         if isinstance(was, dict) and isinstance(now, dict):
             check_same(path, was, now, f"{prefix}{name}.")
         elif was != now and name not in CHANGEABLE:

@@ -59,10 +59,10 @@ class TrainConfig(TrainSettings):
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
         algo = settings.get("algo", TrainConfig.algo)
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
-        named = (settings.get(name, getattr(TrainConfig, name)) for name in ("vehicle", "variant"))
-        values, _ = training_defaults(_fields(), task, algo, *named)
-        if settings.get("memory", values["memory"]) != "none":
-            values["holds_goal"] = False  # what is remembered differs at the goal
+        vehicle = settings.get("vehicle", TrainConfig.vehicle)
+        variant = settings.get("variant", TrainConfig.variant)
+        chosen = task, algo, vehicle, variant, settings.get("memory")
+        values, _ = training_defaults(_fields(), *chosen)
         for name, kind in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
             if isinstance(given, dict):
@@ -94,7 +94,8 @@ class TrainConfig(TrainSettings):
         return f"TrainConfig({self.task!r}, {given})"
 
     def _defaults(self) -> tuple[dict[str, Any], dict[str, str]]:
-        return training_defaults(_fields(), self.task, self.algo, self.vehicle, self.variant)
+        chosen = self.task, self.algo, self.vehicle, self.variant, self.memory
+        return training_defaults(_fields(), *chosen)
 
     def sources(self) -> Iterator[tuple[str, Any, str]]:
         """Name, value and origin of every setting that this training uses.

@@ -5,6 +5,8 @@
 2. task x algorithm: `Task.training`, and `Task.training_with` for the algorithm.
 3. variant: `VARIANTS`, with the aircraft of `OF_VEHICLE`, and `Task.variants`.
 
+A policy with a memory cannot have all of them: see `WITH_MEMORY`.
+
 Every layer states the settings of `PER_STEP` for the control rate of the paper's aircraft. An
 aircraft that is controlled more often looks as far ahead in seconds, collects as many seconds in a
 batch, and trains for as many: `at_rate` reads a layer for it.
@@ -62,10 +64,20 @@ OF_VEHICLE: dict[tuple[str, str], dict[str, Any]] = {
     ("robust", "paper"): {"vehicle_options": {"action_scale": WIDE}}
 }
 """What a variant changes for one aircraft alone."""
+WITH_MEMORY: dict[str, Any] = {
+    "holds_goal": False,  # what is remembered differs at the goal
+    "ppo": {"fused": False},
+}
+"""What holds for a policy with a memory, over all layers."""
 
 
 def training_defaults(
-    fields: dict[str, Any], task: str, algo: str, vehicle: str, variant: str
+    fields: dict[str, Any],
+    task: str,
+    algo: str,
+    vehicle: str,
+    variant: str,
+    memory: str | None = None,
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The fields of `TrainConfig` where nothing is given, and the layer that each comes from.
 
@@ -75,6 +87,7 @@ def training_defaults(
         algo: Name of the algorithm.
         vehicle: Name of the aircraft.
         variant: A name of `VARIANTS`.
+        memory: Of the policy; None for that of the layers.
 
     Returns:
         The values; and a label of the layer by the name of the setting, as in `flat`.
@@ -92,6 +105,8 @@ def training_defaults(
         f"{task} x {algo}": own_settings(kind, algo),
         f"variant {variant}": merged(*varied),
     }
+    if (memory or merged(*layers.values())["memory"]) != "none":
+        layers["memory"] = WITH_MEMORY
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for label, layer in layers.items():

