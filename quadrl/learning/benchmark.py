@@ -53,10 +53,13 @@ class Layer(NamedTuple):
     """One thing that is measured."""
 
     what: str
-    of: str  # the yardstick: bare mj_step on ALL_CORES or ONE_CORE, or another layer
+    of: str
+    """The yardstick: bare mj_step on ALL_CORES or ONE_CORE, or another layer."""
     work: Work
-    target: float | None = None  # share of the yardstick that it should reach
-    bare: bool = False  # a candidate for the yardstick itself; the fastest one is
+    target: float | None = None
+    """Share of the yardstick that it should reach."""
+    is_yardstick: str = ""
+    """The yardstick that it may be; of several the fastest is."""
 
 
 def benchmark(
@@ -79,29 +82,17 @@ def benchmark(
     with contextlib.ExitStack() as stack:
         layers = _layers(tasks.make(task), num_envs, stack)
         rates = _measure([layer.work for layer in layers], seconds, repeats)
-    yardsticks = {}
+    yardsticks: dict[str, list[float]] = {}
     for layer, measured in zip(layers, rates, strict=True):
-        yardsticks |= {of: measured for of in (FREE_FLIGHT, KERNEL) if layer.what.endswith(of)}
-    for of in (ALL_CORES, ONE_CORE):
-        bare = [r for layer, r in zip(layers, rates, strict=True) if layer.bare and layer.of == of]
-        yardsticks[of] = max(bare, key=statistics.median)
-    return {
-        "task": task,
-        "num_envs": num_envs,
-        "seconds": seconds,
-        "rates": [
-            {
-                "what": layer.what,
-                "rate": max(measured),
-                "repeats": measured,
-                "share": statistics.median(map(operator.truediv, measured, yardsticks[layer.of])),
-                "of": layer.of,
-                "target": layer.target,
-            }
-            for layer, measured in zip(layers, rates, strict=True)
-        ],
-        "machine": machine(),
-    }
+        best = yardsticks.get(layer.is_yardstick, measured)
+        yardsticks[layer.is_yardstick] = max(best, measured, key=statistics.median)
+    found = []
+    for layer, measured in zip(layers, rates, strict=True):
+        share = statistics.median(map(operator.truediv, measured, yardsticks[layer.of]))
+        row = {"what": layer.what, "rate": max(measured), "repeats": measured, "share": share}
+        found.append(row | {"of": layer.of, "target": layer.target})
+    given = {"task": task, "num_envs": num_envs, "seconds": seconds}
+    return {**given, "rates": found, "machine": machine()}
 
 
 def rows(measured: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -144,53 +135,56 @@ def _measure(works: list[Work], seconds: float, repeats: int) -> list[list[float
 def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Layer]:
     """Everything that is measured; what has to be closed goes to the stack."""
     gymnasium_id = f"quadrl/{task.name.title().replace('_', '')}-v0"
-    vehicle, size = Vehicle(), f"{num_envs:,}"
+    vehicle, size, free = Vehicle(), f"{num_envs:,}", f"{FREE_FLIGHT_ENVS:,}"
+    air = in_real_air(vehicle)
     model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.scene)
     pool = stack.enter_context(ThreadPoolExecutor(cores()))
     alone, loaded = gym.make(gymnasium_id), suite.make(task, random=0)
     vectors: Any = gym.make_vec(gymnasium_id, num_envs=num_envs)
     for env in (alone, loaded, vectors):
         stack.callback(env.close)
-    batch, free = _batched_mj_step(vehicle, model, num_envs), f"{FREE_FLIGHT_ENVS:,}"
-    air = in_real_air(vehicle)
-    many: list[tuple[Any, ...]] = [
-        ("mj_step, a loop on each core", _mj_step(vehicle, model, pool, cores()), None, True),
-        (f"mj_step, mujoco.batch of {size}", batch, None, True),
-        ("the same with mujoco's own stage clock", _with_clock(batch)),
-        (f"Environment of {size}", _environment(task, num_envs=num_envs), 0.90),
-        (f"Environment of {free}, {FREE_FLIGHT}", _in_free_flight(task), 20.0),
-        (f"Gymnasium make_vec of {size}", _vectors(vectors)),
+    batch = _batched_mj_step(vehicle, model, num_envs)
+    on_cores, on_core = (_mj_step(vehicle, model, pool, count) for count in (cores(), 1))
+    many = _environment(task, num_envs=num_envs)
+    flying, windy, differing, drawn = (
+        _environment(task, num_envs=FREE_FLIGHT_ENVS, engine="free_flight", **settings)
+        for settings in (
+            {},
+            {"vehicle": air, "weather": "light"},
+            {"randomization": DIFFERENT},
+            {"randomization": FULL},
+        )
+    )
+    one = _single(alone, model.nu, lambda step: step[2] or step[3])
+    ours = _single(loaded, model.nu, lambda step: step.last())
+    layers = [
+        Layer("mj_step, a loop on each core", ALL_CORES, on_cores, None, ALL_CORES),
+        Layer(f"mj_step, mujoco.batch of {size}", ALL_CORES, batch, None, ALL_CORES),
+        Layer("the same with mujoco's own stage clock", ALL_CORES, _with_clock(batch)),
+        Layer(f"Environment of {size}", ALL_CORES, many, 0.90),
+        Layer(f"Environment of {free}, {FREE_FLIGHT}", ALL_CORES, flying, 20.0, FREE_FLIGHT),
+        Layer("the same in real air and wind", FREE_FLIGHT, windy, 1 / 3),
+        Layer("the same, different aircraft", FREE_FLIGHT, differing, 0.90),
+        Layer("the same, all that is drawn", FREE_FLIGHT, drawn),
+        Layer(f"Gymnasium make_vec of {size}", ALL_CORES, _vectors(vectors)),
     ]
     if importlib.util.find_spec("torchrl"):
         collector = _collector(task, num_envs, stack)
-        many.append((f"TorchRL collector of {size} with a policy", collector, 0.75))
-    one: list[tuple[Any, ...]] = [
-        ("mj_step, a loop on one core", _mj_step(vehicle, model, pool, 1), None, True),
-        ("Gymnasium make, one aircraft", _single(alone, model.nu, lambda x: x[2] or x[3]), 0.35),
-        ("dm_control load, one aircraft", _single(loaded, model.nu, lambda x: x.last())),
-        (KERNEL, _free_flight(vehicle, HEIGHT)),
-    ]
-    disturbed: list[tuple[Any, ...]] = [
-        (
-            "the same in real air and wind",
-            _in_free_flight(task, vehicle=air, weather="light"),
-            1 / 3,
+        layers.append(
+            Layer(f"TorchRL collector of {size} with a policy", ALL_CORES, collector, 0.75)
+        )
+    return [
+        *layers,
+        Layer("mj_step, a loop on one core", ONE_CORE, on_core, None, ONE_CORE),
+        Layer("Gymnasium make, one aircraft", ONE_CORE, one, 0.35),
+        Layer("dm_control load, one aircraft", ONE_CORE, ours),
+        Layer(KERNEL, ONE_CORE, _free_flight(vehicle, HEIGHT), None, KERNEL),
+        Layer(f"{KERNEL} in air", KERNEL, _free_flight(air, HEIGHT), 1 / 3),
+        Layer(f"{KERNEL} near the ground", KERNEL, _free_flight(air, LOW), 1 / 3),
+        Layer(
+            f"{KERNEL}, different aircraft", KERNEL, _free_flight(vehicle, HEIGHT, DIFFERENT), 0.90
         ),
-        ("the same, different aircraft", _in_free_flight(task, randomization=DIFFERENT), 0.90),
-        ("the same, all that is drawn", _in_free_flight(task, randomization=FULL)),
     ]
-    kernels: list[tuple[Any, ...]] = [
-        (f"{KERNEL} in air", _free_flight(air, HEIGHT), 1 / 3),
-        (f"{KERNEL} near the ground", _free_flight(air, LOW), 1 / 3),
-        (f"{KERNEL}, different aircraft", _free_flight(vehicle, HEIGHT, DIFFERENT), 0.90),
-    ]
-    # The order of the table: what is disturbed follows what is not.
-    after = [layer[0] for layer in many].index(f"Environment of {free}, {FREE_FLIGHT}") + 1
-    groups = (
-        *((ALL_CORES, many[:after]), (FREE_FLIGHT, disturbed), (ALL_CORES, many[after:])),
-        *((ONE_CORE, one), (KERNEL, kernels)),
-    )
-    return [Layer(what, of, *rest) for of, group in groups for what, *rest in group]
 
 
 def _actions(*shape: int) -> Iterator[np.ndarray]:
@@ -267,10 +261,6 @@ def _free_flight(
             engine.ctrl[:] = next(commands)
             engine.advance(vehicle.substeps)
             yield count
-
-
-def _in_free_flight(task: Task, **settings: Any) -> Work:
-    return _environment(task, num_envs=FREE_FLIGHT_ENVS, engine="free_flight", **settings)
 
 
 def _environment(task: Task, **settings: Any) -> Work:
