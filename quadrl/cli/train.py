@@ -134,8 +134,11 @@ class Train:
             _draw(run, video=self.video)
             _list_files(run)
             return
-        configs = [TrainConfig(task or "hover", seed=k, **settings) for k in self._seeds(settings)]
-        where = self.out or Path("runs")
+        for name, other in (("--seed", settings.get("seed")), ("--resume", self.resume)):
+            if other is not None:
+                raise QuadrlError(name=name, value=str(other), allowed="left out beside --seeds")
+        seeds, where = parse_seeds(self.seeds), self.out or Path("runs")
+        configs = [TrainConfig(task or "hover", seed=seed, **settings) for seed in seeds]
         runs = []
         for config in configs:
             folder = names.free_folder(where / f"{config.task}-{config.algo}-{config.seed}")
@@ -173,41 +176,16 @@ class Train:
             kept = (folder / names.CONFIG).exists()
             advice = f"the run is kept, {go_on}" if kept else "choose another --out"
             raise QuadrlError(f"{reason(error)}; {advice}") from error
-        _sum_up(run, imports)
+        say(f"\n{run} (imports: {imports:.1f} s; engine: {config.engine})\n")
         if config.num_envs < FEW:
             say("Many aircraft train faster than few, with shorter rollouts: see --num-envs.\n")
         return run
-
-    def _seeds(self, settings: dict[str, Any]) -> list[int]:
-        """The numbers in --seeds.
-
-        Raises:
-            QuadrlError: They are no such numbers, or another option speaks against them.
-        """
-        for name, other in (("--seed", settings.get("seed")), ("--resume", self.resume)):
-            if other is not None:
-                raise QuadrlError(name=name, value=str(other), allowed="left out beside --seeds")
-        return parse_seeds(self.seeds)
 
 
 def given(settings: dict[str, Any]) -> dict[str, Any]:
     """The settings that are given, at any depth."""
     kept = {k: given(v) if isinstance(v, dict) else v for k, v in settings.items()}
     return {name: value for name, value in kept.items() if value not in (None, "", {})}
-
-
-def _sum_up(run: Run, imports: float) -> None:
-    """Print what the policy reached."""
-    config, metrics = run.config, run.evaluation.metrics
-    console.print(
-        f"\n[bold]{config.task}[/bold] trained with {config.algo.upper()} in "
-        f"{run.seconds:.1f} s of wall clock from the first step to the saved policy "
-        f"(imports: {imports:.1f} s; engine: {config.engine})\n"
-        f"{metrics['episodes']} episodes in MuJoCo with the mean action: "
-        f"{100 * metrics['survival_rate']:.0f} % to the end, "
-        f"{100 * metrics['success_rate']:.0f} % successful, error over the last 2 s "
-        f"{100 * metrics['position_error_m']:.1f} cm\n"
-    )
 
 
 def _draw(run: Run, *, video: bool) -> None:
@@ -257,18 +235,13 @@ def _compare(runs: list[Run], folder: Path) -> None:
     from quadrl.learning.show import curves
 
     head = ("run", "successful", "error over the last 2 s", "return", "training")
-    rows = []
-    for run in runs:
-        found = run.evaluation.metrics
-        rows.append(
-            (
-                str(run.folder),
-                f"{100 * found['success_rate']:.0f} %",
-                f"{100 * found['position_error_m']:.1f} cm",
-                f"{found['return_mean']:.0f}",
-                f"{run.seconds:.1f} s",
-            )
-        )
+    found = [(run, run.evaluation.metrics) for run in runs]
+    rows = [
+        (str(run.folder), f"{100 * reached['success_rate']:.0f} %",
+         f"{100 * reached['position_error_m']:.1f} cm", f"{reached['return_mean']:.0f}",
+         f"{run.seconds:.1f} s")
+        for run, reached in found
+    ]  # fmt: skip
     console.print("", make_table(head, rows, numbers=4))
     config = runs[0].config
     path = folder / f"{config.task}-{config.algo}-seeds.png"
