@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -91,3 +92,27 @@ def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) 
             reason = "what was saved is of another environment"
             allowed = f"{array.dtype} {array.shape}"
             raise QuadrlError(reason, name=name, value=found, allowed=allowed)
+
+
+class Columns:
+    """Where arrays (N, ...) stand in a table (rows, N), a row per number."""
+
+    def __init__(self, first: int, arrays: list[Any]) -> None:
+        """Lay them out from a row on, by their shapes."""
+        self._places: list[tuple[Any, int, tuple[int, ...]]] = []
+        self.end = first
+        for array in arrays:
+            tail = array.shape[1:]
+            start, self.end = self.end, self.end + math.prod(tail)
+            self._places.append((slice(start, self.end) if tail else start, len(tail), tail))
+
+    def views(self, table: np.ndarray) -> list[np.ndarray]:
+        """The arrays in a table."""
+        return [
+            table[place]
+            if not axes
+            else table[place].T
+            if axes == 1
+            else np.moveaxis(table[place].reshape(*tail, -1), -1, 0)
+            for place, axes, tail in self._places
+        ]

@@ -11,7 +11,6 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import functools
-import math
 import warnings
 import weakref
 from typing import Any
@@ -109,30 +108,6 @@ class _Rows(ctypes.Structure):
     ]
 
 
-class _Columns:
-    """Where arrays (N, ...) stand in a table (rows, N), a row per number."""
-
-    def __init__(self, first: int, arrays: list[Array]) -> None:
-        """Lay them out from a row on, by their shapes."""
-        self._places: list[tuple[Any, int, tuple[int, ...]]] = []
-        self.end = first
-        for array in arrays:
-            tail = array.shape[1:]
-            start, self.end = self.end, self.end + math.prod(tail)
-            self._places.append((slice(start, self.end) if tail else start, len(tail), tail))
-
-    def views(self, table: np.ndarray) -> list[np.ndarray]:
-        """The arrays in a table."""
-        return [
-            table[place]
-            if not axes
-            else table[place].T
-            if axes == 1
-            else np.moveaxis(table[place].reshape(*tail, -1), -1, 0)
-            for place, axes, tail in self._places
-        ]
-
-
 class _Page:
     """A table of all that a step gives, a row per number, and its named views."""
 
@@ -190,7 +165,7 @@ class CompiledStep(Step):
         kept = [*records.leaves(like), *records.leaves(episode)]
         if any(array.dtype != np.float64 for array in kept):
             raise NotCompilable("what it remembers is not all float64")
-        self.kept = _Columns(0, kept)
+        self.kept = records.Columns(0, kept)
         kinds = type(now.task), type(now.potentials)
         self._reads = Reads(self.task, METHODS, kinds)
         (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
@@ -254,8 +229,8 @@ class CompiledStep(Step):
         self.observed, self._rewarded = list(done.observation), list(done.reward_terms)
         seen = [*done.observation.values(), *(done.truth.values() if self._estimate else ())]
         rest = [*done.reward_terms.values(), done.reward, done.error]
-        self.seen = _Columns(self.kept.end, seen)
-        own = _Columns(self.seen.end, rest)
+        self.seen = records.Columns(self.kept.end, seen)
+        own = records.Columns(self.seen.end, rest)
         self.flags = own.end  # the row of flags, a byte each
         numbers, outputs = np.arange(self.flags)[:, None], {}
         for columns, arrays in ((self.kept, kept), (self.seen, seen), (own, rest)):

@@ -205,25 +205,25 @@ def test_without_a_compiler_a_task_is_run_as_it_is_written(monkeypatch):
 # --------------------------------------------------------------------- what may change elsewhere
 
 WEIGHT = 1.0
-SETTINGS = {"weight": 1.0}
+MAP = {"weight": 1.0}
+PAIR = (1.0, 2.0)
 FIXED = np.array([1.0])
 FIXED.flags.writeable = False
 
 
-class Curriculum:
-    weight = 1.0
-
-
 class Stage:
-    def __init__(self):
-        self.weight = 1.0
+    weight = 1.0
 
 
 STAGE = Stage()
 
 
 def weight_of_default(stage=STAGE):
-    return stage.weight
+    return stage.own
+
+
+def put_global(weight):
+    globals().update(WEIGHT=weight)
 
 
 def closed_over(value):
@@ -239,26 +239,14 @@ def closed_over(value):
 
 CLOSED, PUT = closed_over(1.0)
 FOLLOWED = {  # what a reward reads, how it changes, and what is said of it
-    "a global": (lambda: WEIGHT, lambda w: globals().update(WEIGHT=w), "WEIGHT, which it reads"),
-    "through a function": (
-        lambda: through_a_function(),
-        lambda w: globals().update(WEIGHT=w),
-        "WEIGHT, which it reads",
-    ),
-    "a class": (
-        lambda: Curriculum.weight,
-        lambda w: setattr(Curriculum, "weight", w),
-        "weight, which it reads",
-    ),
+    "a global": (lambda: WEIGHT, put_global, "WEIGHT, which it reads"),
+    "through a function": (lambda: through_a_function(), put_global, "WEIGHT, which it reads"),
+    "by name": (lambda: globals()["WEIGHT"], put_global, "globals"),
+    "a class": (lambda: Stage.weight, lambda w: setattr(Stage, "weight", w), "weight, which"),
     "a closure": (CLOSED, PUT, "value, which it reads"),
-    "a mapping": (
-        lambda: SETTINGS["weight"],
-        lambda w: SETTINGS.update(weight=w),
-        "it reads SETTINGS",
-    ),
-    "an object": (lambda: STAGE.weight, lambda w: setattr(STAGE, "weight", w), "it reads STAGE"),
-    "a default": (weight_of_default, lambda w: setattr(STAGE, "weight", w), "a default of"),
-    "by name": (lambda: globals()["WEIGHT"], lambda w: globals().update(WEIGHT=w), "globals"),
+    "a mapping": (lambda: MAP["weight"], lambda w: MAP.update(weight=w), "it reads MAP"),
+    "an object": (lambda: STAGE.own, lambda w: setattr(STAGE, "own", w), "it reads STAGE"),
+    "a default": (weight_of_default, lambda w: setattr(STAGE, "own", w), "a default of"),
 }
 
 
@@ -293,9 +281,6 @@ def test_what_cannot_change_is_compiled():
     assert not helpers.begun(variant(error=error), 2).not_compiled
 
 
-PAIR = (1.0, 2.0)
-
-
 def test_options_share_the_compiled_code(monkeypatch, tmp_path):
     monkeypatch.setenv("QUADRL_CACHE", str(tmp_path))
     native.compile_generated.cache_clear()
@@ -305,19 +290,23 @@ def test_options_share_the_compiled_code(monkeypatch, tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_what_a_transition_holds_is_its_own_but_the_observation():
-    environment = helpers.begun("hover", 3)
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("task", tasks.TASKS)
+def test_what_a_transition_holds_is_its_own_but_the_observation(task, compiled):
+    environment = helpers.begun(variant(tasks.TASKS[task], compiled=compiled), 3)
     held = [helpers.idle(environment) for _ in range(4)]
     kept = [arrays(dataclasses.replace(now, observation={}, truth={})) for now in held]
     copies = [{name: array.copy() for name, array in own.items()} for own in kept]
     seen = {name: array.copy() for name, array in held[-1].observation.items()}
-    helpers.idle(environment)
-    environment.reset()
+    for rows in ([1, 2], None):
+        environment.reset(rows)
+    if compiled:
+        helpers.idle(environment)  # as long as the state of an engine
+        for name, array in seen.items():
+            np.testing.assert_array_equal(held[-1].observation[name], array, err_msg=name)
     for own, copied in zip(kept, copies, strict=True):
         for name, array in own.items():
             np.testing.assert_array_equal(array, copied[name], err_msg=name)
-    for name, array in seen.items():  # is valid for one more step
-        np.testing.assert_array_equal(held[-1].observation[name], array, err_msg=name)
 
 
 # ------------------------------------------------------------------------------ single operations
