@@ -20,15 +20,12 @@ import numpy as np
 import safetensors.numpy
 
 from quadrl import tasks
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.core.environment import Environment
 from quadrl.core.rules import ROWS, blame, check_rules, require, require_equal, varied_actions
 from quadrl.core.task import Task
 
-PAPER = Vehicle()
 EPISODE = 2.4  # [s], the longest that is flown in the APIs
 SEED = 3
-COORDINATES = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
 
 
 def check_task(task: str | Task | type[Task]) -> None:

@@ -14,16 +14,8 @@ from quadrl.base.validation import number
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
-from quadrl.core.task import (
-    OBSERVATION,
-    TARGET_VELOCITY,
-    EpisodeEnd,
-    Potentials,
-    Snapshot,
-    Target,
-    Task,
-    TaskState,
-)
+from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY
+from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
 

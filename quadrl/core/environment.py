@@ -28,8 +28,9 @@ from quadrl.conditions.weather import Weather, Weathered, WeatherProcess
 from quadrl.control import modes
 from quadrl.core import catalogue, compiled, observer, saving, transition
 from quadrl.core.markers import Marker
+from quadrl.core.observation import layout
 from quadrl.core.step import Inputs, Step
-from quadrl.core.task import Snapshot, Task, layout
+from quadrl.core.task import Snapshot, Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
 from quadrl.engines import mujoco
 from quadrl.engines.engine import Engine, EngineName

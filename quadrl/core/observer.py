@@ -16,8 +16,9 @@ from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import NONE
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.conditions.sampler import AircraftSampler
+from quadrl.core.observation import ObservationTerm, layout
 from quadrl.core.snapshot import Snapshot
-from quadrl.core.task import ObservationTerm, Task, layout
+from quadrl.core.task import Task
 from quadrl.core.transition import Transition, observe
 from quadrl.engines import native
 from quadrl.engines.dynamics import thrust_wrench

@@ -8,7 +8,7 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.core.environment import Environment
-from quadrl.core.task import layout
+from quadrl.core.observation import layout
 from quadrl.learning.config import TrainConfig
 
 DRAWN = 16  # goal states that are compared

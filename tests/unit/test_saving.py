@@ -106,22 +106,15 @@ def test_wind_that_somebody_sets_survives_save_and_restore(engine):
     assert (apart[1:, 7:10].max(axis=1) > 1e-3).all()  # [m/s]
 
 
-def test_parameters_of_another_aircraft_are_not_restored():
-    saved = flying(randomization=None).save()
-    other = flying(randomization=None, vehicle=dataclasses.replace(PAPER, mass=0.7))
-    before = drawn(other)
-    with pytest.raises(QuadrlError) as caught:
-        other.restore(saved)
-    assert "parameters" in caught.value.name
-    np.testing.assert_array_equal(drawn(other), before)
-
-
-def test_rows_that_the_randomization_cannot_hold_are_not_restored():
-    other = flying(randomization={"mass": (0.9, 1.1)})
-    before = drawn(other)
-    heavy = dataclasses.replace(PAPER, inertia=(8e-3, 8e-3, 1.4e-2))
-    wrong = flying(randomization={"mass": (0.9, 1.1)}, vehicle=heavy).save()
-    broken = other.save()
+@pytest.mark.parametrize(
+    ("randomization", "changed"),
+    [(None, {"mass": 0.7}), ({"mass": (0.9, 1.1)}, {"inertia": (8e-3, 8e-3, 1.4e-2)})],
+)
+def test_the_state_of_another_aircraft_is_not_restored(randomization, changed):
+    other = flying(randomization=randomization)
+    before, broken = drawn(other), other.save()
+    vehicle = dataclasses.replace(PAPER, **changed)
+    wrong = flying(randomization=randomization, vehicle=vehicle).save()
     broken["engine.rows"][0, 0] = np.nan
     for saved, name in ((wrong, "engine.parameters"), (broken, "engine.rows")):
         with pytest.raises(QuadrlError) as caught:

@@ -1,0 +1,48 @@
+"""Named entries of observations: what each is, and where it stands in the flat vector."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationTerm:
+    """One named entry of the observation."""
+
+    size: int
+    """Numbers in it; per rotor where `per_rotor`."""
+    unit: str
+    meaning: str
+    """And the frame."""
+    per_rotor: bool = False
+
+    def width(self, rotors: int) -> int:
+        """Numbers in it for an aircraft with some rotors."""
+        return self.size * rotors if self.per_rotor else self.size
+
+
+def layout(terms: Mapping[str, ObservationTerm], rotors: int) -> dict[str, slice]:
+    """Where each term stands in the flat vector of an aircraft with some rotors."""
+    ends = list(itertools.accumulate(term.width(rotors) for term in terms.values()))
+    return dict(zip(terms, map(slice, [0, *ends], ends), strict=False))
+
+
+OBSERVATION = {
+    "position": ObservationTerm(3, "m", "world frame, from the origin of the task's frame"),
+    "sin_attitude": ObservationTerm(3, "1", "sine of roll, pitch and yaw (Z-Y-X)"),
+    "cos_attitude": ObservationTerm(3, "1", "cosine of roll, pitch and yaw"),
+    "velocity": ObservationTerm(3, "m/s", "body frame"),
+    "body_rate": ObservationTerm(3, "rad/s", "angular velocity, body frame"),
+    "rotor_speed": ObservationTerm(1, "1", "over the largest rotor speed", per_rotor=True),
+    "goal": ObservationTerm(3, "m", "from the aircraft to the goal, body frame"),
+}
+"""The observation of every task, in the order of the flat vector."""
+
+TARGET_VELOCITY = {
+    "target_velocity": ObservationTerm(
+        3, "m/s", "of the target relative to the aircraft, body frame"
+    )
+}
+"""What tasks with a moving target add at the end."""
