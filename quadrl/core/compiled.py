@@ -29,6 +29,7 @@ from quadrl.core.task import Task
 from quadrl.core.transition import Episode, Transition, finish
 from quadrl.engines import native
 from quadrl.engines.engine import padded
+from quadrl.engines.native import compiling
 from quadrl.engines.state import State
 
 METHODS = ("measure", "terminated", "error", "succeeded", "reward", "update", "observe")
@@ -174,7 +175,9 @@ class CompiledStep(Step):
         if loops and "last_state[" in body:
             raise NotCompilable("the control mode reads the state in between, into the same memory")
         try:
-            self._call = native.compile_generated(SOURCE.format(flags=self.flags, body=body)).step
+            self._call = compiling.compile_generated(
+                SOURCE.format(flags=self.flags, body=body)
+            ).step
         except NativeError as error:
             raise NotCompilable(str(error).partition("\n")[0]) from error
         self._call.argtypes, self._call.restype = [ctypes.c_void_p, ctypes.c_int64], None

@@ -31,6 +31,7 @@ from quadrl.core.markers import Marker
 from quadrl.deploy import flights
 from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import world
+from quadrl.engines.native import compiling
 from quadrl.engines.state import c_rows
 from quadrl.evaluation.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
 from quadrl.rendering import drawing
@@ -177,7 +178,7 @@ def compile_flights(source: str) -> bytes:
     names = BUILD / "exported.json"
     names.write_text(json.dumps([f"_{name}" for name in exported]))
     folder = Path(native.__file__).parent
-    kept = [flag for flag in native.FLAGS if flag not in ("-fPIC", "-shared")]
+    kept = [flag for flag in compiling.FLAGS if flag not in ("-fPIC", "-shared")]
     command = [
         *("emcc", *kept, "-Wno-logical-op-parentheses", f"-I{BUILD}", f"-I{folder}"),
         *(str(folder / name) for name in KERNELS),

@@ -23,8 +23,9 @@ from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR
 from quadrl.aircraft.parameters import AIR, AIRCRAFT, MAX_ROTORS, ROW_SIZE, Parameters
 from quadrl.base.rotation import Array
 from quadrl.base.trace import Trace
-from quadrl.engines import dynamics, native
+from quadrl.engines import dynamics
 from quadrl.engines.free_flight import LANES
+from quadrl.engines.native import compiling
 
 COORDINATES = 13
 """Numbers of a motion beside its rotor speeds: 7 of qpos, 6 of qvel."""
@@ -80,7 +81,9 @@ def kernel(effects: int, rotors: int) -> Callable[[int, int, int], None]:
         NativeError: There is no compiler, or it refused the sources.
     """
     written = {"reverse.h": reverse(effects, rotors)}
-    function = native.open_library(native.build(("adjoint.c",), "adjoint", written)).quadrl_adjoint
+    function = compiling.open_library(
+        compiling.build(("adjoint.c",), "adjoint", written)
+    ).quadrl_adjoint
     function.restype = None
     function.argtypes = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64]
     return function

@@ -17,6 +17,7 @@ from apis import APIS
 import quadrl
 from quadrl.core.environment import Environment
 from quadrl.engines import native
+from quadrl.engines.native import compiling
 from quadrl.testing import varied_actions
 
 REPOSITORY = Path(quadrl.__file__).parents[1]
@@ -26,7 +27,7 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(REPOSITORY)}
 def test_processes_that_build_at_once_do_not_disturb_each_other(tmp_path):
     settings = {"QUADRL_CACHE": str(tmp_path / "cache"), "QUADRL_CFLAGS": "-O0"}
     environment = ENVIRONMENT | settings
-    code = "from quadrl.engines import native; print(native.build()); native.load(native.build())"
+    code = "from quadrl.engines.native import build, load; print(build()); load(build())"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     command = [sys.executable, "-c", code]
     running = [subprocess.Popen(command, env=environment, **pipes) for _ in range(4)]
@@ -45,11 +46,11 @@ def test_a_library_for_another_mujoco_is_refused(tmp_path, monkeypatch):
     line = f"#define mjVERSION_HEADER {running}"
     assert line in header.read_text()
     header.write_text(header.read_text().replace(line, line + "0"))
-    path = native.build(include=tmp_path / "include")
+    path = compiling.build(include=tmp_path / "include")
     with pytest.raises(native.NativeError, match=rf"{running}0.*{running}\b"):
         native.load(path)
     # The one for this mujoco stands beside it under another name.
-    right = native.build()
+    right = compiling.build()
     assert right != path
     assert native.load(right).quadrl_mujoco_version() == running
 

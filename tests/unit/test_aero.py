@@ -14,6 +14,7 @@ import pytest
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
 from quadrl.engines import dynamics, native
+from quadrl.engines.native import compiling
 
 LANES = 8
 SHIM = """
@@ -50,7 +51,15 @@ def shim(tmp_path_factory):
     (folder / "layout.h").write_text(parameters.c_structs())
     (folder / "shim.c").write_text(SHIM)
     include = f"-I{Path(native.__file__).parent}"
-    command = [native.compiler(), *native.FLAGS, "-O1", include, f"-I{folder}", "-o", "shim.so"]
+    command = [
+        compiling.compiler(),
+        *compiling.FLAGS,
+        "-O1",
+        include,
+        f"-I{folder}",
+        "-o",
+        "shim.so",
+    ]
     subprocess.run([*command, "shim.c", "-lm"], check=True, cwd=folder)
     return ctypes.CDLL(str(folder / "shim.so")).shim
 

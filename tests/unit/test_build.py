@@ -12,13 +12,14 @@ import pytest
 
 import quadrl
 from quadrl.engines import native
+from quadrl.engines.native import compiling
 
 
 @pytest.fixture
 def copying_compiler(tmp_path, monkeypatch):
     """A compiler that is done at once: it gives out a copy of the library that there is."""
     program = tmp_path / "copying-cc"
-    copy = f'while [ "$1" != -o ]; do shift; done; cp "{native.build()}" "$2"'
+    copy = f'while [ "$1" != -o ]; do shift; done; cp "{compiling.build()}" "$2"'
     program.write_text(f"#!/bin/sh\n{copy}\n")
     program.chmod(0o755)
     monkeypatch.setenv("CC", str(program))
@@ -37,7 +38,7 @@ def test_without_a_compiler_the_error_says_what_to_install(cache, monkeypatch, t
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
     with pytest.raises(native.NativeError, match="apt-get install build-essential"):
-        native.build()
+        compiling.build()
     assert list(cache.iterdir()) == []  # nothing half-made
 
 
@@ -46,25 +47,25 @@ def test_cc_names_the_compiler_and_what_it_says_is_quoted(cache, monkeypatch, tm
     chosen.write_text("#!/bin/sh\necho 'no such target: toaster' >&2\nexit 1\n")
     chosen.chmod(0o755)
     monkeypatch.setenv("CC", str(chosen))
-    assert native.compiler() == str(chosen)
+    assert compiling.compiler() == str(chosen)
     with pytest.raises(native.NativeError, match="no such target: toaster"):
-        native.build()
+        compiling.build()
     assert list(cache.iterdir()) == []
 
 
 def test_the_cache_is_used_and_other_flags_make_another_library(
     copying_compiler, cache, monkeypatch, tmp_path
 ):
-    path = native.build()
+    path = compiling.build()
     assert list(cache.iterdir()) == [path]
     built = path.stat().st_mtime_ns
     monkeypatch.setenv("QUADRL_CFLAGS", "-O0 -DQUADRL_SAID='a word'")
-    assert native.flags()[-2:] == ("-O0", "-DQUADRL_SAID=a word")
-    assert native.build() != path and len(list(cache.iterdir())) == 2
+    assert compiling.flags()[-2:] == ("-O0", "-DQUADRL_SAID=a word")
+    assert compiling.build() != path and len(list(cache.iterdir())) == 2
     monkeypatch.setenv("QUADRL_CFLAGS", "-O0")
     monkeypatch.setenv("PATH", str(tmp_path))  # no compiler any more
     monkeypatch.delenv("CC", raising=False)
-    assert native.build() == path
+    assert compiling.build() == path
     assert path.stat().st_mtime_ns == built
 
 
@@ -79,7 +80,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
     monkeypatch.setenv("QUADRL_CACHE", str(impossible))
-    path = native.build()
+    path = compiling.build()
     assert path.is_relative_to(tmp_path / "tmp")
     assert native.load(path).quadrl_mujoco_version() == mujoco.mj_version()
 
@@ -87,7 +88,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(
 def generated(function="f"):
     """A library of generated C, loaded as for the first time."""
     seen = '__attribute__((visibility("default")))'
-    return native.compile_generated.__wrapped__(f"{seen} int {function}(void) {{ return 1; }}")
+    return compiling.compile_generated.__wrapped__(f"{seen} int {function}(void) {{ return 1; }}")
 
 
 DAMAGES = {
@@ -110,24 +111,24 @@ def test_a_damaged_library_is_never_loaded_but_built_anew(cache, damage):
 
 @pytest.mark.parametrize("name", ["mujoco", "adjoint"])
 def test_the_other_kinds_of_library_are_checked_as_well(copying_compiler, cache, name):
-    path = native.build(name=name)
+    path = compiling.build(name=name)
     whole = path.read_bytes()
     path.write_bytes(whole[:4096])
-    assert native.build(name=name) == path and path.read_bytes() == whole
+    assert compiling.build(name=name) == path and path.read_bytes() == whole
 
 
 def test_a_library_without_a_digest_of_an_earlier_version_is_built_anew(copying_compiler, cache):
-    path = native.build()
+    path = compiling.build()
     path.unlink()
     product, name, version, key, *_ = path.stem.split("-")
     path.with_name(f"{product}-{name}-{version}-{key}.so").write_bytes(b"cut short")
-    assert native.load(native.build()).quadrl_mujoco_version() == mujoco.mj_version()
+    assert native.load(compiling.build()).quadrl_mujoco_version() == mujoco.mj_version()
 
 
 def test_what_the_system_does_not_load_is_said_in_a_line(cache, monkeypatch):
     monkeypatch.setenv("QUADRL_CFLAGS", "-O0 -Wl,-z,now")
     with pytest.raises(native.NativeError, match="cannot be loaded.*nowhere.*QUADRL_CACHE"):
-        native.compile_generated("int nowhere(void); int f(void) { return nowhere(); }")
+        compiling.compile_generated("int nowhere(void); int f(void) { return nowhere(); }")
 
 
 @pytest.fixture
@@ -139,7 +140,7 @@ def run(tmp_path, cache):
     processes = []
 
     def start(code, **variables):
-        code = f"from quadrl.engines import native; {code}"
+        code = f"from quadrl.engines.native import compiling, library; {code}"
         environment = os.environ | settings | variables
         command = [sys.executable, "-c", code]
         processes.append(subprocess.Popen(command, env=environment, start_new_session=True))
@@ -154,9 +155,9 @@ def run(tmp_path, cache):
 @pytest.mark.parametrize(
     ("code", "compiler"),
     [
-        ("native.library(), native.compile_generated('int f;')", None),
-        ("native.build(), native.build(name='again')", None),
-        ("native.build()", "false"),
+        ("library(), compiling.compile_generated('int f;')", None),
+        ("compiling.build(), compiling.build(name='again')", None),
+        ("compiling.build()", "false"),
     ],
     ids=["loaded", "never loaded", "refused"],
 )
@@ -183,7 +184,7 @@ def test_what_a_killed_build_left_is_removed_by_the_next_one_but_not_a_living_on
     builders = []
     for name in ("dead", "living"):
         said = tmp_path / name
-        builders.append(run("native.build()", CC=str(program), SAID=str(said), **variables))
+        builders.append(run("compiling.build()", CC=str(program), SAID=str(said), **variables))
         while not said.exists():
             assert builders[-1].poll() is None
             time.sleep(0.01)
@@ -192,7 +193,7 @@ def test_what_a_killed_build_left_is_removed_by_the_next_one_but_not_a_living_on
     os.killpg(builders[0].pid, signal.SIGKILL)
     builders[0].wait()
     assert dead.exists()
-    assert run("native.compile_generated('int f;')", **variables).wait() == 0
+    assert run("compiling.compile_generated('int f;')", **variables).wait() == 0
     assert not dead.exists() and (living / "ccXYZ.o").exists()
     assert not list((tmp_path / "tmp").glob("cc*"))
     os.killpg(builders[1].pid, signal.SIGKILL)

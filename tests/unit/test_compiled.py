@@ -12,7 +12,7 @@ from quadrl import tasks
 from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace
 from quadrl.core.environment import Environment
-from quadrl.engines import native
+from quadrl.engines.native import compiling
 from quadrl.tasks.hover import Hover
 
 STEPS = 40
@@ -197,7 +197,7 @@ def test_without_a_compiler_a_task_is_run_as_it_is_written(monkeypatch):
     def fail(source):
         raise NativeError("there is no C compiler\nof any name")
 
-    monkeypatch.setattr(native, "compile_generated", fail)
+    monkeypatch.setattr(compiling, "compile_generated", fail)
     with pytest.warns(QuadrlWarning, match="not compiled: there is no C compiler;"):
         helpers.idle(helpers.begun(variant()))
 
@@ -283,7 +283,7 @@ def test_what_cannot_change_is_compiled():
 
 def test_options_share_the_compiled_code(monkeypatch, tmp_path):
     monkeypatch.setenv("QUADRL_CACHE", str(tmp_path))
-    native.compile_generated.cache_clear()
+    compiling.compile_generated.cache_clear()
     for limit, weight in ((5.0, 17.0), (7.0, 19.0)):
         task = tasks.make("hover", time_limit=limit, progress_weight=weight)
         assert not helpers.begun(task, 1).not_compiled
@@ -328,7 +328,7 @@ def run(compute, *columns):
         "const double* c, const double* state, double* out)\n{ for (int64_t i = 0; i < n; ++i) {\n"
         f"{body} }} }}".replace("void step", '__attribute__((visibility("default"))) void step')
     )
-    step = native.compile_generated(source).step
+    step = compiling.compile_generated(source).step
     step.argtypes, step.restype = [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 3, None
     table, constants = np.array(columns, dtype=float), np.array([*trace.constants, 0.0])
     out = np.empty(table.shape[1])

@@ -12,7 +12,7 @@ from quadrl.base.philox import START
 from quadrl.control.geometric import GeometricController
 from quadrl.core.environment import Environment
 from quadrl.deploy import flights
-from quadrl.engines import native
+from quadrl.engines.native import compiling
 from quadrl.engines.rng import uniform
 
 
@@ -23,7 +23,9 @@ class Memory:
         self.numbers = np.zeros(sum(flights.PARTS.values()))
         written = flights.write(environment)
         self.drawn = written.drawn
-        self._library = native.compile_generated("#include <math.h>\n" + exported(written.source))
+        self._library = compiling.compile_generated(
+            "#include <math.h>\n" + exported(written.source)
+        )
         self._prefix = f"{environment.task.name}_{environment.vehicle.name}"
 
     def __getitem__(self, part):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from quadrl.engines import native
+from quadrl.engines.native import compiling
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "sanitize"
 FAULTS = {
@@ -55,7 +55,7 @@ def built(tmp_path_factory):
         for k, body in enumerate(FAULTS.values())
     ]
     (folder / "fault.c").write_text("\n".join(["#include <stdlib.h>", *bodies, ""]))
-    command = ["gcc", *native.FLAGS, *flags(), "-fvisibility=default", "-w", "-o", "fault.so"]
+    command = ["gcc", *compiling.FLAGS, *flags(), "-fvisibility=default", "-w", "-o", "fault.so"]
     subprocess.run([*command, "fault.c"], check=True, cwd=folder)
     return folder / "fault.so"
 
@@ -78,5 +78,5 @@ def test_a_deliberate_fault_is_caught(fault, built):
 
 @pytest.mark.skipif("ASAN_OPTIONS" not in os.environ, reason="not run by scripts/sanitize")
 def test_the_library_in_use_is_the_sanitized_one():
-    assert "-fsanitize=address,undefined" in native.flags()
-    assert b"__asan_" in native.build().read_bytes()
+    assert "-fsanitize=address,undefined" in compiling.flags()
+    assert b"__asan_" in compiling.build().read_bytes()

@@ -1,63 +1,31 @@
 """The compiled part: callbacks of the rotors, free flight, state, weather, random numbers.
 
-The C sources beside this file are compiled at first use with the machine's own compiler against
-the headers of the installed mujoco, because they read the structs of exactly that version. The
-library is kept in a cache folder (`$QUADRL_CACHE`, else the user's cache folder), one for each
-version of mujoco, of the sources and of the flags; `$QUADRL_CFLAGS` adds flags at the end of
-these (`scripts/sanitize` does). Its name ends with a digest of its bytes, so that one that was
-damaged is known before it is loaded, and built anew. `layout.h`, which declares a row of parameters
-and the rows of the state and of the weather, is written into the build from
-`quadrl.aircraft.parameters`, `quadrl.engines.state` and `quadrl.engines.air`.
+Its sources stand beside this file; `compiling` says when and how they are compiled.
 """
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import ctypes
 import functools
-import hashlib
 import os
-import platform
-import shlex
-import shutil
-import subprocess
-import sys
-import tempfile
 import threading
 import warnings
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from quadrl.aircraft.parameters import c_structs
 from quadrl.base.errors import NativeError
-from quadrl.base.files import lock, put
-from quadrl.engines.air import c_weather
-from quadrl.engines.state import c_rows
+from quadrl.engines.native.compiling import build, open_library
 
-SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
-           "disturbances.c", "solids.c", "warnings.c")  # fmt: skip
-HEADERS = ("aero.h", "export.h", "philox.h", "runge_kutta.h", "solids.h")
 MARK_SLOT = 9
 """Entry of an actuator's `dynprm` that holds MARK."""
-# No contraction: a fused multiply-add would round otherwise than NumPy does.
-FLAGS = (
-    "-std=c11",
-    "-O3",
-    "-fPIC",
-    "-shared",
-    "-fvisibility=hidden",
-    "-ffp-contract=off",
-    "-fno-math-errno",
-)
 CALLBACKS = ("act_dyn", "act_gain", "passive")
 MAX_WARNINGS = 500
 """Lines of a file of MuJoCo's warnings: at most 60 kB."""
 
-_FOLDER = Path(__file__).parent
 _POINTER = ctypes.c_void_p
 _ACTUATOR_CALLBACK = ctypes.CFUNCTYPE(ctypes.c_double, _POINTER, _POINTER, ctypes.c_int)
 _KINDS = {
@@ -67,180 +35,6 @@ _KINDS = {
     "time": ctypes.CFUNCTYPE(ctypes.c_double),
     "warning": ctypes.CFUNCTYPE(None, ctypes.c_char_p),
 }
-_SCRATCH = "quadrl-build-"
-_ALONE: dict[Path, contextlib.ExitStack] = {}
-"""Libraries of this process alone that are not loaded yet, and what removes each."""
-
-
-def cache_folder() -> Path:
-    """The folder of compiled libraries: `$QUADRL_CACHE` or the user's cache folder."""
-    if chosen := os.environ.get("QUADRL_CACHE"):
-        return Path(chosen)
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "quadrl"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "quadrl"
-
-
-def flags() -> tuple[str, ...]:
-    """What the compiler is given: FLAGS, and those of `$QUADRL_CFLAGS`."""
-    return (*FLAGS, *shlex.split(os.environ.get("QUADRL_CFLAGS", "")))
-
-
-def compiler() -> str:
-    """Path of the C compiler: `$CC`, cc, gcc or clang.
-
-    Raises:
-        NativeError: None is there; the message says what to install.
-    """
-    for name in filter(None, (os.environ.get("CC"), "cc", "gcc", "clang")):
-        if path := shutil.which(name):
-            return path
-    raise NativeError(
-        "no C compiler found (looked for $CC, cc, gcc, clang); install one: "
-        "`apt-get install build-essential` on Debian or Ubuntu, `dnf install gcc` on Fedora, "
-        "`xcode-select --install` on macOS"
-    )
-
-
-def build(
-    sources: Sequence[str] = SOURCES,
-    name: str = "mujoco",
-    generated: Mapping[str, str] | None = None,
-    include: Path | None = None,
-) -> Path:
-    """Compile a library unless the cache holds it.
-
-    Args:
-        sources: Files beside this one.
-        name: Of the library, with the version of mujoco behind it.
-        generated: Headers that they include besides, by name.
-        include: Folder with mujoco's headers; None for those of the installed package.
-
-    Returns:
-        The path of the shared library.
-
-    Raises:
-        NativeError: There is no compiler, or it refused the sources.
-    """
-    include = include or Path(mujoco.__file__).parent / "include"
-    digest = hashlib.sha256(" ".join((*flags(), platform.machine(), str(include))).encode())
-    written = {"layout.h": c_structs() + c_rows() + c_weather()} | dict(generated or {})
-    digest.update("".join(written.values()).encode())
-    for file in (*HEADERS, *sources):
-        digest.update((_FOLDER / file).read_bytes())
-    digest.update((include / "mujoco" / "mujoco.h").read_bytes())
-    whole = f"quadrl-{name}-{mujoco.__version__}-{digest.hexdigest()[:16]}"
-    paths = [str(_FOLDER / source) for source in sources]
-    return _cached(whole, [f"-I{include}", *paths], written)
-
-
-@functools.cache
-def compile_generated(source: str) -> ctypes.CDLL:
-    """A library of C that was generated, compiled unless the cache holds it.
-
-    Raises:
-        NativeError: There is no compiler, or it refused the source.
-    """
-    digest = hashlib.sha256(" ".join((*flags(), platform.machine(), source)).encode())
-    name = digest.hexdigest()[:16]
-    return open_library(_cached(f"quadrl-generated-{name}", [], {f"{name}.c": source}))
-
-
-def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
-    """A library of the cache, compiled first where there is no sound one.
-
-    Args:
-        name: Of its file, without digest and ending; another one for other contents.
-        arguments: Further ones of the compiler.
-        written: Files that are written first, by name: headers, and sources to compile.
-    """
-    folder = cache_folder()
-    with contextlib.suppress(OSError):  # a folder that may not be looked into
-        for path in folder.glob(f"{name}-*.so"):
-            if path == _place(path, name):
-                return path
-    with contextlib.ExitStack() as stack:
-        try:
-            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            scratch = stack.enter_context(_scratch(folder))
-        except OSError:  # a read-only home: a library for this process alone
-            scratch = stack.enter_context(_scratch(Path(tempfile.gettempdir())))
-            folder = scratch
-        for file, text in written.items():
-            (scratch / file).write_text(text)
-        sources = [f"{scratch}/{file}" for file in written if file.endswith(".c")]
-        command = [compiler(), *flags(), f"-I{scratch}", "-o", f"{scratch}/built.so"]
-        command += [*arguments, *sources, "-lm"]
-        # What a compiler that is killed leaves behind goes with the rest.
-        environment = os.environ | {"TMPDIR": str(scratch)}
-        outcome = subprocess.run(command, capture_output=True, text=True, env=environment)
-        if outcome.returncode != 0:
-            raise NativeError(
-                f"the C compiler failed: {' '.join(command)}\n{outcome.stderr.strip()[-2000:]}"
-            )
-        path = folder / _place(scratch / "built.so", name).name
-        put(scratch / "built.so", path)
-        if folder == scratch:
-            _ALONE[path] = stack.pop_all()
-            atexit.register(_ALONE[path].close)  # if it is never loaded
-    return path
-
-
-def _place(library: Path, name: str) -> Path:
-    """Where a library belongs by its name and its bytes, in its folder."""
-    digest = hashlib.sha256(library.read_bytes()).hexdigest()
-    return library.with_name(f"{name}-{digest[:16]}.so")
-
-
-@contextlib.contextmanager
-def _scratch(folder: Path) -> Generator[Path]:
-    """A new folder in another one, for a build; those that killed builds left there are removed.
-
-    A build holds the lock of its folder: one that can be locked belongs to nobody any more.
-    """
-    for left in folder.glob(f"{_SCRATCH}*"):
-        with contextlib.suppress(OSError):
-            descriptor = lock(left)
-            shutil.rmtree(left, ignore_errors=True)
-            os.close(descriptor)
-    path, descriptor = _locked(folder)
-    try:
-        yield path
-    finally:
-        shutil.rmtree(path, ignore_errors=True)
-        if descriptor is not None:
-            os.close(descriptor)
-
-
-def _locked(folder: Path) -> tuple[Path, int | None]:
-    """A new folder in another one, and the descriptor that locks it, if the file system can."""
-    while True:
-        path = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=folder))
-        try:
-            descriptor = lock(path)
-        except (BlockingIOError, FileNotFoundError):
-            continue  # another build was faster, and takes it for one that was left
-        except OSError:
-            return path, None  # nor can another build lock and remove it
-        if path.exists():
-            return path, descriptor
-        os.close(descriptor)
-
-
-def open_library(path: Path) -> ctypes.CDLL:
-    """Open a compiled library; one for this process alone leaves no file behind.
-
-    Raises:
-        NativeError: The system refuses it.
-    """
-    try:
-        return ctypes.CDLL(str(path))
-    except OSError as error:
-        reason = f"the compiled library cannot be loaded: {error}; $QUADRL_CACHE names a folder"
-        raise NativeError(f"{reason} that programs may be run from") from error
-    finally:
-        if stack := _ALONE.pop(path, None):
-            stack.close()
 
 
 def load(path: Path) -> ctypes.CDLL:
