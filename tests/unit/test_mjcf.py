@@ -45,8 +45,7 @@ def test_every_layout_has_what_is_drawn(vehicle):
 def test_a_layout_is_drawn(cheap_pictures, name):
     with Renderer(mjcf.compile_model(helpers.LAYOUTS[name]), 160, 120) as renderer:
         pictures = [renderer.frame([0, y, 3, 1, 0, 0, 0], camera="fixed") for y in (0, 50)]
-        closer = renderer.frame([0, 0, 3, 1, 0, 0, 0])
-    assert closer.std() > 10 and (pictures[0] != pictures[1]).any()
+    assert (pictures[0] != pictures[1]).any()
 
 
 KINDS = "geom site cam light mat mesh tex".split()

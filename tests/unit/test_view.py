@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from quadrl import cli, tasks
 from quadrl.aircraft.presets import resolve
-from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Mesh, Primitive
 from quadrl.cli.view import others
 from quadrl.core.markers import Marker
@@ -90,41 +89,29 @@ def test_between_two_steps_the_aircraft_is_drawn_between_their_poses():
     assert (np.abs((drawn[:, 3:7] * flight.pose[:, 3:7]).sum(1)) > 0.99).all()
 
 
-def test_wind_blows_in_the_engine_and_is_felt():
-    calm, windy = hover(2), hover(2)
+def test_wind_is_felt_and_blows_on_in_the_next_episode():
+    calm, windy = (hover(2, time_limit=10 * STEP, settle_time=STEP) for _ in range(2))
     windy.wind[:] = (6.0, 0.0, 0.0)
-    for flight in (calm, windy):
-        for _ in range(10):
-            flight.step()
-    np.testing.assert_array_equal(windy.environment.engine.wind, [[6.0, 0.0, 0.0]] * 2)
+    for _ in range(9):
+        calm.step()
+        windy.step()
     assert (windy.pose[:, 0] > calm.pose[:, 0] + 1e-3).all()
-
-
-def test_wind_blows_on_in_the_next_episode():
-    flight = hover(1, time_limit=2 * STEP, settle_time=STEP)
-    flight.wind[:] = (0.0, 2.0, 0.0)
-    for _ in range(3):
-        flight.step()
-    assert flight.episodes == 1
-    np.testing.assert_array_equal(flight.environment.engine.wind, [[0.0, 2.0, 0.0]])
+    for _ in range(2):
+        windy.step()
+    assert windy.episodes == 2
+    np.testing.assert_array_equal(windy.environment.engine.wind, [[6.0, 0.0, 0.0]] * 2)
 
 
 def test_a_push_changes_the_velocity_of_one_aircraft():
     flight = hover(2)
-    was = flight.environment.engine.qvel.copy()
+    was, height = flight.environment.engine.qvel.copy(), flight.pose[:, 2].copy()
     flight.push(np.array([0.0, 0.0, 2.0]), 1)
     np.testing.assert_allclose(flight.environment.engine.qvel - was, [[0] * 6, [0, 0, 2, 0, 0, 0]])
-    height = flight.pose[:, 2].copy()
     flight.step()
     rose = flight.pose[:, 2] - height
     assert rose[1] - rose[0] > 0.5 * 2.0 * STEP
-
-
-def test_blades_turn_as_the_rotors_do():
-    flight = hover()
-    flight.step()
     spins = np.sign([rotor.spin for rotor in VEHICLE.rotors])
-    np.testing.assert_array_equal(np.sign(flight.pose[0, 7:]), spins)
+    np.testing.assert_array_equal(np.sign(flight.pose[0, 7:]), spins)  # and the blades turn
 
 
 def test_an_episode_that_ends_begins_anew_without_a_jump_in_the_picture():
@@ -159,24 +146,6 @@ def test_keys_fly_velocities():
     np.testing.assert_array_equal(keyboard.action, [-1.0, 0.0, 0.0, 0.0])
     keyboard.press("X")
     np.testing.assert_array_equal(keyboard.action, 0.0)
-
-
-def test_a_controller_that_does_not_fit_changes_nothing():
-    flight = hover()
-    flown = flight.controller
-    with pytest.raises(QuadrlError):
-        flight.fly_with(Policy.pretrained("target_following"))
-    assert flight.controller is flown
-    flight.step()
-
-
-def test_numbers_are_those_of_the_aircraft():
-    flight = hover(2)
-    flight.step()
-    flight.error[:] = (0.1, 0.25)
-    assert "10.0 cm" in readout.html(flight, 0)
-    assert "25.0 cm" in readout.html(flight, 1)
-    assert readout.html(flight, 0).count("background:rgb(") == VEHICLE.rotor_count
 
 
 @pytest.mark.parametrize("vehicle", ["paper", "hexa"])
@@ -235,20 +204,20 @@ def test_controls_act_on_the_flight(page):
     page.frame(STEP)
     np.testing.assert_allclose(engine.qvel[:, 0] - place, [0.0, 3.0])
     np.testing.assert_array_equal(page.flight.time, was)
+    page.flight.error[:] = (0.1, 0.25)
+    assert "10.0 cm" in readout.html(page.flight, 0) and "25.0 cm" in readout.html(page.flight, 1)
+    assert readout.html(page.flight, 0).count("background:rgb(") == VEHICLE.rotor_count
 
 
-def test_what_flies_can_be_changed(page):
-    page.flown_by.value = "policy"
-    page.frame(STEP)
-    assert isinstance(page.flight.controller, Policy)
-    page.flown_by.value = "of another task"
-    page.frame(STEP)
-    assert page.flown_by.value == "policy"
-    assert page.flight.controller.task == "hover"
+def test_what_flies_can_be_changed_for_what_fits(page):
+    for chosen in ("policy", "of another task"):  # which changes nothing
+        page.flown_by.value = chosen
+        page.frame(STEP)
+        assert page.flown_by.value == "policy" and page.flight.controller.task == "hover"
     page.flown_by.value = "keyboard"
-    page.frame(STEP)
+    for _ in range(2):
+        page.frame(STEP)
     assert page.flight.controller is page.keyboard
-    page.frame(STEP)
 
 
 @pytest.mark.parametrize("scale", [None, 90.0])
@@ -265,29 +234,24 @@ def test_what_is_offered_commands_what_it_did_in_its_training(scale):
             assert controller.make_vehicle().action_scale == vehicle.action_scale
 
 
-def test_aircraft_are_drawn_apart_and_where_they_are(page):
-    page.frame(STEP)
-    node = page.scene._airframe
+def test_aircraft_and_trails_are_drawn_apart_and_where_they_are(page):
+    node, trails = page.scene._airframe, page.scene._trails
+    begun = len(trails.points)
+    page.push("east")
+    for _ in range(8):
+        page.frame(STEP)
     drawn = page.flight.drawn()
     apart = node.batched_positions - drawn[:, :3]
     np.testing.assert_allclose(np.abs(apart[0] - apart[1]), [page.apart.value, 0, 0], atol=1e-5)
     np.testing.assert_allclose(node.batched_wxyzs, drawn[:, 3:7], atol=1e-6)
+    assert len(trails.points) == begun  # viser's client draws no more than there were at first
+    places = page.flight.pose[:, :3] + page.scene.offsets(page.apart.value)
+    np.testing.assert_allclose(trails.points[-2:, 1], places, atol=1e-5)
+    lengths = np.linalg.norm(trails.points[:, 1] - trails.points[:, 0], axis=1).reshape(-1, 2)
+    assert (lengths[-3:] > 0).all() and lengths[0].max() == 0
     page.apart.value = 0.0
     page.frame(0.0)
     np.testing.assert_allclose(node.batched_positions, page.flight.drawn()[:, :3], atol=1e-6)
-
-
-def test_trails_end_at_the_aircraft(page):
-    node = page.scene._trails
-    begun = len(node.points)
-    page.push("east")
-    for _ in range(8):
-        page.frame(STEP)
-    assert len(node.points) == begun  # viser's client draws no more than there were at first
-    places = page.flight.pose[:, :3] + page.scene.offsets(page.apart.value)
-    np.testing.assert_allclose(node.points[-2:, 1], places, atol=1e-5)
-    lengths = np.linalg.norm(node.points[:, 1] - node.points[:, 0], axis=1).reshape(-1, 2)
-    assert (lengths[-3:] > 0).all() and lengths[0].max() == 0
 
 
 @pytest.mark.parametrize("camera", ["follow", "chase"])
