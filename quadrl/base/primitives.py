@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
+import numpy as np
+
 from quadrl.base.rotation import Array
 
 Shape = Literal[
@@ -47,3 +49,9 @@ class Primitive:
     """Of the shape mesh."""
     name: str = ""
     """Name of a part; the text of a label."""
+
+    def moved(self, offset: Array) -> Primitive:
+        """The same primitive, shifted by an offset (3,) [m]."""
+        position, points = np.add(self.position, offset), self.points
+        points = np.add(points, offset) if len(points) else ()
+        return dataclasses.replace(self, position=position, points=points)

@@ -17,9 +17,11 @@ import numpy as np
 
 from quadrl.aircraft.parameters import MARK
 from quadrl.base.errors import QuadrlError
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, namespace
 from quadrl.base.validation import number
 from quadrl.engines.engine import Engine
+from quadrl.engines.solids import KINDS
 
 Vector = tuple[float, float, float]
 FAR = 1000.0  # [m]
@@ -245,6 +247,18 @@ class Scene:
         touched = np.zeros((count, len(self.solids)), dtype=bool)
         far = np.full(count, FAR)
         return Surroundings(self.names, position + 0.0, far, touched, 0.0 * far)
+
+    def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
+        """The solids as pictures show them, where they stand in the world of a row."""
+        parts = ((solid, part) for solid in self.solids for part in solid.parts)
+        shown = []
+        for (solid, part), placed in zip(parts, engine.solids.table[row], strict=True):
+            turn = np.empty(4)
+            mujoco.mju_mat2Quat(turn, placed["turn"])
+            place = placed["position"].copy()
+            kind = KINDS[part.kind]
+            shown.append(Primitive(kind, part.size, place, turn, solid.rgba, glow=0.0))
+        return tuple(shown)
 
     def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
         """What is about some aircraft (n,) of an engine now, or about all; arrays of their own."""

@@ -19,6 +19,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import machine, records, validation
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SOLIDS, Seed
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.conditions import observing
 from quadrl.conditions.randomization import Randomized
@@ -321,10 +322,11 @@ class Environment(saving.Copied):
         """Where each aircraft should be, (N, 3) [m], world frame."""
         return self.task.goal(self.snapshot) + self.origin
 
-    def markers(self, row: int = 0) -> tuple[Marker, ...]:
-        """What the task asks to be drawn of one aircraft's episode, world frame."""
+    def markers(self, row: int = 0) -> tuple[Marker | Primitive, ...]:
+        """What is drawn beside an aircraft, world frame: what its task asks for, and solids."""
         alone = records.mapped(lambda array: array[row : row + 1], self.snapshot)
-        return tuple(marker.moved(self.origin) for marker in self.task.markers(alone))
+        asked = (marker.moved(self.origin) for marker in self.task.markers(alone))
+        return (*asked, *self.scene.primitives(self.engine, row))
 
     def _memory(self) -> saving.Memory:
         begun, parts = self._begun, (self.randomizer, self.observer, self.blowing)

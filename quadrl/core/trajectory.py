@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.core.markers import Marker
 
+Shown = tuple[Marker | Primitive, ...]
 FASTEST_GOAL = 10.0  # [m/s]; one that moves faster has jumped
 
 
@@ -38,7 +40,7 @@ class Trajectory:
     max_rotor_speed: Array | float  # (R,) or one for all [rad/s]
     task: str  # its name
     # World frame; one tuple per state, or one for all.
-    markers: Sequence[tuple[Marker, ...]] = ((),)
+    markers: Sequence[Shown] = ((),)
     outcome: str = ""  # how the episode ended, shown with the last state
     wind: Array | None = None  # (T, 3) [m/s], world frame; None for calm air
 
@@ -78,14 +80,15 @@ class Trajectory:
         )
 
 
-def _between(
-    before: tuple[Marker, ...], after: tuple[Marker, ...], share: float
-) -> tuple[Marker, ...]:
-    """Markers on their way from one state to the next; those with an end stay until they jump."""
-    if before is after or [m.kind for m in before] != [m.kind for m in after]:
+def _between(before: Shown, after: Shown, share: float) -> Shown:
+    """What is drawn between two states; markers with an end stay until they jump, as solids do."""
+    kinds = [[getattr(one, "kind", None) for one in shown] for shown in (before, after)]
+    if before is after or kinds[0] != kinds[1]:
         return before
-    ways = [np.subtract(b.position, a.position) for a, b in zip(before, after, strict=True)]
-    return tuple(
-        a if a.end else dataclasses.replace(a, position=tuple(a.position + share * way))
-        for a, way in zip(before, ways, strict=True)
-    )
+    between = []
+    for one, other in zip(before, after, strict=True):
+        if isinstance(one, Marker) and isinstance(other, Marker) and not one.end:
+            way = np.subtract(other.position, one.position)
+            one = dataclasses.replace(one, position=tuple(one.position + share * way))
+        between.append(one)
+    return tuple(between)

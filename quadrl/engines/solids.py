@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 
 from quadrl.aircraft.parameters import MARK
+from quadrl.base.primitives import Shape
 from quadrl.base.rotation import rotation_matrix
 from quadrl.engines import native
 
-KINDS = {
+KINDS: dict[mujoco.mjtGeom, Shape] = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
     mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
     mujoco.mjtGeom.mjGEOM_BOX: "box",

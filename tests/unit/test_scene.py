@@ -13,6 +13,7 @@ from quadrl.conditions.scene import Box, Cylinder, Gate, Pose, Scene, Sphere, he
 from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import make
 from quadrl.engines.state import Start
+from quadrl.evaluation.rollout import fly
 from quadrl.tasks.hover import Hover
 from quadrl.testing import check_task
 
@@ -198,6 +199,20 @@ class Posted(Hover):
 
     def terminated(self, now):
         return super().terminated(now) | now.touched.any(-1)
+
+
+def test_pictures_have_solids_where_they_stand_in_the_episode():
+    environment = Environment(Posted(), num_envs=2, seed=0)
+    environment.reset()
+    where = environment.snapshot.around.position + environment.origin
+    for row in range(2):
+        post, ball = environment.markers(row)[-2:]
+        assert (post.shape, ball.shape) == ("cylinder", "sphere") and post.glow == 0.0
+        np.testing.assert_allclose([post.position, ball.position], where[row])
+        np.testing.assert_allclose(post.size[:2], [0.2, 4.0])
+    flown = fly(lambda seen: np.zeros((len(seen), 4)), Posted(time_limit=0.2), episodes=1)
+    flight = flown.trajectory(environment.vehicle).resampled(60)
+    assert len(flight.markers) == len(flight.time) and flight.markers[5][-2].shape == "cylinder"
 
 
 def test_a_task_with_solids_keeps_the_contract_in_every_api():

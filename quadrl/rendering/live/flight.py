@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.base.validation import number
 from quadrl.conditions.observing import resolve
@@ -206,7 +207,7 @@ class Flight:
         pose[:, 3:7] /= np.linalg.norm(pose[:, 3:7], axis=1, keepdims=True)
         return pose
 
-    def markers(self, row: int) -> tuple[Marker, ...]:
+    def markers(self, row: int) -> tuple[Marker | Primitive, ...]:
         """The goal of an aircraft and what its task asks to be drawn, world frame."""
         goal = tuple(self.environment.goals()[row])
         return (
