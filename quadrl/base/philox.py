@@ -20,6 +20,7 @@ MAX_SEED = (1 << 62) - 1
 START, PARAMETERS, SOLIDS = 0, 1, 2
 WEATHER, TURBULENCE = 8, 9  # numbers of an episode; blocks of its control steps
 NOISE, PUSHES = 16, 17  # blocks of its control steps
+SENSORS = 1 << 30  # and further ones: two for each sensor, its noise and its bias
 MASK = 0xFFFFFFFF
 """Of a 32-bit word."""
 Seed = int | Sequence[int | None] | None

@@ -8,9 +8,10 @@ from typing import Any, Literal
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, keys, number
+from quadrl.conditions import sensors
+from quadrl.conditions.sensors import LONGEST_HISTORY, Sensor
 
 ROTOR_SPEEDS = ("true", "estimated", "none")
-LONGEST_HISTORY = 1000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,8 @@ class Observing:
     privileged: bool = False
     """Whether there is an observation for the critic alone: the true one, what was drawn, and the
     wind in the body frame."""
+    sensors: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    """Further sensors by name, each with its options: noise, bias, delay [s], rate [Hz]."""
 
     def __post_init__(self) -> None:
         """Validate the options."""
@@ -43,6 +46,27 @@ class Observing:
         for name in ("airspeed", "disturbance", "privileged"):
             if not isinstance(value := getattr(self, name), bool):
                 raise QuadrlError(name=name, value=value, allowed="True or False")
+        if not isinstance(self.sensors, Mapping):
+            allowed = "a mapping of their names to their options"
+            raise QuadrlError(name="sensors", value=self.sensors, allowed=allowed)
+        for name, options in self.sensors.items():
+            sensors.make(name, options)
+        own = {name: dict(options) for name, options in self.sensors.items()}
+        object.__setattr__(self, "sensors", own)
+
+    def made(self, further: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Sensor]:
+        """The sensors by name, in the order of their entries.
+
+        Args:
+            further: Those that the task asks for, where the options do not name them.
+        """
+        given: dict[str, Any] = {"state": {}}
+        given |= {name: {} for name in ("airspeed", "disturbance") if getattr(self, name)}
+        if self.action_history:
+            given["action_history"] = {"length": self.action_history}
+        for own in (further or {}, self.sensors):
+            given |= {name: given.get(name, {}) | dict(options) for name, options in own.items()}
+        return {name: sensors.make(name, options) for name, options in given.items()}
 
     def given(self) -> dict[str, Any]:
         """The options that differ from the usual."""

@@ -173,6 +173,11 @@ class Randomization:
         """Whether parameters of the aircraft are drawn."""
         return any(getattr(self, name) != getattr(NONE, name) for name in AFFECTS)
 
+    @property
+    def uncertain(self) -> bool:
+        """Whether the state estimate has errors."""
+        return (self.noise, self.bias) != (Errors(), Errors())
+
 
 NONE = Randomization()
 RANDOMIZATIONS = {

@@ -20,7 +20,6 @@ from quadrl.conditions.randomization import (
     NONE,
     OFF,
     Randomized,
-    Range,
     resolve,
 )
 
@@ -48,8 +47,8 @@ class AircraftSampler:
         self._vehicle, self._specified = vehicle, parameters.rows(vehicle)
         timesteps = (vehicle.physics_timestep, vehicle.control_timestep)
         self.delays = [
-            _steps(name, getattr(randomization, name), timestep)
-            for name, timestep in zip(DELAYS, timesteps, strict=True)
+            whole_steps(name, getattr(randomization, name), timestep, kind)
+            for name, timestep, kind in zip(DELAYS, timesteps, ("physics", "control"), strict=True)
         ]
         """Fewest and most steps: physics steps of commands, control steps of observations."""
         ends = {name: getattr(randomization, name) for name in (*FACTORS, *DELAYS, "wind")}
@@ -217,15 +216,14 @@ def vehicle_of(vehicle: Vehicle, row: np.void) -> Vehicle:
     return made(vehicle, row, rotors=rotors, aerodynamics=made(vehicle.aerodynamics, row))
 
 
-def _steps(name: str, delay: Range, timestep: float) -> tuple[int, int]:
-    """A delay [s] in steps.
+def whole_steps(name: str, times: tuple[float, ...], timestep: float, kind: str) -> tuple[int, ...]:
+    """Times [s] in steps.
 
     Raises:
-        QuadrlError: It is not a multiple of the time step.
+        QuadrlError: One is not a multiple of the time step.
     """
-    fewest, most = (round(end / timestep) for end in delay)
-    if any(abs(end / timestep - round(end / timestep)) > WHOLE for end in delay):
-        kind = "physics" if name == DELAYS[0] else "control"
+    steps = tuple(round(time / timestep) for time in times)
+    if any(abs(time / timestep - k) > WHOLE for time, k in zip(times, steps, strict=True)):
         allowed = f"a whole number of {kind} steps of {timestep:g} s"
-        raise QuadrlError(name=name, value=delay, allowed=allowed)
-    return fewest, most
+        raise QuadrlError(name=name, value=times, allowed=allowed)
+    return steps

@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import warnings
 import weakref
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -164,6 +165,8 @@ class CompiledStep(Step):
         self.count, self.columns = self._engine.num_envs, padded(self._engine.num_envs)
         like = dataclasses.replace(now, state=None, parameters=None)  # these have their own tables
         kept = [*records.leaves(like), *records.leaves(episode)]
+        if self.task.sensors:
+            raise NotCompilable("it reads sensors")
         if any(array.dtype != np.float64 for array in kept):
             raise NotCompilable("what it remembers is not all float64")
         self.kept = records.Columns(0, kept)
@@ -251,12 +254,12 @@ class CompiledStep(Step):
         arrays = [*records.leaves(moment), *records.leaves(episode)]
         for into, array in zip(self._pages[0].kept, arrays, strict=True):
             into[:] = array
-        self._show(self._pages[0])
+        self._show(self._pages[0], now.sensed)
 
     def hold(self) -> None:
         """Keep nothing: where the engine is read in between, no step looks back at the state."""
 
-    def finish(self) -> Transition:
+    def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
         last, page = self._pages
         self._pages = page, last
@@ -264,7 +267,7 @@ class CompiledStep(Step):
         rows.state, rows.last_state = now.address, before.address
         rows.was, rows.out = last.address, page.address
         self._call(self._address, self.count)
-        self._show(page)
+        self._show(page, sensed)
         self._observation = page.observation.copy()
         rest, count = page.rest.copy(), self.count
         *terms, reward, error = rest[:-1, :count]
@@ -282,8 +285,9 @@ class CompiledStep(Step):
             truth=page.truth or self._observation,
         )
 
-    def _show(self, page: _Page) -> None:
+    def _show(self, page: _Page, sensed: Mapping[str, np.ndarray]) -> None:
         """Make a table the present one."""
+        page.now.sensed = sensed
         page.now.state, page.now.parameters = self._engine.state, self._parameters
         self.snapshot, self.episode = page.now, page.episode
 

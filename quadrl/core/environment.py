@@ -180,13 +180,16 @@ class Environment(saving.Copied):
         around = self.scene.surroundings(self.engine, rows) if self.scene.solids else None
         given = task_state, seen, self.action_size, around
         now, episode = transition.begin(self.task, state, *given)
+        see = self.observer.begin if self.observer else None
+        observation = see(rows, now) if see else self.task.observe(now)
         self.seeds.episodes[rows] += 1
         if len(rows) == self.num_envs:
             self._take(now, episode)
         else:
             records.put(self.snapshot, rows, now)
             records.put(self.episode, rows, episode)
-        return self.observer.begin(rows, now) if self.observer else self.task.observe(now)
+            self.snapshot.sensed = self.sensed
+        return observation
 
     def _placed(
         self, place: tuple[Array, Array], start: Start, task_state: Any
@@ -227,6 +230,7 @@ class Environment(saving.Copied):
         """Take a snapshot of all rows as the present one."""
         # What a task remembers must not be a view of buffers that the next steps write.
         now.task, now.parameters = records.owned(now.task), self._parameters
+        now.sensed = self.sensed
         if self._step is None:
             estimate = self.observer.frame if self.observer else None
             parts = self.task, self._clock, self.engine, self._inputs, estimate, self.scene
@@ -299,11 +303,11 @@ class Environment(saving.Copied):
         if (diverged := self.engine.read()) is not None:
             self._inputs.diverged[diverged] = True
         if self.observer:
-            self.observer.estimate()
-        done = self._begun.finish()
+            self.observer.sense(self._inputs.action)
+        done = self._begun.finish(self.sensed)
         transition.check_reward(self.task, done)
         if self.observer:
-            done.observation = self.observer.observe(done, self._inputs.action)
+            done.observation = self.observer.observe(done)
         self.transition = done
         return done
 
@@ -317,6 +321,11 @@ class Environment(saving.Copied):
     def privileged(self) -> Array | None:
         """The observation for the critic alone (N, p); None unless `observe` asks for it."""
         return self.observer.privileged if self.observer else None
+
+    @property
+    def sensed(self) -> Mapping[str, Array]:
+        """What the sensors that `observe` or the task asks for give now, (N, size) by name."""
+        return self.observer.sensed if self.observer else {}
 
     def goals(self) -> np.ndarray:
         """Where each aircraft should be, (N, 3) [m], world frame."""
@@ -351,6 +360,7 @@ class Environment(saving.Copied):
             self._step = None if fresh else self._step
             raise
         now, episode = self._memory().restore(saved)
+        now.sensed = self.sensed
         if self.scene.solids:
             now.around = self.scene.surroundings(self.engine)
         now.potentials = self.task.measure(now)

@@ -1,35 +1,33 @@
-"""What is seen of N aircraft: the estimated state, and the observation that policies get."""
+"""What is seen of N aircraft: the task's entries of the estimated state, sensors, histories."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.rotors import GRAVITY
-from quadrl.base.philox import NOISE
-from quadrl.base.rotation import Array, to_body, to_world
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, to_body
+from quadrl.conditions.estimate import StateEstimate
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import NONE
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.conditions.sampler import AircraftSampler
+from quadrl.conditions.sensors import Channel, Moment
 from quadrl.core.observation import ObservationTerm, layout
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import Task
 from quadrl.core.transition import Transition, observe
-from quadrl.engines import native
-from quadrl.engines.dynamics import thrust_wrench
-from quadrl.engines.engine import Engine, Frame
+from quadrl.engines.engine import Engine
 from quadrl.engines.state import State
 
 
 def make(
     sampler: AircraftSampler, options: Observing, task: Task, engine: Engine, actions: int
 ) -> tuple[Randomizer, Observer | None, Mapping[str, ObservationTerm]]:
-    """What disturbs aircraft, what sees them otherwise than the task says, and the entries.
+    """What randomizes aircraft, what observes them, and the entries of the observation.
 
     Args:
         sampler: Samples what is drawn.
@@ -38,25 +36,20 @@ def make(
         engine: Flies the aircraft.
         actions: Numbers in an action.
     """
-    given, observes = sampler.randomization, options != Observing()
+    given, observes = sampler.randomization, options != Observing() or bool(task.sensors)
     randomizer = Randomizer(sampler, engine, active=observes or given != NONE)
-    observes |= (given.noise, given.bias) != (NONE.noise, NONE.bias) or sampler.delays[1][1] > 0
+    observes |= given.uncertain or sampler.delays[1][1] > 0
     observer = Observer(options, task, engine, actions, randomizer) if observes else None
     return randomizer, observer, observer.terms if observer else task.observation
 
 
 class Observer:
-    """Sees N aircraft: makes the estimated state, and the observation from the task's terms."""
+    """Observes N aircraft otherwise than their task alone would."""
 
     def __init__(
-        self,
-        options: Observing,
-        task: Task,
-        engine: Engine,
-        actions: int,
-        randomizer: Randomizer,
+        self, options: Observing, task: Task, engine: Engine, actions: int, randomizer: Randomizer
     ) -> None:
-        """Lay out what is seen.
+        """Lay out the observation.
 
         Args:
             options: Of the observation.
@@ -64,213 +57,182 @@ class Observer:
             engine: Flies the aircraft.
             actions: Numbers in an action.
             randomizer: Of those aircraft.
+
+        Raises:
+            QuadrlError: The delay or the rate of a sensor does not fit the control step, or it has
+                the name of an entry of the task.
         """
-        self._options, self._task = options, task
-        self._engine, self._randomizer = engine, randomizer
-        vehicle, count = engine.vehicle, engine.num_envs
-        rotors, sampler = vehicle.rotor_count, randomizer.sampler
-        given = sampler.randomization
-        self._rows = np.arange(count)
-        terms = dict(task.observation)
-        if options.rotor_speed == "none":
-            terms.pop("rotor_speed", None)
-        if options.airspeed:
-            terms["airspeed"] = ObservationTerm(3, "m/s", "velocity through the air, body frame")
-        if options.disturbance:
-            meaning = "acceleration that weight and specified thrust do not explain, body frame"
-            terms["disturbance"] = ObservationTerm(3, "m/s^2", meaning)
-        self._single = tuple(terms)
-        single = sum(term.width(rotors) for term in terms.values())
-        if many := options.action_history:
-            meaning = f"the last {many} actions, the newest first"
-            terms["action_history"] = ObservationTerm(many * actions, "1", meaning)
-        if many := options.observation_history:
-            meaning = f"the {many} observations before, the newest first"
-            terms["observation_history"] = ObservationTerm(many * single, "", meaning)
-        self.terms = terms
-        """The entries of the observation in the order of the flat vector."""
-        self.layout = layout(terms, rotors)
-        """Where each of them stands in it."""
-        self._size = sum(term.width(rotors) for term in terms.values())
-        # The newest observation first: as many as the oldest that is looked at asks for.
-        self._seen = np.zeros(
-            (1 + sampler.delays[1][1] + options.observation_history, count, single)
-        )
-        self._actions = np.zeros((count, options.action_history * actions))
-        self._noise, self._noisy = given.noise.sizes, given.noise != NONE.noise
-        self._feels = options.disturbance
-        unknown = options.rotor_speed == "none" and self._feels
-        self._estimated = options.rotor_speed == "estimated" or unknown
-        self._rotor_speed = np.zeros((count, rotors))  # [rad/s]
-        self._lags = np.array([[r.lag_up, r.lag_down] for r in vehicle.rotors]).T  # [1/s]
-        uncertain = self._noisy or given.bias != NONE.bias or self._estimated
-        self.frame = Frame(count, rotors) if uncertain else None
+        self._task, self._engine, self._randomizer = task, engine, randomizer
+        vehicle, rotors = engine.vehicle, engine.vehicle.rotor_count
+        timestep, (count, _) = vehicle.control_timestep, engine.ctrl.shape
+        self._specified = Parameters.of(parameters.rows(vehicle), timestep)
+        sensors = options.made(task.sensors)
+        modelled = options.rotor_speed == "estimated"
+        modelled |= options.rotor_speed == "none" and "disturbance" in sensors
+        uncertain = modelled or randomizer.sampler.randomization.uncertain
+        self._estimate = StateEstimate(engine, randomizer, modelled=modelled) if uncertain else None
+        self.frame = self._estimate and self._estimate.frame
         """Table of the estimated state; None where the true one is seen."""
-        self._coordinates = np.zeros((count, 13 + rotors))
-        nominal, self._library = parameters.rows(vehicle), native.library()
-        self._limits = parameters.limits(nominal)
-        if self.frame is not None:
-            first = self._coordinates.ctypes.data
-            places = [first, first + 7 * 8, first + 13 * 8, engine.origin.ctypes.data]
-            places += [self._limits.ctypes.data, engine.air.ctypes.data]
-            places += [self._coordinates.shape[1], 0]
-            places += [self.frame.columns, rotors]
-            self._seen_rows = np.array(places)  # as `Rows` in native/state.c
+        own = dict(task.observation)
+        if options.rotor_speed == "none":
+            own.pop("rotor_speed", None)
+        self._own = tuple(own)
+        entries = sensors.pop("state")
+        width = sum(term.width(rotors) for term in own.values())
+        self._entries = Channel(entries, width, randomizer, timestep)
+        self._sensors, terms = {}, {}
+        for name, sensor in sensors.items():
+            if name in task.observation:
+                allowed = f"a name that no entry of the task {task.name} has"
+                raise QuadrlError(name="sensor", value=name, allowed=allowed)
+            self._sensors[name] = Channel(sensor, sensor.width(actions), randomizer, timestep)
+            meaning = str(type(sensor).__doc__).partition("\n")[0]
+            terms[name] = ObservationTerm(sensor.width(actions), sensor.unit, meaning)
+        self._late = [name for name in terms if sensors[name].measured]
+        self._known = [name for name in terms if not sensors[name].measured]
+        self.terms = own | {name: terms[name] for name in (*self._late, *self._known)}
+        """The entries of the observation in the order of the flat vector."""
+        self._further = options.observation_history
+        single = width + sum(terms[name].size for name in self._late)
+        if self._further:
+            meaning = f"the {self._further} observations before, the newest first"
+            self.terms["observation_history"] = ObservationTerm(self._further * single, "", meaning)
+        self.layout = layout(self.terms, rotors)
+        """Where each of them stands in it."""
+        # The newest first: as many as the oldest that is looked at asks for.
+        self._past = np.zeros((1 + randomizer.sampler.delays[1][1] + self._further, count, single))
+        self._rows = np.arange(count)
+        self.sensed: dict[str, Array] = {}
+        """What the sensors give now, (N, size) by name."""
         self.observation: dict[str, Array] = {}
         """The last one, its entries views of `flat`."""
-        self.flat = np.zeros((count, self._size))
+        self.flat = np.zeros((count, sum(part.stop - part.start for part in self.layout.values())))
         """The same as vectors."""
-        self._specified = Parameters.of(nominal, vehicle.control_timestep)
-        self._disturbance = np.zeros((count, 3))  # [m/s^2], world frame
-        self._motion = np.zeros((count, 6))  # velocity, and acceleration by thrust, world frame
-        self._scaled = np.zeros((count, len(sampler.spread)))
-        width = (
-            sum(term.width(rotors) for term in task.observation.values()) + len(sampler.spread) + 3
-        )
-        self.privileged = np.zeros((count, width)) if options.privileged else None
-        """(N, p) for the critic alone, where the options ask for it."""
+        self._critic = Critic(task, engine, randomizer) if options.privileged else None
 
-    # -------------------------------------------------------------------- the estimated state
+    @property
+    def privileged(self) -> Array | None:
+        """The observation for the critic alone (N, p), where the options ask for it."""
+        return self._critic and self._critic.seen
 
     def follow(self, command: Array, seconds: float) -> None:
-        """Let the estimate of the rotor speeds follow commands (N, R) [rad/s] for a time [s]."""
-        if self._estimated:
-            goal = np.minimum(command, self._engine.vehicle.max_speed)
-            up, down = 1 - np.exp(-seconds * self._lags)
-            speed = self._rotor_speed
-            speed += np.where(goal > speed, up, down) * (goal - speed)
+        """Let the modelled rotor speeds follow commands (N, R) [rad/s] for a time [s]."""
+        if self._estimate:
+            self._estimate.follow(command, seconds)
 
-    def estimate(self, rows: np.ndarray | None = None) -> State | None:
-        """The estimated state of some aircraft (n,), or of all; None where the true one is seen."""
-        if self.frame is None:
-            return None
-        ids = None if rows is None else rows.ctypes.data
-        count = len(self._rows) if rows is None else len(rows)
-        source, own, engine = self._randomizer, self._coordinates, self._engine
-        speed = self._rotor_speed if self._estimated else engine.act
-        bias = source.sampler.columns(source.drawn, "position_bias_x", 12)
-        arrays = (*source.place, source.steps, engine.qpos, engine.qvel, speed, self._noise, bias)
-        strided = (engine.qpos, speed, bias, own)
-        # As `Rows` in native/disturbances.c.
-        where = np.array(
-            [*(array.ctypes.data for array in (*arrays, own)),
-             *(array.strides[0] // 8 for array in strided), speed.shape[1], self._noisy, NOISE]
-        )  # fmt: skip
-        self._library.quadrl_estimate(where.ctypes.data, count, ids)
-        self._library.quadrl_state(self._seen_rows.ctypes.data, count, ids, self.frame.address)
-        if rows is None:
-            return self.frame.state
-        return State.of_table(self.frame.table[:, rows])
-
-    # -------------------------------------------------------------------- the observation
+    # ------------------------------------------------------------------------- the start
 
     def begin(self, rows: np.ndarray, now: Snapshot) -> dict[str, Array]:
         """The first observation of episodes (n,), from their snapshot (n, ...)."""
-        self._rotor_speed[rows] = self._engine.act[rows]
-        truth, estimate = self._task.observe(now), self.estimate(rows)
-        seen = now.state if estimate is None else estimate
-        terms = truth if estimate is None else observe(self._task, now, estimate)
-        if self._feels:
-            self._disturbance[rows], self._motion[rows] = 0.0, moving(self._specified, seen)
-        self._seen[:, rows] = self._vector(terms, seen, rows)
-        self._actions[rows] = 0.0
-        self._tell(truth, now.state, rows, drawn=True)
+        state = self._estimate.begin(rows) if self._estimate else now.state
+        moment = self._moment(now.state, state, self._engine.wind[rows], now.action)
+        for channel in self._sensors.values():
+            channel.begin(rows, moment)
+        self._sensed()
+        now.sensed = {name: array[rows] for name, array in self.sensed.items()}
+        truth = self._task.observe(now)
+        seen = observe(self._task, now, state) if self._estimate else truth
+        moment.entries = self._joined(seen)
+        self._entries.begin(rows, moment)
+        past = self._past.copy()
+        past[:, rows] = self._single()[rows]
+        self._past = past
+        if self._critic:
+            self._critic.renew(truth, now.state, rows)
         flat = self._present()[rows]
         return {name: flat[:, part] for name, part in self.layout.items()}
 
-    def observe(self, done: Transition, action: Array) -> dict[str, Array]:
-        """The observation of all after a control step with an action (N, k)."""
-        if len(self._seen) > 1:
-            self._seen[1:] = self._seen[:-1].copy()
-        seen = self._engine.state if self.frame is None else self.frame.state
-        if self._feels:
-            last, self._motion = self._motion, moving(self._specified, seen)
-            timestep = self._engine.vehicle.control_timestep
-            self._disturbance = felt(self._disturbance, last, self._motion, timestep)
-        self._seen[0] = self._vector(done.observation, seen, self._rows)
-        if self._options.action_history:
-            size = action.shape[1]
-            self._actions[:, size:] = self._actions[:, :-size].copy()
-            self._actions[:, :size] = np.clip(action, -1.0, 1.0)
-        self._tell(done.truth, self._engine.state, self._rows)
-        return self._show(self._present())
+    # ------------------------------------------------------------------------- each step
+
+    def sense(self, action: Array) -> None:
+        """Estimate the state and let the sensors measure, after a control step with an action."""
+        true = self._engine.state
+        state = self._estimate.update() if self._estimate else true
+        self._now = self._moment(true, state, self._engine.wind, action)
+        for channel in self._sensors.values():
+            channel.step(self._now)
+        self._sensed()
+
+    def observe(self, done: Transition) -> dict[str, Array]:
+        """The observation of all, from the transition that followed `sense`."""
+        self._now.entries = self._joined(done.observation)
+        self._entries.step(self._now)
+        self._past = np.concatenate([self._single()[None], self._past[:-1]])
+        if self._critic:
+            self._critic.renew(done.truth, self._engine.state, self._rows)
+        return self._show()
 
     def again(self, now: Snapshot) -> dict[str, Array]:
         """The present observation of all once more, after `restore`."""
-        self._tell(self._task.observe(now), now.state, self._rows, drawn=True)
-        return self._show(self._present())
+        if self._critic:
+            self._critic.renew(self._task.observe(now), now.state, self._rows)
+        return self._show()
 
-    def _show(self, flat: Array) -> dict[str, Array]:
-        self.flat = flat
-        self.observation = {name: flat[:, part] for name, part in self.layout.items()}
-        return self.observation
+    # ------------------------------------------------------------------------- the parts
 
-    def _vector(self, terms: Mapping[str, Array], state: State, rows: np.ndarray) -> Array:
-        """What is seen at one moment, (n, single)."""
-        if self._options.airspeed:
-            through_air = state.velocity - self._engine.wind[rows]
-            terms = {**terms, "airspeed": to_body(state.rotation, through_air)}
-        if self._feels:
-            felt = to_body(state.rotation, self._disturbance[rows])
-            terms = {**terms, "disturbance": felt}
-        return np.concatenate([terms[name] for name in self._single], axis=-1)
+    def _moment(self, true: State, state: State, wind: Array, action: Array) -> Moment:
+        return Moment(true, state, wind, action, self._specified, np.zeros((len(action), 0)), {})
+
+    def _joined(self, entries: Mapping[str, Array]) -> Array:
+        return np.concatenate([entries[name] for name in self._own], axis=-1)
+
+    def _sensed(self) -> None:
+        self.sensed = {name: channel.seen for name, channel in self._sensors.items()}
+
+    def _single(self) -> Array:
+        """What is measured at one moment, (N, single)."""
+        sensed = (self.sensed[name] for name in self._late)
+        return np.concatenate([self._entries.seen, *sensed], axis=-1)
 
     def _present(self) -> Array:
         """The flat observation (N, size): as late as it is, with what is remembered."""
-        source = self._randomizer
-        delay = source.sampler.columns(source.drawn, "observation_delay")[:, 0]
-        age = np.rint(delay / self._engine.vehicle.control_timestep).astype(np.int64)
-        many = range(1 + self._options.observation_history)
-        now, *before = (self._seen[age + k, self._rows] for k in many)
-        return np.concatenate([now, self._actions, *before], axis=-1)
+        timestep = self._engine.vehicle.control_timestep
+        age = np.rint(self._randomizer.column("observation_delay") / timestep).astype(np.int64)
+        now, *before = (self._past[age + k, self._rows] for k in range(1 + self._further))
+        known = (self.sensed[name] for name in self._known)
+        return np.concatenate([now, *known, *before], axis=-1)
 
-    def _tell(
-        self, truth: Mapping[str, Array], state: State, rows: np.ndarray, *, drawn: bool = False
-    ) -> None:
-        """Renew the privileged observation of some aircraft (n,), and what was drawn for them."""
-        if self.privileged is None:
-            return
-        if drawn:
-            source = self._randomizer
-            self._scaled[rows] = source.sampler.scaled(source.drawn[rows])
-        wind = to_body(state.rotation, self._engine.wind[rows])
-        fresh = np.concatenate([*truth.values(), self._scaled[rows], wind], axis=-1)
-        if len(rows) < len(self._rows):
-            fresh, part = self.privileged.copy(), fresh
-            fresh[rows] = part
-        self.privileged = fresh
+    def _show(self) -> dict[str, Array]:
+        self.flat = flat = self._present()
+        self.observation = {name: flat[:, part] for name, part in self.layout.items()}
+        return self.observation
 
     def save(self) -> dict[str, np.ndarray]:
         """Copies of what is remembered."""
-        return {name: np.array(getattr(self, f"_{name}")) for name in REMEMBERED}
+        saved = {"past": np.array(self._past)}
+        if self._estimate:
+            saved["rotor_speed"] = np.array(self._estimate.rotor_speed)
+        for channel in (self._entries, *self._sensors.values()):
+            saved |= channel.save()
+        return saved
 
-    def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Take up what `save` gave."""
-        for name in REMEMBERED:
-            setattr(self, f"_{name}", np.array(saved[name]))
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Restore what `save` returned."""
+        self._past = np.array(saved["past"])
+        if self._estimate:
+            self._estimate.rotor_speed = np.array(saved["rotor_speed"])
+        for channel in (self._entries, *self._sensors.values()):
+            channel.restore(saved)
+        self._sensed()
 
 
-def moving(specified: Parameters, state: State) -> Array:
-    """Velocity [m/s] and the acceleration by the specified thrust [m/s^2], (n, 6), world frame."""
-    force, _ = thrust_wrench(specified, state.rotor_speed)
-    thrust = to_world(state.rotation, force / specified.mass[:, None])
-    return np.concatenate([state.velocity, thrust], axis=-1)
+class Critic:
+    """The privileged observation: the task's true entries, what was drawn, and the wind.
 
-
-def felt(disturbance: Array, last: Array, now: Array, timestep: float) -> Array:
-    """The acceleration that weight and specified thrust do not explain, smoothed.
-
-    Args:
-        disturbance: The last one, (n, 3) [m/s^2], world frame.
-        last: What `moving` gave a control step ago, (n, 6).
-        now: What it gives now.
-        timestep: Of control [s].
+    What was drawn lies between -1 and 1 in its range; the wind [m/s] is in the body frame.
     """
-    rate = (now[:, :3] - last[:, :3]) / timestep
-    rate = rate - (0.5 * (now[:, 3:] + last[:, 3:]) + WEIGHT)
-    return disturbance + (1 - math.exp(-timestep / SMOOTHING)) * (rate - disturbance)
 
+    def __init__(self, task: Task, engine: Engine, randomizer: Randomizer) -> None:
+        """Begin with zeros."""
+        self._engine, self._randomizer = engine, randomizer
+        rotors, drawn = engine.vehicle.rotor_count, len(randomizer.sampler.spread)
+        width = sum(term.width(rotors) for term in task.observation.values()) + drawn + 3
+        self.seen = np.zeros((engine.num_envs, width))
+        """(N, p), replaced and never changed."""
 
-REMEMBERED = ("seen", "actions", "rotor_speed", "disturbance", "motion")
-WEIGHT = np.array([0.0, 0.0, -GRAVITY])
-SMOOTHING = 0.1  # [s], of the acceleration that thrust does not explain
+    def renew(self, truth: Mapping[str, Array], state: State, rows: np.ndarray) -> None:
+        """Renew that of some aircraft (n,), or of all."""
+        drawn = self._randomizer.sampler.scaled(self._randomizer.drawn[rows])
+        wind = to_body(state.rotation, self._engine.wind[rows])
+        self.seen = self.seen.copy()
+        self.seen[rows] = np.concatenate([*truth.values(), drawn, wind], axis=-1)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -71,8 +72,12 @@ class Step(abc.ABC):
         """Take a snapshot of all rows as the present one."""
 
     @abc.abstractmethod
-    def finish(self) -> Transition:
-        """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
+    def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
+        """Bring the snapshot forward to the engine's state, as `transition.finish` does.
+
+        Args:
+            sensed: What the sensors give now, (N, size) by name.
+        """
 
     @abc.abstractmethod
     def hold(self) -> None:
@@ -98,7 +103,7 @@ class WrittenStep(Step):
         """Copy the snapshot, whose buffers the engine reuses."""
         self.snapshot = records.copied(self.snapshot)
 
-    def finish(self) -> Transition:
+    def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
         inputs, estimate = records.copied(self._inputs), self._estimate
         self.snapshot, self.episode, done = transition.finish(
@@ -106,6 +111,7 @@ class WrittenStep(Step):
             *(inputs.action, inputs.command, inputs.diverged),
             estimate.state if estimate else None,
             self.scene.surroundings(self._engine) if self.scene.solids else None,
+            sensed,
         )
         # What a task remembers must not be a view of buffers that the next steps write.
         self.snapshot.task = records.owned(self.snapshot.task)

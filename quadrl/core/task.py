@@ -84,6 +84,9 @@ class Task(abc.ABC):
     at anything but their arguments."""
     true_parameters: ClassVar[bool] = False
     """Whether snapshots show the parameters that were drawn, instead of the specified ones."""
+    sensors: ClassVar[dict[str, dict[str, Any]]] = {}
+    """Sensors that it reads in `Snapshot.sensed`, by name, with their options; policies see what
+    they give."""
     variants: ClassVar[dict[str, dict[str, Any]]] = {}
     """Settings of other trainings than the usual one that differ from it, by variant."""
     signed: ClassVar[tuple[str, ...]] = ()

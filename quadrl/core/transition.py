@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SOLIDS
 from quadrl.base.rotation import Array, namespace, square_norm
+from quadrl.conditions import sensors
 from quadrl.conditions.scene import Scene, Surroundings
 from quadrl.core.rewards import total
 from quadrl.core.task import EpisodeEnd, Snapshot, Task
@@ -115,6 +117,7 @@ def finish(
     diverged: Array,
     estimate: State | None = None,
     around: Surroundings | None = None,
+    sensed: Mapping[str, Array] | None = None,
 ) -> tuple[Snapshot, Episode, Transition]:
     """The transition to a new state.
 
@@ -129,6 +132,7 @@ def finish(
         diverged: (N,) bool, where the simulation broke down.
         estimate: The state that is observed; None for the true one, which all else looks at.
         around: The solids about the aircraft; None where there are none.
+        sensed: What the sensors give now, (N, size) by name.
 
     Returns:
         The snapshot after it, how far the episodes are, and the transition.
@@ -138,6 +142,7 @@ def finish(
     time = steps * clock.control_timestep
     now = Snapshot(state, before.task, before.parameters, action, rotor_command, time)
     now.around = around
+    now.sensed = sensed or {}
     now.potentials = task.measure(now)
     terminated = task.terminated(now) | diverged
     truncated = (steps >= clock.time_limit_steps) & ~terminated
@@ -150,8 +155,7 @@ def finish(
     terms = task.reward(before, now, end)
     task_state = task.update(before, now)
     if task_state is not now.task:  # a goal may have moved on
-        now = Snapshot(state, task_state, before.parameters, action, rotor_command, time)
-        now.around = around
+        now = dataclasses.replace(now, task=task_state)
         now.potentials = task.measure(now)
     truth = task.observe(now)
     transition = Transition(
@@ -170,8 +174,7 @@ def finish(
 
 def observe(task: Task, now: Snapshot, estimate: State) -> Observation:
     """The task's observation of a moment, of another state than the true one."""
-    moment = (now.task, now.parameters, now.action, now.rotor_command, now.time)
-    seen = Snapshot(estimate, *moment, around=now.around)
+    seen = dataclasses.replace(now, state=estimate)
     seen.potentials = task.measure(seen)
     return task.observe(seen)
 
@@ -230,6 +233,9 @@ def check_task(
     start_state = {f.name: getattr(start, f.name) for f in dataclasses.fields(start)}
     state = State.of_coordinates(**start_state, origin_height=origin_height)
     now, _ = begin(task, state, task_state, parameters, actions, around)
+    for name, options in task.sensors.items():
+        sensed = np.zeros((rows, sensors.make(name, options).width(actions)))
+        now.sensed = {**now.sensed, name: sensed}
     terminated = task.terminated(now)
     _check_array(task, "terminated", terminated, (rows,), "b")
     if terminated.any():

@@ -27,10 +27,10 @@ from quadrl.aircraft.vehicle import MAX_ROTORS, commanded
 from quadrl.base import records
 from quadrl.base.rotation import Array, to_body
 from quadrl.base.trace import Trace
+from quadrl.conditions.sensors import felt, moving
 from quadrl.control.geometric import GeometricController
 from quadrl.control.reading import Reading
 from quadrl.core.environment import Environment
-from quadrl.core.observer import felt, moving
 from quadrl.core.rewards import total
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.transition import Clock, Episode, begin, finish
@@ -55,7 +55,7 @@ PARTS = {
     "diverged": 1,
     "observation": 64,
     "scale": 1,  # of actions [rad/s]: Vehicle.action_scale, or that of a policy's training
-    "moving": 6,  # as quadrl.core.observer.moving gives it
+    "moving": 6,  # as quadrl.conditions.sensors.moving gives it
     "disturbance": 3,  # [m/s^2], world frame
     "felt": 3,  # the same in the body frame, as policies see it
     "given": 8,  # error [m], reward, goal (3) [m, world], terminated, truncated, is_success

@@ -48,6 +48,25 @@ def uniform(keys: Array, episodes: Array, stream: int, first: int, count: int) -
     return uniform_array_api(keys, episodes, stream, first, count)
 
 
+def normal(keys: Array, episodes: Array, steps: Array, stream: int, count: int) -> np.ndarray:
+    """Numbers of a control step of streams, of mean 0 and variance 1, within 3.5 of it.
+
+    Args:
+        keys: (n,) int64, of the rows.
+        episodes: (n,) int64.
+        steps: (n,) int64, control steps since the start of the episode.
+        stream: Which stream of the episode.
+        count: How many.
+
+    Returns:
+        (n, count) float64.
+    """
+    words, out = np.array((keys, episodes, steps), dtype=np.int64), np.empty((len(keys), count))
+    places = (native.address(words) + k * words.strides[0] for k in range(3))
+    native.library().quadrl_normal(len(keys), *places, stream, count, native.address(out))
+    return out
+
+
 class Rng:
     """The random numbers of one stream of the episodes of n rows, taken one after the other."""
 

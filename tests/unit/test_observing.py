@@ -13,8 +13,8 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import to_body
 from quadrl.conditions.observing import Observing
+from quadrl.conditions.sensors import SMOOTHING
 from quadrl.core.environment import Environment
-from quadrl.core.observer import SMOOTHING
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
 from quadrl.evaluation.evaluate import evaluate
 

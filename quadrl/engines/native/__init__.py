@@ -66,9 +66,13 @@ def load(path: Path) -> ctypes.CDLL:
     opened.quadrl_weather.argtypes = [_POINTER, integer, _POINTER, integer]
     real, stride = ctypes.c_double, integer
     opened.quadrl_estimate.restype = opened.quadrl_push.restype = None
+    opened.quadrl_normal.restype = None
     opened.quadrl_estimate.argtypes = [_POINTER, integer, _POINTER]
     opened.quadrl_push.argtypes = [
         *(integer, _POINTER, _POINTER, _POINTER, integer, real, real, real, _POINTER, stride),
+    ]
+    opened.quadrl_normal.argtypes = [
+        *(integer, _POINTER, _POINTER, _POINTER, integer, integer, _POINTER),
     ]
     opened.quadrl_uniform.argtypes = [
         *(integer, _POINTER, _POINTER, integer, integer, integer, _POINTER),

@@ -1,7 +1,7 @@
 // What disturbs many aircraft at a control step: errors of the estimated state, and pushes.
 //
 // Random numbers are those of quadrl/engines/rng.py: a stream of each episode, BLOCKS of four words for each
-// control step. The numbers of quadrl/conditions/randomizer.py and quadrl/core/observer.py say which.
+// control step. The numbers of quadrl/conditions/randomizer.py and quadrl/conditions/estimate.py say which.
 #include <math.h>
 #include <stdint.h>
 
@@ -10,7 +10,7 @@
 
 enum { ERRORS = 12, NOISE_BLOCKS = 6, PUSH_BLOCKS = 2 };
 
-// Where the rows are. Filled by quadrl/core/observer.py.
+// Where the rows are. Filled by quadrl/conditions/estimate.py.
 typedef struct {
   const int64_t *keys, *episodes, *steps;
   const double *qpos, *qvel, *act;  // of aircraft i at i * stride doubles, act at i * act_stride
@@ -32,6 +32,19 @@ static void words(uint32_t w[4], int64_t block, int64_t stream, int64_t episode,
 static double normal(uint32_t one, uint32_t other) {
   const int32_t halves = (int32_t)((one & 0xFFFF) + (one >> 16) + (other & 0xFFFF) + (other >> 16));
   return (halves + (2 - 131072)) * 0x1.bb67ae8584caap-16;  // the root of 3 over 2^16
+}
+
+// Normal numbers (n, count) of a control step of streams, as those of the estimate are.
+QUADRL_EXPORT void quadrl_normal(int64_t n, const int64_t* keys, const int64_t* episodes,
+                                 const int64_t* steps, int64_t stream, int64_t count, double* out) {
+  const int64_t blocks = (count + 1) / 2;
+  for (int64_t i = 0; i < n; ++i) {
+    for (int64_t k = 0; k < count; ++k) {
+      uint32_t w[4];
+      words(w, steps[i] * blocks + k / 2, stream, episodes[i], keys[i]);
+      out[i * count + k] = normal(w[2 * (k % 2)], w[2 * (k % 2) + 1]);
+    }
+  }
 }
 
 // The estimate (qpos, qvel, act) of n aircraft: position, attitude, velocity and body rate with

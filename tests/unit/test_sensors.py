@@ -1,0 +1,245 @@
+"""Sensors: a registry of them, each with its own noise, bias, delay and rate; and one's own."""
+
+import copy
+import dataclasses
+import json
+
+import helpers
+import numpy as np
+import pytest
+from apis import APIS
+from test_observing import ACTIONS, seen
+from test_policy import linear
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import to_body
+from quadrl.conditions import sensors
+from quadrl.conditions.observing import Observing
+from quadrl.conditions.sensors import Sensor, register_sensor
+from quadrl.core.environment import Environment
+from quadrl.evaluation.evaluate import evaluate
+from quadrl.evaluation.policy import Policy
+from quadrl.tasks.hover import Hover
+
+NORTH = np.array([0.0, 1.0, 0.0])
+
+
+@register_sensor
+class Compass(Sensor):
+    """Direction of a pole, body frame."""
+
+    name, size, unit = "compass", 3, "1"
+
+    strength: float = 1.0
+
+    def sense(self, now):
+        """Of a unit field, or of another strength."""
+        return self.strength * to_body(
+            now.true.rotation, np.broadcast_to(NORTH, (len(now.wind), 3))
+        )
+
+
+@register_sensor
+class Odometer(Sensor):
+    """Way that was flown."""
+
+    name, unit = "odometer", "m"
+
+    def begin(self, now):
+        """From here on."""
+        return {"way": np.zeros((len(now.wind), 1)), "last": np.array(now.true.position)}
+
+    def update(self, now):
+        """Add the last stretch."""
+        position = np.array(now.true.position)
+        stretch = np.linalg.norm(position - now.memory["last"], axis=1, keepdims=True)
+        return {"way": now.memory["way"] + stretch, "last": position}
+
+    def sense(self, now):
+        """What has added up."""
+        return now.memory["way"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Northwards(Hover):
+    """Rewards a heading that the compass shows."""
+
+    sensors = {"compass": {"rate": 10.0}}
+
+    def reward(self, before, now, end):
+        """As hover, and the change of what the compass shows ahead."""
+        turned = now.sensed["compass"][..., 0] - before.sensed["compass"][..., 0]
+        return super().reward(before, now, end) | {"north": turned}
+
+
+WILD = {
+    "sensors": {
+        "compass": {"noise": 0.1, "bias": 0.2, "delay": 0.1, "rate": 10},
+        "odometer": {"delay": 0.05},
+        "airspeed": {"noise": 0.3},
+        "state": {"rate": 10, "delay": 0.05},
+    }
+}
+WILD |= {"disturbance": True, "action_history": 1, "observation_history": 1}
+
+
+@pytest.mark.parametrize("name", ["state", "airspeed"])
+def test_samples_are_held_and_as_late_as_the_sensor_says(name):
+    # A step is 0.05 s: every fourth gives a sample, which is seen two steps later.
+    environment = Environment(
+        "hover", num_envs=3, seed=1, observe={"sensors": {name: {"delay": 0.1, "rate": 5}}}
+    )
+    plain = Environment("hover", num_envs=3, seed=1, observe={"airspeed": True})
+    entry = "velocity" if name == "state" else name
+    found, true = [environment.reset()[entry].copy()], [plain.reset()[entry].copy()]
+    fresh = np.array([1])
+    for t, action in enumerate(ACTIONS):
+        found.append(environment.step(action).observation[entry].copy())
+        true.append(plain.step(action).observation[entry].copy())
+        if t == 4:  # an episode of its own, whose samples count from its start
+            found[-1][1], true[-1][1] = (one.reset(fresh)[entry][0] for one in (environment, plain))
+    for row, start in ((0, 0), (1, 5), (2, 0)):
+        for t in range(len(ACTIONS) + 1 - start):
+            sample = start + max(0, (t - 2) // 4 * 4)
+            np.testing.assert_array_equal(found[start + t][row], true[sample][row])
+
+
+def test_noise_is_new_in_each_sample_and_a_bias_lasts():
+    options = {"compass": {"noise": 0.1, "bias": 0.5}}
+    environment = helpers.begun("hover", 400, observe={"sensors": options})
+    errors = []
+    for _ in range(6):
+        state = environment.engine.state
+        exact = to_body(state.rotation, np.broadcast_to(NORTH, (400, 3)))
+        errors.append(environment.sensed["compass"] - exact)
+        helpers.idle(environment)
+    # The mean of six samples is the bias within 5 * 0.1 / sqrt(6).
+    bias = np.mean(errors, axis=0)
+    assert np.abs(bias).max() < 0.5 + 0.21 and np.ptp(bias, axis=0).min() > 0.9
+    noise = (np.array(errors) - bias) / (0.1 * np.sqrt(5 / 6))
+    assert abs(noise.std() - 1) < 0.05  # of 7200 numbers
+    # Of numbers that are less their mean of six, two go together by -1/5; 1200 pairs.
+    assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1] + 0.2) < 5 / np.sqrt(1200)
+
+
+@pytest.mark.parametrize("randomization", [None, "full"])
+def test_row_i_senses_what_the_single_aircraft_of_seed_plus_i_does(randomization):
+    settings = {"randomization": randomization, "weather": "light"}
+    whole, _ = seen(WILD, **settings)
+    for i in range(3):
+        single = Environment("hover", seed=1 + i, observe=WILD, **settings)
+        found = [single.reset()]
+        found += [copy.copy(single.step(action[i : i + 1]).observation) for action in ACTIONS]
+        for one, other in zip(found, whole, strict=True):
+            for name, part in one.items():
+                np.testing.assert_array_equal(part[0], other[name][i], err_msg=name)
+    # Another sensor beside it changes nothing.
+    alone, _ = seen({"sensors": {"compass": WILD["sensors"]["compass"]}}, **settings)
+    np.testing.assert_array_equal(alone[-1]["compass"], whole[-1]["compass"])
+
+
+def test_a_copy_goes_on_bit_for_bit():
+    environment = helpers.begun("hover", 3, observe=WILD, weather="light")
+    for action in ACTIONS[:5]:
+        environment.step(action)
+    environment.reset(np.array([2]))
+    other = copy.deepcopy(environment)
+    restored = helpers.begun("hover", 3, observe=WILD, weather="light")
+    restored.restore(environment.save())
+    for action in ACTIONS[5:]:
+        expected = environment.flatten(environment.step(action).observation)
+        for one in (other, restored):
+            np.testing.assert_array_equal(one.flatten(one.step(action).observation), expected)
+            for name, sensed in environment.snapshot.sensed.items():
+                np.testing.assert_array_equal(one.snapshot.sensed[name], sensed)
+
+
+@pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
+def test_every_api_shows_a_sensor_of_ones_own(api):
+    observe = {"sensors": {"compass": {"strength": 2.0}}}
+    flown = api(seed=4, observe=observe)
+    found = flown.observation(flown.reset())
+    core = flown.core
+    assert core.layout["compass"] == slice(22, 25) and found.shape[-1] == 25
+    np.testing.assert_allclose(np.linalg.norm(found[:, 22:], axis=1), 2.0, rtol=1e-6)
+    flown.step(np.zeros((flown.rows, 4)))
+    np.testing.assert_array_equal(core.snapshot.sensed["compass"], core.sensed["compass"])
+
+
+@pytest.mark.filterwarnings("ignore:the step of the task hover is not compiled")
+@pytest.mark.parametrize("rotor_speed", ["true", "none"])
+def test_a_task_sees_the_sensors_that_it_asks_for(rotor_speed):
+    environment = helpers.begun(Northwards(), 3, observe={"rotor_speed": rotor_speed})
+    assert environment.not_compiled == "it reads sensors"
+    shown = [environment.snapshot.sensed["compass"][:, 0].copy()]
+    for action in ACTIONS:
+        done = environment.step(action)
+        shown.append(done.observation["compass"][:, 0].copy())
+        np.testing.assert_array_equal(done.reward_terms["north"], shown[-1] - shown[-2])
+    assert (np.array(shown)[1::2] == np.array(shown)[:-1:2]).all()  # each is held for two steps
+
+
+def test_a_policy_knows_the_sensors_of_its_training(tmp_path):
+    observe = json.loads(json.dumps(Observing(**WILD).given()))
+    size = Environment("hover", observe=observe).size
+    linear(size, 4, observe=observe).save(tmp_path / "policy")
+    policy = Policy.load(tmp_path / "policy")
+    assert evaluate(policy, "hover", episodes=2, time_limit=0.2).metrics["episodes"] == 2
+    changed = {**observe, "sensors": {**observe["sensors"], "odometer": {}}}
+    with pytest.raises(QuadrlError) as caught:
+        evaluate(policy, "hover", episodes=1, observe=changed)
+    assert caught.value.name == "observe" and "odometer" in caught.value.allowed
+
+
+class Nameless(Sensor):
+    """Has no name."""
+
+    sense = Compass.sense
+
+
+class Namesake(Nameless):
+    """Has the name of another one."""
+
+    name = "compass"
+
+
+class Narrow(Compass):
+    """Gives another number of values than it says."""
+
+    name, size = "narrow", 2
+
+
+class Velocity(Compass):
+    """Has the name of an entry of the task."""
+
+    name = "velocity"
+
+
+@pytest.mark.parametrize(
+    ("given", "name", "allowed"),
+    [
+        (["compass"], "sensors", "mapping"),
+        ({"compas": {}}, "sensor", "did you mean compass?"),
+        ({"compass": 0.1}, "sensor compass", "mapping"),
+        ({"compass": {"lag": 1}}, "option of compass", "noise, bias, delay, rate, strength"),
+        ({"compass": {"noise": -1}}, "compass noise", "between 0"),
+        ({"compass": {"delay": 11}}, "compass delay", "between 0 and 10"),
+        ({"compass": {"delay": 0.07}}, "compass delay and time", "control steps of 0.05 s"),
+        ({"compass": {"rate": 50}}, "compass delay and time", "control steps of 0.05 s"),
+        ({"action_history": {"length": 0}}, "action_history length", "between 1"),
+        ({"velocity": {}}, "sensor", "no entry of the task hover has"),
+        ({"narrow": {}}, "sense of narrow", "(1, 2)"),
+    ],
+)
+def test_an_impossible_sensor_is_refused(given, name, allowed, monkeypatch):
+    for kind in (Narrow, Velocity):
+        monkeypatch.setitem(sensors.SENSORS, kind.name, kind)
+    with pytest.raises(QuadrlError) as caught:
+        Environment("hover", observe={"sensors": given}).reset()
+    assert caught.value.name.startswith(name) and allowed in caught.value.allowed
+
+
+@pytest.mark.parametrize("kind", [Nameless, Namesake, object, "compass"])
+def test_only_sensors_with_a_name_of_their_own_are_registered(kind):
+    with pytest.raises(QuadrlError, match="sensor"):
+        register_sensor(kind)
