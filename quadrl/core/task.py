@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, norm, to_body
 from quadrl.base.validation import keys, like, number
 from quadrl.conditions.scene import Pose, Scene, Solid
@@ -239,8 +240,8 @@ class Task(abc.ABC):
         Scene(self.solids()).add_to(spec)
         self.scene(spec)
 
-    def markers(self, now: Snapshot) -> Sequence[Marker]:
-        """What to draw of the episode of one aircraft (N = 1); the goal is drawn anyway."""
+    def markers(self, now: Snapshot) -> Sequence[Marker | Primitive]:
+        """What to draw of the episode of one aircraft (N = 1); goal and solids are drawn anyway."""
         return ()
 
     def metrics(self, rollout: Rollout) -> dict[str, float]:

@@ -301,32 +301,27 @@ def test_every_marker_and_primitive_is_drawn(page, monkeypatch):
     assert not page.scene._batches and not len(page.scene._marks.points)
 
 
-def test_a_port_that_is_taken_is_named(capsys):
+def test_what_cannot_be_shown_is_said_in_one_line(capsys, monkeypatch):
     pytest.importorskip("viser")
+
+    def said(*words):
+        assert command("view", "hover", *words) == 2
+        text = capsys.readouterr().err
+        assert text.count("\n") == 1
+        return text
+
     with socket.socket() as taken:
         taken.bind(("localhost", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert command("view", "hover", "--port", port) == 2
-    said = capsys.readouterr().err
-    assert str(port) in said and said.count("\n") == 1
-
-
-def test_without_the_extra_there_is_one_line(capsys, monkeypatch):
+        assert str(port) in said("--port", port)
+    if sys.platform == "linux":  # other systems always have a screen
+        for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+            monkeypatch.delenv(name, raising=False)
+        assert "screen" in said("--native")
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.delitem(sys.modules, "quadrl.rendering.live.browser", raising=False)
-    assert command("view", "hover") == 2
-    said = capsys.readouterr().err
-    assert "view" in said and said.count("\n") == 1
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a screen")
-def test_without_a_screen_there_is_one_line(capsys, monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    assert command("view", "hover", "--native") == 2
-    said = capsys.readouterr().err
-    assert "screen" in said and said.count("\n") == 1
+    assert "extra `view`" in said()
 
 
 def test_the_command_serves_until_it_is_interrupted(capsys, monkeypatch):

@@ -1,6 +1,7 @@
 """Wind in pictures: streaks that go where the air goes, its strength in the panel."""
 
 import dataclasses
+import types
 
 import helpers
 import numpy as np
@@ -61,7 +62,11 @@ def flown():
 
 def test_a_flight_is_drawn_in_its_wind(flown, monkeypatch, cheap_pictures):
     asked, written = [], []
-    monkeypatch.setattr(Renderer, "frame", lambda self, *_, **o: asked.append(o) or _blank())
+    monkeypatch.setattr(
+        Renderer,
+        "frame",
+        lambda self, *_, **o: asked.append(o) or np.zeros((120, 160, 3), np.uint8),
+    )
     monkeypatch.setattr(overlay.Panel, "draw", lambda self, _, lines, *__: written.append(lines))
     model = mjcf.compile_model(flown[0].vehicle)
     for one in flown:
@@ -82,13 +87,12 @@ def test_a_flight_is_drawn_in_its_wind(flown, monkeypatch, cheap_pictures):
     assert all(one["markers"] == () for one in calm) and len(written[-1]) == 4
 
 
-def _blank():
-    return np.zeros((120, 160, 3), np.uint8)
-
-
 def test_pictures_of_an_environment_show_its_wind(monkeypatch, cheap_pictures):
     asked = []
-    monkeypatch.setattr(LiveFlight, "picture", lambda self, *given: asked.append(given) or large())
+    large = np.full((300, 400, 3), 128, np.uint8)
+    monkeypatch.setattr(
+        LiveFlight, "picture", lambda self, *given: asked.append(given) or large.copy()
+    )
     for weather in (WEST, None):
         environment = helpers.begun("hover", 2, weather=weather)
         pictures = Pictures(environment, "follow", 400, 300)
@@ -103,23 +107,13 @@ def test_pictures_of_an_environment_show_its_wind(monkeypatch, cheap_pictures):
             np.testing.assert_array_equal(wind, environment.engine.wind[1])
 
 
-def large():
-    return np.full((300, 400, 3), 128, np.uint8)
-
-
 def test_a_flight_in_progress_hands_on_how_far_the_air_has_come():
-    seen = []
-
-    class Recorder:
-        scale, aspect, spins = 1.0, 1.0, np.ones(4)
-
-        def frame(self, qpos, **options):
-            seen.append(next(heads(options["markers"])))
-
+    recorder = types.SimpleNamespace(scale=1.0, aspect=1.0, spins=np.ones(4))
+    recorder.frame = lambda qpos, **options: next(heads(options["markers"]))
     flying, pose = LiveFlight("track"), np.array([*HIGH, 1.0, 0, 0, 0])
     wind = np.array([4.0, 0, 0])
-    for time in (0.0, 0.01, 0.0):
-        flying.picture(Recorder(), time, pose, np.zeros(4), HIGH, (), wind)
+    times, still = (0.0, 0.01, 0.0), np.zeros(4)
+    seen = [flying.picture(recorder, t, pose, still, HIGH, (), wind) for t in times]
     apart = np.linalg.norm(seen[1][:, None] - (seen[0] + 0.01 * wind), axis=-1).min(axis=0)
     assert np.sort(apart)[: len(apart) // 2].max() < 1e-12
     np.testing.assert_array_equal(seen[2], seen[0])  # another flight begins anew
