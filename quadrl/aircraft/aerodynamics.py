@@ -120,7 +120,6 @@ NONE, FULL = "none", "full"
 def check_air(
     air: Aerodynamics,
     rotors: Sequence[Rotor],
-    *,
     mass: float,
     inertia: Vector,
     max_speed: np.ndarray,

@@ -131,3 +131,16 @@ def hover_squares(mixer: np.ndarray, mass: Array) -> np.ndarray:
     weight[..., 0, 0] = np.asarray(mass) * GRAVITY / scale[..., 0, 0]
     across = np.swapaxes(rows, -1, -2)
     return (across @ np.linalg.solve(rows @ across, weight))[..., 0]
+
+
+PAPER_ROTORS = plus(
+    0.23,  # gym-aero
+    thrust_coefficient=3.13e-5,  # gym-aero
+    torque_coefficient=7.5e-7,  # gym-aero
+    lag_up=1 / 0.18,  # gym-aero
+    lag_down=1 / 0.18,  # gym-aero, which has one constant for both
+    max_speed=math.sqrt(2.0) * math.sqrt(0.65 * GRAVITY / (4 * 3.13e-5)),  # twice the weight
+    radius=0.06,  # chosen
+    disc_radius=0.15,  # the OS4: the physics page says why
+)
+"""The paper's rotors, in a cross."""

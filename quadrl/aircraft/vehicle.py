@@ -21,11 +21,11 @@ from quadrl.aircraft.rotors import (
     LENGTHS,
     MAX,
     MIN,
+    PAPER_ROTORS,
     Rotor,
     Vector,
     hover_squares,
     mixer,
-    plus,
 )
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
@@ -46,17 +46,6 @@ SLOWEST_TURN = 2 * math.pi  # [rad/s]
 LEAN = 0.01  # of the weight; the controllers then hover about 3 cm aside
 SINGULAR = 1e-9
 """Smallest singular value of a mixer over its largest; each row over its largest entry."""
-
-PAPER_ROTORS = plus(
-    0.23,  # gym-aero
-    thrust_coefficient=3.13e-5,  # gym-aero
-    torque_coefficient=7.5e-7,  # gym-aero
-    lag_up=1 / 0.18,  # gym-aero
-    lag_down=1 / 0.18,  # gym-aero, which has one constant for both
-    max_speed=math.sqrt(2.0) * math.sqrt(0.65 * GRAVITY / (4 * 3.13e-5)),  # twice the weight
-    radius=0.06,  # chosen
-    disc_radius=0.15,  # the OS4: the physics page says why
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,14 +88,8 @@ class Vehicle:
         check_inertia("inertia", self.inertia, self.inertia)
         self._check_rotors()
         self._check_timesteps()
-        check_air(
-            self.aerodynamics,
-            self.rotors,
-            mass=self.mass,
-            inertia=self.inertia,
-            max_speed=self.max_speed,
-            timestep=self.physics_timestep,
-        )
+        mass, inertia, fastest = self.mass, self.inertia, self.max_speed
+        check_air(self.aerodynamics, self.rotors, mass, inertia, fastest, self.physics_timestep)
 
     def _check_rotors(self) -> None:
         """Refuse rotors that cannot hold the aircraft in hover and turn it about every axis."""
@@ -114,8 +97,7 @@ class Vehicle:
         if not isinstance(rotors, Sequence) or not all(isinstance(r, Rotor) for r in rotors):
             raise QuadrlError(name="rotors", value=rotors, allowed="a sequence of Rotor")
         object.__setattr__(self, "rotors", tuple(rotors))
-        count = len(rotors)
-        if not MIN_ROTORS <= count <= MAX_ROTORS:
+        if not MIN_ROTORS <= (count := len(rotors)) <= MAX_ROTORS:
             allowed = f"between {MIN_ROTORS} and {MAX_ROTORS}"
             raise QuadrlError(name="number of rotors", value=count, allowed=allowed)
         number("distance of the farthest rotor [m]", self.size, *LENGTHS)
@@ -161,12 +143,11 @@ class Vehicle:
             reason = f"a rotor's rate is {fastest:g} 1/s, and rate times step may be at most 1"
             allowed = f"at most {1 / fastest:.3g} s"
             raise QuadrlError(reason, name="physics_timestep", value=step, allowed=allowed)
-        for resolved, needed, names in (
-            (self.resolved_turn, SLOWEST_TURN, "moment_coefficient and inertia"),
-            (self.resolved_speed, self._terminal_speed, "drag_coefficient and mass"),
+        for resolved, needed, unit, names in (
+            (self.resolved_turn, SLOWEST_TURN, "rad/s", "moment_coefficient and inertia"),
+            (self.resolved_speed, self._terminal_speed, "m/s", "drag_coefficient and mass"),
         ):
             if resolved < needed:
-                unit = "rad/s" if needed == SLOWEST_TURN else "m/s"
                 raise QuadrlError(
                     f"with this {names} the step resolves up to {resolved:.3g} {unit}, and "
                     f"{needed:.3g} {unit} are needed",
@@ -227,8 +208,8 @@ class Vehicle:
         |omega| dt is at most 0.5, and 2 k_M |omega| dt / J at most 1. Faster turns are terminated
         and reported as diverged.
         """
-        least = min(self.inertia)
-        return float(resolved_turn(least, self.moment_coefficient, self.physics_timestep))
+        own = min(self.inertia), self.moment_coefficient, self.physics_timestep
+        return float(resolved_turn(*own))
 
     @functools.cached_property
     def _terminal_speed(self) -> float:
@@ -250,13 +231,15 @@ class Vehicle:
     @property
     def foot(self) -> Vector:
         """Lowest point of the foot ahead on the left [m]; the others mirror it."""
-        x, y, z = DRAWN_FOOT
-        return x * self.scale, y * self.scale, z * self.scale
+        return self._scaled(DRAWN_FOOT)
 
     @property
     def hull(self) -> Vector:
         """Semi-axes of the ellipsoid that must not touch the ground [m]."""
-        x, y, z = DRAWN_HULL
+        return self._scaled(DRAWN_HULL)
+
+    def _scaled(self, drawn: Vector) -> Vector:
+        x, y, z = drawn
         return x * self.scale, y * self.scale, z * self.scale
 
     @property
@@ -274,9 +257,8 @@ class Vehicle:
 
         Omega_c = clip(Omega_hover + action_scale * clip(action, -1, 1), 0, Omega_max).
         """
-        if self._always_within:
-            return commanded(action, self.hover_speed, self.action_scale)
-        return commanded(action, self.hover_speed, self.action_scale, self.max_speed)
+        most = None if self._always_within else self.max_speed
+        return commanded(action, self.hover_speed, self.action_scale, most)
 
     @functools.cached_property
     def _always_within(self) -> bool:

@@ -453,23 +453,6 @@ def test_flights_are_those_of_the_exact_solution(name):
 # ------------------------------------------------------------------- rows, threads, save, restore
 
 
-@pytest.mark.parametrize("threads", [2, 3])
-def test_threads_change_no_bit(threads):
-    vehicle, count = in_real_air(VEHICLES["crazyflie"]), 1030
-    motion = helpers.random_motion(vehicle, count, wind=3.0, rotor=0.3)
-    motion.position[:, 2] = np.random.default_rng(1).uniform(0.0, 1.0, count)
-    command = helpers.random_commands(vehicle, count, 1, rotor=0.3)[0]
-    noise = np.random.default_rng(2).normal(size=(count, 8))
-    ends = []
-    for number in (1, threads):
-        batch = BatchEngine(vehicle, count, altitude=3.0, engine="free_flight", num_threads=number)
-        helpers.put(batch, motion, origin=0)
-        batch.ctrl[:], batch.air[:, WIND:] = command, noise
-        batch.advance(8)
-        ends.append(helpers.coordinates(batch))
-    np.testing.assert_array_equal(*ends)
-
-
 def test_the_ground_effect_is_the_same_bits_beside_any_neighbour():
     # Blocks that are all high fly without it, where it is exactly nothing. Aircraft sink through
     # 8 radii here, alone, and beside one that is near the ground.

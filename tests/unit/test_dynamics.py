@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from quadrl.aircraft.parameters import Parameters, rows
 from quadrl.aircraft.rotors import GRAVITY, plus
@@ -105,21 +104,6 @@ def test_a_step_of_free_flight_is_that_of_the_equations(name):
 
 
 @every_layout
-def test_the_rate_of_free_flight_is_the_derivative(name):
-    # Of a step h: (x(h) - x(0)) / h is the derivative but for h / 2 times the second one.
-    case = Case.of(name)
-    case.vehicle = dataclasses.replace(case.vehicle, physics_timestep=1e-7, control_timestep=1e-7)
-    flying = batch(case, "free_flight")
-    flying.advance(1)
-    after, rate = helpers.taken(flying, origin=0), case.equations(dynamics.derivative)
-    for field in FIELDS:
-        expected = getattr(rate, field)
-        moved = (getattr(after, field) - getattr(case.motion, field)) / 1e-7
-        atol = 1e-5 * np.abs(expected).max()
-        np.testing.assert_allclose(moved, expected, rtol=0, atol=atol, err_msg=field)
-
-
-@every_layout
 def test_the_accelerations_of_mujoco_are_the_derivative(name):
     case = Case.of(name)
     model = mjcf.compile_model(case.vehicle, drawn=False)
@@ -142,74 +126,13 @@ def test_the_accelerations_of_mujoco_are_the_derivative(name):
         np.testing.assert_allclose(got, value, rtol=0, atol=1e-12 * np.abs(value).max())
 
 
-def mujoco_step(case):
-    """MuJoCo's Runge-Kutta step on the equations: it turns the attitude by mean body rates."""
-    step = case.vehicle.physics_timestep
-    p, start = Parameters.of(case.table), case.motion
-
-    def moved(rate, time):
-        angle = time * np.linalg.norm(rate.body_turn, axis=-1, keepdims=True)
-        axis = rate.body_turn / np.linalg.norm(rate.body_turn, axis=-1, keepdims=True)
-        turn = np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=-1)
-        then = Rotation.from_quat(start.quaternion, scalar_first=True)
-        then = then * Rotation.from_quat(turn, scalar_first=True)
-        return dynamics.Motion(
-            position=start.position + time * rate.position,
-            quaternion=then.as_quat(scalar_first=True),
-            velocity=start.velocity + time * rate.velocity,
-            body_rate=start.body_rate + time * rate.body_rate,
-            rotor_speed=start.rotor_speed + time * rate.rotor_speed,
-        )
-
-    @dataclasses.dataclass
-    class Rate:
-        position: np.ndarray
-        body_turn: np.ndarray
-        velocity: np.ndarray
-        body_rate: np.ndarray
-        rotor_speed: np.ndarray
-
-    def rate_at(motion):
-        d = dynamics.derivative(p, motion, case.command, case.air, -GRAVITY)
-        return Rate(motion.velocity, motion.body_rate, d.velocity, d.body_rate, d.rotor_speed)
-
-    first = rate_at(dynamics.Motion(*(getattr(start, name) for name in FIELDS)))
-    second = rate_at(moved(first, step / 2))
-    third = rate_at(moved(second, step / 2))
-    fourth = rate_at(moved(third, step))
-    mean = Rate(
-        *(
-            (
-                getattr(first, f)
-                + 2 * getattr(second, f)
-                + 2 * getattr(third, f)
-                + getattr(fourth, f)
-            )
-            / 6
-            for f in Rate.__dataclass_fields__
-        )
-    )
-    return moved(mean, step)
-
-
-@every_layout
-def test_a_step_of_mujoco_is_its_runge_kutta_of_the_equations(name):
-    case = Case.of(name)
-    flying = batch(case, "mujoco")
-    flying.advance(1)
-    assert_close(helpers.taken(flying, origin=0), mujoco_step(case))
-
-
 @every_layout
 def test_tensors_give_the_same_numbers(name):
     case = Case.of(name)
-    for function, more in (
-        (dynamics.derivative, ()),
-        (step_of_equations, (case.vehicle.physics_timestep,)),
-    ):
-        got = case.equations(function, *more, array=tensor)
-        assert all(getattr(got, field).dtype == torch.float64 for field in FIELDS)
-        assert_close(got, case.equations(function, *more), tolerance=1e-14)
+    step = step_of_equations, case.vehicle.physics_timestep
+    got = case.equations(*step, array=tensor)
+    assert all(getattr(got, field).dtype == torch.float64 for field in FIELDS)
+    assert_close(got, case.equations(*step), tolerance=1e-14)
 
 
 @every_layout

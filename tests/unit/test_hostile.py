@@ -17,7 +17,8 @@ from hypothesis.extra import numpy as hnp
 
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.aircraft.vehicle import PAPER_ROTORS, Vehicle
+from quadrl.aircraft.rotors import PAPER_ROTORS
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import Randomization

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from quadrl.aircraft.parameters import Parameters, rows
-from quadrl.aircraft.vehicle import PAPER_ROTORS, Vehicle
+from quadrl.aircraft.rotors import PAPER_ROTORS
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.engines import dynamics, mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from quadrl.aircraft.presets import VEHICLES, resolve
-from quadrl.aircraft.rotors import Rotor, plus, ring
-from quadrl.aircraft.vehicle import PAPER_ROTORS, Vehicle
+from quadrl.aircraft.rotors import PAPER_ROTORS, Rotor, plus, ring
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 
 PAPER = Vehicle()
