@@ -38,7 +38,7 @@ METHODS = ("measure", "terminated", "error", "succeeded", "reward", "update", "o
 FLAGS = ("terminated", "truncated", "is_success", "diverged")
 POINTERS = (
     *("constants", "parameters", "action", "command", "diverged"),
-    *("state", "last_state", "estimate", "was", "out"),
+    *("state", "last_state", "estimate", "was", "out", "rest"),
 )
 SOURCE = """#include <math.h>
 #include <stdint.h>
@@ -46,7 +46,7 @@ typedef struct {{
   const double *constants, *parameters, *action, *command;
   const uint8_t* diverged;
   const double *state, *last_state, *estimate, *was;
-  double* out;
+  double *out, *rest;
   int64_t stride, columns;
 }} Rows;
 __attribute__((visibility("default"))) void step(const Rows* rows, int64_t n) {{
@@ -55,9 +55,9 @@ __attribute__((visibility("default"))) void step(const Rows* rows, int64_t n) {{
   const double *restrict state = rows->state, *restrict last_state = rows->last_state;
   const double *restrict estimate = rows->estimate, *restrict was = rows->was;
   const uint8_t* restrict diverged = rows->diverged;
-  double* restrict out = rows->out;
+  double *restrict out = rows->out, *restrict rest = rows->rest;
   const int64_t stride = rows->stride, columns = rows->columns;
-  uint8_t* restrict flags = (uint8_t*)(out + {flags} * columns);
+  uint8_t* restrict flags = (uint8_t*)(rest + {flags} * columns);
   for (int64_t i = 0; i < n; ++i) {{
     {body}
   }}
@@ -115,7 +115,7 @@ class _Page:
 
     def __init__(self, step: CompiledStep, now: Snapshot, episode: Episode) -> None:
         """Lay out a table for records like those."""
-        whole = np.empty((step.flags + 1, step.columns))
+        whole = np.empty((step.seen.end, step.columns))
         table = whole[:, : step.count]
         self.address = native.address(whole)
         self.kept = step.kept.views(table)
@@ -126,15 +126,14 @@ class _Page:
         self.truth = dict(zip(step.observed, seen[len(step.observed) :], strict=False))
         size = sum(array.shape[1] for array in self.observation.values())
         self.vectors = table[step.kept.end : step.kept.end + size].T
-        self.rest = whole[step.seen.end :]
-        """Terms of the reward, their sum, the error, and the flags, a byte each."""
 
 
 class CompiledStep(Step):
     """A task's step for N rows, in C.
 
     What is live stands in one of two tables in turn, as an engine's state does. The rest of a
-    transition is its own: a copy of the table's last rows.
+    transition has a table of its own: a row for each term of the reward, for their sum, for the
+    error, and one for the flags, a byte each.
     """
 
     def __init__(
@@ -236,14 +235,15 @@ class CompiledStep(Step):
         seen = [*done.observation.values(), *(done.truth.values() if self._estimate else ())]
         rest = [*done.reward_terms.values(), done.reward, done.error]
         self.seen = records.Columns(self.kept.end, seen)
-        own = records.Columns(self.seen.end, rest)
-        self.flags = own.end  # the row of flags, a byte each
-        numbers, outputs = np.arange(self.flags)[:, None], {}
-        for columns, arrays in ((self.kept, kept), (self.seen, seen), (own, rest)):
+        self.flags, outputs = len(rest), {}
+        numbers = np.arange(self.seen.end)[:, None]
+        for columns, arrays in ((self.kept, kept), (self.seen, seen)):
             for places, array in zip(columns.views(numbers), arrays, strict=True):
                 values = np.broadcast_to(np.asarray(array, dtype=object), places.shape)
                 for place, value in zip(places.ravel(), values.ravel(), strict=True):
                     outputs[f"out[{place} * columns + i]"] = value
+        for k, array in enumerate(rest):
+            outputs[f"rest[{k} * columns + i]"] = np.asarray(array, dtype=object)[0]
         for k, name in enumerate(FLAGS):
             outputs[f"flags[{k} * columns + i]"] = np.asarray(getattr(done, name), dtype=object)[0]
         return outputs
@@ -265,11 +265,11 @@ class CompiledStep(Step):
         self._pages = page, last
         rows, (now, before) = self._arguments, self._engine.frames
         rows.state, rows.last_state = now.address, before.address
-        rows.was, rows.out = last.address, page.address
-        self._call(self._address, self.count)
+        rest, count = np.empty((self.flags + 1, self.columns)), self.count
+        rows.was, rows.out, rows.rest = last.address, page.address, native.address(rest)
+        self._call(self._address, count)
         self._show(page, sensed)
         self._observation = page.observation.copy()
-        rest, count = page.rest.copy(), self.count
         *terms, reward, error = rest[:-1, :count]
         flags = rest[-1].view(np.bool_).reshape(-1, self.columns)[: len(FLAGS), :count]
         terminated, truncated, is_success, diverged = flags
