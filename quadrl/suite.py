@@ -40,9 +40,8 @@ def load(
     Args:
         domain_name: "quadrotor".
         task_name: A name of the catalogue.
-        task_kwargs: `random` (seed), `time_limit` [s], `vehicle`, `control_mode`, `engine`,
-            `aerodynamics`, `weather`, `randomization`, `observe` (see
-            `quadrl.envs.dm_control.make`), and any option of the task.
+        task_kwargs: `random` (seed), `time_limit` [s], the conditions (`vehicle`, `weather` and the
+            others, as `quadrl.core.scenario.Conditions` has them), and any option of the task.
         environment_kwargs: Those of `dm_control.rl.control.Environment`: `time_limit` and
             `control_timestep` [s], `n_sub_steps`, `flat_observation`, `legacy_step`.
         visualize_reward: Colour the aircraft by its reward, clipped to [0, 1].
@@ -52,7 +51,8 @@ def load(
     """
     validation.choice("domain_name", domain_name, [DOMAIN])
     validation.choice("task_name", task_name, tasks.TASKS)
-    environment = make(task_name, environment_kwargs=environment_kwargs, **(task_kwargs or {}))
+    given: Any = task_kwargs or {}
+    environment = make(task_name, environment_kwargs=environment_kwargs, **given)
     environment.task.visualize_reward = visualize_reward
     return environment
 

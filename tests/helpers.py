@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -14,6 +15,7 @@ from quadrl.aircraft.rotors import ring
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.conditions.randomization import Randomization
 from quadrl.core.environment import Environment
+from quadrl.engines.mjcf import compile_model
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.engines.state import Start
 
@@ -67,6 +69,11 @@ IN_AIR = {
     for name, vehicle in LAYOUTS.items()
 }
 """The same with every effect of the air."""
+
+
+def grounded(vehicle: Vehicle) -> mujoco.MjModel:
+    """The lean model of an aircraft that can touch the ground."""
+    return compile_model(vehicle, contact=True, drawn=False)
 
 
 @dataclasses.dataclass

@@ -11,7 +11,7 @@ from quadrl.aircraft.aerodynamics import EFFECTS, FULL, NONE, SWITCHES, Aerodyna
 from quadrl.aircraft.rotors import Rotor, ring
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice, keys
+from quadrl.base.validation import choice, keys, record
 
 CRAZYFLIE = Vehicle(
     name="crazyflie",  # Crazyflie 2.1, brushed; motors 1 to 4, clockwise from ahead on the right
@@ -126,11 +126,13 @@ REAL_AIR = {
 """By aircraft: its full set, and the share of its quadratic drag that is not the rotors' own."""
 
 
-def resolve(vehicle: Vehicle | str | None, options: Mapping[str, Any] | None = None) -> Vehicle:
-    """A vehicle, the one of a name, or the paper's for None.
+def resolve(
+    vehicle: Vehicle | str | Mapping[str, Any] | None, options: Mapping[str, Any] | None = None
+) -> Vehicle:
+    """A vehicle, the one of a name or of some fields, or the paper's for None.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: The vehicle; fields are changes to the known one of their `name`, else the paper's.
         options: Numbers that differ from it, by their fields' names.
 
     Raises:
@@ -138,12 +140,26 @@ def resolve(vehicle: Vehicle | str | None, options: Mapping[str, Any] | None = N
     """
     if isinstance(vehicle, str):
         vehicle = VEHICLES[choice("vehicle", vehicle, VEHICLES)]
+    if isinstance(vehicle, Mapping):
+        vehicle = _of_fields(vehicle)
     vehicle = VEHICLES["paper"] if vehicle is None else vehicle
     if not isinstance(vehicle, Vehicle):
         allowed = f"a Vehicle or a name ({', '.join(VEHICLES)})"
         raise QuadrlError(name="vehicle", value=vehicle, allowed=allowed)
     keys("vehicle option", options or {}, OPTIONS)
     return dataclasses.replace(vehicle, **options) if options else vehicle
+
+
+def _of_fields(given: Mapping[str, Any]) -> Vehicle:
+    """A vehicle from fields that differ from a known one's, as JSON has them."""
+    keys("field of vehicle", given, [field.name for field in dataclasses.fields(Vehicle)])
+    changes = dict(given)
+    if isinstance(rotors := changes.get("rotors"), (list, tuple)):
+        changes["rotors"] = tuple(record("rotors", rotor, Rotor) for rotor in rotors)
+    if "aerodynamics" in changes:
+        changes["aerodynamics"] = record("aerodynamics", changes["aerodynamics"], Aerodynamics)
+    known = VEHICLES.get(str(changes.get("name")), VEHICLES["paper"])
+    return dataclasses.replace(known, **changes)
 
 
 def in_real_air(vehicle: Vehicle) -> Vehicle:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import math
 import numbers as abstract
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,25 @@ def keys(what: str, given: Iterable[str], choices: Iterable[str]) -> None:
         except QuadrlError as error:
             reason = f"got an unexpected keyword argument {name!r}"
             raise UnknownKeyword(reason, name=what, value=name, allowed=error.allowed) from None
+
+
+def record(name: str, value: Any, kind: type) -> Any:
+    """What is given, or the dataclass of a kind that it has some fields of, as JSON has them.
+
+    Raises:
+        UnknownKeyword: The kind has no such field; the message lists the choices.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    keys(f"field of {name}", value, [field.name for field in dataclasses.fields(kind)])
+    return kind(**value)
+
+
+def tuples(value: Any) -> Any:
+    """Lists as JSON has them to tuples, at any depth."""
+    if isinstance(value, dict):
+        return {name: tuples(item) for name, item in value.items()}
+    return tuple(map(tuples, value)) if isinstance(value, (list, tuple)) else value
 
 
 def like(name: str, value: Any, default: Any) -> Any:

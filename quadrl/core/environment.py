@@ -7,34 +7,34 @@ Row i of a batch seeded with s is the single environment seeded with s + i.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.presets import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import machine, records, validation
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SOLIDS, Seed
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
-from quadrl.conditions import observing
-from quadrl.conditions.randomization import Randomized
+from quadrl.conditions.observing import Observing
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.scene import Scene
-from quadrl.conditions.weather import Weather, Weathered, WeatherProcess
+from quadrl.conditions.weather import WeatherProcess
 from quadrl.control import modes
-from quadrl.core import catalogue, compiled, observer, saving, transition
+from quadrl.core import compiled, observer, saving, transition
 from quadrl.core.markers import Marker
 from quadrl.core.observation import layout
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.step import Inputs, Step
 from quadrl.core.task import Snapshot, Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
 from quadrl.engines import mujoco
-from quadrl.engines.engine import Engine, EngineName
+from quadrl.engines.engine import Engine
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
 
@@ -44,52 +44,53 @@ class Environment(saving.Copied):
 
     def __init__(
         self,
-        task: str | Task,
+        task: str | Task | Scenario | Mapping[str, Any],
         *,
         num_envs: int = 1,
         seed: Seed = None,
-        vehicle: Vehicle | str | None = None,
         num_threads: int = 0,
-        engine: EngineName | Engine = "mujoco",
-        control_mode: str = "rotor",
-        randomization: Randomized = None,
-        observe: observing.Observed = None,
-        weather: Weathered = None,
+        **conditions: Unpack[Conditions],
     ) -> None:
         """Make the engine and seed the rows.
 
         Args:
-            task: A name of the catalogue or a task.
+            task: A name of the catalogue, a task, or a whole scenario, as `Scenario.of` takes it.
             num_envs: Number of aircraft N.
             seed: As `seed` takes it.
-            vehicle: The aircraft or its name; None for the paper's.
             num_threads: Threads of a batch; 0 for every core.
-            engine: "mujoco", "free_flight" (wherever there is nothing to touch), or an engine that
-                is made already, whose vehicle and N count then.
-            control_mode: What actions mean, a name of `control.modes.CONTROL_MODES`.
-            randomization: What is drawn at each reset, a name of `randomization.RANDOMIZATIONS`.
-            observe: Options of the observation.
-            weather: What the wind is like, a name of `weather.WEATHERS`; None for calm air.
+            **conditions: As `quadrl.core.scenario.Conditions` has them. Of an engine that is made
+                already, vehicle and N count.
 
         Raises:
             QuadrlError: An unknown name or an impossible value.
             NativeError: The rotor callbacks cannot be built or installed.
         """
-        self.task = catalogue.make(task)
-        self.vehicle = engine.vehicle if isinstance(engine, Engine) else resolve(vehicle)
-        sampler = AircraftSampler(randomization, self.vehicle)
-        self.observing = observing.resolve(observe)
+        if isinstance(engine := conditions.get("engine"), Engine):
+            conditions["engine"] = engine.name
+        self.scenario = Scenario.of(task, **conditions)
+        """What is flown and how."""
+        if isinstance(engine, Engine) and engine.vehicle != self.scenario.aircraft:
+            own: Any = {"vehicle": engine.vehicle, "aerodynamics": None}
+            self.scenario = dataclasses.replace(self.scenario, **own)
+        self.task, self.vehicle = self.scenario.task, self.scenario.aircraft
+        self.observing, self.weather = self.scenario.observe, self.scenario.weather
+        sampler = AircraftSampler(self.scenario.randomization, self.vehicle)
         self.randomization = sampler.randomization
-        world: Any = {"num_threads": num_threads, "per_row": self.randomization.per_row}
         if not isinstance(engine, Engine):
             validation.number("num_envs", num_envs, 1, mujoco.MAX_ENVS, whole=True)
             per_row = row_memory(self.task, self.vehicle, sampler, self.observing)
             machine.check_memory(f"num_envs = {num_envs}", num_envs * per_row)
+            world = self.vehicle, self.scenario.compile_model(drawn=False), num_envs
+            settings: Any = {"num_threads": num_threads, "per_row": self.randomization.per_row}
+            altitude = self.scenario.altitude
+            engine = mujoco.make(self.scenario.engine, *world, altitude=altitude, **settings)
+        elif self.randomization.per_row and len(engine.parameters) < engine.num_envs:
+            allowed = "made with per_row=True, since parameters are drawn"
+            raise QuadrlError(name="engine", value=engine, allowed=allowed)
         self.scene = Scene(self.task.solids())
-        engine = mujoco.of_task(engine, self.task, self.vehicle, num_envs, **world)
         self.scene.check(engine)
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
-        self.control_mode = modes.make(control_mode, self.vehicle)
+        self.control_mode = modes.make(self.scenario.control_mode, self.vehicle)
         self.action_size = self.control_mode.size
         timestep = self.vehicle.control_timestep
         self._clock = Clock.of(self.task, timestep)
@@ -107,7 +108,6 @@ class Environment(saving.Copied):
         self.size = max(part.stop for part in self.layout.values())
         self.stepwise = self.control_mode.has_loops or self.randomizer.late
         """Whether the rotors get a command at each physics step, from `control`."""
-        self.weather = Weather.of(weather)
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
         self._all = np.arange(self.num_envs)
         self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
@@ -368,9 +368,7 @@ class Environment(saving.Copied):
         return self.observer.again(now) if self.observer else self.task.observe(now)
 
 
-def row_memory(
-    task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: observing.Observing
-) -> float:
+def row_memory(task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Observing) -> float:
     """Memory that one more aircraft takes at least [bytes]; measured, and the histories counted."""
     rotors, (commands, observations) = vehicle.rotor_count, sampler.delays
     single = sum(term.width(rotors) for term in task.observation.values())

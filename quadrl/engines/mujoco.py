@@ -49,25 +49,23 @@ class BatchEngine(Engine):
         num_envs: int,
         *,
         altitude: float,
-        contact: bool = False,
-        scene: mjcf.Scene | None = None,
+        model: mujoco.MjModel | None = None,
         num_threads: int = 0,
         engine: EngineName = "mujoco",
         per_row: bool = False,
     ) -> None:
-        """Compile the lean model and make the batch.
+        """Make the batch.
 
         Args:
             vehicle: The aircraft.
             num_envs: N, at least 1.
             altitude: Height of the origin of the task's frame above the ground [m].
-            contact: Whether the aircraft can touch the ground.
-            scene: Adds to the world.
+            model: The lean model of the aircraft in its world; None for nothing to touch.
             num_threads: Threads to step on; 0 for every core.
             engine: One of ENGINES.
             per_row: Whether each aircraft has parameters of its own.
         """
-        self.model = mjcf.compile_model(vehicle, contact=contact, drawn=False, scene=scene)
+        self.model = mjcf.compile_model(vehicle, drawn=False) if model is None else model
         self.batch = Batch(self.model, num_envs, nthread=num_threads)
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._fresh = self.batch.state[0].copy()
@@ -189,11 +187,10 @@ def _over(copied: Callable[..., DataEngine], vehicle: Vehicle, data: mujoco.MjDa
 def make(
     name: str,
     vehicle: Vehicle,
+    model: mujoco.MjModel,
     num_envs: int = 1,
     *,
     altitude: float,
-    contact: bool = False,
-    scene: mjcf.Scene | None = None,
     num_threads: int = 0,
     per_row: bool = False,
 ) -> Engine:
@@ -207,36 +204,10 @@ def make(
     validation.number("num_threads", num_threads, 0, MAX_THREADS, whole=True)
     world: Any = {"altitude": altitude, "engine": name}
     if num_envs > 1:
-        world |= {"contact": contact, "scene": scene, "num_threads": num_threads}
+        world |= {"model": model, "num_threads": num_threads}
         return BatchEngine(vehicle, num_envs, per_row=per_row, **world)
     # One alone needs no pool of threads.
-    model = mjcf.compile_model(vehicle, contact=contact, drawn=False, scene=scene)
     return DataEngine(vehicle, model, mujoco.MjData(model), **world)
-
-
-def of_task(
-    engine: str | Engine, task: Any, vehicle: Vehicle, num_envs: int, **settings: Any
-) -> Engine:
-    """The engine of a name in the world of a task, or one that is made already.
-
-    Args:
-        engine: The name, or the engine.
-        task: A `Task`.
-        vehicle: The aircraft.
-        num_envs: N.
-        **settings: Those of `make`; `per_row` is asked of either.
-
-    Raises:
-        QuadrlError: As `make`; or the engine's aircraft cannot have parameters of their own.
-    """
-    if isinstance(engine, Engine):
-        if settings["per_row"] and len(engine.parameters) < engine.num_envs:
-            allowed = "made with per_row=True, since parameters are drawn"
-            raise QuadrlError(name="engine", value=engine, allowed=allowed)
-        return engine
-    altitude = max(task.altitude, vehicle.ground_clearance)
-    world: Any = {"altitude": altitude, "contact": task.contact, "scene": task.build}
-    return make(engine, vehicle, num_envs, **world, **settings)
 
 
 def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:

@@ -3,93 +3,53 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from quadrl import tasks
-from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.presets import resolve, with_effects
-from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base import validation
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.rotation import norm
 from quadrl.core.environment import Environment
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.engines import mjcf
 
-ENVIRONMENT = (
-    *("control_mode", "engine", "weather", "randomization", "observe", "num_threads", "seed"),
-)
-"""Keywords of `quadrl.core.environment.Environment` that every API passes on."""
-OWN = ("vehicle", "aerodynamics", "control_timestep", "max_episode_steps", "reward_terms")
-KEYWORDS = (*ENVIRONMENT, *OWN)
+OWN = ("num_threads", "seed", "reward_terms")
+"""Keywords of every API beside those of a scenario."""
 PICTURE = ("width", "height", "camera")
 """Keywords of the pictures that an API draws."""
 
 
 def make(
-    task: str | Task,
+    task: str | Task | Scenario,
     num_envs: int,
-    *,
-    vehicle: Vehicle | str | None = None,
-    aerodynamics: Aerodynamics | str | None = None,
-    control_timestep: float | None = None,
-    max_episode_steps: int | None = None,
     also: Iterable[str] = (),
-    **settings: Any,
+    *,
+    seed: int | None = None,
+    num_threads: int = 0,
+    **conditions: Unpack[Conditions],
 ) -> Environment:
     """Make an environment.
 
     Args:
-        task: A name of the catalogue or a task.
+        task: A name of the catalogue, a task, or a whole scenario.
         num_envs: N.
-        vehicle: A name of `quadrl.VEHICLES` or a Vehicle; None for the paper's.
-        aerodynamics: Effects of the air on its rotors: "none", "full", names of single ones with
-            commas between them, or an Aerodynamics; None for those of the vehicle.
-        control_timestep: Time between two actions [s]; None for the vehicle's.
-        max_episode_steps: The time limit in control steps, in place of `time_limit` [s].
         also: Keywords that the API takes itself.
-        **settings: `control_mode` (what actions mean, a name of `quadrl.control.CONTROL_MODES`),
-            `engine` ("mujoco", or "free_flight": no contact is computed where there is nothing to
-            touch), `weather` (a name of `weather.WEATHERS` or a Weather), `randomization`
-            (what is drawn at each reset and disturbs the flight: a name of `quadrl.RANDOMIZATIONS`
-            or a `quadrl.Randomization`), `observe` (options of the observation, as
-            `quadrl.Observing` has them), `num_threads` (of the simulation; 0 for every core),
-            `seed` (row i is seeded with seed + i; None for one from the system), and any option of
-            the task.
+        seed: Row i is seeded with seed + i; None for one from the system.
+        num_threads: Of the simulation; 0 for every core.
+        **conditions: `vehicle`, `weather`, `randomization` and the others, as
+            `quadrl.core.scenario.Conditions` has them, and options of the task.
 
     Raises:
         QuadrlError: Unknown name or impossible value.
     """
-    vehicle = with_timestep(with_effects(resolve(vehicle), aerodynamics), control_timestep)
-    own = {name: settings.pop(name) for name in ENVIRONMENT if name in settings}
-    if max_episode_steps is not None:
-        steps = validation.number("max_episode_steps", max_episode_steps, 1, whole=True)
-        settings["time_limit"] = steps * vehicle.control_timestep
-    task = make_task(task, settings, [*KEYWORDS, *also])
-    return Environment(task, num_envs=num_envs, vehicle=vehicle, **own)
+    scenario = Scenario.of(task, [*OWN, *also], **conditions)
+    return Environment(scenario, num_envs=num_envs, seed=seed, num_threads=num_threads)
 
 
-def with_timestep(vehicle: Vehicle, control_timestep: float | None) -> Vehicle:
-    """A vehicle with another time between two actions [s], unless that is None."""
-    if control_timestep is None:
-        return vehicle
-    return dataclasses.replace(vehicle, control_timestep=control_timestep)
-
-
-def make_task(task: str | Task, options: Mapping[str, Any], keywords: Iterable[str]) -> Task:
-    """A task with some options; the refusal of an unknown one lists the API's keywords as well."""
-    task = tasks.make(task)
-    names = [*keywords, *(field.name for field in dataclasses.fields(task))]
-    validation.keys(f"{task.name} option", options, names)
-    return task.replace(**options)
-
-
-def told(environment: Environment) -> dict[str, np.ndarray]:
-    """What is told beside the observation, arrays (N, k); nothing in the usual case.
+def episode_info(environment: Environment) -> dict[str, np.ndarray]:
+    """What `info` says of each episode, arrays (N, k); nothing in the usual case.
 
     Returns:
         drawn: what was drawn for each aircraft, with names; privileged: for the critic alone.
@@ -158,7 +118,7 @@ class Pictures:
         from quadrl.rendering.overlay import Panel, task_title
 
         vehicle, task = self._environment.vehicle, self._environment.task
-        model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.build)
+        model = self._environment.scenario.compile_model()
         self._renderer = Renderer(model, self._width, self._height)
         if self._overlay:
             with contextlib.suppress(RenderingUnavailable):  # without Pillow

@@ -9,7 +9,7 @@ from __future__ import annotations
 import collections
 import contextlib
 from collections.abc import Callable, Generator
-from typing import Any
+from typing import Any, Unpack
 
 from quadrl.rendering import gl
 from quadrl.rendering.camera import FOLLOW, aircraft_scale, follow_cameras, in_view
@@ -24,21 +24,14 @@ from dm_control.rl import control
 from dm_control.suite import base
 from dm_env import specs
 
-from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.presets import resolve, with_effects
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
-from quadrl.conditions.observing import Observed
-from quadrl.conditions.randomization import Randomized
-from quadrl.conditions.weather import Weathered
 from quadrl.core.environment import Environment, Transition
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
-from quadrl.engines import mjcf, native
-from quadrl.engines.mujoco import ENGINES, DataEngine
-from quadrl.envs.common import make_task, with_timestep
+from quadrl.engines import native
+from quadrl.engines.mujoco import DataEngine
 
-KEYWORDS = "random vehicle aerodynamics control_mode engine weather randomization observe".split()
 ENVIRONMENT_KWARGS = "time_limit control_timestep n_sub_steps flat_observation legacy_step".split()
 
 
@@ -169,37 +162,24 @@ class QuadrotorTask(base.Task):
 
 
 def make(
-    task: str | Task,
+    task: str | Task | Scenario,
     time_limit: float | None = None,
     random: Any = None,
     environment_kwargs: dict[str, Any] | None = None,
-    vehicle: Vehicle | str | None = None,
-    control_mode: str = "rotor",
-    engine: str = "mujoco",
-    aerodynamics: Aerodynamics | str | None = None,
-    weather: Weathered = None,
-    randomization: Randomized = None,
-    observe: Observed = None,
-    **options: Any,
+    **conditions: Unpack[Conditions],
 ) -> control.Environment:
     """Build the dm_control environment of a task.
 
+    `task.environment.randomizer.shown()` has what a randomization drew, and
+    `task.environment.privileged` the observation for the critic alone.
+
     Args:
-        task: A name of the catalogue or a task.
+        task: A name of the catalogue, a task, or a whole scenario.
         time_limit: Of an episode [s]; None for the task's.
         random: Seed, RandomState or None.
         environment_kwargs: As in `quadrl.suite.load`.
-        vehicle: A name of `quadrl.VEHICLES` or a Vehicle; None for the paper's.
-        control_mode: What actions mean, a name of `quadrl.control.CONTROL_MODES`.
-        engine: "mujoco" or "free_flight".
-        aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them.
-        weather: What the wind is like, as `quadrl.conditions.weather.Weather.of` takes it.
-        randomization: What is drawn at each reset and disturbs the flight, as
-            `conditions.randomization.resolve` takes it; `task.environment.randomizer.shown()`
-            has what was drawn.
-        observe: Options of the observation, as `quadrl.conditions.observing.resolve` takes them;
-            `task.environment.privileged` is the observation for the critic alone.
-        **options: Those of the task.
+        **conditions: `vehicle`, `weather`, `randomization` and the others, as
+            `quadrl.core.scenario.Conditions` has them, and options of the task.
 
     Raises:
         QuadrlError: Unknown name or impossible value.
@@ -208,37 +188,23 @@ def make(
     validation.keys("environment_kwargs", settings, ENVIRONMENT_KWARGS)
     # The task keeps the clock, not dm_control: there a time limit hides a crash on the last step.
     if (limit := settings.pop("time_limit", time_limit)) is not None:
-        options["time_limit"] = limit
-    task, vehicle = make_task(task, options, KEYWORDS), resolve(vehicle)
-    vehicle = with_effects(vehicle, aerodynamics)
+        conditions["time_limit"] = limit
+    scenario = Scenario.of(task, ["random"], **conditions)
     timestep = settings.pop("control_timestep", None)
     if (substeps := settings.pop("n_sub_steps", None)) is not None:
         if timestep is not None:
             allowed = "absent where control_timestep is given"
             raise QuadrlError(name="n_sub_steps", value=substeps, allowed=allowed)
         substeps = validation.number("n_sub_steps", substeps, 1, whole=True)
-        timestep = substeps * vehicle.physics_timestep
-    vehicle = with_timestep(vehicle, timestep)
-    model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.build)
+        timestep = substeps * scenario.vehicle.physics_timestep
+    scenario = Scenario.of(scenario, control_timestep=timestep)
+    model = scenario.compile_model()
     # A simulation that diverges must not pass for a fresh one.
     model.opt.disableflags |= int(_mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     physics = Physics.from_model(wrapper.MjModel(model))
-    physics.engine = DataEngine(
-        vehicle,
-        model,
-        physics.data.ptr,
-        altitude=max(task.altitude, vehicle.ground_clearance),
-        engine=validation.choice("engine", engine, ENGINES),
-    )
-    environment = Environment(
-        task,
-        vehicle=vehicle,
-        engine=physics.engine,
-        control_mode=control_mode,
-        weather=weather,
-        randomization=randomization,
-        observe=observe,
-    )
-    return control.Environment(
-        physics, QuadrotorTask(environment, random), n_sub_steps=vehicle.substeps, **settings
-    )
+    vehicle, engine = scenario.aircraft, scenario.engine
+    data = physics.data.ptr
+    physics.engine = DataEngine(vehicle, model, data, altitude=scenario.altitude, engine=engine)
+    environment = Environment(scenario, engine=physics.engine)
+    quadrotor = QuadrotorTask(environment, random)
+    return control.Environment(physics, quadrotor, n_sub_steps=vehicle.substeps, **settings)

@@ -25,7 +25,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import Seed
 from quadrl.core.environment import Environment, Transition
 from quadrl.core.task import Task
-from quadrl.envs.common import PICTURE, Named, Pictures, make, told
+from quadrl.envs.common import PICTURE, Named, Pictures, episode_info, make
 
 Array = np.ndarray
 Info = dict[str, Any]
@@ -67,7 +67,7 @@ class _Shared:
         if render_mode is not None:
             validation.choice("render_mode", render_mode, self.metadata["render_modes"])
         also = ("render_mode", *PICTURE)
-        environment = self.environment = make(task, num_envs, also=also, **settings)
+        environment = self.environment = make(task, num_envs, also, **settings)
         self._pictures = Pictures(environment, camera, width, height)
         self.render_mode, self._terms_wanted = render_mode, reward_terms
         fps = round(1 / environment.vehicle.control_timestep)
@@ -114,7 +114,8 @@ class QuadrotorEnv(_Shared, gym.Env):
         begun = self.environment.reset(start=options, seed=seed)
         super().reset(seed=seed)
         observation = self.environment.flatten(begun)[0]
-        return observation, {name: value[0] for name, value in told(self.environment).items()}
+        info = episode_info(self.environment)
+        return observation, {name: value[0] for name, value in info.items()}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, Info]:
         """Fly one control step; an action (k,) that is not finite raises a QuadrlError."""
@@ -122,7 +123,7 @@ class QuadrotorEnv(_Shared, gym.Env):
         now = self.environment.step(action[None] if isinstance(action, np.ndarray) else (action,))
         observation = self.environment.flatten(now.observation)[0]
         # Scalars of NumPy, which TorchRL reads; flags as arrays, which Gymnasium's vectors stack.
-        values = (self._values(now) | told(self.environment)).items()
+        values = (self._values(now) | episode_info(self.environment)).items()
         info = {k: np.array(v[0]) if v.dtype == bool else v[0] for k, v in values}
         return observation, now.reward.item(), now.terminated.item(), now.truncated.item(), info
 
@@ -177,7 +178,7 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
             allowed = f"an array of {self.num_envs} bool, at least one of them True"
             raise QuadrlError(name="reset_mask", value=rows, allowed=allowed)
         self._begin(rows, start, seed)
-        return self._observation.copy(), _masked(told(self.environment), rows)
+        return self._observation.copy(), _masked(episode_info(self.environment), rows)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Info]:
         """Fly one control step in every row; actions (N, k)."""
@@ -187,7 +188,7 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         reward = np.where(flown, now.reward, 0.0)
         terminated, truncated = now.terminated & flown, now.truncated & flown
         ended, values = terminated | truncated, self._values(now)
-        last = told(self.environment)
+        last = episode_info(self.environment)
         if mode == AutoresetMode.SAME_STEP and ended.any():
             final = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(ended):
@@ -201,7 +202,7 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
                 self._begin(resting)
             self._resting = ended & (mode == AutoresetMode.NEXT_STEP)
         if last:
-            info |= _masked(told(self.environment), np.ones(self.num_envs, dtype=bool))
+            info |= _masked(episode_info(self.environment), np.ones(self.num_envs, dtype=bool))
         return self._observation.copy(), reward, terminated, truncated, info
 
     def _begin(self, rows: Array, start: Info | None = None, seed: Seed = None) -> None:

@@ -57,7 +57,7 @@ class QuadrotorEnv(EnvBase):
             QuadrlError: Unknown name or impossible value.
         """
         also = ("from_pixels", *PICTURE)
-        self.environment = make(task, num_envs, seed=seed, also=also, **settings)
+        self.environment = make(task, num_envs, also, seed=seed, **settings)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._terms = self.environment.term_names if reward_terms else ()
         shape, column = torch.Size([num_envs]), torch.Size([num_envs, 1])

@@ -478,7 +478,9 @@ def test_the_ground_is_nearer_for_rotors_that_can_lift_more():
     # Whoever could touch something is MuJoCo's: farther up where the air adds to the thrust.
     marked = []
     for vehicle in (PAPER, with_effects(PAPER, "inflow"), in_real_air(PAPER)):
-        batch = BatchEngine(vehicle, 400, altitude=3.0, contact=True, engine="free_flight")
+        batch = BatchEngine(
+            vehicle, 400, altitude=3.0, model=helpers.grounded(vehicle), engine="free_flight"
+        )
         batch.qpos[:, 2:4] = np.stack([np.linspace(0.3, 1.3, 400), np.ones(400)], axis=-1)
         batch.act[:] = batch.ctrl[:] = vehicle.max_speed
         assert batch._free_flight

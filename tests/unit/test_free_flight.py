@@ -77,7 +77,7 @@ def test_an_aircraft_flies_the_same_whatever_flies_beside_it(name, threads, per_
 def test_what_could_touch_the_ground_is_mujocos_bit_by_bit():
     # From one state both engines make the same step of every aircraft that is near the ground,
     # and not of those that are not: each is flown by the engine that it should be.
-    free, whole = (BatchEngine(PAPER, 32, altitude=0.07, contact=True, engine=e)
+    free, whole = (BatchEngine(PAPER, 32, altitude=0.07, model=helpers.grounded(PAPER), engine=e)
                    for e in ("free_flight", "mujoco"))  # fmt: skip
     helpers.put(free, helpers.random_motion(PAPER, 32, speed=1.0, turn=1.0), origin=0)
     free.qpos[:, 2] = np.linspace(0.07, 3.0, 32)
@@ -113,7 +113,9 @@ def test_nothing_that_free_flight_takes_comes_near_the_ground_in_a_step(name):
     wild.rotor_speed[::2], command[::2] = vehicle.max_speed, vehicle.max_speed
     ends = []
     for engine in ("free_flight", "mujoco"):
-        batch = BatchEngine(vehicle, count, altitude=3.0, contact=True, engine=engine)
+        batch = BatchEngine(
+            vehicle, count, altitude=3.0, model=helpers.grounded(vehicle), engine=engine
+        )
         helpers.put(batch, wild, origin=0)
         batch.ctrl[:] = command
         batch.advance(vehicle.substeps)
@@ -138,7 +140,9 @@ def test_an_aircraft_that_the_wind_pushes_to_the_ground_is_handed_over(name):
     motion.position[:, 2] = reach + MARGIN + np.linspace(0.001, 1.0, count)
     ends = []
     for engine in ("free_flight", "mujoco"):
-        batch = BatchEngine(vehicle, count, altitude=3.0, contact=True, engine=engine)
+        batch = BatchEngine(
+            vehicle, count, altitude=3.0, model=helpers.grounded(vehicle), engine=engine
+        )
         helpers.put(batch, motion, origin=0)
         batch.ctrl[:] = motion.rotor_speed
         batch.advance(vehicle.substeps)

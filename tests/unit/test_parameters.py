@@ -39,7 +39,8 @@ def by_itself(vehicle, task, engine, altitude):
     model = mjcf.compile_model(vehicle, contact=task.contact)
     settings = dict(altitude=altitude, engine=engine)
     yield DataEngine(vehicle, model, mujoco.MjData(model), **settings)
-    yield BatchEngine(vehicle, 1, contact=task.contact, **settings)
+    lean = mjcf.compile_model(vehicle, contact=task.contact, drawn=False)
+    yield BatchEngine(vehicle, 1, model=lean, **settings)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -248,7 +249,7 @@ def test_a_reset_calms_the_air(count):
 
 
 def test_a_batch_of_equal_aircraft_draws_no_parameters():
-    alike = engines.make("mujoco", PAPER, 4, altitude=3.0)
+    alike = engines.make("mujoco", PAPER, mjcf.compile_model(PAPER, drawn=False), 4, altitude=3.0)
     with pytest.raises(QuadrlError) as caught:
         Environment("hover", engine=alike, randomization={"mass": (0.9, 1.1)})
     assert caught.value.name == "engine"

@@ -1,0 +1,236 @@
+"""A scenario: what is flown, with which aircraft and in which conditions, as one record.
+
+Names, JSON and options become a scenario once, where they come in: at the three APIs, in the
+functions of Python and on the command line. From there on it is carried alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Unpack
+
+from typing_extensions import TypedDict
+
+from quadrl.aircraft import presets
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base import validation
+from quadrl.conditions import observing, randomization
+from quadrl.conditions.observing import Observed, Observing
+from quadrl.conditions.randomization import Randomization, Randomized
+from quadrl.conditions.weather import Weather, Weathered
+from quadrl.control.modes import CONTROL_MODES
+from quadrl.core import catalogue
+from quadrl.core.task import Task
+from quadrl.engines import mjcf
+from quadrl.engines.engine import ENGINES, Engine, EngineName
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+class Conditions(TypedDict, total=False, extra_items=Any):
+    """Keywords that make a scenario; what is None or left out stays as it is.
+
+    Further keywords are options of the task, such as `time_limit=5`.
+    """
+
+    task_options: Mapping[str, Any] | None
+    """Options of the task, such as time_limit=5."""
+    vehicle: str | Vehicle | Mapping[str, Any] | None
+    """The aircraft: a name of `quadrl.VEHICLES`, a Vehicle, or fields that differ from one."""
+    vehicle_options: Mapping[str, Any] | None
+    """Numbers of the aircraft that differ from it, such as mass=0.7 action_scale=90."""
+    aerodynamics: str | Aerodynamics | Mapping[str, Any] | None
+    """Effects of the air on the rotors: none, full, names of single ones with commas between them,
+    or an Aerodynamics; by default those of the aircraft."""
+    weather: Weathered
+    """The weather: calm, light, moderate or severe, a Weather, or some of its fields, such as
+    {"wind_speed": 5}."""
+    randomization: Randomized
+    """What is drawn for each aircraft at each reset and disturbs it: none, light or full, a
+    Randomization, or some of its fields, such as {"mass": [0.8, 1.2]}."""
+    observe: Observed
+    """Options of the observation, as `quadrl.Observing` has them, such as action_history=2."""
+    control_mode: str | None
+    """Meaning of the actions: rotor, thrust_body_rate, velocity or position."""
+    engine: EngineName | Engine | None
+    """The engine: mujoco, or free_flight (MuJoCo only near what can be touched). An `Environment`
+    also takes one that is made already."""
+    control_timestep: float | None
+    """Time between two actions [s]; by default that of the aircraft."""
+    max_episode_steps: int | None
+    """Time limit of an episode in control steps, in place of the task's option time_limit."""
+
+
+def _one_of(name: str, choices: Iterable[str]) -> Callable[[Any], Any]:
+    return lambda given: validation.choice(name, given, choices)
+
+
+def _effects(given: Any) -> Any:
+    return validation.record("aerodynamics", given, Aerodynamics)
+
+
+def _condition(default: Any, parse: Callable[[Any], Any]) -> Any:
+    """A field with the function that makes its value of what may be given for it."""
+    return dataclasses.field(default=default, metadata={"parse": parse})
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """What is flown and how; `of` makes one, and `to_json` gives back what `of` takes.
+
+    To add a condition, add a field with the function that parses it, and its keyword to
+    `Conditions`.
+    """
+
+    task: Task = dataclasses.field(metadata={"parse": catalogue.make})
+    """The task with its options."""
+    vehicle: Vehicle = _condition(presets.VEHICLES["paper"], presets.resolve)
+    """The aircraft as it is specified; `aircraft` is what flies."""
+    aerodynamics: str | Aerodynamics | None = _condition(None, _effects)
+    """Effects of the air that were asked for; None for the aircraft's own."""
+    weather: Weather = _condition(Weather(), Weather.of)
+    """What the wind is like."""
+    randomization: Randomization = _condition(Randomization(), randomization.resolve)
+    """What is drawn for each aircraft at each reset and disturbs it."""
+    observe: Observing = _condition(Observing(), observing.resolve)
+    """Options of the observation."""
+    control_mode: str = _condition("rotor", _one_of("control_mode", CONTROL_MODES))
+    """What actions mean."""
+    engine: EngineName = _condition("mujoco", _one_of("engine", ENGINES))
+    """What flies it."""
+
+    def __post_init__(self) -> None:
+        """Parse and validate each field."""
+        for field in dataclasses.fields(self):
+            value = field.metadata["parse"](getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
+        _ = self.aircraft
+
+    @classmethod
+    def of(
+        cls,
+        given: str | Task | Scenario | Mapping[str, Any],
+        also: Iterable[str] = (),
+        /,
+        *,
+        task: str | Task | None = None,
+        **keywords: Unpack[Conditions],
+    ) -> Scenario:
+        """Make a scenario of what a caller gives, or change one.
+
+        The name of the task or of the aircraft that is there already keeps its options. Another
+        aircraft by its name flies in the air that was asked for; a Vehicle brings its own.
+
+        Args:
+            given: The name of a task, a task, a scenario, or a mapping as `to_json` has it.
+            also: Keywords that the caller takes itself, for the refusal of an unknown one.
+            task: Another task, or its name; None for the one that is given.
+            **keywords: What differs from it.
+
+        Raises:
+            QuadrlError: A name is unknown, a value impossible, or a keyword of nobody.
+        """
+        if isinstance(given, Scenario):
+            if task is None and not keywords:
+                return given
+            whole: dict[str, Any] = {f.name: getattr(given, f.name) for f in FIELDS}
+        else:
+            whole = dict(given) if isinstance(given, Mapping) else {"task": given}
+        new: dict[str, Any] = {
+            name: value
+            for name, value in {"task": task, **keywords}.items()
+            if value is not None or name not in KEYWORDS
+        }
+        for name in ("task", "vehicle"):
+            if name in new and new[name] == getattr(there := whole.get(name), "name", there):
+                del new[name]
+            elif name in new:
+                whole.pop(f"{name}_options", None)
+        if isinstance(new.get("vehicle"), Vehicle):
+            whole.pop("aerodynamics", None)
+        options = {**whole.pop("task_options", {}), **new.pop("task_options", {})}
+        vehicle_options = {**whole.pop("vehicle_options", {}), **new.pop("vehicle_options", {})}
+        whole |= new
+        options |= {name: whole.pop(name) for name in list(whole) if name not in KEYWORDS}
+        vehicle = presets.resolve(whole.get("vehicle"), vehicle_options)
+        if (timestep := whole.pop("control_timestep", None)) is not None:
+            vehicle = dataclasses.replace(vehicle, control_timestep=timestep)
+        if (steps := whole.pop("max_episode_steps", None)) is not None:
+            steps = validation.number("max_episode_steps", steps, 1, whole=True)
+            options["time_limit"] = steps * vehicle.control_timestep
+        made, options = catalogue.make(whole["task"]), validation.tuples(options)
+        known = [*KEYWORDS, *also, *(field.name for field in dataclasses.fields(made))]
+        validation.keys(f"{made.name} option", options, known)
+        parts = {name: value for name, value in whole.items() if value is not None}
+        return cls(**parts | {"task": made.replace(**options), "vehicle": vehicle})
+
+    def to_json(self) -> dict[str, Any]:
+        """What differs from the defaults, as JSON can hold it; `of` makes the same scenario."""
+        found: dict[str, Any] = {"task": self.task.name}
+        if options := _differing(self.task):
+            found["task_options"] = options
+        found |= _vehicle_json(self.vehicle)
+        for field in FIELDS[2:]:
+            value = getattr(self, field.name)
+            if value != field.default:
+                found[field.name] = _differing(value) if dataclasses.is_dataclass(value) else value
+        return found
+
+    @functools.cached_property
+    def aircraft(self) -> Vehicle:
+        """The vehicle in its air: what flies."""
+        return presets.with_effects(self.vehicle, self.aerodynamics)
+
+    @property
+    def altitude(self) -> float:
+        """Height of the origin of the task's frame above the ground [m]."""
+        return max(self.task.altitude, self.aircraft.ground_clearance)
+
+    def compile_model(self, *, drawn: bool = True) -> mujoco.MjModel:
+        """The model of the aircraft in the world of the task, to draw, or lean, to simulate."""
+        task = self.task
+        return mjcf.compile_model(
+            self.aircraft, contact=task.contact, drawn=drawn, scene=task.build
+        )
+
+
+FIELDS = dataclasses.fields(Scenario)
+KEYWORDS = ("task", *Conditions.__annotations__)
+"""The keywords of `Scenario.of`."""
+
+
+def _differing(record: Any, usual: Any = None) -> dict[str, Any]:
+    """The fields of a record that differ from those of another, by default from the defaults."""
+    differs = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        other = field.default if usual is None else getattr(usual, field.name)
+        if _json(value) != _json(other):
+            differs[field.name] = _json(value)
+    return differs
+
+
+def _json(value: Any) -> Any:
+    """A value as JSON gives it back."""
+    return json.loads(json.dumps(value, default=_taken_apart))
+
+
+def _taken_apart(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _vehicle_json(vehicle: Vehicle) -> dict[str, Any]:
+    """An aircraft by its name and its options where that is all, else by all that differs."""
+    if (known := presets.VEHICLES.get(vehicle.name)) is None:
+        return {"vehicle": _json(vehicle)}
+    differs = _differing(vehicle, known)
+    if set(differs) <= set(presets.OPTIONS):
+        return {"vehicle": vehicle.name} | ({"vehicle_options": differs} if differs else {})
+    return {"vehicle": {"name": vehicle.name, **differs}}
