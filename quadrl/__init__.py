@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from dm_control.rl.control import Environment as ControlEnvironment
 
     from quadrl import rendering, suite, testing
-    from quadrl.evaluation.checked import check
+    from quadrl.evaluation.check import check
     from quadrl.evaluation.evaluate import evaluate
     from quadrl.evaluation.robustness import robustness
     from quadrl.learning.run import train
@@ -49,7 +49,7 @@ LAZY = {
     "plot": "quadrl.learning.show",
     "robustness": "quadrl.evaluation.robustness",
     "study": "quadrl.learning.study",
-    "check": "quadrl.evaluation.checked",
+    "check": "quadrl.evaluation.check",
 }
 """Functions that are imported on first use, and their modules."""
 

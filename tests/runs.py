@@ -69,7 +69,7 @@ def assert_same_run(a: Path, b: Path) -> None:
     """Weights, normaliser and header; metrics; evaluation."""
     assert (a / "policy.safetensors").read_bytes() == (b / "policy.safetensors").read_bytes()
     assert metrics(a) == metrics(b)
-    task = TrainConfig.of_folder(a).make_task()
+    task = TrainConfig.of_folder(a).scenario.task
     one, other = (evaluate(folder, task, episodes=4).metrics for folder in (a, b))
     assert one == other
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import ast
-import dataclasses
 import inspect
 import linecache
 import textwrap
 
 
 def docstrings(kind: type) -> dict[str, str]:
-    """The docstrings under the fields of a dataclass and of its bases, each in one line."""
+    """The docstrings under the fields of a dataclass or a TypedDict and of its bases, by field."""
     found: dict[str, str] = {}
-    for base in reversed([c for c in kind.__mro__ if dataclasses.is_dataclass(c)]):
+    for base in reversed([c for c in kind.__mro__ if vars(c).get("__annotations__")]):
         body = source(base)
         for field, text in zip(body, body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):

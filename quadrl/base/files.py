@@ -116,8 +116,13 @@ def write_sealed_json(path: Path, content: Mapping[str, Any], form: str) -> None
     write_sealed(path, json.dumps(sealed, indent=2).encode())
 
 
-def read_sealed_json(path: Path, form: str) -> dict[str, Any]:
-    """Read what `write_sealed_json` wrote, or a table of an earlier quadrl, without a digest.
+def read_sealed_json(path: Path, form: str, *, unsealed: bool = True) -> dict[str, Any]:
+    """Read what `write_sealed_json` wrote.
+
+    Args:
+        path: The file.
+        form: Its format.
+        unsealed: Whether it may be a table of an earlier quadrl, without a digest.
 
     Raises:
         QuadrlError: The file cannot be read, is no table, of another format, or damaged.
@@ -129,7 +134,7 @@ def read_sealed_json(path: Path, form: str) -> dict[str, Any]:
         raise QuadrlError(f"{path} cannot be read: {error}") from error
     if not isinstance(table, dict):
         raise QuadrlError(f"{path} must hold a table")
-    check_seal(path, content, unsealed="format" not in table)
+    check_seal(path, content, unsealed=unsealed and "format" not in table)
     if (written := table.get("format", form)) != form:
         raise QuadrlError(name=f"format of {path}", value=written, allowed=form)
     return {name: value for name, value in table.items() if name not in ("digest", "format")}

@@ -7,7 +7,7 @@ from typing import Any
 
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
-from quadrl.cli.flown import Flown
+from quadrl.cli.flown import Flown, beside
 from quadrl.evaluation.evaluate import evaluate, shown
 
 
@@ -17,9 +17,6 @@ class Evaluate(Flown):
 
     episodes: int = 100
     """Number of episodes."""
-    weather: choices.WeatherName = ""
-    """The weather: calm, light, moderate or severe, or JSON such as '{"wind_speed": 5}'; by default
-    that of the policy's training, and calm for a controller."""
     sampled: bool = False
     """Draw the actions of a policy as in training, instead of taking their mean."""
     csv: Path | None = None
@@ -29,7 +26,7 @@ class Evaluate(Flown):
 
     def run(self) -> None:
         """Print the metrics, beside those of the geometric controller."""
-        _, controller, task, vehicle = self.setting()
+        _, controller, scenario = self.setting()
         name = self.controller or "policy"
         flown: dict[str, Any] = {name: controller}
         if self.controller != "geometric" and not self.json:
@@ -37,12 +34,9 @@ class Evaluate(Flown):
         evaluations = {
             name: evaluate(
                 one,
-                task,
+                scenario if one is controller else beside(scenario),
                 episodes=self.episodes,
                 seed=self.seed,
-                vehicle=vehicle,
-                randomization=self.of_all("randomization", [controller]),
-                weather=self.of_all("weather", [controller]),
                 sampled=self.sampled and one is controller,
             )
             for name, one in flown.items()

@@ -2,27 +2,70 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Iterable
+import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from quadrl import tasks
-from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice
+from quadrl.base.validation import choice, tuples
 from quadrl.cli import choices
+from quadrl.conditions.observing import Observing
 from quadrl.control import CONTROLLERS
-from quadrl.core.task import Task
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.evaluation.evaluate import comes_with_quadrl, setting
 from quadrl.evaluation.rollout import Controller
-from quadrl.learning.config import tuples
+
+
+def make_conditions() -> type:
+    """A dataclass with an option for each condition, empty by default: "not given"."""
+    hints, texts = typing.get_type_hints(Conditions), docstrings(Conditions)
+    fields = []
+    for name, hint in hints.items():
+        kind: Any = choices.SETTINGS.get(name, str)
+        default: Any = ""
+        if hint == Mapping[str, Any] | None or name == "observe":
+            kind, default = tuple[str, ...], ()
+        elif hint in (float | None, int | None):
+            kind, default = hint, None
+        text = texts[name]
+        text += "" if "by default" in text else "; by default as in the policy's training"
+        fields.append((name, Annotated[kind, arg(help=text, help_behavior_hint="")], default))
+    return dataclasses.make_dataclass("ConditionOptions", fields, frozen=True)
+
+
+ConditionOptions: Any = make_conditions()
+
+
+class Conditioned(ConditionOptions):
+    """The options of a command that say in which conditions is flown."""
+
+    def conditions(self) -> dict[str, Any]:
+        """Those that are given, as `Scenario.of` takes them.
+
+        Raises:
+            QuadrlError: One begins like JSON and is none, or has no equals sign.
+        """
+        given = {field.name: getattr(self, field.name) for field in FIELDS}
+        parsed: dict[str, Any] = {
+            name: parse_options(value) if isinstance(value, tuple) else parse_named(name, value)
+            for name, value in given.items()
+            if value not in (None, "", ())
+        }
+        return parsed
+
+
+FIELDS = dataclasses.fields(ConditionOptions)
 
 
 @choices.command
-class Flown:
+class Flown(Conditioned):
     """What flies, and what it flies."""
 
     policy: Annotated[Positional[str], arg(metavar="[POLICY]")] = ""
@@ -34,23 +77,11 @@ class Flown:
     """A controller instead of a policy: geometric or lqr."""
     task: choices.TaskName = ""
     """The task; by default the one that the policy was trained for, and hover for a controller."""
-    vehicle: choices.VehicleName = ""
-    """The aircraft; by default the one that the policy was trained with, paper for a controller."""
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
-    task_options: tuple[str, ...] = ()
-    """Options of the task that differ from the training's, such as time_limit=5."""
 
-    randomization: choices.RandomizationName = ""
-    """What is drawn for each aircraft and disturbs it: none, light or full, or JSON such as
-    '{"mass": [0.8, 1.2]}'; by default that of the policy's training, and none for a controller."""
-
-    aerodynamics: str = ""
-    """Effects of the air on the rotors: none, full, or names of single ones with commas between
-    them; by default those of the policy's training."""
-
-    def setting(self) -> tuple[str, Controller, Task, Vehicle]:
-        """A name for what flies, what flies, task and aircraft.
+    def setting(self) -> tuple[str, Controller, Scenario]:
+        """A name for what flies, what flies, and what it flies.
 
         Raises:
             QuadrlError: One is unknown, or the choice is ambiguous.
@@ -70,23 +101,21 @@ class Flown:
         flown = self.controller or (
             self.policy if comes_with_quadrl(self.policy) else Path(self.policy)
         )
-        options = parse_options(self.task_options)
-        chosen = self.task or None, self.vehicle or None, options, self.algo or "ppo"
-        return setting(flown, *chosen, self.aerodynamics or None)
-
-    def of_all(self, name: str, flown: Iterable[Controller]) -> Any:
-        """The weather, or the randomization, in which all fly beside each other."""
-        own = (getattr(controller, "conditions", {}).get(name) for controller in flown)
-        return parse_named(name, getattr(self, name)) or next(filter(None, own), None)
+        return setting(flown, self.task or None, self.algo or "ppo", **self.conditions())
 
 
-def parse_named(name: str, text: str) -> Any:
+def beside(scenario: Scenario) -> Scenario:
+    """What the yardstick flies beside a policy: its scenario, with rotor commands, seeing all."""
+    return dataclasses.replace(scenario, control_mode="rotor", observe=Observing())
+
+
+def parse_named(name: str, text: Any) -> Any:
     """A name as it is, or what JSON such as {"mass": [0.8, 1.2]} stands for.
 
     Raises:
         QuadrlError: It begins like JSON and is none.
     """
-    if not text.startswith("{"):
+    if not isinstance(text, str) or not text.startswith("{"):
         return text
     try:
         return tuples(json.loads(text))

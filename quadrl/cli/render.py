@@ -9,13 +9,11 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.progress import ProgressBar
 from quadrl.cli import choices
 from quadrl.cli.console import console, say
 from quadrl.cli.flown import Flown
-from quadrl.core.task import Task
-from quadrl.engines import mjcf
+from quadrl.core.scenario import Scenario
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import FILE
 from quadrl.evaluation.rollout import Controller
@@ -38,9 +36,6 @@ class Render(Flown):
     """Output file. Its ending sets the kind: .mp4, .gif, or, for moments of the flight in one
     picture, .png or .jpg. By default flight.mp4 or, where that exists, flight-2.mp4 and so on; a
     file that is named here is overwritten."""
-    weather: choices.WeatherName = ""
-    """The weather: calm, light, moderate or severe, or JSON such as '{"wind_speed": 5}'; by default
-    that of the policy's training, and calm for a controller."""
     camera: choices.Camera = "follow"
     """Camera: follow keeps the goal in view, chase is behind the aircraft."""
     width: int | None = None
@@ -63,13 +58,10 @@ class Render(Flown):
         write = write_contact_sheet if kind in SHEETS else write_video
         width, height, fps = SHEET if kind in SHEETS else GIF if kind == "gif" else VIDEO
         flights, models, labels = [], [], []
-        settings: dict[str, Any] = {"seed": self.seed}
-        for name in ("weather", "randomization"):
-            settings[name] = self.of_all(name, [one[1] for one in flown])
-        for label, controller, task, vehicle in flown:
-            one = evaluate(controller, task, episodes=1, vehicle=vehicle, **settings)
-            flights.append(one.rollout.trajectory(vehicle))
-            models.append(mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene))
+        for label, controller, scenario in flown:
+            one = evaluate(controller, scenario, episodes=1, seed=self.seed)
+            flights.append(one.rollout.trajectory(one.vehicle))
+            models.append(one.scenario.compile_model())
             labels.append(label if len(flown) > 1 else "")
         with ProgressBar(console) as bar:
             write(
@@ -85,8 +77,8 @@ class Render(Flown):
             )
         say(f"wrote {out}")
 
-    def flown(self) -> list[tuple[str, Controller, Task, Vehicle]]:
-        """Label, controller, task and aircraft of each flight; the task is that of the first.
+    def flown(self) -> list[tuple[str, Controller, Scenario]]:
+        """Label, controller and scenario of each flight, in the task and the world of the first.
 
         Raises:
             QuadrlError: One is unknown, or there is none.
@@ -95,15 +87,22 @@ class Render(Flown):
         shared: dict[str, Any] = {name: getattr(self, name) for name in names}
         chosen: list[dict[str, Any]] = [{"policy": name, "controller": ""} for name in self.policy]
         chosen += [{"policy": "", "controller": name} for name in self.controller]
-        flown: list[tuple[str, Controller, Task, Vehicle]] = []
+        flown: list[tuple[str, Controller, Scenario]] = []
         for one in chosen or [{"policy": "", "controller": ""}]:
             if one["controller"]:
                 shared["algo"] = ""
             if flown and not self.task:
-                shared["task"] = flown[0][2].name
-            _, controller, task, vehicle = Flown(**(shared | one)).setting()
-            task = flown[0][2] if flown else task
-            flown.append((label_of(**one), controller, task, vehicle))
+                shared["task"] = flown[0][2].task.name
+            _, controller, scenario = Flown(**(shared | one)).setting()
+            flown.append((label_of(**one), controller, scenario))
+        disturbed = [scenario for *_, scenario in flown]
+        world: Any = {"task": disturbed[0].task}
+        for name in ("weather", "randomization"):
+            own = (getattr(scenario, name) for scenario in disturbed)
+            default = Scenario.__dataclass_fields__[name].default
+            world[name] = next((x for x in own if x != default), default)
+        for k, (label, controller, scenario) in enumerate(flown):
+            flown[k] = label, controller, dataclasses.replace(scenario, **world)
         return flown
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -13,14 +13,14 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
-from quadrl.cli.flown import parse_options
+from quadrl.cli.flown import Conditioned
 from quadrl.control import CONTROLLERS
 from quadrl.evaluation.evaluate import comes_with_quadrl
 from quadrl.evaluation.robustness import robustness
 
 
 @choices.command
-class Robustness:
+class Robustness(Conditioned):
     """Fly policies or controllers through graded disturbances, and map where they recover from."""
 
     policies: Positional[tuple[str, ...]] = ()
@@ -34,12 +34,7 @@ class Robustness:
     task: choices.TaskName = ""
     """The task; by default the one that the first policy was trained for, and hover for a
     controller."""
-    vehicle: choices.VehicleName = ""
-    """The aircraft; by default the one that the first policy was trained with."""
-    aerodynamics: str = ""
-    """Effects of the air on the rotors: none, full, or names of single ones with commas between
-    them; by default those of the first policy's training."""
-    axes: tuple[str, ...] = ()
+    disturbances: tuple[str, ...] = ()
     """Names of the disturbances; by default all."""
     recovery: bool = True
     """Also fly the recovery maps."""
@@ -47,13 +42,9 @@ class Robustness:
     """Flights of each level; a cell of a recovery map has a tenth of them."""
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
-    engine: choices.EngineName = ""
-    """free_flight or mujoco; by default free flight, unless the task touches the ground."""
     out: Path = Path("robustness")
     """Folder for the pictures (.png, .pdf), the numbers (.json) and the table (.csv). Until they
     are written it keeps what was flown, from which the same command goes on after a stop."""
-    task_options: tuple[str, ...] = ()
-    """Options of the task that differ from the training's, such as time_limit=5."""
 
     def run(self) -> None:
         """Fly, print where half of the flights fail, and write the files."""
@@ -66,7 +57,6 @@ class Robustness:
             choice("controller", name, CONTROLLERS)
         # The name of a controller is no policy here: a folder may be called so.
         flown = [name if comes_with_quadrl(name) else Path(name) for name in self.policies]
-        chosen: dict[str, Any] = {name: getattr(self, name) or None for name in GIVEN}
         try:
             card = robustness(
                 [*flown, *(str(name) for name in self.controller)],
@@ -75,8 +65,8 @@ class Robustness:
                 seed=self.seed,
                 recovery=self.recovery,
                 keep=self.out,
-                **chosen,
-                **parse_options(self.task_options),
+                disturbances=self.disturbances or None,
+                **self.conditions(),
             )
         except KeyboardInterrupt:
             words = shlex.join(["quadrl", *sys.argv[1:]])
@@ -87,7 +77,3 @@ class Robustness:
             say(card.reach)
         for path in card.save(self.out):
             say(f"wrote {path}")
-
-
-GIVEN = ("vehicle", "aerodynamics", "engine", "axes")
-"""Options that stand for a default where they are empty."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import RenderingUnavailable
@@ -11,6 +11,7 @@ from quadrl.cli import choices
 from quadrl.cli.console import say
 from quadrl.cli.flown import Flown
 from quadrl.control import CONTROLLERS
+from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.policy import Policy, shipped
@@ -43,12 +44,12 @@ class View(Flown):
         from quadrl.rendering.live.flight import Flight
 
         native.check_screen()
-        _, controller, task, vehicle = self.setting()
-        native.run(Flight(controller, task, vehicle, **self._settings(controller)))
+        _, controller, scenario = self.setting()
+        native.run(Flight(controller, scenario, num_envs=self.num_envs, seed=self.seed))
 
-    def _settings(self, controller: Controller) -> dict[str, Any]:
-        drawn = self.of_all("randomization", [controller])
-        return {"num_envs": self.num_envs, "seed": self.seed, "randomization": drawn}
+    def setting(self) -> tuple[str, Controller, Scenario]:
+        """As of the others, but in calm air by default: there the wind is the spectator's."""
+        return super(View, dataclasses.replace(self, weather=self.weather or "calm")).setting()
 
     def _browser(self) -> None:
         try:
@@ -59,8 +60,9 @@ class View(Flown):
             ) from error
         from quadrl.rendering.live.flight import Flight
 
-        _, controller, task, vehicle = self.setting()
-        flight = Flight(controller, task, vehicle, **self._settings(controller))
+        _, controller, scenario = self.setting()
+        task, vehicle = scenario.task, scenario.aircraft
+        flight = Flight(controller, scenario, num_envs=self.num_envs, seed=self.seed)
         name = self.controller or self.policy
         if name in TASKS:
             name = f"{name}_{self.algo or 'ppo'}"
@@ -79,7 +81,7 @@ def others(task: Task, vehicle: Vehicle) -> dict[str, Callable[[], Controller]]:
     for file in shipped():
         policy = Policy.load(file)
         # The aircraft stays the same, so that its commands have to mean what they did in training.
-        scale = policy.make_vehicle().action_scale
+        scale = policy.scenario.aircraft.action_scale
         if policy.task == task.name and scale == vehicle.action_scale:
             policies[file.stem] = lambda policy=policy: policy
     return policies | {

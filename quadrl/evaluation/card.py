@@ -10,15 +10,13 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
 from quadrl.base.media import Media
+from quadrl.evaluation.cache import ResultCache
 from quadrl.evaluation.evaluate import html_table
-
-if TYPE_CHECKING:
-    from quadrl.evaluation.kept import Kept
 
 NORMAL_95 = 1.959963984540054  # the normal distribution's quantile of 97.5 %
 QUARTILES = (0.25, 0.5, 0.75)
@@ -59,13 +57,13 @@ class Card:
     """What policies withstand, beside each other; a table and pictures in a notebook."""
 
     found: dict[str, Any]
-    """As the JSON file has it: task, vehicle, seed, episodes, engine; `flown`, the names; by axis
-    its levels and, for each that flew, `success`, its 95 % interval `low` and `high`, quartiles of
-    the error over the last 2 s `error_m`, and `half`, the levels under and over the usual one at
-    which half of the flights fail, and `reach`, for each that flew those from which on no policy
-    can hover within its actions (older files have none); by recovery map the shares of the flights
-    that recover."""
-    kept: Kept | None = dataclasses.field(default=None, compare=False)
+    """As the JSON file has it: task, vehicle, seed, episodes, engine; `flown`, the names, and
+    `scenarios` by name; in `axes` by disturbance its levels and, for each that flew, `success`,
+    its 95 % interval `low` and `high`, quartiles of the error over the last 2 s `error_m`, and
+    `half`, the levels under and over the usual one at which half of the flights fail, and `reach`,
+    for each that flew those from which on no policy can hover within its actions; by recovery map
+    the shares of the flights that recover. Older files have neither `reach` nor `scenarios`."""
+    kept: ResultCache | None = dataclasses.field(default=None, compare=False)
     """What was kept of the flights until the card is saved."""
 
     def __repr__(self) -> str:

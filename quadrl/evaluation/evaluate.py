@@ -6,22 +6,17 @@ import csv
 import dataclasses
 import html
 import io
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 from quadrl import tasks
-from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.presets import resolve, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
 from quadrl.base.validation import number
-from quadrl.conditions.observing import Observed
-from quadrl.conditions.randomization import Randomized
-from quadrl.conditions.weather import Weathered
 from quadrl.control import CONTROLLERS
 from quadrl.control.feasibility import warn_of_unreached
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.snapshot import Rollout
 from quadrl.core.task import Task
 from quadrl.evaluation.controllers import make_controller
@@ -33,6 +28,7 @@ from quadrl.evaluation.rollout import (
     Controller,
     flights,
     fly,
+    scenario_of,
     summarize,
 )
 
@@ -45,14 +41,24 @@ class Evaluation:
 
     name: str
     """What flew."""
-    task: Task
-    vehicle: Vehicle
+    scenario: Scenario
+    """What it flew."""
     seed: int
     """Of the episodes."""
     metrics: dict[str, Any]
     """Names of task and vehicle, the seed, and what `quadrl.evaluation.rollout.summarize` gives."""
     rollout: Rollout
     """The flights, step by step."""
+
+    @property
+    def task(self) -> Task:
+        """The task that was flown."""
+        return self.scenario.task
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The aircraft in its air."""
+        return self.scenario.aircraft
 
     def __repr__(self) -> str:
         found = self.metrics
@@ -86,111 +92,82 @@ class Evaluation:
 
 def evaluate(
     controller: Any,
-    task: str | Task | None = None,
+    task: str | Task | Scenario | None = None,
     *,
     episodes: int = 100,
     seed: int = 0,
-    vehicle: Vehicle | str | None = None,
-    aerodynamics: str | Aerodynamics | None = None,
-    weather: Weathered = None,
     sampled: bool = False,
-    randomization: Randomized = None,
-    observe: Observed = None,
-    **task_options: Any,
+    **conditions: Unpack[Conditions],
 ) -> Evaluation:
-    """Fly a policy or a controller through episodes that no training has seen, in MuJoCo.
+    """Fly a policy or a controller through episodes that no training has seen.
+
+    They are flown in MuJoCo unless `engine` says otherwise.
 
     Args:
         controller: What flies, as `setting` takes it.
-        task: A task or its name; by default the one that the policy was trained for.
+        task: A task or its name, or a whole scenario; by default the task that the policy was
+            trained for.
         episodes: Their number.
         seed: Of the episodes; the same ones for every controller.
-        vehicle: The aircraft or its name; by default the one that the policy was trained with.
-        aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them; by
-            default those of the training.
-        weather: A `Weather` or its name, one of `conditions.weather.WEATHERS`; by default that of
-            the training.
         sampled: Whether to draw the actions of a policy, as in training, instead of their mean.
-        randomization: What is drawn for each flight and disturbs it: a name of
-            `quadrl.RANDOMIZATIONS` or a `quadrl.Randomization`; by default that of the training.
-        observe: Options of the observation, for a function; a policy knows its own.
-        **task_options: Options of the task that differ from the training's.
+        **conditions: `vehicle`, `weather`, `randomization` and the others, as
+            `quadrl.core.scenario.Conditions` has them, and options of the task; what is left out
+            is as in the training.
 
     Raises:
         QuadrlError: Something is unknown, out of range, or does not fit together.
     """
     seed = number("seed", seed, 0, MAX_SEED, whole=True)
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
-    name, flown, task, vehicle = setting(
-        controller, task, vehicle, task_options, aerodynamics=aerodynamics
-    )
+    name, flown, scenario = setting(controller, task, **conditions)
     if sampled:
         if not isinstance(flown, Policy):
             raise QuadrlError(name="sampled", value=True, allowed="False for a controller")
         flown = flown.flying(episodes, SAMPLING_SEED)
-    own = getattr(flown, "conditions", {}).get("randomization")
-    warn_of_unreached(vehicle, own if randomization is None else randomization)
-    chosen: Any = {"episodes": episodes, "vehicle": vehicle, "weather": weather}
-    chosen |= {"randomization": randomization, "observe": observe}
-    rollout = fly(flown, task, seed=EVALUATION_SEED + seed, **chosen)
-    metrics = {"task": task.name, "vehicle": vehicle.name, "seed": seed} | summarize(rollout)
-    return Evaluation(name, task, vehicle, seed, metrics, rollout)
+    warn_of_unreached(scenario.aircraft, scenario.randomization)
+    rollout = fly(flown, scenario, episodes=episodes, seed=EVALUATION_SEED + seed)
+    names = {"task": scenario.task.name, "vehicle": scenario.vehicle.name, "seed": seed}
+    return Evaluation(name, scenario, seed, names | summarize(rollout), rollout)
 
 
 def setting(
     controller: Any,
-    task: str | Task | None = None,
-    vehicle: Vehicle | str | None = None,
-    task_options: Mapping[str, Any] | None = None,
+    task: str | Task | Scenario | None = None,
     algo: str = "ppo",
-    aerodynamics: str | Aerodynamics | None = None,
-) -> tuple[str, Controller, Task, Vehicle]:
-    """What flies, what it flies, and with which aircraft.
+    **conditions: Unpack[Conditions],
+) -> tuple[str, Controller, Scenario]:
+    """What flies, and what it flies.
 
     Args:
         controller: A `Policy`; what `quadrl.train` returned; a run folder or a .safetensors file;
             the name of a task, for the policy for it that comes with quadrl, or of such a policy
             (hover_robust); "geometric" or "lqr";
             or any function of flat observations (N, size) that gives actions (N, k).
-        task: A task or its name; None for what the policy was trained for, hover for a controller.
-        vehicle: The aircraft or its name; None for the policy's, the paper's for a controller.
-        task_options: Options of the task that differ from the training's.
+        task: A task or its name, or a whole scenario; None for what the policy was trained for,
+            hover for a controller.
         algo: Which of the policies that come with quadrl.
-        aerodynamics: Effects of the air on the aircraft; None for those that a policy was trained
-            with, unless the aircraft is a Vehicle.
+        **conditions: As `evaluate` takes them.
 
     Returns:
-        A name for what flies, a function of observations, the task and the aircraft.
+        A name for what flies, a function of observations, and the scenario.
 
     Raises:
         QuadrlError: Something is unknown or missing.
     """
-    options = dict(task_options or {})
     flown: Any = getattr(controller, "policy", controller)
     if isinstance(flown, str) and flown in CONTROLLERS:
-        vehicle = with_effects(resolve(vehicle), aerodynamics)
-        task = tasks.make(task or "hover", **options)
-        return f"{flown} controller", make_controller(flown, task, vehicle), task, vehicle
+        scenario = Scenario.of(task or "hover", **conditions)
+        made = make_controller(flown, scenario.task, scenario.aircraft)
+        return f"{flown} controller", made, scenario
     name = "policy" if isinstance(flown, Policy) else getattr(flown, "__name__", "controller")
     if isinstance(flown, (str, Path)):
         shipped = isinstance(flown, str) and comes_with_quadrl(flown)
         name, path = str(flown), flown
         flown = Policy.pretrained(str(path), algo) if shipped else Policy.load(path)
-    if isinstance(flown, Policy):
-        own = flown.metadata
-        if task is None or task == flown.task:
-            task, options = flown.task, own.get("task_options", {}) | options
-        if vehicle is None or vehicle == own.get("vehicle"):
-            vehicle, aerodynamics = flown.make_vehicle(aerodynamics), None
-        elif aerodynamics is None and not isinstance(vehicle, Vehicle):
-            aerodynamics = own.get("aerodynamics")
-    elif not callable(flown):
+    if not callable(flown):
         allowed = "a policy, a run, a path, the name of a task or a controller, or a function"
         raise QuadrlError(name="controller", value=flown, allowed=allowed)
-    elif task is None:
-        raise QuadrlError(name="task", value=None, allowed="given, for a function")
-    vehicle = with_effects(resolve(vehicle), aerodynamics)
-    return name, cast(Any, flown), tasks.make(task, **options), vehicle
+    return name, cast(Any, flown), scenario_of(flown, task, **conditions)
 
 
 def comes_with_quadrl(name: str) -> bool:

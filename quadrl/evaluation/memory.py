@@ -64,7 +64,7 @@ FIELDS = dataclasses.fields(GRU)
 NAMES = tuple(PREFIX + field.name for field in FIELDS)
 
 
-class Flyer:
+class PolicyInFlight:
     """A policy in flight: a function of observations that keeps what the policy remembers."""
 
     def __init__(self, policy: Any, count: int | None, seed: int | None) -> None:

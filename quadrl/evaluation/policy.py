@@ -18,20 +18,18 @@ import numpy as np
 from safetensors.numpy import load as of_bytes
 from safetensors.numpy import save as to_bytes
 
-from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.presets import VEHICLES, with_effects
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.presets import resolve as resolve_vehicle
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import read_safetensors, read_sealed_json, write_safetensors
 from quadrl.base.validation import choice, number
-from quadrl.conditions.observing import resolve
-from quadrl.evaluation.memory import GRU, NAMES, PREFIX, Flyer
+from quadrl.conditions import observing
+from quadrl.core.scenario import KEYWORDS, Scenario
+from quadrl.evaluation.memory import GRU, NAMES, PREFIX, PolicyInFlight
 
 if TYPE_CHECKING:
     from quadrl.core.environment import Environment
 
-CONDITIONS = ("weather", "randomization", "observe")
 FORMAT, RECURRENT_FORMAT = "quadrl-policy-3", "quadrl-policy-gru-2"
 UNSEALED, RECURRENT_UNSEALED = "quadrl-policy-2", "quadrl-policy-gru-1"
 """Formats of files without a digest."""
@@ -63,8 +61,8 @@ class Policy:
     task: str
     """The task that it was trained for."""
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """How it was made: algo, seed, variant, steps, vehicle, rotors, control_mode, task_options; and
-    the other conditions of `TrainConfig.conditions`, where they differ from the usual."""
+    """How it was made: algo, seed, variant, steps, rotors; and its scenario, as
+    `Scenario.to_json` gives it."""
     memory: GRU | None = None
     """What it remembers with: its state after an observation joins the normalised observation."""
 
@@ -81,33 +79,30 @@ class Policy:
 
     @property
     def conditions(self) -> dict[str, Any]:
-        """What its training flew in and saw, for `Environment`, where it is not the usual."""
-        return {name: self.metadata[name] for name in CONDITIONS if name in self.metadata}
+        """What it was trained for and in, as `Scenario.of` takes it; it may have unknown names."""
+        known = {name: self.metadata[name] for name in KEYWORDS if name in self.metadata}
+        return known | {"task": self.task}
 
-    def make_vehicle(self, aerodynamics: str | Aerodynamics | None = None) -> Vehicle:
-        """The aircraft of its training.
+    @property
+    def scenario(self) -> Scenario:
+        """What it was trained for and in.
 
-        Args:
-            aerodynamics: Effects of the air, as `with_effects` takes them; None for those of the
-                training.
+        Raises:
+            QuadrlError: Its task or its aircraft is not known here.
         """
-        own = self.metadata
-        vehicle = resolve_vehicle(own.get("vehicle"), own.get("vehicle_options"))
-        if aerodynamics is None:
-            aerodynamics = own.get("aerodynamics")
-        return with_effects(vehicle, aerodynamics)
+        return Scenario.of(self.conditions)
 
     @property
     def keywords(self) -> dict[str, Any]:
         """Keywords with which each API makes an environment that it fits.
 
         They are the aircraft, the control mode, the observation and the options of the task of its
-        training: `gymnasium.make("quadrl/Hover-v0", **policy.keywords)`. Its training's weather
-        and randomization are in `conditions`.
+        training: `gymnasium.make("quadrl/Hover-v0", **policy.keywords)`. The weather and the
+        randomization of its training are in `scenario`.
         """
-        seen = self.conditions.get("observe", {})
-        needed = {"vehicle": self.make_vehicle(), "control_mode": self.control_mode}
-        return needed | {"observe": seen} | self.metadata.get("task_options", {})
+        own = self.scenario
+        needed = {"vehicle": own.aircraft, "control_mode": own.control_mode, "observe": own.observe}
+        return needed | self.metadata.get("task_options", {})
 
     @property
     def size(self) -> int:
@@ -174,14 +169,14 @@ class Policy:
             raise QuadrlError(name="state shape", value=state.shape, allowed=f"{needed}")
         return self._act(observation, state, generator)
 
-    def flying(self, n: int | None = None, seed: int | None = None) -> Flyer:
+    def flying(self, n: int | None = None, seed: int | None = None) -> PolicyInFlight:
         """Any policy as a function of observations that remembers; its `reset` makes it forget.
 
         Args:
             n: Aircraft that it flies: observations are (n, size). None for one, (size,).
             seed: Of the draws of the stochastic policy; None for the mean action.
         """
-        return Flyer(self, n, seed)
+        return PolicyInFlight(self, n, seed)
 
     def check_fits(self, environment: Environment) -> None:
         """Refuse an environment in which observations or actions mean something else.
@@ -195,20 +190,17 @@ class Policy:
         """
         vehicle, name = environment.vehicle, self.metadata.get("vehicle")
         # One that is not known here is taken for the one that it is to fly.
-        known = name if name in VEHICLES else vehicle
+        known = name if isinstance(name, dict) or name in VEHICLES else vehicle
         trained = resolve_vehicle(known, self.metadata.get("vehicle_options"))
-        needed, seen = (
-            resolve(self.conditions.get("observe")).for_policy(),
-            environment.observing.for_policy(),
-        )
+        needed = observing.resolve(self.metadata.get("observe")).for_policy()
+        seen = environment.scenario.observe.for_policy()
         if needed != seen:
             allowed = f"{needed}, as in the training of the policy for {self.task}"
             raise QuadrlError(name="observe", value=seen, allowed=allowed)
-        own_sizes, there = (
-            (self.size, self.action_size),
-            (environment.size, environment.action_size),
-        )
-        for what, own, needed in zip(("observation", "action"), own_sizes, there, strict=True):
+        for what, own, needed in (
+            ("observation", self.size, environment.size),
+            ("action", self.action_size, environment.action_size),
+        ):
             if own != needed:
                 name = f"{what} size of the policy for {self.task}"
                 where = f"{environment.task.name} with the vehicle {vehicle.name}"

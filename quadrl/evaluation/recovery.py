@@ -14,14 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import quaternion_from_heading_and_tilt
-from quadrl.conditions.randomization import NONE
-from quadrl.conditions.weather import Weather
 from quadrl.core.contact import touches_ground
 from quadrl.core.environment import Environment
-from quadrl.core.task import Task
-from quadrl.engines.engine import EngineName
+from quadrl.core.scenario import Scenario
 from quadrl.engines.state import State
 from quadrl.evaluation.rollout import FINAL_STRETCH, Controller, prepared
 
@@ -112,31 +108,21 @@ MAPS = {
 
 
 def recovered(
-    controller: Controller,
-    task: Task,
-    chart: RecoveryMap,
-    *,
-    episodes: int,
-    seed: int,
-    vehicle: Vehicle,
-    engine: EngineName,
+    controller: Controller, scenario: Scenario, chart: RecoveryMap, *, episodes: int, seed: int
 ) -> np.ndarray:
     """Share of the flights that recover, (levels of y, levels of x).
 
     Args:
         controller: What flies.
-        task: What is flown, in calm air.
+        scenario: What is flown.
         chart: The map.
         episodes: Flights of each pair of levels, different ones for each pair.
         seed: Of the first aircraft.
-        vehicle: The aircraft.
-        engine: Its name.
     """
     y, x = np.meshgrid(chart.y.levels, chart.x.levels, indexing="ij")
     shape = (*x.shape, episodes)
     x, y = (np.broadcast_to(part[..., None], shape).reshape(-1) for part in (x, y))
-    calm: dict[str, Any] = {"weather": Weather(), "randomization": NONE}
-    environment, flown = prepared(controller, task, x.size, seed, vehicle, None, engine, calm)
+    environment, flown = prepared(controller, scenario, x.size, seed)
     observation = begin(environment, chart, x, y, seed)
     steps = environment.time_limit_steps
     last = min(steps, round(FINAL_STRETCH / environment.vehicle.control_timestep))
@@ -149,7 +135,7 @@ def recovered(
         over |= now.terminated | now.truncated
         lost += touches_ground(environment.snapshot) | now.diverged
         error += now.error * (step >= steps - last)
-    back = succeeded if task.contact else (lost == 0) & (error / last < RECOVERED)
+    back = succeeded if scenario.task.contact else (lost == 0) & (error / last < RECOVERED)
     return back.reshape(shape).mean(axis=-1)
 
 

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.progress import ProgressBar
 from quadrl.base.validation import choice, number
-from quadrl.conditions.randomization import Randomization
+from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control.feasibility import limit
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
-from quadrl.engines.engine import EngineName
-from quadrl.evaluation.axes import AXES, Axis
+from quadrl.evaluation.cache import ResultCache
 from quadrl.evaluation.card import QUARTILES, Card, half_level, wilson
 from quadrl.evaluation.evaluate import setting
-from quadrl.evaluation.kept import Kept
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.recovery import MAPS, recovered
 from quadrl.evaluation.rollout import (
@@ -36,64 +35,139 @@ from quadrl.evaluation.rollout import (
     fly,
 )
 
+WORLD = ("weather", "randomization", "engine")
+"""Fields of the first one's scenario in which the others fly too, beside task and aircraft."""
 CELL_SHARE = 10  # a cell of a recovery map has this part of the flights of a level
+PUSHES_PER_SECOND = 0.5  # chosen: about five in a flight of 10 s
+
+
+@dataclasses.dataclass(frozen=True)
+class Disturbance:
+    """One disturbance, at levels that are the same for every policy."""
+
+    name: str
+    label: str
+    unit: str
+    levels: tuple[float, ...]
+    """In rising order."""
+    at: Callable[[float], Randomization | Weather]
+    """What flights of a level are disturbed by."""
+    usual: float = 0.0
+    """The level at which nothing is disturbed; one of the levels."""
+
+
+def _noise(times: float) -> Randomization:
+    full = vars(RANDOMIZATIONS["full"].noise)
+    return Randomization(noise=Errors(**{name: times * size for name, size in full.items()}))
+
+
+def _pushes(speed: float) -> Randomization:
+    pushes = Pushes(rate=PUSHES_PER_SECOND, velocity=speed, body_rate=speed)
+    return Randomization(pushes=pushes if speed else Pushes())
+
+
+def _exactly(name: str, value: float) -> Randomization:
+    given: dict[str, Any] = {name: (value, value)}
+    return Randomization(**given)
+
+
+def _delay(milliseconds: float) -> Randomization:
+    return _exactly("command_delay", milliseconds / 1000)
+
+
+def _weather(name: str) -> Callable[[float], Weather]:
+    return lambda level: Weather(**{name: level})
+
+
+def _factor(name: str) -> Callable[[float], Randomization]:
+    return lambda level: _exactly(name, level)
+
+
+def _loss(name: str) -> Callable[[float], Randomization]:
+    return lambda percent: _exactly(name, 1 - percent / 100)
+
+
+WIND_SPEEDS = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+GUST_SPEEDS = (0.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0)
+MASSES = (0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2, 1.3)
+INERTIAS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
+LOSSES = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 15.0, 20.0)
+DELAYS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 70.0, 100.0)
+LAGS = (0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
+NOISES = (0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0)
+PUSHES = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
+SPECIFIED = "of the specified"
+DISTURBANCES = {
+    one.name: one
+    for one in (
+        Disturbance("wind", "mean wind, turbulent", "m/s", WIND_SPEEDS, _weather("wind_speed")),
+        Disturbance("gust", "one gust", "m/s", GUST_SPEEDS, _weather("gust_speed")),
+        Disturbance("mass", "mass", SPECIFIED, MASSES, _factor("mass"), 1.0),
+        Disturbance("inertia", "inertia", SPECIFIED, INERTIAS, _factor("inertia"), 1.0),
+        Disturbance("thrust", "thrust lost", "%", LOSSES, _loss("thrust")),
+        Disturbance("one_rotor", "thrust lost by one rotor", "%", LOSSES, _loss("one_rotor")),
+        Disturbance("delay", "delay of commands", "ms", DELAYS, _delay),
+        Disturbance("lag", "rotor lag", SPECIFIED, LAGS, _factor("lag"), 1.0),
+        Disturbance("noise", "noise of the estimate", "of 'full'", NOISES, _noise),
+        Disturbance("pushes", "pushes, 0.5 per second", "m/s", PUSHES, _pushes),
+    )
+}
+"""By name."""
 
 
 def robustness(
     controller: Any,
-    task: str | Task | None = None,
+    task: str | Task | Scenario | None = None,
     *,
     episodes: int = 300,
     seed: int = 0,
-    vehicle: Vehicle | str | None = None,
-    aerodynamics: str | Aerodynamics | None = None,
-    engine: EngineName | None = None,
-    axes: Iterable[str] | None = None,
+    disturbances: Iterable[str] | None = None,
     recovery: bool = True,
     progress: bool = True,
     keep: str | Path | None = None,
-    **task_options: Any,
+    **conditions: Unpack[Conditions],
 ) -> Card:
     """Fly policies or controllers through graded disturbances, each alone, and map recoveries.
 
-    All fly the same task with the same aircraft, through the same episodes. What a policy was
-    trained in does not count: a level is all that disturbs its flights.
+    All fly the same task with the same aircraft, through the same episodes. The weather and the
+    randomization that a policy was trained in do not count: beside those that are given, a level
+    is all that disturbs its flights.
 
     Args:
         controller: What flies, as `quadrl.evaluate` takes it; a list of such; or a mapping of names
             to such.
-        task: A task or its name; by default that of the first.
+        task: A task or its name, or a whole scenario; by default the task of the first.
         episodes: Flights of each level; a cell of a recovery map has a tenth of them.
         seed: Of the episodes.
-        vehicle: The aircraft or its name; by default that of the first.
-        aerodynamics: Effects of the air; by default those of the first.
-        engine: "free_flight" or "mujoco"; by default free flight, unless the task touches ground.
-        axes: Names of the disturbances, of `quadrl.evaluation.axes.AXES`; by default all.
+        disturbances: Names of `DISTURBANCES`; by default all.
         recovery: Whether to fly the recovery maps.
         progress: Whether to show a progress bar.
         keep: A folder in which each level and each map is kept as soon as it is flown, until the
             card is saved; a call with the same conditions that follows one that was stopped takes
             them from there. What a function of your own flies is not kept.
-        **task_options: Options of the task.
+        **conditions: As `quadrl.evaluate` takes them; by default the aircraft of the first, and
+            free flight unless the task touches the ground.
 
     Raises:
         QuadrlError: Something is unknown, out of range, or does not fit together.
     """
     seed = number("seed", seed, 0, MAX_SEED, whole=True)
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
-    chosen = [AXES[choice("axis", name, AXES)] for name in (AXES if axes is None else axes)]
-    flown, task, vehicles = _flyers(controller, task, vehicle, aerodynamics, task_options)
-    vehicle = next(iter(vehicles.values()))
-    engine = engine or ("mujoco" if task.contact else "free_flight")
-    common: dict[str, Any] = {"engine": engine, "seed": EVALUATION_SEED + seed}
-    levels = sum(len(axis.levels) - 1 for axis in chosen) + 1
+    names = DISTURBANCES if disturbances is None else disturbances
+    chosen = [DISTURBANCES[choice("disturbance", name, DISTURBANCES)] for name in names]
+    flown = _flown(controller, task, **conditions)
+    first = next(iter(flown.values()))[1]
+    levels = sum(len(one.levels) - 1 for one in chosen) + 1
     total = len(flown) * (levels + recovery * len(MAPS))
-    found: dict[str, Any] = {"task": task.name, "vehicle": vehicle.name, "seed": seed}
-    found |= {"episodes": episodes, "engine": engine, "flown": [*flown]}
-    found |= {"axes": {axis.name: _described(axis) for axis in chosen}, "recovery": {}}
-    for axis in chosen:
-        found["axes"][axis.name]["reach"] = {name: _reach(axis, vehicles[name]) for name in flown}
-    done, kept = 0, Kept(None if keep is None else Path(keep))
+    found: dict[str, Any] = {"task": first.task.name, "vehicle": first.vehicle.name, "seed": seed}
+    found |= {"episodes": episodes, "engine": first.engine, "flown": [*flown]}
+    found["scenarios"] = {name: scenario.to_json() for name, (_, scenario) in flown.items()}
+    found |= {"axes": {one.name: _described(one) for one in chosen}, "recovery": {}}
+    for one in chosen:
+        reach = {name: _reach(one, scenario.aircraft) for name, (_, scenario) in flown.items()}
+        found["axes"][one.name]["reach"] = reach
+    done, kept = 0, ResultCache(None if keep is None else Path(keep))
+    fresh: Any = {"seed": EVALUATION_SEED + seed}
 
     with ProgressBar() as bar:
 
@@ -103,105 +177,107 @@ def robustness(
                 bar.update(done, total, text)
             done += 1
 
-        for name, one in flown.items():
+        for name, (flies, scenario) in flown.items():
             count(f"{name}, undisturbed")
-            alike: Any = common | {"vehicle": vehicles[name], "episodes": episodes}
-            undisturbed = kept(measured, one, task, Randomization(), **alike)
-            for axis in chosen:
-                at = [undisturbed] * len(axis.levels)
-                for k, level in enumerate(axis.levels):
-                    if level != axis.usual:
-                        count(f"{name}, {axis.label}")
-                        at[k] = kept(measured, one, task, axis.at(level), **alike)
-                found["axes"][axis.name]["flown"][name] = _summary(axis, at)
+            undisturbed = kept(measured, flies, scenario, episodes=episodes, **fresh)
+            for one in chosen:
+                at = [undisturbed] * len(one.levels)
+                for k, level in enumerate(one.levels):
+                    if level != one.usual:
+                        count(f"{name}, {one.label}")
+                        there = disturbed(scenario, one.at(level))
+                        at[k] = kept(measured, flies, there, episodes=episodes, **fresh)
+                found["axes"][one.name]["flown"][name] = _summary(one, at)
         for chart in MAPS.values() if recovery else ():
             sides = {side: vars(getattr(chart, side)) for side in "xy"}
             entry = found["recovery"][chart.name] = {**sides, "flown": {}}
-            for name, one in flown.items():
+            for name, (flies, scenario) in flown.items():
                 count(f"{name}, {chart.name}")
-                alike = common | {"vehicle": vehicles[name]}
-                each = max(1, episodes // CELL_SHARE)
-                entry["flown"][name] = kept(recovered, one, task, chart, episodes=each, **alike)
+                fresh["episodes"] = max(1, episodes // CELL_SHARE)
+                entry["flown"][name] = kept(recovered, flies, scenario, chart, **fresh)
         if progress:
             bar.update(total, total, "flown")
     return Card(json.loads(json.dumps(found)), kept)  # tuples as lists, as in the file
 
 
+def disturbed(scenario: Scenario, level: Randomization | Weather) -> Scenario:
+    """A scenario in which what a level says is different."""
+    name = "weather" if isinstance(level, Weather) else "randomization"
+    usual, changes = type(level)(), vars(level).items()
+    changes = {field: value for field, value in changes if value != getattr(usual, field)}
+    changed: Any = {name: dataclasses.replace(getattr(scenario, name), **changes)}
+    return dataclasses.replace(scenario, **changed)
+
+
 def measured(
-    controller: Controller,
-    task: Task,
-    disturbed: Randomization | Weather,
-    *,
-    episodes: int,
-    vehicle: Vehicle,
-    **common: Any,
+    controller: Controller, scenario: Scenario, *, episodes: int, seed: int
 ) -> dict[str, Any] | None:
     """Success with its interval, and quartiles of the error [m]; None where none can hover."""
-    windy = isinstance(disturbed, Weather)
-    weather, randomization = (disturbed, Randomization()) if windy else (Weather(), disturbed)
     try:
-        AircraftSampler(randomization, vehicle)
+        AircraftSampler(scenario.randomization, scenario.aircraft)
     except QuadrlError:  # the aircraft cannot exist, or hardly fly
         return None
-    given: dict[str, Any] = {"weather": weather, "randomization": randomization}
-    rollout = fly(controller, task, episodes=episodes, vehicle=vehicle, **given, **common)
-    flown = flights(rollout)
-    success = int(flown["success"].sum())
+    reached = flights(fly(controller, scenario, episodes=episodes, seed=seed))
+    success = int(reached["success"].sum())
     low, high = wilson(success, episodes)
-    errors = np.quantile(flown["position_error_m"], QUARTILES).tolist()
+    errors = np.quantile(reached["position_error_m"], QUARTILES).tolist()
     return {"success": success / episodes, "low": low, "high": high, "error_m": errors}
 
 
-def _summary(axis: Axis, at: list[dict[str, Any] | None]) -> dict[str, Any]:
-    """What was reached at the levels of an axis, and where half fail."""
+def _summary(one: Disturbance, at: list[dict[str, Any] | None]) -> dict[str, Any]:
+    """What was reached at the levels of a disturbance, and where half fail."""
     names = ("success", "low", "high", "error_m")
-    columns = {name: [one[name] if one else None for one in at] for name in names}
-    start, shares = axis.levels.index(axis.usual), columns["success"]
-    below = half_level(axis.levels[start::-1], shares[start::-1])
-    above = half_level(axis.levels[start:], shares[start:])
+    columns = {name: [level[name] if level else None for level in at] for name in names}
+    start, shares = one.levels.index(one.usual), columns["success"]
+    below = half_level(one.levels[start::-1], shares[start::-1])
+    above = half_level(one.levels[start:], shares[start:])
     return {**columns, "half": [below, above]}
 
 
-def _reach(axis: Axis, vehicle: Vehicle) -> list[float | None]:
+def _reach(one: Disturbance, vehicle: Vehicle) -> list[float | None]:
     """The levels under and over the usual one from which on no policy can hover."""
-    ends = (axis.levels[0], axis.levels[-1])
-    return [limit(axis.at, axis.usual, end, vehicle) for end in ends]
+    return [limit(one.at, one.usual, end, vehicle) for end in (one.levels[0], one.levels[-1])]
 
 
-def _described(axis: Axis) -> dict[str, Any]:
-    return {name: getattr(axis, name) for name in ("label", "unit", "levels", "usual")} | {
-        "flown": {}
-    }
+def _described(one: Disturbance) -> dict[str, Any]:
+    names = ("label", "unit", "levels", "usual")
+    return {name: getattr(one, name) for name in names} | {"flown": {}}
 
 
-def _flyers(
-    controller: Any,
-    task: str | Task | None,
-    vehicle: Vehicle | str | None,
-    aerodynamics: str | Aerodynamics | None,
-    task_options: Mapping[str, Any],
-) -> tuple[dict[str, Controller], Task, dict[str, Vehicle]]:
-    """What flies and with which aircraft, by names that differ; the task is that of the first.
+def _flown(
+    controller: Any, task: str | Task | Scenario | None, **conditions: Unpack[Conditions]
+) -> dict[str, tuple[Controller, Scenario]]:
+    """What flies and what it flies, by names that differ.
 
-    The aircraft is that of the first too, but an action means what it meant in a policy's training.
+    Task and aircraft are those of the first, but an action means what it meant in a policy's
+    training, and a policy observes what it observed there.
     """
     named = controller.items() if isinstance(controller, Mapping) else None
     several = controller if isinstance(controller, (list, tuple)) else [controller]
     pairs = list(named or ((None, one) for one in several))
     if not pairs:
         raise QuadrlError(name="controller", value=controller, allowed="at least one that flies")
-    flown: dict[str, Controller] = {}
-    vehicles: dict[str, Vehicle] = {}
+    given: dict[str, Any] = {name: x for name, x in conditions.items() if x is not None}
+    if not isinstance(task, Scenario):
+        given = {"weather": Weather(), "randomization": Randomization()} | given
+    flown: dict[str, tuple[Controller, Scenario]] = {}
     for name, one in pairs:
-        own, flies, task, flown_with = setting(
-            one, task, vehicle, task_options, aerodynamics=aerodynamics
-        )
-        # The others get the task and the aircraft as they are.
-        vehicle, task_options, aerodynamics = vehicle if flown else flown_with, {}, None
+        own, flies, scenario = setting(one, task, **given)
+        if not flown:
+            if "engine" not in given and not isinstance(task, Scenario):
+                engine = "mujoco" if scenario.task.contact else "free_flight"
+                scenario = dataclasses.replace(scenario, engine=engine)
+            # The others get the task, the aircraft and the world as they are.
+            observed = {name: given.get(name) for name in ("observe", "control_mode")}
+            given = {name: getattr(scenario, name) for name in WORLD} | observed
+            task, given["vehicle"] = scenario.task, scenario.aircraft
+        if isinstance(flies, Policy):
+            trained = Scenario.of(flies.conditions, task=scenario.task).vehicle
+            if trained.name == scenario.vehicle.name:
+                scale = {"action_scale": trained.action_scale}
+                scenario = dataclasses.replace(scenario, vehicle=resolve(scenario.vehicle, scale))
         name, k = name or own, 2
         while name in flown:
             name, k = f"{own} {k}", k + 1
-        if isinstance(flies, Policy) and (own_one := flies.make_vehicle()).name == flown_with.name:
-            flown_with = resolve(flown_with, {"action_scale": own_one.action_scale})
-        flown[str(name)], vehicles[str(name)] = flies, flown_with
-    return flown, task, vehicles  # type: ignore[return-value]
+        flown[str(name)] = flies, scenario
+    return flown

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Unpack
 
 import numpy as np
 
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import machine
 from quadrl.base.errors import QuadrlError
-from quadrl.conditions.observing import Observed
-from quadrl.conditions.randomization import Randomized
-from quadrl.conditions.weather import Weathered
 from quadrl.core.environment import Environment
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.snapshot import Rollout
 from quadrl.core.task import Task
-from quadrl.engines.engine import EngineName
-from quadrl.evaluation.memory import Flyer
+from quadrl.evaluation.memory import PolicyInFlight
 from quadrl.evaluation.policy import Policy
 
 Controller = Callable[[np.ndarray], np.ndarray]
 """Flat observations (N, size) float32 to actions (N, k); its attribute `control_mode`, if it has
-one, says what they mean, and `conditions` what it has to see and what it was trained in."""
+one, says what they mean, and `conditions` what it was trained in, as `Scenario.of` takes it."""
 
 EVALUATION_SEED = 1 << 53
 """Beyond the seeds of every training (2^32 * 2^20), so that evaluation episodes are fresh ones."""
@@ -34,42 +30,30 @@ HISTORY = ("position", "quaternion", "velocity", "body_rate", "rotor_speed", "go
 
 def fly(
     controller: Controller,
-    task: str | Task,
+    task: str | Task | Scenario | None = None,
     *,
     episodes: int,
     seed: int = EVALUATION_SEED,
-    vehicle: Vehicle | str | None = None,
-    control_mode: str | None = None,
-    weather: Weathered = None,
-    randomization: Randomized = None,
-    observe: Observed = None,
-    engine: EngineName = "mujoco",
+    **conditions: Unpack[Conditions],
 ) -> Rollout:
     """Fly one episode of each of N aircraft.
 
+    Each aircraft flies in a wind of its own, from its seed, and does not observe it.
+
     Args:
         controller: A `Policy`, or any function of observations.
-        task: A task or its name.
+        task: A task or its name, or a whole scenario; None for that of the controller's training.
         episodes: N.
         seed: Aircraft i has the seed `seed + i`.
-        vehicle: The aircraft; None for that of the controller's training, or the paper's.
-        control_mode: What actions mean; None for what the controller says, or "rotor".
-        weather: A `Weather` or its name; None for that of the controller's training, or calm air.
-            Each aircraft flies in a wind of its own, from its seed, and does not observe it.
-        randomization: What is drawn for each aircraft and disturbs it; None for what the controller
-            was trained with, or nothing.
-        observe: Options of the observation; None for those that the controller needs.
-        engine: "mujoco", or "free_flight" wherever there is nothing to touch.
+        **conditions: As `Conditions` has them; what is left out is as in the controller's training.
 
     Raises:
         QuadrlError: The controller's actions have another meaning or another size, or an argument
             is out of range.
     """
-    environment, controller = prepared(
-        *(controller, task, episodes, seed, vehicle, control_mode, engine),
-        {"weather": weather, "randomization": randomization, "observe": observe},
-    )
-    task, timestep = environment.task, environment.vehicle.control_timestep
+    scenario = scenario_of(controller, task, **conditions)
+    environment, controller = prepared(controller, scenario, episodes, seed)
+    flown, timestep = environment.task, environment.vehicle.control_timestep
     steps, numbers = environment.time_limit_steps, 21 + len(environment.vehicle.rotors)
     machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
     observation = environment.flatten(environment.reset())
@@ -83,7 +67,7 @@ def fly(
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         markers.append(environment.markers())
-        state, goal = environment.snapshot.state, task.goal(environment.snapshot)
+        state, goal = environment.snapshot.state, flown.goal(environment.snapshot)
         moment = {"goal": goal, "action": taken, "error": now.error, "reward": now.reward}
         moment["wind"] = environment.engine.wind
         for name, values in history.items():
@@ -101,58 +85,67 @@ def fly(
         markers=tuple(markers),
         origin=np.array(environment.origin),
         control_timestep=timestep,
-        task=task,
+        task=flown,
     )
 
 
+def scenario_of(
+    controller: Any, task: str | Task | Scenario | None = None, **conditions: Unpack[Conditions]
+) -> Scenario:
+    """The scenario of a flight: that of a controller's training, but for what is given.
+
+    Args:
+        controller: What flies. Its attribute `conditions`, if it has one, says what it was trained
+            in, and `control_mode` what its actions mean.
+        task: As `fly` takes it. A whole scenario leaves nothing of the training's.
+        **conditions: What differs.
+
+    Raises:
+        QuadrlError: There is no task, a name is unknown, or a value impossible.
+    """
+    own = getattr(controller, "control_mode", None)
+    if isinstance(task, Scenario):
+        scenario = Scenario.of(task, **conditions)
+    else:
+        trained = {"control_mode": own, **getattr(controller, "conditions", {})}
+        if task is None and "task" not in trained:
+            raise QuadrlError(name="task", value=None, allowed="given, for a function")
+        scenario = Scenario.of(trained, task=task, **conditions)
+    if own not in (None, mode := scenario.control_mode):
+        raise QuadrlError(name="control_mode", value=mode, allowed=f"{own!r}, as trained")
+    return scenario
+
+
 def prepared(
-    controller: Controller,
-    task: str | Task,
-    episodes: int,
-    seed: int,
-    vehicle: Vehicle | str | None,
-    control_mode: str | None,
-    engine: EngineName,
-    conditions: Mapping[str, Any],
+    controller: Controller, scenario: Scenario, episodes: int, seed: int
 ) -> tuple[Environment, Controller]:
     """An environment for a controller, and the controller with nothing remembered.
 
     Args:
-        controller: As `fly` takes it, as well as the arguments before `conditions`.
-        task: What is flown.
+        controller: What flies.
+        scenario: What is flown.
         episodes: N.
         seed: Of the first aircraft.
-        vehicle: The aircraft.
-        control_mode: What actions mean.
-        engine: Its name.
-        conditions: Weather, randomization and options of the observation; None for the
-            controller's own.
 
     Raises:
         QuadrlError: As `fly`.
     """
-    own = getattr(controller, "control_mode", None)
-    if None not in (control_mode, own) and control_mode != own:
-        raise QuadrlError(name="control_mode", value=control_mode, allowed=f"{own!r}, as trained")
-    policy = controller if isinstance(controller, Policy) else getattr(controller, "policy", None)
-    if vehicle is None and isinstance(policy, Policy):
-        vehicle = policy.make_vehicle()
-    given = {name: value for name, value in conditions.items() if value is not None}
-    environment = Environment(
-        task,
-        num_envs=episodes,
-        seed=seed,
-        vehicle=vehicle,
-        control_mode=control_mode or own or "rotor",
-        engine=engine,
-        **getattr(controller, "conditions", {}) | given,
-    )
+    environment = Environment(scenario, num_envs=episodes, seed=seed)
+    return environment, begun(controller, environment)
+
+
+def begun(controller: Controller, environment: Environment) -> Controller:
+    """A controller that has nothing remembered, to fly the aircraft of an environment.
+
+    Raises:
+        QuadrlError: It is a policy that does not fit.
+    """
     if isinstance(controller, Policy):
-        controller = controller.flying(episodes)
-    if isinstance(controller, Flyer):
+        controller = controller.flying(environment.num_envs)
+    if isinstance(controller, PolicyInFlight):
         controller.policy.check_fits(environment)
         controller.reset()
-    return environment, controller
+    return controller
 
 
 def flights(rollout: Rollout) -> dict[str, np.ndarray]:

@@ -29,8 +29,8 @@ from quadrl.base.machine import cores, machine
 from quadrl.conditions.randomization import FACTORS, RANDOMIZATIONS, Randomization
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.core.environment import Environment
+from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
-from quadrl.engines import mjcf
 from quadrl.engines.mujoco import BatchEngine
 
 Work = Iterator[int]
@@ -137,7 +137,7 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
     gymnasium_id = f"quadrl/{task.name.title().replace('_', '')}-v0"
     vehicle, size, free = Vehicle(), f"{num_envs:,}", f"{FREE_FLIGHT_ENVS:,}"
     air = in_real_air(vehicle)
-    model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.scene)
+    model = Scenario.of(task, vehicle=vehicle).compile_model(drawn=False)
     pool = stack.enter_context(ThreadPoolExecutor(cores()))
     alone, loaded = gym.make(gymnasium_id), suite.make(task, random=0)
     vectors: Any = gym.make_vec(gymnasium_id, num_envs=num_envs)

@@ -10,20 +10,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from quadrl import __version__, tasks
-from quadrl.aircraft.presets import resolve as resolve_vehicle
-from quadrl.aircraft.presets import with_effects
-from quadrl.aircraft.vehicle import Vehicle
+from quadrl import __version__
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice, keys, number
+from quadrl.base.validation import choice, keys, number, tuples
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.observing import resolve as resolve_observing
-from quadrl.conditions.randomization import Randomization, resolve
+from quadrl.conditions.randomization import Randomization
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
-from quadrl.control.modes import CONTROL_MODES
-from quadrl.core.task import Task
-from quadrl.engines.mujoco import ENGINES, MAX_ENVS, MAX_THREADS
+from quadrl.core.scenario import KEYWORDS, Scenario
+from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning.defaults import CHOSEN, PAIRS, flat, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, free_folder, read_config
@@ -140,46 +136,31 @@ class TrainConfig(TrainSettings):
             number("width of a hidden layer", width, 1, MAX_WIDTH, whole=True)
         batch = self.num_envs * self.rollout  # the advantage of a single one has no deviation
         number("num_envs * rollout", batch, 2, MAX_BATCH, whole=True)
-        choice("control_mode", self.control_mode, CONTROL_MODES)
-        choice("engine", self.engine, ENGINES)
         choice("memory", self.memory, MEMORIES)
         if not isinstance(self.holds_goal, bool) or (self.holds_goal and self.memory != "none"):
             allowed = "True or False; False for a policy with a memory"
             raise QuadrlError(name="holds_goal", value=self.holds_goal, allowed=allowed)
         if not isinstance(self.device, str) or not self.device:
             raise QuadrlError(name="device", value=self.device, allowed="a device of torch")
-        self.make_task()
-        self.make_training_task()
-        AircraftSampler(self.randomization, self.make_vehicle())
-        Weather.of(self.weather)
-        resolve_observing(self.observe)
+        scenario, _ = self.training_scenario, self.scenario
+        AircraftSampler(scenario.randomization, scenario.aircraft)
         getattr(self, self.algo).check(self)
 
-    def conditions(self) -> dict[str, Any]:
-        """What its aircraft meet that others do not, for whoever flies the policy."""
-        drawn, seen = resolve(self.randomization), resolve_observing(self.observe)
-        wind, calm = vars(Weather.of(self.weather)), vars(Weather())
-        met = {
-            "vehicle_options": self.vehicle_options,
-            "aerodynamics": self.aerodynamics,
-            "weather": {name: value for name, value in wind.items() if value != calm[name]},
-            "randomization": drawn.given(),
-            "observe": seen.for_policy(),
-        }
-        return {name: given for name, given in met.items() if given}
+    @property
+    def scenario(self) -> Scenario:
+        """What the policy is asked to fly, in MuJoCo, and what it observes."""
+        observe = resolve_observing(self.observe).for_policy()
+        return Scenario.of(self._conditions(), engine="mujoco", observe=observe)
 
-    def make_vehicle(self) -> Vehicle:
-        """The aircraft in its air."""
-        vehicle = resolve_vehicle(self.vehicle, self.vehicle_options)
-        return with_effects(vehicle, self.aerodynamics or None)
+    @property
+    def training_scenario(self) -> Scenario:
+        """What is flown in the training."""
+        return Scenario.of(self._conditions(), task_options=self.training_options)
 
-    def make_task(self) -> Task:
-        """The task with its options."""
-        return tasks.make(self.task, **self.task_options)
-
-    def make_training_task(self) -> Task:
-        """The task as it is trained."""
-        return tasks.make(self.task, **self.task_options | self.training_options)
+    def _conditions(self) -> dict[str, Any]:
+        """The fields that make a scenario."""
+        given = {name: getattr(self, name, None) for name in KEYWORDS}
+        return {name: value for name, value in given.items() if value not in (None, "", {})}
 
     @property
     def iterations(self) -> int:
@@ -189,11 +170,12 @@ class TrainConfig(TrainSettings):
     def resolved(self) -> dict[str, Any]:
         """The settings and everything that their names stand for, as JSON gives them back."""
         packages = ("mujoco", "torch", "torchrl", "numpy")
+        flown = self.training_scenario
         whole = dataclasses.asdict(self) | {
-            "resolved_task": dataclasses.asdict(self.make_training_task()),
-            "resolved_vehicle": dataclasses.asdict(self.make_vehicle()),
-            "resolved_weather": dataclasses.asdict(Weather.of(self.weather)),
-            "resolved_randomization": dataclasses.asdict(resolve(self.randomization)),
+            "resolved_task": dataclasses.asdict(flown.task),
+            "resolved_vehicle": dataclasses.asdict(flown.aircraft),
+            "resolved_weather": dataclasses.asdict(flown.weather),
+            "resolved_randomization": dataclasses.asdict(flown.randomization),
             "versions": {"quadrl": __version__} | {name: version(name) for name in packages},
         }
         return json.loads(json.dumps(whole))
@@ -263,10 +245,3 @@ def _fields() -> dict[str, Any]:
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value is not None}
-
-
-def tuples(value: Any) -> Any:
-    """Lists as JSON has them to tuples, at any depth."""
-    if isinstance(value, dict):
-        return {name: tuples(item) for name, item in value.items()}
-    return tuple(map(tuples, value)) if isinstance(value, (list, tuple)) else value

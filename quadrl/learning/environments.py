@@ -76,17 +76,11 @@ class RecordingEnv(QuadrotorEnv):
 def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
     """The aircraft of a training."""
     settings: dict[str, Any] = dict(
-        task=config.make_training_task(),
+        task=config.training_scenario,
         num_envs=config.num_envs,
         seed=config.seed * SEED_STRIDE,
         device=device,
-        vehicle=config.make_vehicle(),
-        control_mode=config.control_mode,
         num_threads=config.num_threads,
-        engine=config.engine,
-        weather=config.weather,
-        randomization=config.randomization,
-        observe=config.observe,
     )
     if config.algo == "apg":
         return RecordingEnv(**settings)

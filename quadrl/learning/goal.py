@@ -29,9 +29,9 @@ def goal_state(config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         QuadrlError: The observation of the task's goal states differs in anything else.
     """
-    task, vehicle = config.make_task(), config.make_vehicle()
-    settings: Any = {"control_mode": config.control_mode, "observe": config.observe}
-    environment = Environment(task, vehicle=vehicle, num_envs=DRAWN, seed=0, **settings)
+    calm: Any = {"weather": "calm", "randomization": "none", "observe": config.observe}
+    environment = Environment(config.scenario, num_envs=DRAWN, seed=0, **calm)
+    task, vehicle = environment.task, environment.vehicle
     environment.reset()
     goals = environment.goals() - environment.origin
     yaw = np.zeros(DRAWN) if task.heading_matters else np.linspace(-3.0, 3.0, DRAWN)

@@ -12,7 +12,6 @@ from typing import Any
 from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.validation import number
 from quadrl.control.feasibility import warn_of_unreached
-from quadrl.engines import mjcf
 from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import MAX_EPISODES
@@ -68,10 +67,7 @@ class Run:
         if video:
             from quadrl.rendering import write_video
 
-            model = mjcf.compile_model(
-                flown.vehicle, contact=flown.task.contact, scene=flown.task.scene
-            )
-            flight = flown.rollout.trajectory(flown.vehicle)
+            model, flight = flown.scenario.compile_model(), flown.rollout.trajectory(flown.vehicle)
             yield write_video(flight, model, self.folder / VIDEO, on_frame=on_frame)
 
 
@@ -120,12 +116,13 @@ def train_in(
 ) -> Run:
     """What `train` does once settings and folder are known, in the context `heed` of a training."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
-    vehicle = config.make_vehicle()
-    warn_of_unreached(vehicle, config.randomization)
+    scenario = config.scenario
+    warn_of_unreached(scenario.aircraft, scenario.randomization)
     training = Training(config, folder, resume=resume)
     with heed(training):
         policy = training.run(show)
-    found = evaluate(policy, config.make_task(), episodes=episodes, vehicle=vehicle)
+    found = evaluate(policy, scenario, episodes=episodes)
     seconds = round(training.seconds, 2)
-    write_json(folder / EVALUATION, found.metrics | {"training_s": seconds})
+    record = {"training_s": seconds, "scenario": scenario.to_json()}
+    write_json(folder / EVALUATION, found.metrics | record)
     return Run(folder, config, policy, found, seconds)

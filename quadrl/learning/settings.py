@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import number
 from quadrl.conditions.observing import Observing
-from quadrl.conditions.observing import resolve as resolve_observing
-from quadrl.conditions.randomization import NONE, resolve
+from quadrl.conditions.randomization import NONE
 
 LATE_OR_UNSURE = ("command_delay", "observation_delay", "noise", "bias")
 """What a randomization may not have where a training goes through the physics: the observation must
@@ -142,9 +141,10 @@ class APGConfig(AlgorithmConfig):
 
     def check(self, config: Any) -> None:
         """Refuse the settings with which the derivatives of the flight are not known."""
-        task, drawn = config.make_task(), resolve(config.randomization)
+        scenario = config.training_scenario
+        task, drawn = scenario.task, scenario.randomization
         unsure = any(getattr(drawn, name) != getattr(NONE, name) for name in LATE_OR_UNSURE)
-        observed = resolve_observing(config.observe) != Observing()
+        observed = scenario.observe != Observing()
         for name, value, wrong, allowed in (
             ("control_mode", config.control_mode, config.control_mode != "rotor", "'rotor'"),
             ("engine", config.engine, config.engine != "free_flight", "'free_flight'"),

@@ -5,17 +5,13 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
-from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.media import Media
 from quadrl.base.progress import ProgressBar
-from quadrl.conditions.randomization import Randomized
-from quadrl.conditions.weather import Weathered
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
-from quadrl.engines import mjcf
 from quadrl.evaluation.evaluate import Evaluation, evaluate
 from quadrl.learning.folder import METRICS, read_config, read_metrics
 
@@ -23,35 +19,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+PICTURE = ("camera", "width", "height", "fps")
+"""Options of a picture; those of `render` are conditions otherwise."""
+
+
 def render(
     controller: Any,
-    task: str | Task | None = None,
+    task: str | Task | Scenario | None = None,
     *,
     seed: int = 0,
-    vehicle: Vehicle | str | None = None,
-    aerodynamics: str | Aerodynamics | None = None,
-    weather: Weathered = None,
     kind: str = "mp4",
     progress: bool = True,
-    task_options: dict[str, Any] | None = None,
-    randomization: Randomized = None,
-    **options: Any,
+    **options: Unpack[Conditions],
 ) -> Media:
     """Draw a flight of a policy or a controller as a video; `quadrl render` in Python.
 
     Args:
         controller: What flies, as `quadrl.evaluate` takes it.
-        task: A task or its name; by default the one that the policy was trained for.
+        task: A task or its name, or a whole scenario; by default the task that the policy was
+            trained for.
         seed: Of the episode.
-        vehicle: The aircraft or its name; by default the one that the policy was trained with.
-        aerodynamics: Effects of the air; by default those of the training.
-        weather: A `Weather` or its name; by default that of the training.
         kind: "mp4", "gif", or "png" for a sheet of frames.
         progress: Whether to show a progress bar.
-        task_options: Options of the task that differ from the training's.
-        randomization: What is drawn for the flight and disturbs it; by default that of the
-            training.
-        **options: `camera`, `width`, `height` [pixels], `fps`; see `quadrl.rendering.write_video`.
+        **options: Conditions, as `quadrl.evaluate` takes them; and `camera`, `width`, `height`
+            [pixels], `fps`, see `quadrl.rendering.write_video`.
 
     Raises:
         QuadrlError: Something is unknown, out of range, or does not fit together.
@@ -59,16 +50,15 @@ def render(
     """
     from quadrl.rendering import write_contact_sheet, write_video
 
-    chosen: dict[str, Any] = {"seed": seed, "vehicle": vehicle, "weather": weather}
-    chosen |= {"aerodynamics": aerodynamics, "randomization": randomization}
-    flown = evaluate(controller, task, episodes=1, **chosen, **(task_options or {}))
-    model = mjcf.compile_model(flown.vehicle, contact=flown.task.contact, scene=flown.task.scene)
-    flight = flown.rollout.trajectory(flown.vehicle)
+    conditions: dict[str, Any] = dict(options)
+    picture = {name: conditions.pop(name) for name in PICTURE if name in conditions}
+    flown = evaluate(controller, task, episodes=1, seed=seed, **conditions)
+    model, flight = flown.scenario.compile_model(), flown.rollout.trajectory(flown.vehicle)
     with ProgressBar() as bar, tempfile.TemporaryDirectory() as folder:
         if progress:
-            options["on_frame"] = lambda done, total: bar.update(done, total, "drawing")
+            picture["on_frame"] = lambda done, total: bar.update(done, total, "drawing")
         write = write_contact_sheet if kind == "png" else write_video
-        path = write(flight, model, Path(folder, f"flight.{kind}"), **options)
+        path = write(flight, model, Path(folder, f"flight.{kind}"), **picture)
         return Media(path.read_bytes(), kind)
 
 

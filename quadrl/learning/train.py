@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import PART
 from quadrl.base.machine import check_memory, processor_kind
@@ -244,11 +243,8 @@ class Training:
             "run": self._known_as,
             "variant": config.variant,
             "steps": self.steps,
-            "vehicle": config.vehicle,
-            "rotors": VEHICLES[config.vehicle].rotor_count,
-            "control_mode": config.control_mode,
-            "task_options": config.task_options,
-            **config.conditions(),
+            "rotors": config.scenario.vehicle.rotor_count,
+            **config.scenario.to_json(),
         }
         return export(self.actor, config.task, metadata)
 

@@ -175,8 +175,8 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     free = {name: getattr(usual, name) for name in (*FREE, "seed", "engine")}
     if dataclasses.replace(config, **free) != usual:
         return f"left out, {run} has other settings than `quadrl train` gives"
-    policy, given = Policy.load(run), {"vehicle": config.make_vehicle()}
-    metrics = summarize(fly(policy, config.make_task(), episodes=SHIPPED_EPISODES, **given))
+    policy, given = Policy.load(run), {"vehicle": config.scenario.aircraft}
+    metrics = summarize(fly(policy, config.scenario.task, episodes=SHIPPED_EPISODES, **given))
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {SHIPPED_EPISODES}"
     if metrics["success_rate"] < WORTH_HAVING:
         for old in (file, file.with_suffix(".json")):

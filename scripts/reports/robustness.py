@@ -120,7 +120,8 @@ def flown(flyer: Any, task: str, condition: Condition, episodes: int) -> Result:
     if isinstance(flyer, Integrating):
         vehicle = flyer.vehicle
     else:
-        _, flyer, _, vehicle = setting(flyer, task, aerodynamics=condition.aerodynamics)
+        _, flyer, scenario = setting(flyer, task, aerodynamics=condition.aerodynamics)
+        vehicle = scenario.aircraft
     given: Any = {"weather": condition.weather, "randomization": condition.randomization}
     given |= {"vehicle": vehicle, "engine": engine(task), "seed": FRESH}
     each = flights(fly(flyer, tasks.make(task), episodes=episodes, **given))

@@ -362,9 +362,7 @@ def test_the_critic_sees_the_last_observation_of_an_episode_not_the_next_first(t
     learn = training._learn
     training._learn = lambda batch: (seen.append(batch.clone()), learn(batch))[1]
     training.run()
-    environment = Environment(
-        TINY.make_training_task(), num_envs=8, seed=TINY.seed * SEED_STRIDE, engine=TINY.engine
-    )
+    environment = Environment(TINY.training_scenario, num_envs=8, seed=TINY.seed * SEED_STRIDE)
     observation = environment.flatten(environment.reset())
     ends = 0
     for batch in seen:

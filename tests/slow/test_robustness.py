@@ -24,10 +24,10 @@ from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.core.environment import Environment
 from quadrl.core.rules import import_own
+from quadrl.core.scenario import Scenario
 from quadrl.evaluation import robustness as disturbed
-from quadrl.evaluation.axes import AXES
+from quadrl.evaluation.cache import FILE, digest
 from quadrl.evaluation.card import Card, half_level, wilson
-from quadrl.evaluation.kept import FILE, digest
 from quadrl.evaluation.recovery import MAPS, begin
 from quadrl.evaluation.rollout import flights
 
@@ -37,7 +37,7 @@ SHORT: Any = dict(episodes=4, progress=False, time_limit=0.5)
 @pytest.fixture(scope="module")
 def card():
     flown = {"a": "hover", "again": "hover", "geometric": "geometric"}
-    return quadrl.robustness(flown, axes=("mass", "gust"), **SHORT)
+    return quadrl.robustness(flown, disturbances=("mass", "gust"), **SHORT)
 
 
 @pytest.mark.parametrize("successes", [0, 1, 17, 49, 50])
@@ -59,25 +59,27 @@ def test_half_of_the_flights_fail_where_the_line_crosses():
 def test_a_level_disturbs_what_it_says(monkeypatch):
     seen = []
 
-    def noted(controller, task, **given):
-        seen.append(given)
+    def noted(controller, scenario, **given):
+        seen.append(scenario)
         raise InterruptedError
 
     monkeypatch.setattr(disturbed, "fly", noted)
     for name, level in (("mass", 1.3), ("gust", 8.0)):
         with pytest.raises(InterruptedError):
-            given = {"episodes": 3, "vehicle": Vehicle(), "engine": "free_flight", "seed": 1}
-            disturbed.measured(None, None, AXES[name].at(level), **given)  # type: ignore[arg-type]
+            there = disturbed.disturbed(
+                Scenario.of("hover"), disturbed.DISTURBANCES[name].at(level)
+            )
+            disturbed.measured(None, there, episodes=3, seed=1)  # type: ignore[arg-type]
     heavy, windy = seen
-    assert heavy["weather"] == Weather() and windy["randomization"] == Randomization()
-    assert windy["weather"] == Weather(gust_speed=8.0)
-    environment = Environment("hover", num_envs=3, seed=0, randomization=heavy["randomization"])
+    assert heavy.weather == Weather() and windy.randomization == Randomization()
+    assert windy.weather == Weather(gust_speed=8.0)
+    environment = Environment(heavy, num_envs=3, seed=0)
     environment.reset()
     mass = environment.engine.parameters.view(rows(Vehicle()).dtype)["mass"].ravel()
     np.testing.assert_allclose(mass, 1.3 * Vehicle().mass)
 
 
-@pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
+@pytest.mark.parametrize("axis", disturbed.DISTURBANCES.values(), ids=disturbed.DISTURBANCES)
 def test_only_the_usual_level_disturbs_nothing(axis):
     nothing = (Randomization(), Weather())
     assert axis.usual in axis.levels and list(axis.levels) == sorted(set(axis.levels))
@@ -111,7 +113,11 @@ def test_an_action_means_what_it_meant_in_training():
     options = {"vehicle_options": {"action_scale": 50.0}}
     wide = dataclasses.replace(usual, metadata=usual.metadata | options)
     found = quadrl.robustness(
-        {"usual": usual, "wide": wide}, episodes=3, axes=["thrust"], recovery=False, progress=False
+        {"usual": usual, "wide": wide},
+        episodes=3,
+        disturbances=["thrust"],
+        recovery=False,
+        progress=False,
     ).found["axes"]["thrust"]["flown"]
     for name, policy in (("usual", usual), ("wide", wide)):
         errors = flights(quadrl.evaluate(policy, episodes=3).rollout)["position_error_m"]
@@ -126,9 +132,8 @@ def test_the_undisturbed_level_is_an_evaluation(card):
 
 
 def test_what_no_aircraft_can_fly_is_left_open():
-    given = {"episodes": 2, "vehicle": Vehicle(), "engine": "free_flight", "seed": 0}
-    nothing = Randomization(mass=(5.0, 5.0))
-    assert disturbed.measured(None, None, nothing, **given) is None  # type: ignore[arg-type]
+    heavy: Any = Scenario.of("hover", randomization={"mass": 5.0})
+    assert disturbed.measured(heavy, heavy, episodes=2, seed=0) is None
 
 
 def test_a_card_is_read_as_it_was_written(card, tmp_path):
@@ -182,7 +187,9 @@ def test_maps_start_where_they_say(task, chart):
 
 
 def test_who_falls_too_fast_too_low_does_not_recover(card):
-    chart = quadrl.robustness("geometric", "hover", axes=("gust",), episodes=20, progress=False)
+    chart = quadrl.robustness(
+        "geometric", "hover", disturbances=("gust",), episodes=20, progress=False
+    )
     shares = np.array(chart.found["recovery"]["falling"]["flown"]["geometric controller"])
     heights, speeds = MAPS["falling"].y.levels, MAPS["falling"].x.levels
     assert shares[heights.index(3.0), speeds.index(0.0)] == 1
@@ -192,7 +199,7 @@ def test_who_falls_too_fast_too_low_does_not_recover(card):
 
 def test_the_command_writes_the_files(tmp_path, capsys):
     out = tmp_path / "card"
-    few = ["--episodes", "2", "--axes", "delay", "--no-recovery", "--out", str(out)]
+    few = ["--episodes", "2", "--disturbances", "delay", "--no-recovery", "--out", str(out)]
     main(["robustness", "hover", "--controller", "geometric", *few, "--task-options",
           "time_limit=0.5"])  # fmt: skip
     found = Card.load(out).found
@@ -203,7 +210,7 @@ def test_the_command_writes_the_files(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("name", "given"),
     [
-        ("axis", {"axes": ("mas",)}),
+        ("disturbance", {"disturbances": ("mas",)}),
         ("episodes", {"episodes": 0}),
         ("seed", {"seed": -1}),
         ("engine", {"engine": "jet"}),
@@ -225,7 +232,7 @@ def test_nothing_to_fly_is_refused(capsys):
 
 # ---------------------------------------------------------------- stopped, and gone on with
 
-AXIS: Any = dict(axes=("delay",), **SHORT)
+AXIS: Any = dict(disturbances=("delay",), **SHORT)
 LEVELS, FLOWN = 8, 8 + len(MAPS)  # of delay; of one that flies
 
 
@@ -369,7 +376,7 @@ def test_a_damaged_file_is_not_used_and_kept_aside(tmp_path, flights_flown, dama
 
 
 def test_a_killed_command_goes_on(tmp_path):
-    words = ["robustness", "hover", "--axes", "delay", "noise", "--episodes", "20", "--no-recovery"]
+    words = "robustness hover --disturbances delay noise --episodes 20 --no-recovery".split()
     command = [sys.executable, "-m", "quadrl", *words, "--out", "card"]
     environment = os.environ | {"PYTHONPATH": str(Path(quadrl.__file__).parents[1])}
     given: Any = dict(cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)

@@ -185,7 +185,7 @@ def test_a_tumble_is_stopped(tmp_path, algo, settings):
     returns = [float(row["return"]) for row in metrics(folder) if row["return"]]
     assert np.mean(returns[:3]) < -0.5
     assert np.mean(returns[-3:]) > 0.4
-    task = config.make_task()
+    task = config.scenario.task
     learned = evaluate(Policy.load(folder), task, episodes=64).metrics["return_mean"]
     nothing = evaluate(lambda o: np.zeros((len(o), 4)), task, episodes=64).metrics["return_mean"]
     assert learned > nothing + 0.3
@@ -196,7 +196,7 @@ def test_hover_is_learned_by_default(tmp_path, algo):
     """Seeds 0 to 3 of either succeed in all of the episodes, with mean errors of 1 to 4 cm."""
     config = TrainConfig("hover", algo=algo)
     policy = Policy.load(train(config, tmp_path / "run"))
-    reached = evaluate(policy, config.make_task(), episodes=100).metrics
+    reached = evaluate(policy, config.scenario.task, episodes=100).metrics
     assert reached["success_rate"] >= 0.9
 
 
@@ -234,8 +234,8 @@ def test_a_shipped_policy_still_reaches_its_metrics(file):
     for name in ("seed", "vehicle"):
         assert config[name] == metadata[name]
     assert beside["command"].split()[:2] == ["quadrl", "train"]
-    task = quadrl.tasks.make(policy.task, **metadata["task_options"])
-    *_, vehicle = setting(policy)
+    task = quadrl.tasks.make(policy.task, **metadata.get("task_options", {}))
+    vehicle = setting(policy)[2].aircraft
     settings = {"episodes": FRESH_EPISODES, "seed": FRESH_SEED, "vehicle": vehicle}
     reached = summarize(fly(policy, task, **settings))
     n, share = recorded["episodes"], recorded["success_rate"]

@@ -171,7 +171,7 @@ PUSHES = [
 def test_a_flight_of_a_policy_is_pythons(node, name, events):
     policy = Policy.load(SHIPPED / f"{name}.safetensors")
     needed = {"observe": policy.conditions["observe"]} if name != TRAINED else {}
-    expected = fly(policy.task, policy.make_vehicle(), policy, events, **needed)
+    expected = fly(policy.task, policy.scenario.aircraft, policy, events, **needed)
     last, differences = compared(node, expected, policy.task, "paper", name, events)
     assert last["error"] < 0.1 and differences["succeeded"] == differences["truncated"] == 0
     assert last["truncated"] == last["succeeded"] == (policy.task == "hover")

@@ -22,10 +22,10 @@ from quadrl.conditions.sampler import AircraftSampler
 from quadrl.control import feasibility
 from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
 from quadrl.evaluation import card_figures
-from quadrl.evaluation.axes import AXES
 from quadrl.evaluation.card import Card
-from quadrl.evaluation.checked import OK
+from quadrl.evaluation.check import OK
 from quadrl.evaluation.policy import Policy, shipped
+from quadrl.evaluation.robustness import DISTURBANCES
 from quadrl.learning.defaults import VARIANTS
 
 PAPER = Vehicle()
@@ -106,20 +106,20 @@ def test_an_action_of_1_lifts_what_is_in_reach_and_no_more():
     ],
 )
 def test_where_a_disturbance_goes_beyond_the_actions(axis, expected):
-    of = AXES[axis]
+    of = DISTURBANCES[axis]
     for end, level in zip((of.levels[0], of.levels[-1]), expected, strict=True):
         found = limit(of.at, of.usual, end, PAPER)
         assert found == (level if level is None else pytest.approx(level, rel=1e-4))
 
 
 def test_a_wider_action_scale_reaches_farther():
-    mass, wide = AXES["mass"], resolve("paper", {"action_scale": 90})
+    mass, wide = DISTURBANCES["mass"], resolve("paper", {"action_scale": 90})
     # (225.68 + 90)^2 / 225.68^2
     assert limit(mass.at, 1.0, 1.3, wide) == pytest.approx((315.68 / 225.68) ** 2, rel=1e-4)
 
 
 def test_more_than_four_rotors_share_what_one_of_them_lacks():
-    of = AXES["one_rotor"]
+    of = DISTURBANCES["one_rotor"]
     alone = 100 * (1 - float(Reach(VEHICLES["hexa"]).loads(110.0)[1][0]) ** -1)
     found = limit(of.at, of.usual, of.levels[-1], VEHICLES["hexa"])
     assert found is not None and found > alone + 10
@@ -165,7 +165,7 @@ def test_what_ships_can_hover_wherever_it_was_trained(name):
     task, _, algo = name.rpartition("_")
     robust = algo == "robust"
     policy = Policy.pretrained(task, "ppo" if robust else algo, *(["robust"] if robust else []))
-    vehicle = policy.make_vehicle()
+    vehicle = policy.scenario.aircraft
     given = policy.conditions.get("randomization")
     assert ("mass" in (given or {})) == robust
     assert unreached(vehicle, AircraftSampler(given, vehicle))[0] == 0
@@ -215,7 +215,7 @@ def card():
     own = Policy.pretrained("hover")
     options = {"vehicle_options": {"action_scale": 20.0}}
     narrow = dataclasses.replace(own, metadata=own.metadata | options)
-    given = {"axes": ("mass", "delay"), "recovery": False, "progress": False}
+    given = {"disturbances": ("mass", "delay"), "recovery": False, "progress": False}
     return quadrl.robustness({"usual": own, "narrow": narrow}, **given, **SHORT)
 
 

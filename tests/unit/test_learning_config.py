@@ -171,7 +171,7 @@ def test_a_run_of_a_task_or_an_aircraft_that_has_changed_is_not_continued(tmp_pa
 
 def test_a_task_may_be_trained_with_other_options_than_it_is_flown_with():
     config = TrainConfig("random_waypoint", task_options={"time_limit": 5}, num_envs=512, rollout=1)
-    asked, trained = config.make_task(), config.make_training_task()
+    asked, trained = config.scenario.task, config.training_scenario.task
     assert asked.time_limit == trained.time_limit == 5
     assert trained.farthest > asked.farthest == RandomWaypoint().farthest
     env = make_env(config, torch.device("cpu"))
@@ -180,10 +180,10 @@ def test_a_task_may_be_trained_with_other_options_than_it_is_flown_with():
     assert asked.farthest < way.max() <= trained.farthest
     assert config.resolved()["resolved_task"]["farthest"] == trained.farthest
     asked = TrainConfig("random_waypoint", task_options={"farthest": 4})  # holds in both
-    assert asked.make_training_task().farthest == asked.make_task().farthest == 4
-    assert dataclasses.replace(asked, seed=3).make_training_task() == asked.make_training_task()
+    assert asked.training_scenario.task.farthest == asked.scenario.task.farthest == 4
+    assert dataclasses.replace(asked, seed=3).training_scenario.task == asked.training_scenario.task
     both = dataclasses.replace(asked, training_options={"farthest": 5})
-    assert both.make_training_task().farthest == 5 and both.make_task().farthest == 4
+    assert both.training_scenario.task.farthest == 5 and both.scenario.task.farthest == 4
     assert (
         TrainConfig("random_waypoint", practice={"farthest": 5}).training_options["farthest"] == 5
     )
@@ -201,8 +201,9 @@ def test_a_variant_is_settings_that_go_together():
     assert (config.weather, usual.weather) == ("light", "calm")
     assert config.steps == Hover.variants["robust"]["steps"] != usual.steps
     assert config.ppo.learning_rate < usual.ppo.learning_rate
-    assert config.make_vehicle().action_scale > usual.make_vehicle().action_scale
-    assert usual.conditions() == {} and usual.task_options == {}
+    assert config.scenario.aircraft.action_scale > usual.scenario.aircraft.action_scale
+    assert usual.scenario.to_json() == {"task": "hover", "vehicle": "paper"}
+    assert usual.task_options == {}
     # What is given is added to the dicts, and stands in place of the rest.
     own = TrainConfig("hover", variant="robust", weather="calm", observe={"airspeed": True})
     assert own.observe == config.observe | {"airspeed": True} and own.weather == "calm"
@@ -213,14 +214,14 @@ def test_a_variant_is_settings_that_go_together():
 
 def test_numbers_of_the_aircraft_can_differ_and_go_with_the_policy(tmp_path):
     config = TrainConfig("hover", vehicle_options={"mass": 0.7, "inertia": [0.01, 0.01, 0.015]})
-    vehicle = config.make_vehicle()
+    vehicle = config.scenario.aircraft
     assert (vehicle.mass, vehicle.inertia) == (0.7, (0.01, 0.01, 0.015))
-    linear(22, 4, vehicle="paper", **config.conditions()).save(tmp_path / "policy.safetensors")
-    *_, flown = evaluation.setting(tmp_path)
+    linear(22, 4, **config.scenario.to_json()).save(tmp_path / "policy.safetensors")
+    flown = evaluation.setting(tmp_path)[2].aircraft
     assert flown == vehicle
-    *_, named = evaluation.setting(tmp_path, vehicle="paper")
+    named = evaluation.setting(tmp_path, vehicle="paper")[2].aircraft
     assert named == vehicle
-    *_, given = evaluation.setting(tmp_path, vehicle=quadrl.Vehicle())
+    given = evaluation.setting(tmp_path, vehicle=quadrl.Vehicle())[2].aircraft
     assert given == quadrl.Vehicle()
 
 
@@ -230,5 +231,5 @@ def test_a_randomization_and_options_of_the_observation_are_settings():
     assert config.observe == {"airspeed": True}
     again = TrainConfig(**json.loads(json.dumps(dataclasses.asdict(config))))
     assert again == config
-    assert again.conditions()["randomization"] == drawn.given()
-    assert TrainConfig("hover").conditions() == {}
+    assert again.scenario.randomization == drawn
+    assert TrainConfig("hover").scenario.to_json() == {"task": "hover", "vehicle": "paper"}

@@ -12,9 +12,9 @@ from torchrl.data import Unbounded
 from torchrl.modules import set_recurrent_mode
 
 from quadrl import tasks
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.files import write_safetensors
 from quadrl.core.environment import Environment
+from quadrl.core.scenario import Scenario
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.memory import GRU
 from quadrl.evaluation.policy import RECURRENT_FORMAT, Policy
@@ -392,7 +392,7 @@ def test_a_sampled_policy_commands_what_it_was_trained_to():
 
 def test_a_live_flight_forgets_the_rows_that_begin_anew():
     task = tasks.make("hover", time_limit=0.2)
-    flight = Flight(make_policy(), task, Vehicle(), num_envs=2)
+    flight = Flight(make_policy(), Scenario.of(task), num_envs=2)
     for _ in range(4):  # to the end of the episodes
         flight.step()
     assert flight.episodes == 2 and (flight._act.state == 0).all()

@@ -280,7 +280,7 @@ def test_pretrained_is_the_file_that_ships(algo):
     ("name", "task"), [("hover", "hover"), ("hover_robust", "hover"), ("landing_gae", "landing")]
 )
 def test_what_ships_flies_by_its_task_and_by_its_own_name(name, task):
-    assert setting(name)[2].name == task
+    assert setting(name)[2].task.name == task
 
 
 @pytest.mark.parametrize(("task", "algo"), [("hovr", "ppo"), ("hover", "sac"), ("../hover", "ppo")])
@@ -325,7 +325,7 @@ def test_a_robust_policy_flies_its_own_aircraft_or_says_which(name):
     assert "90" in caught.value.allowed and "keywords" in str(caught.value)
     for flown in (policy, policy.flying(4)):
         with refused("action_scale", 35.0):
-            fly(flown, policy.task, episodes=4, vehicle="paper")
+            fly(flown, policy.task, episodes=4, vehicle=VEHICLES["paper"])
         with refused("action_scale", 35.0):
             quadrl.evaluate(policy, episodes=4, vehicle=VEHICLES["paper"])
     for given in ({}, {"vehicle": "paper"}):  # the name stands for the aircraft of the training

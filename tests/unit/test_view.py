@@ -17,6 +17,7 @@ from quadrl.aircraft.presets import resolve
 from quadrl.base.primitives import Mesh, Primitive
 from quadrl.cli.view import others
 from quadrl.core.markers import Marker
+from quadrl.core.scenario import Scenario
 from quadrl.engines import mjcf
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.policy import Policy
@@ -29,7 +30,8 @@ STEP = VEHICLE.control_timestep
 
 def hover(count=1, vehicle=VEHICLE, **options):
     task = tasks.make("hover", **options)
-    return Flight(make_controller("geometric", task, vehicle), task, vehicle, num_envs=count)
+    controller = make_controller("geometric", task, vehicle)
+    return Flight(controller, Scenario.of(task, vehicle=vehicle), num_envs=count)
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def page():
         "policy": lambda: Policy.pretrained("hover"),
         "of another task": lambda: Policy.pretrained("target_following"),
     }
-    flight = Flight(geometric, task, VEHICLE, num_envs=2)
+    flight = Flight(geometric, Scenario.of(task, vehicle=VEHICLE), num_envs=2)
     with contextlib.closing(browser.Page(flight, choices, port=0)) as page:
         yield page
 
@@ -225,13 +227,13 @@ def test_what_is_offered_commands_what_it_did_in_its_training(scale):
     task, vehicle = tasks.make("hover"), resolve(None, {"action_scale": scale} if scale else {})
     offered = {name: make() for name, make in others(task, vehicle).items()}
     assert ("hover_ppo" in offered) == (scale is None)
-    flight = Flight(offered["geometric"], task, vehicle)
+    flight = Flight(offered["geometric"], Scenario.of(task, vehicle=vehicle))
     for controller in offered.values():
         flight.fly_with(controller)
         flight.step()
         if isinstance(controller, Policy):
             assert controller.task == "hover"
-            assert controller.make_vehicle().action_scale == vehicle.action_scale
+            assert controller.scenario.aircraft.action_scale == vehicle.action_scale
 
 
 def test_aircraft_and_trails_are_drawn_apart_and_where_they_are(page):

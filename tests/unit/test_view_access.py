@@ -14,6 +14,7 @@ import pytest
 from quadrl import tasks
 from quadrl.aircraft.presets import resolve
 from quadrl.base.errors import QuadrlError
+from quadrl.core.scenario import Scenario
 from quadrl.evaluation.controllers import make_controller
 from quadrl.rendering.live.flight import Flight
 
@@ -46,7 +47,7 @@ LABELS = (
 def flying(count):
     task = tasks.make("hover")
     choices = {"geometric": lambda: make_controller("geometric", task, VEHICLE)}
-    flight = Flight(choices["geometric"](), task, VEHICLE, num_envs=count)
+    flight = Flight(choices["geometric"](), Scenario.of(task, vehicle=VEHICLE), num_envs=count)
     return contextlib.closing(browser.Page(flight, choices, port=0))
 
 

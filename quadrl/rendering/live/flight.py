@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.base.validation import number
 from quadrl.conditions.observing import resolve
-from quadrl.conditions.randomization import Randomized
 from quadrl.core.environment import Environment
 from quadrl.core.markers import Marker
-from quadrl.core.task import Task
-from quadrl.evaluation.memory import Flyer
-from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import Controller
+from quadrl.core.scenario import Scenario
+from quadrl.evaluation.memory import PolicyInFlight
+from quadrl.evaluation.rollout import Controller, begun
 from quadrl.rendering.drawing import GOAL_RADIUS
 
 MAX_AIRCRAFT = 256
@@ -73,33 +71,28 @@ class Flight:
     def __init__(
         self,
         controller: Controller,
-        task: Task,
-        vehicle: Vehicle,
+        scenario: Scenario,
         *,
         num_envs: int = 1,
         seed: int = 0,
-        randomization: Randomized = None,
     ) -> None:
         """Begin the first episodes.
 
         Args:
             controller: A `Policy`, or any function of observations.
-            task: The task.
-            vehicle: The aircraft.
+            scenario: What is flown. In a weather of its own the spectator's wind does not blow.
             num_envs: N, at most MAX_AIRCRAFT.
             seed: Row i has the seed `seed + i`.
-            randomization: What is drawn for each aircraft and disturbs it.
 
         Raises:
             QuadrlError: The controller does not fit, or a number is out of range.
         """
         number("num_envs", num_envs, 1, MAX_AIRCRAFT, whole=True)
-        self.task, self.vehicle = task, vehicle
+        self.scenario, self.task, self.vehicle = scenario, scenario.task, scenario.aircraft
         self.speed, self.paused, self.endless = 1.0, False, False
         self.wind = np.zeros(3)
-        self._made_with: dict[str, Any] = {"num_envs": num_envs, "seed": seed, "vehicle": vehicle}
-        self._made_with["randomization"] = randomization
-        self._spins = np.sign([rotor.spin for rotor in vehicle.rotors])
+        self._rows: Any = {"num_envs": num_envs, "seed": seed}
+        self._spins = np.sign([rotor.spin for rotor in self.vehicle.rotors])
         self._environment: Environment | None = None
         self.fly_with(controller)
 
@@ -117,19 +110,13 @@ class Flight:
         Raises:
             QuadrlError: It does not fit the task or the aircraft; nothing has changed then.
         """
-        mode, environment = getattr(controller, "control_mode", "rotor"), self._environment
+        mode = getattr(controller, "control_mode", "rotor")
         seen = resolve(getattr(controller, "conditions", {}).get("observe"))
-        own = environment and (environment.control_mode.name, environment.observing)
-        if environment is None or own != (mode, seen):
-            settings = self._made_with | {"control_mode": mode, "observe": seen}
-            environment = Environment(self.task, **settings)
-        act = controller
-        if isinstance(controller, Policy):
-            act = controller.flying(environment.num_envs)
-        if isinstance(act, Flyer):
-            act.policy.check_fits(environment)
-            act.reset()
-        self.controller, self._act = controller, act
+        scenario = dataclasses.replace(self.scenario, control_mode=mode, observe=seen)
+        if (environment := self._environment) is None or environment.scenario != scenario:
+            environment = Environment(scenario, **self._rows)
+        self._act = begun(controller, environment)
+        self.controller = controller
         if environment is not self._environment:
             self._environment = environment
             self.reset()
@@ -137,7 +124,7 @@ class Flight:
     def reset(self) -> None:
         """Begin new episodes of all aircraft."""
         environment, count = self.environment, self.environment.num_envs
-        if isinstance(self._act, Flyer):
+        if isinstance(self._act, PolicyInFlight):
             self._act.reset()
         steps = max(2, round(TRAIL_SECONDS / self.vehicle.control_timestep))
         self.trail = np.full((steps, count, 3), np.nan)
@@ -151,7 +138,8 @@ class Flight:
     def step(self) -> None:
         """Fly one control step in the wind that is set, and begin anew the episodes that end."""
         environment, timestep = self.environment, self.vehicle.control_timestep
-        environment.engine.wind[:] = self.wind
+        if self.scenario.weather.calm:
+            environment.engine.wind[:] = self.wind
         done = environment.step(np.clip(self._act(self._observation), -1.0, 1.0))
         self._observation = np.array(environment.flatten(done.observation))
         self._angles += TURNING * timestep * self._spins * environment.engine.act
@@ -167,7 +155,7 @@ class Flight:
         if len(ended):
             self.episodes += len(ended)
             self.successes += np.count_nonzero(done.is_success[ended])
-            if isinstance(self._act, Flyer):
+            if isinstance(self._act, PolicyInFlight):
                 self._act.reset(ended)
             self._observation[ended] = environment.flatten(environment.reset(ended))
             self.time[ended] = self.total[ended] = 0.0

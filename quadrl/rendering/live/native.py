@@ -11,7 +11,6 @@ import glfw
 import mujoco
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
-from quadrl.engines import mjcf
 from quadrl.engines.mujoco import DataEngine
 from quadrl.rendering import drawing, scene
 from quadrl.rendering.live.flight import Flight
@@ -51,7 +50,7 @@ def run(flight: Flight) -> None:
     check_screen()
     from mujoco import viewer
 
-    model = mjcf.compile_model(flight.vehicle, contact=flight.task.contact, scene=flight.task.scene)
+    model = flight.scenario.compile_model()
     shown, pressed = mujoco.MjData(model), queue.SimpleQueue()
     _draw(flight, model, shown)
     try:

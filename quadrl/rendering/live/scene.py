@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
-from quadrl.engines import mjcf
 from quadrl.rendering import drawing
 from quadrl.rendering.live import meshes
 from quadrl.rendering.live.flight import Flight
@@ -42,7 +41,7 @@ class Scene:
         self._centre, self._heading = self._home.copy(), np.array([1.0, 0.0])
         self._shown: Any = None
         self._labels, self._labelled = [], []
-        model = mjcf.compile_model(flight.vehicle, scene=flight.task.scene)
+        model = flight.scenario.compile_model()
         seen = meshes.of_model(model)
         self._add_world(seen.world, count)
         self._airframe = self._add_copies("airframe", seen.solid, count)

@@ -21,15 +21,15 @@ import mujoco
 import numpy as np
 
 from quadrl import __version__
-from quadrl.base.errors import QuadrlWarning
-from quadrl.base.files import write_whole
+from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.files import read_sealed_json, write_sealed_json
 from quadrl.core.task import Task
 
 FILE = "flown.json"
-FORMAT = "quadrl-flown-1"
+FORMAT = "quadrl-flown-2"
 
 
-class Kept:
+class ResultCache:
     """Calls functions that fly; what they gave is in a file, and is taken from there."""
 
     def __init__(self, folder: Path | None) -> None:
@@ -40,11 +40,8 @@ class Kept:
         if self._file is None or not self._file.exists():
             return
         try:
-            content = json.loads(self._file.read_bytes())
-            if content["format"] != FORMAT or content["digest"] != digest(content["flown"]):
-                raise ValueError
-            self._found = content["flown"]
-        except (OSError, ValueError, LookupError, TypeError, RecursionError):
+            self._found = read_sealed_json(self._file, FORMAT, unsealed=False)["flown"]
+        except QuadrlError:
             aside = self._file.with_suffix(".unused")
             os.replace(self._file, aside)
             warnings.warn(
@@ -72,7 +69,7 @@ class Kept:
             self._write({k: v for k, v in self._found.items() if k not in self._used})
 
     def _key(self, *what: Any) -> str | None:
-        """A digest over what is flown; None where nothing is kept, or what flies cannot be told."""
+        """A digest over what is flown; None where nothing is kept, or it may do anything."""
         if self._file is None:
             return None
         try:
@@ -86,8 +83,7 @@ class Kept:
             self._file.unlink(missing_ok=True)
             return
         self._file.parent.mkdir(parents=True, exist_ok=True)
-        content = {"format": FORMAT, "digest": digest(found), "flown": found}
-        write_whole(self._file, json.dumps(content).encode())
+        write_sealed_json(self._file, {"flown": found}, FORMAT)
 
 
 def digest(thing: Any) -> str:
@@ -97,10 +93,10 @@ def digest(thing: Any) -> str:
         TypeError: It is a function or an object whose content does not tell what it does.
         OSError: The source of a task cannot be read.
     """
-    return hashlib.sha256(json.dumps(_told(thing), sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(_content(thing), sort_keys=True).encode()).hexdigest()
 
 
-def _told(thing: Any) -> Any:
+def _content(thing: Any) -> Any:
     """The content of a thing as JSON."""
     if isinstance(thing, np.generic):
         return thing.item()
@@ -110,19 +106,19 @@ def _told(thing: Any) -> Any:
         data = hashlib.sha256(thing.tobytes()).hexdigest()
         return [thing.dtype.str, list(thing.shape), data]
     if isinstance(thing, Mapping):
-        return {str(name): _told(value) for name, value in thing.items()}
+        return {str(name): _content(value) for name, value in thing.items()}
     if isinstance(thing, (list, tuple)):
-        return [_told(item) for item in thing]
+        return [_content(item) for item in thing]
     kind = thing if isinstance(thing, FunctionType) else type(thing)
-    told: list[Any] = [kind.__module__, kind.__qualname__]
+    content: list[Any] = [kind.__module__, kind.__qualname__]
     own = kind.__module__.startswith("quadrl.") and "<" not in kind.__qualname__  # no closures
     if not own:
         if not isinstance(thing, Task):
             raise TypeError(f"{kind.__qualname__} may do anything")
-        told.append(hashlib.sha256(Path(inspect.getfile(kind)).read_bytes()).hexdigest())
+        content.append(hashlib.sha256(Path(inspect.getfile(kind)).read_bytes()).hexdigest())
     if not isinstance(thing, FunctionType):
         # What an object of a dataclass has beside its fields it has computed from them.
         data_only = dataclasses.is_dataclass(thing)
         names = [f.name for f in dataclasses.fields(thing)] if data_only else vars(thing)
-        told.append({name: _told(getattr(thing, name)) for name in names})
-    return told
+        content.append({name: _content(getattr(thing, name)) for name in names})
+    return content

@@ -9,13 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import tasks
-from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.presets import resolve, with_effects
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.validation import choice
-from quadrl.conditions.randomization import Randomized
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.control.feasibility import (
     MARGIN,
@@ -27,6 +22,7 @@ from quadrl.control.feasibility import (
     unreached,
 )
 from quadrl.control.modes import CONTROL_MODES
+from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import html_table
 
@@ -70,38 +66,28 @@ class Check:
 
 
 def check(
-    vehicle: Vehicle | str | None = None,
+    vehicle: Vehicle | str | Mapping[str, Any] | None = None,
     *,
-    vehicle_options: Mapping[str, Any] | None = None,
-    task: str | Task = "hover",
-    randomization: Randomized = None,
-    control_mode: str = "rotor",
-    aerodynamics: str | Aerodynamics | None = None,
-    **task_options: Any,
+    task: str | Task | Scenario = "hover",
+    **conditions: Any,
 ) -> Check:
-    """Check what an aircraft leaves to a policy: thrust, moments, steps and delays.
+    """Check what an aircraft's thrust, moments, steps and delays leave to a policy; flies nothing.
 
     Args:
         vehicle: The aircraft or its name; None for the paper's.
-        vehicle_options: Numbers that differ from it, such as {"action_scale": 90}.
-        task: A task or its name; it may ask for a turn of the heading within its time.
-        randomization: What is drawn for each aircraft; the worst ones are checked as well.
-        control_mode: Meaning of the actions; all but "rotor" answer at every physics step.
-        aerodynamics: Effects of the air, as `quadrl.aircraft.presets.with_effects` takes them.
-        **task_options: Options of the task.
+        task: A task or its name; some ask for a turn of the heading within their time.
+        **conditions: As `quadrl.core.scenario.Conditions` has them, and options of the task. Of a
+            `randomization` the worst aircraft are checked as well; every `control_mode` but
+            "rotor" answers at every physics step.
 
     Raises:
         QuadrlError: Something is unknown, out of range, or does not fit together.
     """
-    vehicle = with_effects(resolve(vehicle, vehicle_options), aerodynamics)
-    choice("control_mode", control_mode, CONTROL_MODES)
-    sampler, task = AircraftSampler(randomization, vehicle), tasks.make(task, **task_options)
-    rows = (
-        *_thrust(vehicle, sampler),
-        *_moments(vehicle, task),
-        *_steps(vehicle, sampler, control_mode),
-    )
-    return Check(vehicle, rows)
+    scenario = Scenario.of(task, vehicle=vehicle, **conditions)
+    vehicle, task = scenario.aircraft, scenario.task
+    sampler = AircraftSampler(scenario.randomization, vehicle)
+    steps = _steps(vehicle, sampler, scenario.control_mode)
+    return Check(vehicle, (*_thrust(vehicle, sampler), *_moments(vehicle, task), *steps))
 
 
 def _thrust(vehicle: Vehicle, sampler: AircraftSampler) -> Iterator[Row]:

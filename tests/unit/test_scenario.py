@@ -1,0 +1,168 @@
+"""Scenarios: what is asked for becomes one record, goes through JSON, and flies as it should."""
+
+import dataclasses
+import json
+import pickle
+
+import numpy as np
+import pytest
+from runs import refused
+
+import quadrl
+from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.presets import VEHICLES, in_real_air
+from quadrl.base.errors import UnknownKeyword
+from quadrl.conditions.weather import WEATHERS, Weather
+from quadrl.core.environment import Environment
+from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario
+from quadrl.evaluation.policy import Policy
+from quadrl.learning.config import TrainConfig
+from quadrl.tasks import RandomWaypoint
+
+EVERYTHING = {
+    "task_options": {"farthest": 3.0},
+    "vehicle": "crazyflie",
+    "vehicle_options": {"mass": 0.03},
+    "aerodynamics": "full",
+    "weather": "light",
+    "randomization": {"mass": (0.9, 1.1), "noise": {"position": 0.01}},
+    "observe": {"action_history": 2},
+    "control_mode": "velocity",
+    "engine": "free_flight",
+}
+"""A value that differs from the default for every field."""
+MINE = quadrl.Vehicle(name="mine", mass=0.7, aerodynamics=Aerodynamics.full())
+
+
+def whole() -> Scenario:
+    return Scenario.of("random_waypoint", **EVERYTHING)
+
+
+def test_every_field_has_its_keyword_and_a_value_here():
+    fields = {field.name for field in FIELDS}
+    assert fields <= {*KEYWORDS}
+    assert fields - {"task"} == {*EVERYTHING} - {"task_options", "vehicle_options"}
+    plain, other = Scenario.of("hover"), whole()
+    assert all(getattr(plain, name) != getattr(other, name) for name in fields)
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        Scenario.of("hover"),
+        whole(),
+        Scenario.of("landing", vehicle=MINE, control_timestep=0.02, max_episode_steps=50),
+        Scenario.of("hover", vehicle="hexa", control_timestep=0.01),
+        Scenario.of("hover", aerodynamics=Aerodynamics(inflow=True)),
+    ],
+    ids=["plain", "everything", "an aircraft of one's own", "another step", "air of one's own"],
+)
+def test_json_gives_back_the_same_scenario(scenario):
+    written = json.loads(json.dumps(scenario.to_json(), allow_nan=False))
+    again = Scenario.of(written)
+    assert again == scenario and again.aircraft == scenario.aircraft
+    assert Scenario.of(scenario) is scenario
+    assert pickle.loads(pickle.dumps(scenario)) == scenario
+
+
+def test_what_is_usual_is_not_written():
+    assert Scenario.of("hover").to_json() == {"task": "hover", "vehicle": "paper"}
+    options = whole().to_json()
+    assert options["task_options"] == {"farthest": 3.0}
+    assert (options["vehicle"], options["vehicle_options"]) == ("crazyflie", {"mass": 0.03})
+    assert options["weather"] == {"wind_speed": WEATHERS["light"].wind_speed}
+
+
+def test_it_is_the_same_environment_however_it_is_asked_for():
+    by_keywords = Environment("random_waypoint", num_envs=3, seed=4, **EVERYTHING)
+    given = Environment(Scenario.of(whole().to_json()), num_envs=3, seed=4)
+    action = np.full((3, 4), 0.2)
+    for environment in (by_keywords, given):
+        environment.reset()
+    for _ in range(5):
+        one, other = by_keywords.step(action), given.step(action)
+        np.testing.assert_array_equal(one.reward, other.reward)
+    assert given.scenario == by_keywords.scenario == whole()
+
+
+def test_what_another_aircraft_or_task_leaves_of_a_scenario():
+    base = whole()
+    # The name that is there already keeps its options.
+    same = Scenario.of(base, task="random_waypoint", vehicle="crazyflie", weather=None)
+    assert same == base
+    # Another name flies in the air that was asked for; a Vehicle brings its own.
+    racer = Scenario.of(base, vehicle="racer")
+    assert racer.aircraft == in_real_air(VEHICLES["racer"])
+    assert Scenario.of(base, vehicle=MINE).aircraft == MINE
+    assert Scenario.of(base, vehicle=VEHICLES["crazyflie"]).aircraft.mass == 0.0293
+    assert Scenario.of(base, task="hover").task == quadrl.tasks.make("hover")
+    assert Scenario.of(base, task=RandomWaypoint()).task.farthest != 3.0
+    # Options go on top of what is there, whoever gives them.
+    lower = Scenario.of(base, altitude=2.0, task_options={"time_limit": 4.0})
+    assert (lower.task.altitude, lower.task.time_limit, lower.task.farthest) == (2.0, 4.0, 3.0)  # type: ignore[attr-defined]
+    # Without the air the quadratic drag is whole again.
+    calm = Scenario.of(base, aerodynamics="none").aircraft
+    assert calm.drag_coefficient == VEHICLES["crazyflie"].drag_coefficient
+
+
+def test_timing_is_the_aircrafts_and_the_tasks():
+    scenario = Scenario.of("hover", control_timestep=0.02, max_episode_steps=30)
+    assert scenario.aircraft.control_timestep == 0.02
+    assert scenario.task.time_limit == pytest.approx(0.6)
+    assert Environment(scenario).time_limit_steps == 30
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("vehicle", "brick"),
+        ("vehicle", 3),
+        ("weather", "windy"),
+        ("randomization", "heavy"),
+        ("observe", "all"),
+        ("control_mode", "thrust"),
+        ("engine", "jet"),
+        ("aerodynamics", "thick"),
+        ("max_episode_steps", 0),
+    ],
+)
+def test_what_cannot_be_is_refused_by_its_name(name, value):
+    with refused(name, value):
+        Scenario.of("hover", **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"wether": "light"}, "hover option"),
+        ({"vehicle": {"weight": 1.0}}, "field of vehicle"),
+        ({"aerodynamics": {"lift": 1.0}}, "field of aerodynamics"),
+        ({"vehicle_options": {"rotors": ()}}, "vehicle option"),
+    ],
+)
+def test_an_unknown_name_is_refused_with_the_choices(given, name):
+    with pytest.raises(UnknownKeyword) as caught:
+        Scenario.of("hover", ["num_envs"], **given)
+    assert caught.value.name == name
+    if name == "hover option":
+        assert "weather" in caught.value.allowed and "num_envs" in caught.value.allowed
+
+
+def test_its_model_is_that_of_the_aircraft_in_the_world_of_the_task():
+    scenario = Scenario.of("landing", vehicle="hexa")
+    for model in (scenario.compile_model(), scenario.compile_model(drawn=False)):
+        assert model.nu == 6 and model.geom("ground").contype[0] == 1
+    assert Scenario.of("hover").compile_model().geom("ground").contype[0] == 0
+    assert scenario.altitude >= scenario.aircraft.ground_clearance
+
+
+def test_a_policy_and_a_training_carry_it():
+    config = TrainConfig("hover", variant="robust", vehicle="hexa", aerodynamics="full")
+    flown, asked = config.training_scenario, config.scenario
+    assert (flown.engine, asked.engine) == ("free_flight", "mujoco")
+    assert flown.observe.privileged and not asked.observe.privileged  # that is the critic's
+    assert dataclasses.replace(flown, engine="mujoco", observe=asked.observe) == asked
+    policy = Policy.pretrained("hover", variant="robust")
+    assert policy.scenario.weather == Weather(wind_speed=7.72)
+    assert policy.scenario.aircraft.action_scale == 90.0
+    assert policy.scenario.task.smoothness_weight == 10.0
