@@ -1,9 +1,10 @@
-"""What the algorithms share: their optimisers, the critic's epochs, saving and restoring."""
+"""What the algorithms share: optimisers, the critic's epochs, saving, threads and generators."""
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Sequence
+import contextlib
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -106,6 +107,34 @@ class Algorithm(abc.ABC):
         for name, (adam, _, _) in self._optimisers.items():
             tensors = {int(k): v for k, v in saved.get(name, {}).items()}
             adam.load_state_dict(adam.state_dict() | {"state": tensors})
+
+
+@contextlib.contextmanager
+def one_thread() -> Generator[None]:
+    """Let torch calculate with one thread, so that no bit depends on how many cores there are.
+
+    Networks this small gain nothing from a second thread, and lose a lot when a core is busy.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def generators(device: torch.device) -> dict[str, Tensor]:
+    """The state of every random number generator that a training on a device draws from."""
+    states = {"cpu": torch.get_rng_state()}
+    return states | ({"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {})
+
+
+def set_generators(states: dict[str, Tensor], device: torch.device) -> None:
+    """Set the generators to states of `generators`; one that is missing stays as it is."""
+    if "cpu" in states:
+        torch.set_rng_state(states["cpu"])
+    if "cuda" in states and device.type == "cuda":
+        torch.cuda.set_rng_state(states["cuda"], device)
 
 
 def shuffled(batch: TensorDictBase) -> TensorDictBase:

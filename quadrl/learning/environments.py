@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Unbounded
 from torchrl.modules import ProbabilisticActor
 
+from quadrl.base.errors import QuadrlError
 from quadrl.core.transition import Transition
 from quadrl.engines.adjoint import kernel
 from quadrl.envs.torchrl import QuadrotorEnv
@@ -71,6 +72,50 @@ class RecordingEnv(QuadrotorEnv):
         moment, done = fly(self.environment, action.numpy())
         self._moments.append(moment)
         return done
+
+
+class EpisodeStatistics:
+    """Return and length of the episodes under way, and figures of those that end."""
+
+    def __init__(self, num_envs: int) -> None:
+        """Begin with every aircraft at the start of an episode."""
+        self.running = {name: np.zeros(num_envs) for name in ("return", "length")}
+
+    def count(self, batch: Any) -> dict[str, float]:
+        """Return, length, success and survival of the episodes that end in a batch."""
+        names = ("reward", "done", "terminated", "is_success", "error")
+        columns = (batch["next", name][..., 0].cpu().numpy().T for name in names)
+        reward, done, terminated, success, error = columns  # (time, aircraft)
+        ended: dict[str, list[np.ndarray]] = {name: [] for name in self.running}
+        for gained, over in zip(reward, done, strict=True):
+            self.running["return"] += gained
+            self.running["length"] += 1
+            for name, running in self.running.items():
+                ended[name].append(running[over])
+                running[over] = 0.0
+        metrics = {"episodes": float(done.sum()), "reward": float(reward.mean())}
+        metrics["error"] = float(error.mean())
+        if done.any():
+            metrics |= {name: float(np.concatenate(ended[name]).mean()) for name in ended}
+            metrics["success"] = float(success[done].mean())
+            metrics["survival"] = float(1 - (terminated & ~success)[done].mean())
+        return metrics
+
+
+def make_device(name: str) -> torch.device:
+    """The device of a name.
+
+    Raises:
+        QuadrlError: This torch, or this machine, does not have it.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        allowed = "a device that this torch can use, such as cpu"
+        raise QuadrlError(reason, name="device", value=name, allowed=allowed) from error
+    return device
 
 
 def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import GRUCell, IndependentNormal, ProbabilisticActor, recurrent_mode
 
+from quadrl.base.machine import check_memory
 from quadrl.evaluation.memory import GRU
 from quadrl.evaluation.policy import CLIP, LOG_VARIANCE, Policy
 from quadrl.learning.config import TrainConfig
@@ -58,6 +60,12 @@ class Normaliser(nn.Module):
         self.count.copy_(total)
         self.shift.copy_(self.mean)
         self.deviation.copy_((self.square_sum / total).sqrt().clamp(min=1e-4))
+
+
+def update_normalisers(normalisers: dict[str, Normaliser], batch: TensorDictBase) -> None:
+    """Include a batch in the normaliser of each of its entries."""
+    for name, normaliser in normalisers.items():
+        normaliser.update(batch[name])
 
 
 class MeanAndDeviation(nn.Module):
@@ -233,6 +241,20 @@ def make_actor_critic(
     critic = Entries(value, [*normalisers], ["state_value"])
     critic.plain = Plain([*normalisers], first, [*network][::2])
     return actor, critic, normalisers
+
+
+def check_fits(config: TrainConfig, size: int) -> None:
+    """Refuse networks and batches that do not fit, of observations of a size.
+
+    Of a weight there are four numbers, with gradient and Adam's two; of a transition some ten
+    times its observation and 1 kB more, as was measured.
+    """
+    for name, hidden in (("hidden", config.hidden), ("critic_hidden", config.critic_hidden)):
+        widths = (size, *hidden, 1)
+        weights = sum(a * b for a, b in itertools.pairwise(widths))
+        check_memory(f"{name} = {hidden}", 16.0 * weights)
+    batch = config.num_envs * config.rollout
+    check_memory(f"num_envs * rollout = {batch}", batch * (40.0 * size + 1000))
 
 
 def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Policy:

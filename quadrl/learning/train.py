@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import itertools
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +21,23 @@ import torch
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import PART
-from quadrl.base.machine import check_memory, processor_kind
+from quadrl.base.machine import processor_kind
 from quadrl.base.progress import Progress
 from quadrl.engines import native
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.evaluation.policy import FILE as POLICY_FILE
 from quadrl.evaluation.policy import Policy
 from quadrl.learning import checkpoint
-from quadrl.learning.algorithm import Algorithm
+from quadrl.learning.algorithm import Algorithm, generators, one_thread, set_generators
 from quadrl.learning.apg import APG
 from quadrl.learning.config import TrainConfig, renamed
-from quadrl.learning.environments import RecordingEnv, make_collector, make_env
+from quadrl.learning.environments import (
+    EpisodeStatistics,
+    RecordingEnv,
+    make_collector,
+    make_device,
+    make_env,
+)
 from quadrl.learning.folder import (
     EVALUATION,
     WARNINGS,
@@ -43,7 +48,15 @@ from quadrl.learning.folder import (
     run_of,
     write_config,
 )
-from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE, export, make_actor_critic
+from quadrl.learning.networks import (
+    BEGINS,
+    PRIVILEGED,
+    STATE,
+    check_fits,
+    export,
+    make_actor_critic,
+    update_normalisers,
+)
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
@@ -67,36 +80,6 @@ def make_algorithm(config: TrainConfig, env: QuadrotorEnv, actor: Any, critic: A
     return ALGORITHMS[config.algo](actor, critic, own)
 
 
-def make_device(name: str) -> torch.device:
-    """The device of a name.
-
-    Raises:
-        QuadrlError: This torch, or this machine, does not have it.
-    """
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).strip().partition("\n")[0]
-        allowed = "a device that this torch can use, such as cpu"
-        raise QuadrlError(reason, name="device", value=name, allowed=allowed) from error
-    return device
-
-
-@contextlib.contextmanager
-def one_thread() -> Generator[None]:
-    """Let torch calculate with one thread, so that no bit depends on how many cores there are.
-
-    Networks this small gain nothing from a second thread, and lose a lot when a core is busy.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 class Training:
     """A run in its folder."""
 
@@ -114,7 +97,7 @@ class Training:
         torch.manual_seed(config.seed)
         self.env = make_env(config, device)
         size, actions = self.env.environment.size, self.env.environment.action_size
-        self._check_memory(size)
+        check_fits(config, size)
         given = self.env.observation_spec.get(PRIVILEGED, None)
         self.actor, self.critic, self.normalisers = make_actor_critic(
             size, actions, config, 0 if given is None else given.shape[-1]
@@ -127,7 +110,7 @@ class Training:
         )
         self.iteration = 0
         self.seconds = 0.0  # of training, in all processes that worked on it
-        self._running = {name: np.zeros(config.num_envs) for name in ("return", "length")}
+        self._episodes = EpisodeStatistics(config.num_envs)
         self._generators: dict[str, torch.Tensor] = {}
         self._remembered: dict[str, np.ndarray] = {}  # the states of a recurrent policy
         self._asked = self._stopping = False
@@ -156,20 +139,6 @@ class Training:
         if self.iteration < config.iterations:
             (folder / EVALUATION).unlink(missing_ok=True)
 
-    def _check_memory(self, size: int) -> None:
-        """Refuse networks and batches that do not fit, of observations of a size.
-
-        Of a weight there are four numbers, with gradient and Adam's two; of a transition some ten
-        times its observation and 1 kB more, as was measured.
-        """
-        config = self.config
-        for name, hidden in (("hidden", config.hidden), ("critic_hidden", config.critic_hidden)):
-            widths = (size, *hidden, 1)
-            weights = sum(a * b for a, b in itertools.pairwise(widths))
-            check_memory(f"{name} = {hidden}", 16.0 * weights)
-        batch = config.num_envs * config.rollout
-        check_memory(f"num_envs * rollout = {batch}", batch * (40.0 * size + 1000))
-
     @property
     def steps(self) -> int:
         """Control steps of all aircraft so far."""
@@ -194,7 +163,7 @@ class Training:
                 return policy
             collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
             stack.callback(collector.shutdown, close_env=False)
-            self._set_generators()
+            set_generators(self._generators, self.env.device)
             log = Log(self.folder, self.iteration)
             stack.callback(log.close)
             stack.enter_context(native.warnings_in(self.folder / WARNINGS))
@@ -250,7 +219,7 @@ class Training:
 
     def _learn(self, batch: Any) -> dict[str, float]:
         """One iteration on a batch (aircraft, time)."""
-        metrics = self._episodes(batch)
+        metrics = self._episodes.count(batch)
         with torch.no_grad():
             if self.config.memory != "none":
                 done, state = (batch["next", name] for name in ("done", STATE))
@@ -259,7 +228,7 @@ class Training:
                 self._remembered = {STATE: state[:, -1].masked_fill(done[:, -1], 0.0).cpu().numpy()}
             first = self.iteration == 0 and not self.algorithm.whole
             if first:  # the first batch was collected without a normaliser
-                self._normalise(batch)
+                update_normalisers(self.normalisers, batch)
                 with set_recurrent_mode():
                     present = self.actor.get_dist(batch)
                 batch["action_log_prob"] = present.log_prob(batch["action"])
@@ -271,7 +240,7 @@ class Training:
             flat = flat.reshape(-1)
         metrics |= self.algorithm.update(flat, 1 - self.iteration / self.config.iterations)
         if not first:
-            self._normalise(batch)
+            update_normalisers(self.normalisers, batch)
         return metrics | {"deviation": float(batch["scale"].mean())}
 
     def _evaluate(self, batch: Any) -> None:
@@ -286,35 +255,6 @@ class Training:
         after[ends] = self.critic(batch["next"].select(*self.critic.in_keys)[ends])["state_value"]
         batch["next", "state_value"] = after
 
-    def _normalise(self, batch: Any) -> None:
-        """Include a batch in the normalisers."""
-        for name, normaliser in self.normalisers.items():
-            normaliser.update(batch[name])
-
-    def _episodes(self, batch: Any) -> dict[str, float]:
-        """Return, length, success and survival of the episodes that ended in the batch."""
-        names = ("reward", "done", "terminated", "is_success", "error")
-        columns = (batch["next", name][..., 0].cpu().numpy().T for name in names)
-        reward, done, terminated, success, error = columns  # (time, aircraft)
-        ended: dict[str, list[np.ndarray]] = {name: [] for name in self._running}
-        for gained, over in zip(reward, done, strict=True):
-            self._running["return"] += gained
-            self._running["length"] += 1
-            for name, running in self._running.items():
-                ended[name].append(running[over])
-                running[over] = 0.0
-        returns, lengths = (np.concatenate(ended[name]) for name in ("return", "length"))
-        metrics = {"episodes": float(len(returns)), "reward": float(reward.mean())}
-        metrics["error"] = float(error.mean())
-        if len(returns):
-            metrics |= {
-                "return": float(returns.mean()),
-                "length": float(lengths.mean()),
-                "success": float(success[done].mean()),
-                "survival": float(1 - (terminated & ~success)[done].mean()),
-            }
-        return metrics
-
     def save(self) -> None:
         """Write the checkpoint, and the policy of this moment."""
         tensors = {
@@ -322,8 +262,8 @@ class Training:
             "critic": self.critic.state_dict(),
             "optimisers": self.algorithm.save(),
             "environment": self.env.environment.save() | self._remembered,
-            "running": self._running,
-            "generators": self._get_generators(),
+            "running": self._episodes.running,
+            "generators": generators(self.env.device),
         }
         numbers = {
             "iteration": self.iteration,
@@ -332,19 +272,6 @@ class Training:
         }
         checkpoint.save(self.folder / checkpoint.CHECKPOINT, tensors, numbers)
         self.policy().save(self.folder / POLICY_FILE)
-
-    def _get_generators(self) -> dict[str, torch.Tensor]:
-        """The state of every random number generator that the training draws from."""
-        states = {"cpu": torch.get_rng_state()}
-        if self.env.device.type == "cuda":
-            states["cuda"] = torch.cuda.get_rng_state(self.env.device)
-        return states
-
-    def _set_generators(self) -> None:
-        if "cpu" in self._generators:
-            torch.set_rng_state(self._generators["cpu"])
-        if "cuda" in self._generators and self.env.device.type == "cuda":
-            torch.cuda.set_rng_state(self._generators["cuda"], self.env.device)
 
     def _restore(self) -> None:
         path = self.folder / checkpoint.CHECKPOINT
@@ -355,7 +282,7 @@ class Training:
             self.critic.load_state_dict(tensors["critic"])
             self.algorithm.restore(tensors.get("optimisers", {}))
             self.env.restore({k: v.numpy() for k, v in tensors["environment"].items()})
-            self._running = {k: v.numpy().copy() for k, v in tensors["running"].items()}
+            self._episodes.running = {k: v.numpy().copy() for k, v in tensors["running"].items()}
             self._generators = tensors["generators"]
             self.iteration, self.seconds = int(numbers["iteration"]), float(numbers["seconds"])
         except QuadrlError:
