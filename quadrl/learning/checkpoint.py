@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import read_safetensors, write_safetensors
 from quadrl.learning.folder import CHANGEABLE
+from quadrl.learning.settings import ALGORITHM_CONFIGS
 
 FORMAT, UNSEALED = "quadrl-checkpoint-6", "quadrl-checkpoint-5"
 CHECKPOINT = "checkpoint.safetensors"
@@ -66,8 +67,10 @@ def check_same(
     Raises:
         QuadrlError: A setting differs.
     """
-    for name, was in saved.items():  # a setting that is new since then had its default
-        now = present.get(name)
+    for name in saved | present:
+        if name not in saved and prefix.rstrip(".") in ALGORITHM_CONFIGS:
+            continue  # a setting of an algorithm that is new since then
+        was, now = saved.get(name), present.get(name)
         if isinstance(was, dict) and isinstance(now, dict):
             check_same(path, was, now, f"{prefix}{name}.")
         elif was != now and name not in CHANGEABLE:

@@ -58,15 +58,6 @@ def batch_of(actor, seed=0, rows=ROWS):
 # ---------------------------------------------------------------- the normaliser and the networks
 
 
-def test_torchrl_evaluates_the_critic_without_gradients():
-    """Its estimators map the network over two batches at once."""
-    _, critic, _ = actor_critic()
-    with torch.no_grad():
-        seen = torch.randn(2, ROWS, SIZE)
-        mapped = torch.vmap(critic.module)(seen)
-        assert torch.allclose(mapped, critic.module(seen), atol=1e-6)
-
-
 @pytest.mark.parametrize("sizes", [(500,), (1, 1, 1, 1, 1, 200), (3, 497), (100,) * 5])
 def test_normaliser_is_the_mean_and_deviation_of_everything(sizes):
     generator = np.random.default_rng(0)

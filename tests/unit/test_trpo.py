@@ -148,13 +148,6 @@ def test_no_step_breaks_the_bound_or_loses(seed):
         assert metrics["step"] > 0 and metrics["surrogate_gain"] > 0
 
 
-def test_a_search_that_finds_nothing_leaves_the_policy():
-    actor, algorithm = trpo(max_kl=1e4, backtracks=1)
-    before = flat([p.detach() for p in algorithm.policy]).clone()
-    assert algorithm.natural_step(batch_of(actor))["step"] == 0.0
-    assert torch.equal(flat([p.detach() for p in algorithm.policy]), before)
-
-
 def counted(algorithm):
     """The list to which each vector that the line search sets is added."""
     tried, put = [], algorithm._set
@@ -189,9 +182,10 @@ def test_the_search_goes_straight_to_the_bound(monkeypatch):
     assert trials[True] <= 15 and trials[False] >= 20  # of 6 searches
 
 
-@pytest.mark.parametrize("cause", ["no iteration", "no gain", "not a number"])
+@pytest.mark.parametrize("cause", ["no iteration", "no gain", "not a number", "a bound too wide"])
 def test_without_a_step_the_policy_stays_bit_for_bit(cause):
-    actor, algorithm = trpo(max_kl=0.02, backtracks=3)
+    wide = {"max_kl": 1e4, "backtracks": 1} if cause == "a bound too wide" else {}
+    actor, algorithm = trpo(**{"max_kl": 0.02, "backtracks": 3} | wide)
     batch = batch_of(actor)
     if cause == "no gain":
         batch["advantage"] = torch.zeros(ROWS, 1)
@@ -214,25 +208,6 @@ def refusing(evaluate):
         return (surrogate, kl) if surrogate.requires_grad else (surrogate - 1e3, kl)
 
     return lower
-
-
-def test_fisher_products_are_those_of_the_dense_hessian():
-    actor, algorithm = trpo()
-    actor.double()
-    torch.manual_seed(1)
-    batch = TensorDict({"observation": torch.randn(ROWS, SIZE, dtype=torch.float64)}, [ROWS])
-    with torch.no_grad():
-        batch = actor(batch)
-    batch["advantage"] = torch.zeros(ROWS, 1, dtype=torch.float64)
-    _, kl = algorithm.loss.surrogate_and_kl(batch)
-    gradient = flat(torch.autograd.grad(kl, algorithm.policy, create_graph=True))
-    rows = [torch.autograd.grad(g, algorithm.policy, retain_graph=True) for g in gradient]
-    hessian = torch.stack([flat(row) for row in rows])
-    assert hessian.abs().max() > 1e-2
-    product = fisher_product(kl, algorithm.policy, damping=0.0)
-    for _ in range(3):
-        vector = torch.randn(len(gradient), dtype=torch.float64)
-        torch.testing.assert_close(product(vector), hessian @ vector, rtol=0, atol=1e-10)
 
 
 def test_a_policy_with_a_memory_keeps_the_bound():
