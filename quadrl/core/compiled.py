@@ -36,10 +36,7 @@ from quadrl.engines.state import State
 METHODS = ("measure", "terminated", "error", "succeeded", "reward", "update", "observe")
 """Functions of a task that a step calls."""
 FLAGS = ("terminated", "truncated", "is_success", "diverged")
-POINTERS = (
-    *("constants", "parameters", "action", "command", "diverged"),
-    *("state", "last_state", "estimate", "was", "out", "rest"),
-)
+POINTERS = "constants parameters action command diverged state last_state estimate was out rest"
 SOURCE = """#include <math.h>
 #include <stdint.h>
 typedef struct {{
@@ -104,10 +101,8 @@ def _reported(step: WrittenStep, reason: str) -> WrittenStep:
 class _Rows(ctypes.Structure):
     """Where the function finds its rows; as in SOURCE."""
 
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in POINTERS),
-        *((name, ctypes.c_int64) for name in ("stride", "columns")),
-    ]
+    _fields_ = [(name, ctypes.c_void_p) for name in POINTERS.split()]
+    _fields_ += [("stride", ctypes.c_int64), ("columns", ctypes.c_int64)]
 
 
 class _Page:
