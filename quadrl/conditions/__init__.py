@@ -1,1 +1,1 @@
-"""The conditions of a flight: weather, what is drawn for an aircraft, disturbances, sensors."""
+"""The conditions of a flight: weather, randomization, sensors and the scene."""

@@ -1,4 +1,4 @@
-"""The weather: what the wind is like, and the process that lets it blow.
+"""The weather: the parameters of the wind, and the process that generates it.
 
 The wind is one vector for an aircraft. It changes once a control step, before the physics, and
 stands in the aircraft's row of air (`engine.air`) meanwhile.
@@ -41,19 +41,20 @@ MAX_WIND = 100.0  # [m/s]
 
 @dataclasses.dataclass(frozen=True)
 class Weather:
-    """What the wind is like. The default is calm air."""
+    """Parameters of the wind. The default is calm air."""
 
     wind_speed: float = 0.0
     """Mean wind at a height of 6.096 m (20 ft) [m/s]; turbulence grows with it."""
     direction: float | None = None
-    """Where mean wind and gust blow to, from east towards north [rad]; None: each episode draws
-    one for the wind and one for the gust."""
+    """Direction in which mean wind and gust blow, from east towards north [rad]; None to draw one
+    for each of them in each episode."""
     roughness: float = 0.0457
-    """Height z0 under which there is no mean wind [m]. The default is 0.15 ft: open country."""
+    """Roughness length z0, below which there is no mean wind [m]. The default is 0.15 ft: open
+    country."""
     gust_speed: float = 0.0
-    """Peak of the gust, which blows once an episode [m/s]."""
+    """Peak speed of the gust, of which there is one in each episode [m/s]."""
     gust_time: float = 2.0
-    """How long the gust lasts [s]. An episode draws when it begins."""
+    """Duration of the gust [s]. Each episode draws its start."""
 
     def __post_init__(self) -> None:
         """Validate the numbers."""
@@ -165,7 +166,7 @@ class WeatherProcess:
 
     @classmethod
     def of(cls, weather: Weather, engine: Engine, time_limit: float) -> WeatherProcess | None:
-        """The process, unless the air never moves."""
+        """The process; None in calm air."""
         noise_time = noise_time_of(engine.vehicle)
         if weather.calm and not noise_time:
             return None
@@ -203,7 +204,7 @@ class WeatherProcess:
         self._kernel(self._address, len(rows), rows.ctypes.data, True)
 
     def advance(self) -> None:
-        """Bring the weather of all aircraft one control step forward, and write their air."""
+        """Advance the weather of all aircraft by a control step, and write their air."""
         self._kernel(self._address, self._table.shape[1], None, False)
 
     def _write(self, rows: Any, wind_speed: Any) -> None:
@@ -229,5 +230,5 @@ class WeatherProcess:
             raise QuadrlError(reason, name="weather.table", value=table, allowed="this weather's")
 
     def restore(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Take up what `save` gave; the engine restores its air itself."""
+        """Restore what `save` returned; the engine restores its air itself."""
         self._table[:], self._streams[:] = saved["weather.table"], saved["weather.streams"]

@@ -175,18 +175,6 @@ def test_what_is_drawn_lies_in_its_range_and_differs_by_rotor_row_and_episode():
     assert (drawn(environment) != first).any(axis=1).all()
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_row_i_draws_and_flies_what_the_single_aircraft_of_seed_plus_i_does(engine):
-    task = tasks.make("hover", time_limit=0.4)
-    actions = helpers.random_actions(20, 3)
-    whole = flying(task, count=3, seed=40, engine=engine)
-    first, records = drawn(whole), helpers.fly(whole, actions)
-    for i in range(3):
-        single = flying(task, count=1, seed=40 + i, engine=engine)
-        np.testing.assert_array_equal(drawn(single)[0], first[i])
-        helpers.assert_records(helpers.fly(single, actions[:, i : i + 1]), records, [i])
-
-
 def test_what_is_drawn_changes_neither_the_starts_nor_each_other():
     plain = Environment("hover", num_envs=4, seed=3)
     observation = plain.reset()

@@ -13,6 +13,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.philox import NOISE, PUSHES, uniform_array_api
 from quadrl.base.rotation import norm
 from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.control import CONTROL_MODES
 from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import BatchEngine
 
@@ -34,12 +35,15 @@ WILD = dataclasses.replace(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("mode", ["rotor", "velocity"])
+@pytest.mark.parametrize("mode", CONTROL_MODES)
 def test_row_i_is_disturbed_as_the_single_aircraft_of_seed_plus_i(engine, mode):
     task = tasks.make("hover", time_limit=0.4)
-    settings = {"engine": engine, "control_mode": mode, "weather": "light"}
-    settings |= {"randomization": WILD, "observe": SEEN}
-    actions = helpers.random_actions(20, 3)
+    vehicle = VEHICLES["hexa" if mode == "rotor" else "paper"]
+    settings = {"engine": engine, "control_mode": mode, "weather": "light", "vehicle": vehicle}
+    wild = dataclasses.replace(WILD, observation_delay=(0.0, 2 * vehicle.control_timestep))
+    settings |= {"randomization": wild, "observe": SEEN}
+    size = Environment(task, **settings).action_size
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 3, size))
     whole = helpers.flying(task, count=3, seed=40, **settings)
     drawn, records = whole.randomizer.drawn, helpers.fly(whole, actions)
     told = whole.privileged
@@ -128,56 +132,41 @@ def test_each_row_has_a_delay_of_its_own_and_every_one_is_drawn_as_often():
 SIZES = Errors(position=0.01, attitude=0.02, velocity=0.03, body_rate=0.04)
 
 
-def errors(environment):
-    """Of the estimated state: position, angles about the axes, velocity, body rate, (N, 12)."""
+def angles(environment):
+    """Error of the estimated attitude about the axes of the body (N, 3) [rad]."""
     seen, true = environment.observer.frame.state, environment.engine.state
-    turn = np.swapaxes(true.rotation, -1, -2) @ seen.rotation  # I + [angles]x
-    angles = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0],
-                       turn[:, 1, 0] - turn[:, 0, 1]], axis=-1) / 2  # fmt: skip
     np.testing.assert_allclose(norm(seen.quaternion), 1.0, rtol=1e-12)
-    parts = (seen.position - true.position, angles, seen.velocity - true.velocity)
-    return np.concatenate([*parts, seen.body_rate - true.body_rate], axis=-1)
+    turn = np.swapaxes(true.rotation, -1, -2) @ seen.rotation  # I + [angles]x
+    return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0],
+                     turn[:, 1, 0] - turn[:, 0, 1]], axis=-1) / 2  # fmt: skip
 
 
-def test_the_noise_is_white_of_the_sizes_that_are_given_and_the_bias_lasts():
+def test_the_noise_is_the_definition_and_the_bias_lasts():
     bias = Errors(position=0.1, attitude=0.05, velocity=0.2, body_rate=0.3)
-    environment = helpers.begun("hover", 400, randomization=Randomization(noise=SIZES, bias=bias))
-    found = []
-    for _ in range(6):
-        found.append(errors(environment))
-        helpers.idle(environment)
-    found, shown = np.array(found), environment.randomizer.shown()
-    lasting = np.stack([shown[f"{name}_bias_{axis}"] for name in vars(bias) for axis in "xyz"], 1)
-    assert (np.abs(lasting) <= bias.sizes).all()
-    assert (np.ptp(lasting, axis=0) > 1.9 * bias.sizes).all()
-    noise = (found - lasting) / SIZES.sizes
-    # 2400 numbers of each kind: means within 5 / sqrt(2400), deviations within 5 / sqrt(4800);
-    # angles of 0.07 rad are known to a few parts in a thousand.
-    assert np.abs(noise.mean(axis=(0, 1))).max() < 0.11
-    assert np.abs(noise.std(axis=(0, 1)) - 1).max() < 0.08
-    assert np.abs(noise).max() < math.sqrt(12) * 1.01
-    related = np.corrcoef(
-        np.concatenate([noise[:-1].reshape(-1, 12), noise[1:].reshape(-1, 12)], 1).T
-    )
-    assert np.abs(related - np.eye(24)).max() < 5 / math.sqrt(2000)
-    first = lasting.copy()
-    environment.reset()
-    again = environment.randomizer.shown()["position_bias_x"]
-    assert (again != first[:, 0]).all()
-
-
-def test_the_noise_is_the_definition_bit_for_bit():
-    environment = helpers.begun("hover", 3, seed=2**40, randomization={"noise": SIZES})
+    given = Randomization(noise=SIZES, bias=bias)
+    environment = helpers.begun("hover", 100, seed=2**40, randomization=given)
     for step in range(4):
         keys, episodes = environment.randomizer.place
         words = uniform_array_api(keys, episodes, NOISE, 24 * step, 24) * 2.0**32
         halves = np.floor(words / 65536) + words % 65536
         normal = (halves[:, ::2] + halves[:, 1::2] - 131070) * (math.sqrt(3) / 65536)
+        shown = environment.randomizer.shown()
+        lasting = np.stack([shown[f"{k}_bias_{axis}"] for k in vars(bias) for axis in "xyz"], 1)
+        expected = lasting + SIZES.sizes * normal
         seen, engine = environment.observer.frame.state, environment.engine
-        expected = engine.qpos[:, :3] + SIZES.position * normal[:, :3] - engine.origin
-        np.testing.assert_array_equal(seen.position, expected)
-        np.testing.assert_array_equal(seen.body_rate, engine.qvel[:, 3:] + 0.04 * normal[:, 9:])
+        position = engine.qpos[:, :3] + expected[:, :3] - engine.origin
+        np.testing.assert_array_equal(seen.position, position)
+        np.testing.assert_array_equal(seen.velocity, engine.qvel[:, :3] + expected[:, 6:9])
+        np.testing.assert_array_equal(seen.body_rate, engine.qvel[:, 3:] + expected[:, 9:])
+        # Angles of 0.1 rad are known to a few parts in a thousand.
+        np.testing.assert_allclose(angles(environment), expected[:, 3:6], rtol=0.01, atol=1e-4)
         helpers.idle(environment)
+    # Sums of four uniform numbers: 3.5 deviations at most.
+    assert abs(normal.std() - 1) < 5 / math.sqrt(2400) and np.abs(normal).max() < 3.5
+    assert (np.abs(lasting) <= bias.sizes).all()
+    assert (np.ptp(lasting, axis=0) > 1.8 * bias.sizes).all()
+    environment.reset()
+    assert (environment.randomizer.shown()["position_bias_x"] != lasting[:, 0]).all()
 
 
 @pytest.mark.parametrize("compiled", [True, False])
@@ -217,34 +206,12 @@ def test_the_goal_is_seen_from_where_the_estimate_is():
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_pushes_come_by_chance_and_change_velocity_and_body_rate(engine):
-    pushes = Pushes(rate=2.0, velocity=0.5, body_rate=1.0)
-    environment = helpers.begun("hover", 200, engine=engine, randomization={"pushes": pushes})
-    hits = []
-    for _ in range(10):
-        before, advance = environment.engine.qvel.copy(), environment.engine.advance
-
-        def measured(steps, before=before, advance=advance):
-            hits.append(environment.engine.qvel - before)
-            advance(steps)
-
-        environment.engine.advance = measured
-        assert not helpers.idle(environment).diverged.any()
-        environment.engine.advance = advance
-    hits = np.array(hits).reshape(-1, 6)
-    hit = hits.any(axis=1)
-    # 2000 chances of 1 - exp(-2 * 0.05) = 0.095: 190, with a deviation of 13.
-    assert abs(hit.sum() - 190) < 5 * 13
-    np.testing.assert_allclose(norm(hits[hit, :3]), 0.5, rtol=1e-9)
-    np.testing.assert_allclose(norm(hits[hit, 3:]), 1.0, rtol=1e-9)
-    # Evenly over the sphere: each component has mean 0 and deviation 1 / sqrt(3).
-    assert np.abs(hits[hit].mean(axis=0) / ([0.5] * 3 + [1.0] * 3)).max() < 5 / math.sqrt(3 * 190)
-
-
-def test_the_pushes_are_the_definition():
+def test_the_pushes_are_the_definition(engine):
     # Eight numbers a control step: whether it hits, two directions by height and heading.
     pushes = Pushes(rate=20.0, velocity=0.5, body_rate=1.0)
-    environment = helpers.begun("hover", 20, seed=2**40, randomization={"pushes": pushes})
+    environment = helpers.begun(
+        "hover", 20, seed=2**40, engine=engine, randomization={"pushes": pushes}
+    )
     disturbances, qvel, hits = environment.randomizer, environment.engine.qvel, 0
     for step in range(5):
         keys, episodes = disturbances.place
@@ -273,19 +240,3 @@ def test_what_diverges_is_counted_and_finite():
         assert (now.terminated >= now.diverged).all()
         diverged += now.diverged.sum()
     assert diverged
-
-
-# ---------------------------------------------------------------------------------------- wind
-
-
-def test_each_row_has_a_share_of_the_weather():
-    environment = Environment(
-        "hover", num_envs=200, seed=0, weather="light", randomization={"wind": (0.0, 1.0)}
-    )
-    environment.reset()
-    share = environment.randomizer.shown()["wind"]
-    mean = np.zeros((200, 2))
-    for _ in range(40):
-        helpers.idle(environment)
-        mean += environment.engine.wind[:, :2] / 40
-    assert np.corrcoef(share, norm(mean))[0, 1] > 0.8

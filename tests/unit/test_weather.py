@@ -9,8 +9,6 @@ import helpers
 import numpy as np
 import pytest
 import torch
-from dm_control.mujoco import wrapper
-from dm_control.rl import control
 from runs import refused
 from scipy import stats
 
@@ -20,9 +18,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.conditions.weather import WEATHERS, Weather, WeatherProcess
 from quadrl.core.environment import Environment
-from quadrl.engines import air, mjcf
-from quadrl.engines.mujoco import DataEngine
-from quadrl.envs.dm_control import Physics, QuadrotorTask
+from quadrl.engines import air
 
 LIGHT = WEATHERS["light"]
 GUSTY = Weather(wind_speed=7.72, gust_speed=5.0, gust_time=1.5)
@@ -90,18 +86,6 @@ def test_series_are_the_functions():
         definition.half_wave(share), np.sin(np.pi * share), rtol=0, atol=1e-15
     )
     np.testing.assert_array_equal(definition.half_wave(np.array([-9.0, -1e-9, 1.0 + 1e-9, 7.0])), 0)
-
-
-def test_normal_numbers_have_mean_0_and_variance_1():
-    count = 100_000
-    keys, zero = np.arange(count), np.zeros(count, dtype=np.int64)
-    drawn = np.array(definition.normals((keys, zero), 3.0 + zero, 0, 14))
-    # A sum of four uniform ones: kurtosis 3 - 1.2 / 4 = 2.7, so its square has variance 1.7.
-    assert (abs(drawn.mean(axis=1)) < SIGMAS / math.sqrt(count)).all()
-    assert (abs(drawn.var(axis=1) - 1) < SIGMAS * math.sqrt(1.7 / count)).all()
-    np.testing.assert_allclose(stats.kurtosis(drawn, axis=1, fisher=False), 2.7, atol=0.06)
-    correlation = np.corrcoef(drawn) - np.eye(14)
-    assert abs(correlation).max() < SIGMAS / math.sqrt(count)
 
 
 def test_no_step_draws_the_numbers_of_another():
@@ -296,9 +280,7 @@ def test_the_gust_has_its_peak_and_its_integral():
     # Next to the middle, by at most half a step: 5 cos^2(pi 0.025 / 2) = 4.992; in all 5 * 2 / 2.
     assert (along.max(axis=0) >= 4.992).all() and along.max() <= 5
     np.testing.assert_allclose(STEP * along.sum(axis=0), 5.0, rtol=1e-12)
-
-
-def test_a_gust_longer_than_the_episode_begins_with_it():
+    # A gust that is longer than the episode begins with it.
     made, _ = process(Weather(gust_speed=5.0, gust_time=20.0), 3)
     np.testing.assert_array_equal(column(made, "gust_start"), 0)
 
@@ -395,26 +377,6 @@ def test_row_i_is_the_single_one_seeded_with_i_more(task, engine, settings, thre
     assert (batch.seeds.episodes > 2).all()
 
 
-def test_dm_control_steps_its_own_data_in_the_same_wind():
-    task = tasks.make("hover")
-    core = helpers.begun(task, seed=3, weather=GUSTY)
-    model = mjcf.compile_model(core.vehicle, scene=task.scene)
-    physics = Physics.from_model(wrapper.MjModel(model))
-    engine = DataEngine(core.vehicle, model, physics.data.ptr, altitude=task.altitude)
-    inner = Environment(task, engine=engine, weather=GUSTY)
-    environment = control.Environment(
-        physics, QuadrotorTask(inner, 3), n_sub_steps=core.vehicle.substeps
-    )
-    for _ in range(2):
-        environment.reset()
-        for _ in range(30):
-            np.testing.assert_array_equal(physics.data.userdata, core.engine.air[0])
-            np.testing.assert_array_equal(physics.data.qpos, core.engine.qpos[0])
-            environment.step(np.full(4, 0.1))
-            core.step(np.full((1, 4), 0.1))
-        core.reset()
-
-
 def test_rows_may_have_a_wind_speed_of_their_own():
     speeds = np.array([0.0, 3.0, 7.72, 20.0])
     numbers = np.arange(4), np.arange(4), np.zeros(4, np.int64)
@@ -471,14 +433,9 @@ def test_a_weather_is_found_by_name_and_by_its_fields():
     [
         {"wind_speed": -0.1},
         {"wind_speed": math.nan},
-        {"wind_speed": 1000.0},
-        {"gust_speed": -3.0},
+        {"gust_speed": 1000.0},
         {"gust_time": 0.0},
-        {"gust_time": -1.0},
-        {"gust_time": math.inf},
-        {"roughness": 0.0},
         {"roughness": 6.2},
-        {"direction": math.inf},
         {"direction": "north"},
     ],
     ids=str,
