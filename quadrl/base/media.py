@@ -38,7 +38,7 @@ class Media:
             QuadrlError: The name has another ending.
         """
         path = Path(path)
-        if path.suffix != f".{self.kind}":
+        if path.suffix.lower() != f".{self.kind}":
             allowed = f"a name that ends in .{self.kind}"
             raise QuadrlError(name="path", value=str(path), allowed=allowed)
         path.parent.mkdir(parents=True, exist_ok=True)

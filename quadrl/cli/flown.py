@@ -20,6 +20,7 @@ from quadrl.conditions.observing import Observing
 from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.evaluation.evaluate import comes_with_quadrl, setting
+from quadrl.evaluation.policy import FILE, Policy
 from quadrl.evaluation.rollout import Controller
 
 
@@ -80,11 +81,17 @@ class Flown(Conditioned):
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
 
-    def setting(self) -> tuple[str, Controller, Scenario]:
-        """A name for what flies, what flies, and what it flies.
+    @property
+    def label(self) -> str:
+        """What a flight is called beside others."""
+        path = Path(self.controller or self.policy)
+        return path.parent.name if path.name == FILE and path.parent.name else path.name
+
+    def flies(self) -> str | Path | Policy:
+        """What flies, as the functions of Python take it.
 
         Raises:
-            QuadrlError: One is unknown, or the choice is ambiguous.
+            QuadrlError: It is unknown, or the choice is ambiguous.
         """
         if bool(self.policy) == bool(self.controller):
             raise QuadrlError(
@@ -96,12 +103,16 @@ class Flown(Conditioned):
                 "--algo chooses among the policies that come with quadrl: give the name of a task, "
                 "or leave it out"
             )
-        choice("controller", self.controller or "geometric", CONTROLLERS)
+        if self.controller:
+            return choice("controller", self.controller, CONTROLLERS)
+        if self.algo:
+            return Policy.pretrained(self.policy, self.algo)
         # The name of a controller is no policy here: a folder may be called so.
-        flown = self.controller or (
-            self.policy if comes_with_quadrl(self.policy) else Path(self.policy)
-        )
-        return setting(flown, self.task or None, self.algo or "ppo", **self.conditions())
+        return self.policy if comes_with_quadrl(self.policy) else Path(self.policy)
+
+    def setting(self) -> tuple[str, Controller, Scenario]:
+        """A name for what flies, what flies, and what it flies; raises as `flies`."""
+        return setting(self.flies(), self.task or None, **self.conditions())
 
 
 def beside(scenario: Scenario) -> Scenario:

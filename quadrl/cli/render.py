@@ -9,14 +9,9 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from quadrl.base.progress import ProgressBar
 from quadrl.cli import choices
-from quadrl.cli.console import console, say
+from quadrl.cli.console import say
 from quadrl.cli.flown import Flown
-from quadrl.core.scenario import Scenario
-from quadrl.evaluation.evaluate import evaluate
-from quadrl.evaluation.policy import FILE
-from quadrl.evaluation.rollout import Controller
 
 VIDEO, GIF, SHEET = (848, 480, 20.0), (640, 360, 12.5), (480, 270, 20.0)
 """What a kind of file is drawn with unless it is given: width and height [pixels], frames/s."""
@@ -48,70 +43,34 @@ class Render(Flown):
 
     def run(self) -> None:
         """Fly an episode of each and draw them."""
-        from quadrl.rendering.sheet import SHEETS, write_contact_sheet
-        from quadrl.rendering.video import write_video
+        from quadrl.learning.show import render
+        from quadrl.rendering.sheet import SHEETS
+        from quadrl.rendering.video import VIDEOS, checked
 
-        flown = self.flown()
-        out = self.out or free_name(Path("flight.mp4"))
-        out.parent.mkdir(parents=True, exist_ok=True)  # refused before the flight, not after
-        kind = out.suffix.removeprefix(".").lower()
-        write = write_contact_sheet if kind in SHEETS else write_video
-        width, height, fps = SHEET if kind in SHEETS else GIF if kind == "gif" else VIDEO
-        flights, models, labels = [], [], []
-        for label, controller, scenario in flown:
-            one = evaluate(controller, scenario, episodes=1, seed=self.seed)
-            flights.append(one.rollout.trajectory(one.vehicle))
-            models.append(one.scenario.compile_model())
-            labels.append(label if len(flown) > 1 else "")
-        with ProgressBar(console) as bar:
-            write(
-                flights,
-                models,
-                out,
-                label=labels,
-                camera=self.camera,
-                width=width if self.width is None else self.width,
-                height=height if self.height is None else self.height,
-                fps=fps if self.fps is None else self.fps,
-                on_frame=lambda done, total: bar.update(done, total, f"drawing {out}"),
-            )
-        say(f"wrote {out}")
-
-    def flown(self) -> list[tuple[str, Controller, Scenario]]:
-        """Label, controller and scenario of each flight, in the task and the world of the first.
-
-        Raises:
-            QuadrlError: One is unknown, or there is none.
-        """
+        alone: dict[str, Any] = {"policy": "", "controller": ""}
+        chosen = [alone | {"policy": name} for name in self.policy]
+        chosen += [alone | {"controller": name, "algo": ""} for name in self.controller]
         names = [field.name for field in dataclasses.fields(Flown)]
-        shared: dict[str, Any] = {name: getattr(self, name) for name in names}
-        chosen: list[dict[str, Any]] = [{"policy": name, "controller": ""} for name in self.policy]
-        chosen += [{"policy": "", "controller": name} for name in self.controller]
-        flown: list[tuple[str, Controller, Scenario]] = []
-        for one in chosen or [{"policy": "", "controller": ""}]:
-            if one["controller"]:
-                shared["algo"] = ""
-            if flown and not self.task:
-                shared["task"] = flown[0][2].task.name
-            _, controller, scenario = Flown(**(shared | one)).setting()
-            flown.append((label_of(**one), controller, scenario))
-        disturbed = [scenario for *_, scenario in flown]
-        world: Any = {"task": disturbed[0].task}
-        for name in ("weather", "randomization"):
-            own = (getattr(scenario, name) for scenario in disturbed)
-            default = Scenario.__dataclass_fields__[name].default
-            world[name] = next((x for x in own if x != default), default)
-        for k, (label, controller, scenario) in enumerate(flown):
-            flown[k] = label, controller, dataclasses.replace(scenario, **world)
-        return flown
-
-
-def label_of(policy: str, controller: str) -> str:
-    """What a flight is called beside others."""
-    if controller:
-        return controller
-    path = Path(policy)
-    return path.parent.name if path.name == FILE and path.parent.name else path.name
+        shared = {name: getattr(self, name) for name in names}
+        flown = [Flown(**(shared | one)) for one in chosen or [alone]]
+        controllers: dict[str, Any] = {}
+        for one in flown:
+            again = f" ({len(controllers) + 1})" if one.label in controllers else ""
+            controllers[one.label + again] = one.flies()
+        out, kind = checked(self.out or free_name(Path("flight.mp4")), (*VIDEOS, *SHEETS))
+        out.parent.mkdir(parents=True, exist_ok=True)  # refused before the flight, not after
+        media = render(
+            controllers if len(controllers) > 1 else next(iter(controllers.values())),
+            self.task or None,
+            seed=self.seed,
+            kind=kind,
+            camera=self.camera,
+            width=self.width,
+            height=self.height,
+            fps=self.fps,
+            **self.conditions(),
+        )
+        say(f"wrote {media.save(out)}")
 
 
 def free_name(path: Path) -> Path:

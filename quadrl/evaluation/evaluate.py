@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import html
 import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Unpack, cast
 
@@ -168,6 +169,38 @@ def setting(
         allowed = "a policy, a run, a path, the name of a task or a controller, or a function"
         raise QuadrlError(name="controller", value=flown, allowed=allowed)
     return name, cast(Any, flown), scenario_of(flown, task, **conditions)
+
+
+def beside(
+    controllers: Iterable[Any],
+    task: str | Task | Scenario | None = None,
+    **conditions: Unpack[Conditions],
+) -> list[tuple[Controller, Scenario]]:
+    """What several fly to be seen side by side: the same episode of one task in one world.
+
+    Each has the aircraft and the observation of its training. The task is that of the first; the
+    weather and the randomization are the first that differ from calm air and from none.
+
+    Args:
+        controllers: What flies, each as `setting` takes it.
+        task: As `setting` takes it.
+        **conditions: As `setting` takes them.
+
+    Raises:
+        QuadrlError: Something is unknown or missing.
+    """
+    flown: list[tuple[Controller, Scenario]] = []
+    for one in controllers:
+        _, flies, scenario = setting(one, task, **conditions)
+        task = task or scenario.task.name
+        flown.append((flies, scenario))
+    scenarios = [scenario for _, scenario in flown]
+    same: Any = {"task": scenarios[0].task}
+    for name in ("weather", "randomization"):
+        usual = Scenario.__dataclass_fields__[name].default
+        own = (getattr(scenario, name) for scenario in scenarios)
+        same[name] = next((world for world in own if world != usual), usual)
+    return [(flies, dataclasses.replace(scenario, **same)) for flies, scenario in flown]
 
 
 def comes_with_quadrl(name: str) -> bool:

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.media import Media
 from quadrl.base.progress import ProgressBar
+from quadrl.base.validation import choice
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
-from quadrl.evaluation.evaluate import Evaluation, evaluate
+from quadrl.evaluation.evaluate import Evaluation, beside, evaluate
 from quadrl.learning.folder import METRICS, read_config, read_metrics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-PICTURE = ("camera", "width", "height", "fps")
-"""Options of a picture; those of `render` are conditions otherwise."""
+PICTURES: dict[str, dict[str, Any]] = {
+    "mp4": {"width": 848, "height": 480, "fps": 20.0},
+    "gif": {"width": 640, "height": 360, "fps": 12.5},
+    "sheet": {"width": 480, "height": 270, "fps": 20.0},
+}
+"""What a kind of file is drawn with by default: width and height [pixels], frames a second."""
 
 
 def render(
@@ -29,36 +34,56 @@ def render(
     *,
     seed: int = 0,
     kind: str = "mp4",
+    camera: str = "follow",
+    width: int | None = None,
+    height: int | None = None,
+    fps: float | None = None,
     progress: bool = True,
-    **options: Unpack[Conditions],
+    **conditions: Unpack[Conditions],
 ) -> Media:
-    """Draw a flight of a policy or a controller as a video; `quadrl render` in Python.
+    """Draw a flight of a policy or a controller, or of several; `quadrl render` in Python.
 
     Args:
-        controller: What flies, as `quadrl.evaluate` takes it.
-        task: A task or its name, or a whole scenario; by default the task that the policy was
-            trained for.
+        controller: What flies, as `quadrl.evaluate` takes it; or a mapping of labels to such, which
+            are shown side by side, as `quadrl.evaluation.evaluate.beside` lets them fly.
+        task: A task or its name, or a whole scenario; by default the task that the (first) policy
+            was trained for.
         seed: Of the episode.
-        kind: "mp4", "gif", or "png" for a sheet of frames.
+        kind: "mp4", "gif", or "png" or "jpg" for moments of the flight in one picture.
+        camera: "follow" keeps the goal in view, "chase" is behind the aircraft; or a camera of the
+            model.
+        width: Of a picture [pixels]; by default 848, 640 for gif, 480 for png and jpg. Each of
+            several flights has a picture of this size.
+        height: Of a picture [pixels]; by default 480, 360 for gif, 270 for png and jpg.
+        fps: Frames a second; by default 20, and 12.5 for gif.
         progress: Whether to show a progress bar.
-        **options: Conditions, as `quadrl.evaluate` takes them; and `camera`, `width`, `height`
-            [pixels], `fps`, see `quadrl.rendering.write_video`.
+        **conditions: As `quadrl.evaluate` takes them.
 
     Raises:
         QuadrlError: Something is unknown, out of range, or does not fit together.
         RenderingUnavailable: There is no graphics library.
     """
-    from quadrl.rendering import write_contact_sheet, write_video
+    from quadrl.rendering.sheet import SHEETS, write_contact_sheet
+    from quadrl.rendering.video import VIDEOS, write_video
 
-    conditions: dict[str, Any] = dict(options)
-    picture = {name: conditions.pop(name) for name in PICTURE if name in conditions}
-    flown = evaluate(controller, task, episodes=1, seed=seed, **conditions)
-    model, flight = flown.scenario.compile_model(), flown.rollout.trajectory(flown.vehicle)
+    sheet = choice("kind", kind, (*VIDEOS, *SHEETS)) in SHEETS
+    asked = {"width": width, "height": height, "fps": fps}
+    picture = PICTURES["sheet" if sheet else kind] | {
+        name: value for name, value in asked.items() if value is not None
+    }
+    several = controller if isinstance(controller, Mapping) else {"": controller}
+    flown = [
+        evaluate(one, scenario, episodes=1, seed=seed)
+        for one, scenario in beside(several.values(), task, **conditions)
+    ]
+    flights = [one.rollout.trajectory(one.vehicle) for one in flown]
+    models = [one.scenario.compile_model() for one in flown]
+    write = write_contact_sheet if sheet else write_video
     with ProgressBar() as bar, tempfile.TemporaryDirectory() as folder:
         if progress:
             picture["on_frame"] = lambda done, total: bar.update(done, total, "drawing")
-        write = write_contact_sheet if kind == "png" else write_video
-        path = write(flight, model, Path(folder, f"flight.{kind}"), **picture)
+        path = Path(folder, f"flight.{kind}")
+        write(flights, models, path, label=[*several], camera=camera, **picture)
         return Media(path.read_bytes(), kind)
 
 
