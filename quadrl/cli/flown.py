@@ -22,6 +22,7 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.evaluation.evaluate import comes_with_quadrl, setting
 from quadrl.evaluation.policy import FILE, Policy
 from quadrl.evaluation.rollout import Controller
+from quadrl.learning.defaults import PAIRS
 
 
 def make_conditions() -> type:
@@ -53,16 +54,20 @@ class Conditioned(ConditionOptions):
         Raises:
             QuadrlError: One begins like JSON and is none, or has no equals sign.
         """
-        given = {field.name: getattr(self, field.name) for field in FIELDS}
-        parsed: dict[str, Any] = {
-            name: parse_options(value) if isinstance(value, tuple) else parse_named(name, value)
-            for name, value in given.items()
-            if value not in (None, "", ())
-        }
-        return parsed
+        return parsed({name: getattr(self, name) for name in Conditions.__annotations__})
 
 
-FIELDS = dataclasses.fields(ConditionOptions)
+def parsed(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a command line as the functions of Python take them, without what is not given.
+
+    Raises:
+        QuadrlError: One begins like JSON and is none, or has no equals sign.
+    """
+    return {
+        name: parse_options(value) if name in PAIRS else parse_named(name, value)
+        for name, value in given.items()
+        if value not in (None, "", (), {})
+    }
 
 
 @choices.command

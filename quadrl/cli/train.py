@@ -21,7 +21,7 @@ from quadrl.base.signals import heeded
 from quadrl.base.validation import number
 from quadrl.cli import choices
 from quadrl.cli.console import again, console, make_table, reason, say
-from quadrl.cli.flown import parse_named, parse_options
+from quadrl.cli.flown import parsed
 from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
@@ -116,13 +116,7 @@ class Train:
 
     def run(self) -> None:
         """Train, sum up, draw."""
-        settings = given(dataclasses.asdict(self.settings))
-        for name in PAIRS:
-            if options := parse_options(settings.pop(name, ())):
-                settings[name] = options
-        for name in ("weather", "randomization"):
-            if name in settings:
-                settings[name] = parse_named(name, settings[name])
+        settings = parsed(given(dataclasses.asdict(self.settings)))
         task = settings.pop("task", None)
         if self.dry_run:
             config, _ = prepare(task, self.out, self.resume, settings)

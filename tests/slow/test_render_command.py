@@ -7,6 +7,9 @@ import pytest
 from PIL import Image
 
 from quadrl import cli
+from quadrl.conditions.weather import WEATHERS
+from quadrl.evaluation.evaluate import beside
+from quadrl.evaluation.policy import Policy
 
 pytestmark = [
     pytest.mark.usefixtures("cheap_pictures"),
@@ -41,14 +44,17 @@ def test_policies_and_controllers_side_by_side(capsys):
     capsys.readouterr()
 
 
-def test_side_by_side_they_fly_the_task_of_the_first():
-    words = dict(policy=("landing", "landing"), controller=("lqr",), vehicle="crazyflie")
-    flown = cli.render.Render(**words | {"task_options": ("start_height=2",)}).flown()
-    assert [label for label, *_ in flown] == ["landing", "landing", "lqr"]
-    assert all(task is flown[0][2] and task.start_height == 2 for _, _, task, _ in flown)
-    assert {vehicle.name for *_, vehicle in flown} == {"crazyflie"}
-    (one,) = cli.render.Render(controller=("lqr",)).flown()
-    assert one[2].name == "hover"
+def test_side_by_side_they_fly_the_task_of_the_first_in_one_world():
+    flown = [scenario for _, scenario in beside(["landing_robust", "landing", "lqr"])]
+    assert {scenario.task.name for scenario in flown} == {"landing"}
+    trained = Policy.pretrained("landing", variant="robust").scenario
+    assert all(scenario.randomization == trained.randomization for scenario in flown)
+    flown = beside(["landing", "lqr"], vehicle="crazyflie", weather="light", start_height=2)
+    for _, scenario in flown:
+        assert scenario.task.start_height == 2 and scenario.vehicle.name == "crazyflie"
+        assert scenario.weather == WEATHERS["light"]
+    ((_, alone),) = beside(["lqr"])
+    assert alone.task.name == "hover"
 
 
 @pytest.mark.parametrize(
@@ -57,4 +63,4 @@ def test_side_by_side_they_fly_the_task_of_the_first():
     + [("x/best.safetensors", "best.safetensors"), ("policy.safetensors", "policy.safetensors")],
 )
 def test_flights_are_named_after_their_runs(policy, label):
-    assert cli.render.label_of(policy, "") == label
+    assert cli.flown.Flown(policy=policy).label == label
