@@ -100,14 +100,6 @@ def test_evaluations_that_cannot_be(arguments, name):
         quadrl.evaluate("nowhere")
 
 
-def test_weather_and_samples_change_a_flight(run):
-    plain, *others = (
-        quadrl.evaluate("hover", episodes=2, **more).metrics["return_mean"]
-        for more in ({}, {"weather": "light"}, {"sampled": True})
-    )
-    assert plain not in others and others[0] != others[1]
-
-
 @pytest.mark.parametrize(("kind", "begins"), [("mp4", b"ftyp"), ("gif", b"GIF8"), ("png", b"PNG")])
 def test_render(run, tmp_path, kind, begins):
     video = quadrl.render(run, kind=kind, **SMALL)
