@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -103,7 +103,8 @@ class Parameters:
     def __init__(self, arrays: dict[str, Any]) -> None:
         """Take the arrays; a nested dict becomes nested Parameters."""
         for name, value in arrays.items():
-            setattr(self, name, Parameters(value) if isinstance(value, dict) else value)
+            nested = Parameters(cast(Any, value)) if isinstance(value, dict) else value
+            setattr(self, name, nested)
 
     def __getattr__(self, name: str) -> Array:
         """Tell type checkers that every parameter is an array."""
@@ -141,7 +142,7 @@ def c_structs() -> str:
     """The C declarations of a row, for LANES aircraft side by side (1: exactly a row)."""
 
     def fields(dtype: np.dtype) -> str:
-        lines = []
+        lines: list[str] = []
         for name in dtype.names or ():
             inner = dtype[name]
             if inner.base == ROTOR:

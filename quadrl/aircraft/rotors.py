@@ -87,7 +87,7 @@ def ring(
     """
     number("arm_length", arm_length, *LENGTHS)
     numbers("spins", spins, len(bearings))
-    rotors = []
+    rotors: list[Rotor] = []
     for bearing, spin in zip(bearings, spins, strict=True):
         # Rounded, so that a rotor straight ahead stands at y = 0 exactly.
         cosine, sine = (round(f(math.radians(bearing)), 15) + 0.0 for f in (math.cos, math.sin))
@@ -125,7 +125,7 @@ def mixer(
 def hover_squares(mixer: np.ndarray, mass: Array) -> np.ndarray:
     """Smallest squares of the rotor speeds (..., R) that carry a mass (...) without a moment."""
     # Each row over its largest entry, since they differ by orders of magnitude.
-    scale = np.abs(mixer).max(axis=-1, keepdims=True)
+    scale: np.ndarray = np.abs(mixer).max(axis=-1, keepdims=True)
     rows = mixer / scale
     weight = np.zeros((*rows.shape[:-1], 1))
     weight[..., 0, 0] = np.asarray(mass) * GRAVITY / scale[..., 0, 0]

@@ -12,7 +12,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from safetensors import SafetensorError
 
@@ -129,11 +129,12 @@ def read_sealed_json(path: Path, form: str, *, unsealed: bool = True) -> dict[st
     """
     try:
         content = path.read_bytes()
-        table = json.loads(content)
+        found = json.loads(content)
     except (OSError, ValueError, RecursionError) as error:
         raise QuadrlError(f"{path} cannot be read: {error}") from error
-    if not isinstance(table, dict):
+    if not isinstance(found, dict):
         raise QuadrlError(f"{path} must hold a table")
+    table = cast(dict[str, Any], found)
     check_seal(path, content, unsealed=unsealed and "format" not in table)
     if (written := table.get("format", form)) != form:
         raise QuadrlError(name=f"format of {path}", value=written, allowed=form)
@@ -175,8 +176,9 @@ def read_safetensors(
     try:
         content = path.read_bytes()
         size = int.from_bytes(content[:8], "little")
-        table = json.loads(content[8 : 8 + size])
-        header = json.loads((table.get("__metadata__") or {}).get(HEADER, "{}"))
+        table: dict[str, Any] = json.loads(content[8 : 8 + size])
+        metadata: dict[str, str] = table.get("__metadata__") or {}
+        header: Any = json.loads(metadata.get(HEADER, "{}"))
         written = header.get("format")
         if written not in (*wanted, *unsealed):
             allowed = " or ".join(wanted)

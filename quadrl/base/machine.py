@@ -19,7 +19,7 @@ WORTH_ASKING = 1 << 26  # [bytes]: less is not looked at, since the look takes t
 
 def machine() -> dict[str, str | int]:
     """What the figures were measured on."""
-    versions = {}
+    versions: dict[str, str | int] = {}
     for name in ("mujoco", "gymnasium", "dm-control", "torch", "torchrl"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)

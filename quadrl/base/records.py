@@ -27,7 +27,7 @@ def mapped(function: Callable[[Any], Any], record: Any) -> Any:
 
 def leaves(record: Any) -> list[Any]:
     """A record's arrays, one after the other."""
-    found = []
+    found: list[Any] = []
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
         if dataclasses.is_dataclass(value):

@@ -8,7 +8,7 @@ numbers come out for any number of rows, and from the C kernel (`native/state.c`
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -26,11 +26,12 @@ def namespace(array: Array) -> Any:
 
 def stack(*parts: Array) -> Array:
     """Components (...) of vectors as one array (..., k)."""
-    first = parts[0]
+    first: Any = parts[0]
     if not isinstance(first, np.ndarray):
         return namespace(first).stack(parts, axis=-1)
+    shape = (len(parts), *cast(np.ndarray, first).shape)
     # Each component contiguous, as in the tables of the state: NumPy's loops then run over rows.
-    whole = np.empty_like(first, np.result_type(*parts), shape=(len(parts), *first.shape))
+    whole = np.empty_like(first, np.result_type(*parts), shape=shape)
     for k, part in enumerate(parts):
         whole[k] = part
     return whole.transpose(*range(1, whole.ndim), 0)
@@ -47,9 +48,9 @@ def square_norm(vector: Array) -> Array:
 
 def norm(vector: Array) -> Array:
     """Euclidean norm over the last axis, (..., k) to (...); its gradient at zero is zero."""
-    square = square_norm(vector)
+    square: Any = square_norm(vector)
     if isinstance(square, np.ndarray):
-        return np.sqrt(square)
+        return np.sqrt(cast(np.ndarray, square))
     xp = namespace(square)
     positive = square > 0
     # The root's own gradient is infinite at zero, and infinity times zero is not a number.

@@ -76,7 +76,10 @@ def heeded(training: Asked) -> Generator[None]:
         came.append(number)
         training.ask(stop=True)
 
-    handlers: dict[int, Handler] = {signal.SIGTERM: stop, signal.SIGUSR1: lambda *_: training.ask()}
+    def check(number: int, frame: Any) -> None:
+        training.ask()
+
+    handlers: dict[int, Handler] = {signal.SIGTERM: stop, signal.SIGUSR1: check}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # in the background it is not
         handlers[signal.SIGINT] = stop
     with handling(handlers):

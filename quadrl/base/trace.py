@@ -6,6 +6,8 @@ operations are NumPy's own, one by one and in the same order, so that the compil
 same bits (but sine and its like, which are the C library's).
 """
 
+# pyright: standard
+# Symbols stand for arrays of any kind, and the functions of a task for anything callable.
 from __future__ import annotations
 
 import contextlib

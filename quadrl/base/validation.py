@@ -7,7 +7,7 @@ import difflib
 import math
 import numbers as abstract
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -173,7 +173,8 @@ def action(given: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def _kind(value: Any) -> str:
     if isinstance(value, (bool, str, dict)) or value is None:
-        return {"str": "string", "bool": "flag"}.get(type(value).__name__, type(value).__name__)
+        kind = type(cast(Any, value)).__name__
+        return {"str": "string", "bool": "flag"}.get(kind, kind)
     return "number" if isinstance(value, abstract.Real) else "sequence"
 
 
