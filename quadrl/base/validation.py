@@ -98,15 +98,20 @@ def record(name: str, value: Any, kind: type) -> Any:
     """
     if not isinstance(value, Mapping):
         return value
-    keys(f"field of {name}", value, [field.name for field in dataclasses.fields(kind)])
-    return kind(**value)
+    given = cast(Mapping[str, Any], value)
+    keys(f"field of {name}", given, [field.name for field in dataclasses.fields(kind)])
+    return kind(**given)
 
 
 def tuples(value: Any) -> Any:
     """Lists as JSON has them to tuples, at any depth."""
     if isinstance(value, dict):
-        return {name: tuples(item) for name, item in value.items()}
-    return tuple(map(tuples, value)) if isinstance(value, (list, tuple)) else value
+        return {name: tuples(item) for name, item in cast(dict[str, Any], value).items()}
+    return (
+        tuple(map(tuples, cast(Iterable[Any], value)))
+        if isinstance(value, (list, tuple))
+        else value
+    )
 
 
 def like(name: str, value: Any, default: Any) -> Any:
