@@ -212,7 +212,7 @@ class Channel:
             QuadrlError: The delay or the time between two samples is not a multiple of the time
                 step [s].
         """
-        self.sensor, self._randomizer = sensor, randomizer
+        self.sensor, self._width, self._randomizer = sensor, width, randomizer
         times = sensor.delay, 1 / sensor.rate if sensor.rate else timestep
         names = f"{sensor.name} delay and time of a sample [s]"
         self._delay, self._period = whole_steps(names, times, timestep, "control")
@@ -250,10 +250,6 @@ class Channel:
             fresh = self._randomizer.steps % self._period == 0
             sample = np.where(fresh[:, None], sample, self._values[0])
         self._values = np.concatenate([sample[None], self._values[:-1]])
-
-    @property
-    def _width(self) -> int:
-        return self._bias.shape[1]
 
     def _sample(self, rows: np.ndarray, now: Moment) -> Array:
         """A sample of some aircraft (n,) with its errors."""

@@ -110,10 +110,8 @@ def test_where_a_disturbance_goes_beyond_the_actions(axis, expected):
     for end, level in zip((of.levels[0], of.levels[-1]), expected, strict=True):
         found = limit(of.at, of.usual, end, PAPER)
         assert found == (level if level is None else pytest.approx(level, rel=1e-4))
-    mass, wide = (
-        DISTURBANCES["mass"],
-        resolve("paper", {"action_scale": 90}),
-    )  # 225.68 + 90 = 315.68
+    mass, wide = DISTURBANCES["mass"], resolve("paper", {"action_scale": 90})
+    # 225.68 + 90 = 315.68
     assert limit(mass.at, 1.0, 1.3, wide) == pytest.approx((315.68 / 225.68) ** 2, rel=1e-4)
 
 
