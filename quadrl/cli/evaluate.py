@@ -7,7 +7,7 @@ from typing import Any
 
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
-from quadrl.cli.flown import Flown, beside
+from quadrl.cli.flown import Flown, yardstick
 from quadrl.evaluation.evaluate import evaluate, shown
 
 
@@ -34,7 +34,7 @@ class Evaluate(Flown):
         evaluations = {
             name: evaluate(
                 one,
-                scenario if one is controller else beside(scenario),
+                scenario if one is controller else yardstick(scenario),
                 episodes=self.episodes,
                 seed=self.seed,
                 sampled=self.sampled and one is controller,

@@ -24,6 +24,19 @@ from quadrl.evaluation.policy import FILE, Policy
 from quadrl.evaluation.rollout import Controller
 from quadrl.learning.defaults import PAIRS
 
+HELP = {
+    "vehicle": "The aircraft",
+    "aerodynamics": "Effects of the air on the rotors: none, full, or names of single ones with "
+    "commas between them; by default those of the aircraft",
+    "weather": "The weather: calm, light, moderate or severe, or JSON such as "
+    "'{\"wind_speed\": 5}'",
+    "randomization": "What is drawn for each aircraft at each reset and disturbs it: none, light "
+    "or full, or JSON such as '{\"mass\": [0.8, 1.2]}'",
+    "observe": "Options of the observation, such as action_history=2",
+    "engine": "The engine: mujoco, or free_flight (MuJoCo only near what can be touched)",
+}
+"""Of conditions that Python takes in more forms than a command line."""
+
 
 def make_conditions() -> type:
     """A dataclass with an option for each condition, empty by default: "not given"."""
@@ -36,8 +49,8 @@ def make_conditions() -> type:
             kind, default = tuple[str, ...], ()
         elif hint in (float | None, int | None):
             kind, default = hint, None
-        text = texts[name]
-        text += "" if "by default" in text else "; by default as in the policy's training"
+        text = HELP.get(name, texts[name])
+        text += "" if "by default" in text else "; by default the policy's, or the usual one"
         fields.append((name, Annotated[kind, arg(help=text, help_behavior_hint="")], default))
     return dataclasses.make_dataclass("ConditionOptions", fields, frozen=True)
 
@@ -75,8 +88,8 @@ class Flown(Conditioned):
     """What flies, and what it flies."""
 
     policy: Annotated[Positional[str], arg(metavar="[POLICY]")] = ""
-    """A run folder, a .safetensors file, the name of a task, for the policy for it that comes with
-    quadrl, or of such a policy, as hover_robust (write ./NAME for a folder of that name)."""
+    """A run folder, a .safetensors file, or the name of a shipped policy: that of its task, or
+    one such as hover_robust (write ./NAME for a folder of that name)."""
     algo: choices.Algorithm = ""
     """The algorithm that trained the policy that comes with quadrl; ppo by default."""
     controller: choices.ControllerName = ""
@@ -120,7 +133,7 @@ class Flown(Conditioned):
         return setting(self.flies(), self.task or None, **self.conditions())
 
 
-def beside(scenario: Scenario) -> Scenario:
+def yardstick(scenario: Scenario) -> Scenario:
     """What the yardstick flies beside a policy: its scenario, with rotor commands, seeing all."""
     return dataclasses.replace(scenario, control_mode="rotor", observe=Observing())
 

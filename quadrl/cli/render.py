@@ -22,8 +22,8 @@ class Render(Flown):
     """Draw a flight of a policy or a controller, or of several side by side."""
 
     policy: Annotated[Positional[tuple[str, ...]], arg(metavar="[POLICY ...]")] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
-    """A run folder, a .safetensors file, the name of a task, for the policy for it that comes with
-    quadrl, or of such a policy, as hover_robust (write ./NAME for a folder of that name). Several,
+    """A run folder, a .safetensors file, or the name of a shipped policy: that of its task, or
+    one such as hover_robust (write ./NAME for a folder of that name). Several,
     and controllers, are shown side by side; they fly the same episode, of the first one's task."""
     controller: tuple[choices.ControllerName, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
     """Controllers, beside the policies or alone: geometric or lqr."""

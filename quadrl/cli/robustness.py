@@ -24,8 +24,8 @@ class Robustness(Conditioned):
     """Fly policies or controllers through graded disturbances, and map where they recover from."""
 
     policies: Positional[tuple[str, ...]] = ()
-    """Run folders, .safetensors files, names of tasks, for the policies for them that come with
-    quadrl, or of such policies, as hover_robust (write ./NAME for a folder of that name)."""
+    """Run folders, .safetensors files, or names of shipped policies: those of their tasks, or such
+    as hover_robust (write ./NAME for a folder of that name)."""
     controller: Annotated[
         UseAppendAction[tuple[choices.ControllerName, ...]],
         arg(help_behavior_hint="(repeatable)"),

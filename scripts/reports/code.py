@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from quadrl import VEHICLES, cli, tasks
-from quadrl.aircraft import presets
-from quadrl.aircraft import vehicle as vehicle_module
+from quadrl.aircraft import presets, rotors
 from quadrl.aircraft.rotors import GRAVITY, Rotor
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
@@ -114,7 +113,7 @@ def aircraft(name: str) -> str:
 
 def written_sources(name: str) -> dict[str, str]:
     """Comments beside the numbers of an aircraft in quadrl/aircraft, by parameter."""
-    code = inspect.getsource(vehicle_module if name == "paper" else presets)
+    code = inspect.getsource(rotors if name == "paper" else presets)
     start = "PAPER_ROTORS = plus(" if name == "paper" else f"\n{name.upper()} = Vehicle("
     found: dict[str, str] = {}
     above = ""
@@ -133,7 +132,14 @@ def written_sources(name: str) -> dict[str, str]:
 def command(name: str) -> str:
     """What a command does, and its options."""
     kind, rows = COMMANDS[name], []
-    meanings = docstrings(kind)
+    # The shared conditions have no docstrings there: their help is part of their type.
+    hints = typing.get_type_hints(kind, include_extras=True)
+    meanings = docstrings(kind) | {
+        option: one.help
+        for option, hint in hints.items()
+        for one in getattr(hint, "__metadata__", ())
+        if getattr(one, "help", None)
+    }
     for field in dataclasses.fields(kind):
         if not (meaning := meanings.get(field.name)):
             continue
