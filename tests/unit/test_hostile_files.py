@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_hostile import EXAMPLES, profile, refusal
-from test_memory import make_policy
+from policies import make_remembering
 
 from quadrl.base.errors import QuadrlError
 from quadrl.evaluation.policy import RECURRENT_UNSEALED, SHIPPED, UNSEALED, Policy
@@ -33,7 +33,7 @@ def sound_files(folder):
     tensors = {"actor": {"weight": torch.ones(3, 2), "bias": torch.zeros(3)}, "steps": np.arange(4)}
     checkpoint.save(path, tensors, {"iteration": 3})
     policy = (SHIPPED / "hover_ppo.safetensors").read_bytes()
-    make_policy().save(folder / "memory")
+    make_remembering().save(folder / "memory")
     remembers = (folder / "memory").read_bytes()
     files = {"policy": policy, "memory": remembers, "checkpoint": path.read_bytes()}
     return {name: unsealed(content) for name, content in files.items()}

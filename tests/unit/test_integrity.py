@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from runs import TINY, changed, refused, train
 from test_hostile_files import unsealed
-from test_memory import make_policy as make_recurrent
-from test_policy import make_policy
+from policies import make_policy, make_remembering
 
 from quadrl.base.errors import QuadrlWarning
 from quadrl.base.machine import processor_kind
@@ -57,7 +56,7 @@ def bits(content):
     ],
 )
 def test_one_bit_that_has_changed_is_refused(copy, name, read):
-    make_recurrent().save(copy / "memory")
+    make_remembering().save(copy / "memory")
     path = copy / name
     sound = path.read_bytes()
     read(copy)

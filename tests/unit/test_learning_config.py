@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from runs import TINY, refused
-from test_policy import linear
+from policies import linear
 
 import quadrl
 from quadrl import tasks

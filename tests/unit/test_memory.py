@@ -5,19 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from policies import WIDTH, make_remembering
 from runs import assert_same_run, changed, contents, refused, stopped, train
-from safetensors.numpy import save
 from tensordict import TensorDict
 from torchrl.data import Unbounded
 from torchrl.modules import set_recurrent_mode
 
 from quadrl import tasks
-from quadrl.base.files import write_safetensors
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.evaluation.evaluate import evaluate
-from quadrl.evaluation.memory import GRU
-from quadrl.evaluation.policy import RECURRENT_FORMAT, Policy
+from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import fly
 from quadrl.learning import checkpoint, environments
 from quadrl.learning.config import ALGORITHMS, TrainConfig
@@ -29,7 +27,7 @@ from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
 from quadrl.rendering.live.flight import Flight
 
-SIZE, ACTIONS, WIDTH = 5, 2, 7
+SIZE, ACTIONS = 5, 2
 ROWS, STEPS = 6, 9
 RECURRENT = changed(memory="gru", memory_width=WIDTH)
 KINDS = {PPO: PPOConfig(fused=False), TRPO: TRPOConfig(), VPG: VPGConfig()}
@@ -311,20 +309,8 @@ def test_a_critic_learns_what_only_it_is_told(kind):
 # ------------------------------------------------------------------- the policy
 
 
-def make_policy(seed=0, size=22, actions=4, **metadata) -> Policy:
-    """One layer behind a memory, of random numbers, for hover."""
-    random = np.random.default_rng(seed)
-
-    def array(*shape):
-        return random.normal(0, 0.3, shape).astype(np.float32)
-
-    unit = GRU(array(3 * WIDTH, size), array(3 * WIDTH, WIDTH), array(3 * WIDTH), array(3 * WIDTH))
-    weights, biases = (array(2 * actions, size + WIDTH),), (array(2 * actions),)
-    return Policy(weights, biases, array(size), array(size) + 2, "hover", metadata, unit)
-
-
 def test_it_does_not_forget_in_silence():
-    policy = make_policy()
+    policy = make_remembering()
     for call in (policy, policy.sampled):
         with refused() as caught:
             call(0)
@@ -340,11 +326,11 @@ def test_it_does_not_forget_in_silence():
 )
 def test_a_state_of_another_shape_is_refused(observation, state):
     with refused(name="state shape", value=state):
-        make_policy().step(np.zeros(observation), np.zeros(state))
+        make_remembering().step(np.zeros(observation), np.zeros(state))
 
 
 def test_a_flyer_remembers_and_forgets_rows():
-    policy = make_policy()
+    policy = make_remembering()
     observation = np.random.default_rng(1).normal(size=(4, 3, 22))
     flyer, state = policy.flying(3), policy.initial_state(3)
     for seen in observation[:3]:
@@ -362,7 +348,7 @@ def test_a_flyer_remembers_and_forgets_rows():
     np.testing.assert_allclose(alone(observation[3, 0]), first[0], atol=1e-6)
 
 
-@pytest.mark.parametrize("policy", [make_policy(), Policy.pretrained("hover")], ids=repr)
+@pytest.mark.parametrize("policy", [make_remembering(), Policy.pretrained("hover")], ids=repr)
 def test_every_policy_flies_with_its_memory(policy):
     rollout = fly(policy, "hover", episodes=3)
     environment = Environment("hover", num_envs=3, seed=1 << 53)
@@ -376,7 +362,7 @@ def test_every_policy_flies_with_its_memory(policy):
 
 
 def test_sampled_actions_of_a_memory_are_those_of_its_seed():
-    policy = make_policy()
+    policy = make_remembering()
     one, other = (evaluate(policy, episodes=3, sampled=True).metrics for _ in range(2))
     assert one == other != evaluate(policy, episodes=3).metrics
 
@@ -384,7 +370,7 @@ def test_sampled_actions_of_a_memory_are_those_of_its_seed():
 def test_a_sampled_policy_commands_what_it_was_trained_to():
     # Velocity setpoints of zero hold an aircraft in the air; as rotor commands they would, too, but
     # a policy with a mode is not to be flown in another.
-    policy = make_policy(control_mode="velocity")
+    policy = make_remembering(control_mode="velocity")
     assert policy.flying(2, seed=0).control_mode == "velocity"
     with refused("control_mode"):
         fly(policy.flying(2, seed=0), "hover", episodes=2, control_mode="rotor")
@@ -392,7 +378,7 @@ def test_a_sampled_policy_commands_what_it_was_trained_to():
 
 def test_a_live_flight_forgets_the_rows_that_begin_anew():
     task = tasks.make("hover", time_limit=0.2)
-    flight = Flight(make_policy(), Scenario.of(task), num_envs=2)
+    flight = Flight(make_remembering(), Scenario.of(task), num_envs=2)
     for _ in range(4):  # to the end of the episodes
         flight.step()
     assert flight.episodes == 2 and (flight._act.state == 0).all()
@@ -402,86 +388,8 @@ def test_a_live_flight_forgets_the_rows_that_begin_anew():
     assert (flight._act.state == 0).all()
 
 
-# ------------------------------------------------------------------- the file
-
-
-def parts(policy):
-    arrays = {"mean": policy.mean, "deviation": policy.deviation}
-    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
-    return arrays | policy.memory.arrays()
-
-
-HEADER = {"format": RECURRENT_FORMAT, "task": "hover", "metadata": {}}
-
-
-def write(path, arrays, **header):
-    write_safetensors(path, arrays, HEADER | header, save)
-    return path
-
-
-def test_saved_and_loaded_it_is_the_same(tmp_path):
-    policy = make_policy(seed=3, algo="ppo")
-    policy.save(tmp_path / "policy.safetensors")
-    loaded = Policy.load(tmp_path)
-    assert (loaded.task, loaded.metadata) == (policy.task, policy.metadata)
-    for name, array in parts(policy).items():
-        np.testing.assert_array_equal(parts(loaded)[name], array)
-
-
-def replaced(**arrays):
-    return lambda own: own | {k: np.asarray(v, np.float32) for k, v in arrays.items()}
-
-
-def without(name):
-    return lambda own: {k: v for k, v in own.items() if k != name}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        without("memory_state_bias"),
-        without("weight_0"),
-        lambda own: {k: v for k, v in own.items() if not k.startswith("memory")},
-        replaced(memory_input_weight=np.zeros((3 * WIDTH, 21))),
-        replaced(memory_state_weight=np.zeros((3 * WIDTH, WIDTH + 1))),
-        replaced(memory_state_weight=np.zeros((3 * WIDTH,))),
-        replaced(memory_state_weight=0.0),
-        replaced(memory_state_bias=np.zeros((3 * WIDTH, 1))),
-        replaced(memory_input_bias=np.full(3 * WIDTH, np.nan)),
-        replaced(memory_state_weight=np.full((3 * WIDTH, WIDTH), 3e38)),
-        replaced(memory_input_weight=np.full((3 * WIDTH, 22), 3e37)),  # times the clip
-        replaced(weight_0=np.zeros((8, 22))),  # without what is remembered
-        replaced(weight_0=np.full((8, 22 + WIDTH), 1e38)),
-        lambda own: own | {"memory_input_bias": np.zeros(3 * WIDTH)},  # double precision
-        replaced(
-            memory_input_weight=np.zeros((0, 22)),
-            memory_state_weight=np.zeros((0, 0)),
-            memory_input_bias=np.zeros(0),
-            memory_state_bias=np.zeros(0),
-            weight_0=np.zeros((8, 22)),
-        ),
-    ],
-)
-def test_arrays_that_make_no_policy_are_refused(tmp_path, change):
-    path = write(tmp_path / "policy.safetensors", parts(make_policy()))
-    Policy.load(path)
-    with refused():
-        Policy.load(write(path, change(parts(make_policy()))))
-
-
-def test_the_format_says_whether_it_has_a_memory(tmp_path):
-    path = tmp_path / "policy.safetensors"
-    with refused():
-        Policy.load(write(path, parts(make_policy()), format="quadrl-policy-2"))
-    with refused(name=f"format of {path}"):
-        Policy.load(write(path, parts(make_policy()), format="quadrl-policy-gru-9"))
-    Policy.pretrained("hover").save(path)
-    assert Policy.load(path).memory is None
-
-
 def test_the_numbers_stay_finite_whatever_is_seen():
-    policy = make_policy()
+    policy = make_remembering()
     seen = np.array([np.zeros(22), np.full(22, 1e30), np.full(22, -1e3)])
     state = policy.initial_state(3)
     for _ in range(50):

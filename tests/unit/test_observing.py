@@ -6,7 +6,7 @@ import helpers
 import numpy as np
 import pytest
 from apis import APIS
-from test_policy import linear
+from policies import linear
 
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle

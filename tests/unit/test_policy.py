@@ -11,6 +11,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from policies import WIDTH, linear, make_policy, make_remembering, parts
 from runs import refused
 from safetensors.numpy import save
 
@@ -20,48 +21,17 @@ from quadrl.base.files import write_safetensors
 from quadrl.core.environment import Environment
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.evaluation.evaluate import setting
-from quadrl.evaluation.policy import FORMAT, SHIPPED, Policy, shipped
+from quadrl.evaluation.policy import FORMAT, RECURRENT_FORMAT, SHIPPED, Policy, shipped
 from quadrl.evaluation.rollout import fly
 
-SIZE = 3
 HEADER = {"format": FORMAT, "task": "hover", "metadata": {}}
-
-
-def make_policy(**changes) -> Policy:
-    """A network small enough to be worked out by hand: 3 inputs, 2 hidden units, 4 actions."""
-    values = dict(
-        weights=(
-            np.array([[1, 0, 0], [0, 1, 0]], np.float32),
-            np.array([[1, 0], [0, 1], [1, 1], [9, 9], [0, 0], [0, 0], [0, 0], [0, 0]], np.float32),
-        ),
-        biases=(np.zeros(2, np.float32), np.array([0, 0.5, 0, 0, -1, -1, -1, -1], np.float32)),
-        mean=np.array([1, 2, 3], np.float32),
-        deviation=np.array([2, 4, 1], np.float32),
-        task="hover",
-        metadata={"algo": "ppo", "seed": 3, "task_options": {"time_limit": 5}},
-    )
-    return Policy(**{**values, **changes})
-
-
-def linear(inputs: int, actions: int, **metadata) -> Policy:
-    """One layer of zeros, for any layout."""
-    zeros = np.zeros(2 * actions, np.float32)
-    weights = (np.zeros((2 * actions, inputs), np.float32),)
-    mean = np.zeros(inputs, np.float32)
-    return Policy(weights, (zeros,), mean, mean + 1, "hover", metadata)
+RECURRENT_HEADER = HEADER | {"format": RECURRENT_FORMAT}
 
 
 def write(path, arrays, header):
     """A safetensors file with any content."""
     write_safetensors(path, arrays, header, save)
     return path
-
-
-def parts(policy: Policy) -> dict[str, np.ndarray]:
-    arrays = {"mean": policy.mean, "deviation": policy.deviation}
-    for k in range(len(policy.weights)):
-        arrays |= {f"weight_{k}": policy.weights[k], f"bias_{k}": policy.biases[k]}
-    return arrays
 
 
 # ---------------------------------------------------------------------------- what it computes
@@ -130,8 +100,8 @@ def test_a_policy_flies_any_number_of_rotors(tmp_path):
 # -------------------------------------------------------------------------- saved and loaded
 
 
-def test_saved_and_loaded_it_is_the_same(tmp_path):
-    policy = make_policy()
+@pytest.mark.parametrize("policy", [make_policy(), make_remembering(seed=3, algo="ppo")], ids=repr)
+def test_saved_and_loaded_it_is_the_same(policy, tmp_path):
     policy.save(tmp_path / "policy.safetensors")
     for path in (tmp_path, tmp_path / "policy.safetensors", str(tmp_path)):
         loaded = quadrl.Policy.load(path)
@@ -215,8 +185,8 @@ def test_a_pickle_is_refused_and_not_run(tmp_path):
     assert not trap.exists()
 
 
-def replaced(name, value):
-    return lambda arrays: arrays | {name: np.asarray(value, np.float32)}
+def replaced(**changes):
+    return lambda arrays: arrays | {k: np.asarray(v, np.float32) for k, v in changes.items()}
 
 
 def without(name):
@@ -230,20 +200,20 @@ def without(name):
         without("weight_0"),
         without("bias_1"),
         lambda arrays: {},
-        replaced("weight_9", np.zeros((2, 2))),
-        replaced("weight_0", np.zeros((2, 4))),
-        replaced("weight_0", np.zeros(6)),
-        replaced("bias_0", np.zeros((2, 1))),
-        replaced("bias_0", 0.0),
-        replaced("mean", np.zeros(4)),
-        replaced("mean", 0.0),
-        replaced("mean", np.zeros((1, 3))),
-        replaced("deviation", [1, 0, 1]),
-        replaced("deviation", [1, -1, 1]),
-        replaced("deviation", [1, np.inf, 1]),
-        replaced("weight_1", np.full((8, 2), np.nan)),
-        replaced("weight_1", np.full((8, 2), 3e38)),  # sums that single precision does not hold
-        replaced("bias_1", np.full(8, np.inf)),
+        replaced(weight_9=np.zeros((2, 2))),
+        replaced(weight_0=np.zeros((2, 4))),
+        replaced(weight_0=np.zeros(6)),
+        replaced(bias_0=np.zeros((2, 1))),
+        replaced(bias_0=0.0),
+        replaced(mean=np.zeros(4)),
+        replaced(mean=0.0),
+        replaced(mean=np.zeros((1, 3))),
+        replaced(deviation=[1, 0, 1]),
+        replaced(deviation=[1, -1, 1]),
+        replaced(deviation=[1, np.inf, 1]),
+        replaced(weight_1=np.full((8, 2), np.nan)),
+        replaced(weight_1=np.full((8, 2), 3e38)),  # sums that single precision does not hold
+        replaced(bias_1=np.full(8, np.inf)),
         lambda arrays: arrays | {"weight_1": np.zeros((7, 2), "f"), "bias_1": np.zeros(7, "f")},
         lambda arrays: arrays | {"mean": np.zeros(3)},
     ],
@@ -254,6 +224,51 @@ def test_arrays_that_make_no_network_are_refused(tmp_path, change):
     write(path, change(parts(make_policy())), HEADER)
     with refused():
         Policy.load(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without("memory_state_bias"),
+        without("weight_0"),
+        lambda own: {k: v for k, v in own.items() if not k.startswith("memory")},
+        replaced(memory_input_weight=np.zeros((3 * WIDTH, 21))),
+        replaced(memory_state_weight=np.zeros((3 * WIDTH, WIDTH + 1))),
+        replaced(memory_state_weight=np.zeros((3 * WIDTH,))),
+        replaced(memory_state_weight=0.0),
+        replaced(memory_state_bias=np.zeros((3 * WIDTH, 1))),
+        replaced(memory_input_bias=np.full(3 * WIDTH, np.nan)),
+        replaced(memory_state_weight=np.full((3 * WIDTH, WIDTH), 3e38)),
+        replaced(memory_input_weight=np.full((3 * WIDTH, 22), 3e37)),  # times the clip
+        replaced(weight_0=np.zeros((8, 22))),  # without what is remembered
+        replaced(weight_0=np.full((8, 22 + WIDTH), 1e38)),
+        lambda own: own | {"memory_input_bias": np.zeros(3 * WIDTH)},  # double precision
+        replaced(
+            memory_input_weight=np.zeros((0, 22)),
+            memory_state_weight=np.zeros((0, 0)),
+            memory_input_bias=np.zeros(0),
+            memory_state_bias=np.zeros(0),
+            weight_0=np.zeros((8, 22)),
+        ),
+    ],
+)
+def test_arrays_that_make_no_memory_are_refused(tmp_path, change):
+    own = parts(make_remembering())
+    path = write(tmp_path / "policy.safetensors", own, RECURRENT_HEADER)
+    Policy.load(path)
+    write(path, change(own), RECURRENT_HEADER)
+    with refused():
+        Policy.load(path)
+
+
+def test_the_format_says_whether_it_has_a_memory(tmp_path):
+    path, own = tmp_path / "policy.safetensors", parts(make_remembering())
+    with refused():
+        Policy.load(write(path, own, HEADER | {"format": "quadrl-policy-2"}))
+    with refused(name=f"format of {path}"):
+        Policy.load(write(path, own, HEADER | {"format": "quadrl-policy-gru-9"}))
+    Policy.pretrained("hover").save(path)
+    assert Policy.load(path).memory is None
 
 
 @pytest.mark.parametrize(

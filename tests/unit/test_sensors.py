@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from apis import APIS
 from test_observing import ACTIONS, seen
-from test_policy import linear
+from policies import linear
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import to_body
