@@ -11,8 +11,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_hostile import EXAMPLES, profile, refusal
 from policies import make_remembering
+from test_hostile import EXAMPLES, profile, refusal
 
 from quadrl.base.errors import QuadrlError
 from quadrl.evaluation.policy import RECURRENT_UNSEALED, SHIPPED, UNSEALED, Policy

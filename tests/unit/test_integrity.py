@@ -6,9 +6,9 @@ import warnings
 
 import numpy as np
 import pytest
+from policies import make_policy, make_remembering
 from runs import TINY, changed, refused, train
 from test_hostile_files import unsealed
-from policies import make_policy, make_remembering
 
 from quadrl.base.errors import QuadrlWarning
 from quadrl.base.machine import processor_kind

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from runs import TINY, refused
 from policies import linear
+from runs import TINY, refused
 
 import quadrl
 from quadrl import tasks

@@ -8,8 +8,8 @@ import helpers
 import numpy as np
 import pytest
 from apis import APIS
-from test_observing import ACTIONS, seen
 from policies import linear
+from test_observing import ACTIONS, seen
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import to_body
