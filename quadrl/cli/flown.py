@@ -20,7 +20,8 @@ from quadrl.conditions.observing import Observing
 from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.evaluation.evaluate import comes_with_quadrl, setting
-from quadrl.evaluation.policy import FILE, Policy
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import Controller
 from quadrl.learning.defaults import PAIRS
 

@@ -33,7 +33,8 @@ from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import world
 from quadrl.engines.native import compiling
 from quadrl.engines.state import c_rows
-from quadrl.evaluation.policy import CLIP, FORMAT, UNSEALED, Policy, shipped
+from quadrl.evaluation.policy import Policy, shipped
+from quadrl.evaluation.policy_file import CLIP, FORMAT, UNSEALED
 from quadrl.rendering import drawing
 from quadrl.tasks import TASKS
 

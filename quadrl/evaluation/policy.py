@@ -1,42 +1,33 @@
 """A trained policy as numbers: NumPy in, NumPy out, no torch.
 
-The file is safetensors: arrays and a table of strings, nothing that could run. The network is the
-paper's: hidden layers of tanh, then the mean and the log-variance of a normal distribution over the
-actions. Observations are normalised with the mean and the deviation of the training. A policy with
-a memory has a gated recurrent unit beside that: its state joins the observation.
+The network is the paper's: hidden layers of tanh, then the mean and the log-variance of a normal
+distribution over the actions. Observations are normalised with the mean and the deviation of the
+training. A policy with a memory has a gated recurrent unit beside that: its state joins the
+observation. `policy_file` has its file.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors.numpy import load as of_bytes
-from safetensors.numpy import save as to_bytes
 
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.presets import resolve as resolve_vehicle
-from quadrl.base.errors import QuadrlError, QuadrlWarning
-from quadrl.base.files import read_safetensors, read_sealed_json, write_safetensors
+from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
 from quadrl.core.scenario import KEYWORDS, Scenario
-from quadrl.evaluation.memory import GRU, NAMES, PREFIX, PolicyInFlight
+from quadrl.evaluation import policy_file
+from quadrl.evaluation.memory import GRU, PolicyInFlight
+from quadrl.evaluation.policy_file import CLIP, RUN
 
 if TYPE_CHECKING:
     from quadrl.core.environment import Environment
 
-FORMAT, RECURRENT_FORMAT = "quadrl-policy-3", "quadrl-policy-gru-2"
-UNSEALED, RECURRENT_UNSEALED = "quadrl-policy-2", "quadrl-policy-gru-1"
-"""Formats of files without a digest."""
-FILE, RUN, RUN_FORMAT = "policy.safetensors", "config.json", "quadrl-run-2"
-"""In the folder of a run: its policy, and its settings."""
-CLIP = 10.0
-"""Normalised observations are clipped to +-CLIP."""
 LOG_VARIANCE = (-12.0, 2.0)
 """Bounds of the log-variance of the actions."""
 SHIPPED = Path(__file__).parents[1] / "assets" / "policies"
@@ -259,13 +250,8 @@ class Policy:
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
         arrays = {"mean": self.mean, "deviation": self.deviation}
-        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
-        arrays |= self.memory.arrays() if self.memory else {}
-        arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
-        written = RECURRENT_FORMAT if self.memory else FORMAT
-        header = {"format": written, "task": self.task, "metadata": self.metadata}
-        write_safetensors(Path(path), arrays, header, to_bytes)
+        header = {"task": self.task, "metadata": self.metadata}
+        policy_file.write(Path(path), self.weights, self.biases, self.memory, header, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
@@ -280,47 +266,10 @@ class Policy:
             QuadrlError: The file is missing, damaged or not a policy of quadrl.
         """
         path = Path(path)
-        file = path / FILE if path.is_dir() else path
-        if not file.is_file():
-            if (path / RUN).is_file():
-                raise QuadrlError(
-                    f"the run in {path} has no policy yet, since it was stopped before its first "
-                    f"checkpoint; continue it: quadrl train --resume {path}"
-                )
-            raise QuadrlError(
-                f"there is no policy at {file}; give a run folder (quadrl train ... --out FOLDER "
-                "makes one) or a .safetensors file"
-            )
-        unsealed = UNSEALED, RECURRENT_UNSEALED
-        arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), unsealed, of_bytes)
-        task, metadata = header.get("task"), header.get("metadata")
-        options = metadata.get("task_options", {}) if isinstance(metadata, dict) else None
-        if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
-            raise QuadrlError(f"{file} does not say what its policy was trained for")
-        own = NAMES if header["format"] in (RECURRENT_FORMAT, RECURRENT_UNSEALED) else ()
-        layers = max(1, (len(arrays) - len(own)) // 2 - 1)
-        names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS), *own)
-        if set(arrays) != set(names):
-            raise QuadrlError(f"{file} is damaged: its arrays are {', '.join(sorted(arrays))}")
-        weights, biases = (tuple(arrays[f"{p}_{k}"] for k in range(layers)) for p in PARTS)
-        memory = GRU(**{k.removeprefix(PREFIX): arrays[k] for k in own}) if own else None
-        mean, deviation = arrays["mean"], arrays["deviation"]
-        policy = cls(weights, biases, mean, deviation, task, metadata, memory)
-        if not _is_network(policy):
-            raise QuadrlError(f"{file} is damaged: its arrays do not make a policy network")
-        if path.is_dir() and (path / RUN).is_file():
-            policy._warn_of_another_run(path)
+        policy = cls(**policy_file.read(path))
+        if (path / RUN).is_file():
+            policy_file.warn_of_another_run(path, policy.metadata | {"task": policy.task})
         return policy
-
-    def _warn_of_another_run(self, folder: Path) -> None:
-        """Say so where a policy is not of the run in whose folder it is."""
-        run, own = read_sealed_json(folder / RUN, RUN_FORMAT), self.metadata | {"task": self.task}
-        for name in ("task", "algo", "seed", "run"):
-            if name in own and name in run and own[name] != run[name]:
-                text = f"the policy in {folder} is not of the run there: its {name} is "
-                text += f"{own[name]}, that of the run {run[name]}"
-                warnings.warn(text, QuadrlWarning, stacklevel=3)
-                return
 
     @classmethod
     def pretrained(cls, task: str, algo: str = "ppo", variant: str = "ideal") -> Policy:
@@ -340,28 +289,7 @@ class Policy:
         return cls.load(SHIPPED / f"{choice('pretrained policy', name, known)}.safetensors")
 
 
-PARTS = ("weight", "bias")
 REPR = ("algo", "seed", "vehicle")  # what a policy says of itself
-
-
-def _is_network(policy: Policy) -> bool:
-    """Whether the arrays fit together and no observation makes an output that is not finite."""
-    arrays = (*policy.weights, *policy.biases, policy.mean, policy.deviation)
-    width = policy.mean.size
-    sound = policy.mean.shape == policy.deviation.shape == (width,)
-    sound = sound and all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays)
-    largest: Any = CLIP
-    if sound and policy.memory:
-        sound = policy.memory.is_sound(width, CLIP)
-        largest = np.repeat([CLIP, 1.0], [width, policy.state_size])
-        width += policy.state_size
-    for weight, bias in zip(policy.weights, policy.biases, strict=True):
-        if not sound or weight.shape != (bias.size, width) or bias.shape != (bias.size,):
-            return False
-        sums = (largest * np.abs(weight, dtype=np.float64)).sum(axis=1) + np.abs(bias)
-        sound = bool((sums < np.finfo(np.float32).max / 2).all())
-        width, largest = bias.size, 1.0  # the largest output of tanh
-    return sound and width > 0 and width % 2 == 0 and bool((policy.deviation > 0).all())
 
 
 def shipped() -> list[Path]:

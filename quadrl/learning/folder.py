@@ -20,8 +20,8 @@ import numpy as np
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import NO_LOCKS, lock, read_sealed_json, write_sealed_json, write_whole
 from quadrl.base.machine import processor_kind
-from quadrl.evaluation.policy import RUN as CONFIG
-from quadrl.evaluation.policy import RUN_FORMAT
+from quadrl.evaluation.policy_file import RUN as CONFIG
+from quadrl.evaluation.policy_file import RUN_FORMAT
 
 METRICS = "metrics.csv"
 EVENTS = "events"

@@ -14,7 +14,8 @@ from torchrl.modules import GRUCell, IndependentNormal, ProbabilisticActor, recu
 
 from quadrl.base.machine import check_memory
 from quadrl.evaluation.memory import GRU
-from quadrl.evaluation.policy import CLIP, LOG_VARIANCE, Policy
+from quadrl.evaluation.policy import LOG_VARIANCE, Policy
+from quadrl.evaluation.policy_file import CLIP
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import Plain
 from quadrl.learning.goal import goal_state

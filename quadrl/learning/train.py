@@ -25,8 +25,8 @@ from quadrl.base.machine import processor_kind
 from quadrl.base.progress import Progress
 from quadrl.engines import native
 from quadrl.envs.torchrl import QuadrotorEnv
-from quadrl.evaluation.policy import FILE as POLICY_FILE
 from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.policy_file import FILE as POLICY_FILE
 from quadrl.learning import checkpoint
 from quadrl.learning.algorithm import Algorithm, generators, one_thread, set_generators
 from quadrl.learning.apg import APG

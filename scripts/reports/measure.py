@@ -22,7 +22,8 @@ from quadrl import VEHICLES, tasks
 from quadrl.engines.mujoco import ENGINES
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.plotting import learning_curves, save
-from quadrl.evaluation.policy import FILE, SHIPPED, SHIPPED_AS, Policy
+from quadrl.evaluation.policy import SHIPPED, SHIPPED_AS, Policy
+from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import EVALUATION_SEED, Controller, flights, fly, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig

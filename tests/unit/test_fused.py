@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import set_recurrent_mode
 
-from quadrl.evaluation.policy import CLIP, LOG_VARIANCE
+from quadrl.evaluation.policy import LOG_VARIANCE
+from quadrl.evaluation.policy_file import CLIP
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import BehaviourPolicy
 from quadrl.learning.networks import make_actor_critic

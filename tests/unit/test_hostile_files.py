@@ -15,7 +15,8 @@ from policies import make_remembering
 from test_hostile import EXAMPLES, profile, refusal
 
 from quadrl.base.errors import QuadrlError
-from quadrl.evaluation.policy import RECURRENT_UNSEALED, SHIPPED, UNSEALED, Policy
+from quadrl.evaluation.policy import SHIPPED, Policy
+from quadrl.evaluation.policy_file import RECURRENT_UNSEALED, UNSEALED
 from quadrl.learning import checkpoint
 
 # Of files without a digest: a digest would keep the rest of the reader from seeing them.

@@ -21,7 +21,8 @@ from quadrl.base.files import write_safetensors
 from quadrl.core.environment import Environment
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.evaluation.evaluate import setting
-from quadrl.evaluation.policy import FORMAT, RECURRENT_FORMAT, SHIPPED, Policy, shipped
+from quadrl.evaluation.policy import SHIPPED, Policy, shipped
+from quadrl.evaluation.policy_file import FORMAT, RECURRENT_FORMAT
 from quadrl.evaluation.rollout import fly
 
 HEADER = {"format": FORMAT, "task": "hover", "metadata": {}}

@@ -1,0 +1,124 @@
+"""The file of a policy: safetensors, arrays and a table of strings, nothing that could run."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import load as of_bytes
+from safetensors.numpy import save as to_bytes
+
+from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.files import read_safetensors, read_sealed_json, write_safetensors
+from quadrl.evaluation.memory import GRU, NAMES, PREFIX
+
+FORMAT, RECURRENT_FORMAT = "quadrl-policy-3", "quadrl-policy-gru-2"
+UNSEALED, RECURRENT_UNSEALED = "quadrl-policy-2", "quadrl-policy-gru-1"
+"""Formats of files without a digest."""
+FILE, RUN, RUN_FORMAT = "policy.safetensors", "config.json", "quadrl-run-2"
+"""In the folder of a run: its policy, and its settings."""
+CLIP = 10.0
+"""Normalised observations are clipped to +-CLIP."""
+PARTS = ("weight", "bias")
+
+
+def write(
+    path: Path,
+    weights: tuple[np.ndarray, ...],
+    biases: tuple[np.ndarray, ...],
+    memory: GRU | None,
+    header: dict[str, Any],
+    **arrays: np.ndarray,
+) -> None:
+    """Write the file of a policy, whole or not at all.
+
+    Args:
+        path: The file.
+        weights: Of each layer.
+        biases: Of each layer.
+        memory: What it remembers with.
+        header: Its task and its metadata.
+        **arrays: Its other arrays by name.
+    """
+    for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
+    arrays |= memory.arrays() if memory else {}
+    arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
+    written = RECURRENT_FORMAT if memory else FORMAT
+    write_safetensors(path, arrays, {"format": written, **header}, to_bytes)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The fields of the policy in a file, or in the folder of a run.
+
+    Raises:
+        QuadrlError: The file is missing, damaged or not a policy of quadrl.
+    """
+    file = path / FILE if path.is_dir() else path
+    if not file.is_file():
+        if (path / RUN).is_file():
+            raise QuadrlError(
+                f"the run in {path} has no policy yet, since it was stopped before its first "
+                f"checkpoint; continue it: quadrl train --resume {path}"
+            )
+        raise QuadrlError(
+            f"there is no policy at {file}; give a run folder (quadrl train ... --out FOLDER "
+            "makes one) or a .safetensors file"
+        )
+    unsealed = UNSEALED, RECURRENT_UNSEALED
+    arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), unsealed, of_bytes)
+    task, metadata = header.get("task"), header.get("metadata")
+    options = metadata.get("task_options", {}) if isinstance(metadata, dict) else None
+    if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
+        raise QuadrlError(f"{file} does not say what its policy was trained for")
+    own = NAMES if header["format"] in (RECURRENT_FORMAT, RECURRENT_UNSEALED) else ()
+    layers = max(1, (len(arrays) - len(own)) // 2 - 1)
+    names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS), *own)
+    if set(arrays) != set(names):
+        raise QuadrlError(f"{file} is damaged: its arrays are {', '.join(sorted(arrays))}")
+    weights, biases = (tuple(arrays[f"{p}_{k}"] for k in range(layers)) for p in PARTS)
+    memory = GRU(**{k.removeprefix(PREFIX): arrays[k] for k in own}) if own else None
+    parts = {"weights": weights, "biases": biases, "memory": memory}
+    parts |= {name: arrays[name] for name in ("mean", "deviation")}
+    if not _is_network(**parts):
+        raise QuadrlError(f"{file} is damaged: its arrays do not make a policy network")
+    return {**parts, "task": task, "metadata": metadata}
+
+
+def warn_of_another_run(folder: Path, own: dict[str, Any]) -> None:
+    """Warn the caller's caller where a policy is not of the run in whose folder it is."""
+    run = read_sealed_json(folder / RUN, RUN_FORMAT)
+    for name in ("task", "algo", "seed", "run"):
+        if name in own and name in run and own[name] != run[name]:
+            text = f"the policy in {folder} is not of the run there: its {name} is "
+            text += f"{own[name]}, that of the run {run[name]}"
+            warnings.warn(text, QuadrlWarning, stacklevel=3)
+            return
+
+
+def _is_network(
+    weights: tuple[np.ndarray, ...],
+    biases: tuple[np.ndarray, ...],
+    memory: GRU | None,
+    mean: np.ndarray,
+    deviation: np.ndarray,
+) -> bool:
+    """Whether the arrays fit together and no observation makes an output that is not finite."""
+    arrays = (*weights, *biases, mean, deviation)
+    width = mean.size
+    sound = mean.shape == deviation.shape == (width,)
+    sound = sound and all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays)
+    largest: Any = CLIP
+    if sound and memory:
+        sound = memory.is_sound(width, CLIP)
+        largest = np.repeat([CLIP, 1.0], [width, memory.width])
+        width += memory.width
+    for weight, bias in zip(weights, biases, strict=True):
+        if not sound or weight.shape != (bias.size, width) or bias.shape != (bias.size,):
+            return False
+        sums = (largest * np.abs(weight, dtype=np.float64)).sum(axis=1) + np.abs(bias)
+        sound = bool((sums < np.finfo(np.float32).max / 2).all())
+        width, largest = bias.size, 1.0  # the largest output of tanh
+    return sound and width > 0 and width % 2 == 0 and bool((deviation > 0).all())
