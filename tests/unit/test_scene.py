@@ -11,6 +11,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import rotation_matrix
 from quadrl.conditions.scene import Box, Cylinder, Gate, Pose, Scene, Sphere, heading
 from quadrl.core.environment import Environment
+from quadrl.engines.mjcf import compile_model
 from quadrl.engines.mujoco import make
 from quadrl.engines.state import Start
 from quadrl.evaluation.rollout import fly
@@ -31,7 +32,8 @@ EVERY = Scene(
 def flown(scene, poses, velocity, steps=12, engine="mujoco", vehicle=PAPER):
     """Engine and track (steps + 1, N, 3) [m] of aircraft at hover speed, from the origin on."""
     count = len(velocity)
-    made = make(engine, vehicle, count, altitude=3.0, scene=scene.add_to if scene else None)
+    model = compile_model(vehicle, drawn=False, scene=scene.add_to if scene else None)
+    made = make(engine, vehicle, model, count, altitude=3.0)
     rest, hover = np.zeros((count, 3)), np.tile(vehicle.hover_speed, (count, 1))
     level = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
     start = Start(rest, level, np.asarray(velocity, dtype=float), rest, hover)
