@@ -10,6 +10,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.cli import choices
 from quadrl.cli.console import say
 from quadrl.learning.folder import LEARNING_CURVE
+from quadrl.learning.show import curve, curves
 
 
 @choices.command
@@ -26,7 +27,6 @@ class Plot:
     def run(self) -> None:
         """Write the pictures."""
         from quadrl.evaluation.plotting import save
-        from quadrl.learning.show import curve, curves
 
         if not self.run_folders:
             raise QuadrlError("give a run folder, or several: quadrl plot runs/*")

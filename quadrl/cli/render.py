@@ -12,6 +12,9 @@ from tyro.conf import Positional, arg
 from quadrl.cli import choices
 from quadrl.cli.console import say
 from quadrl.cli.flown import Flown
+from quadrl.learning.show import render
+from quadrl.rendering.sheet import SHEETS
+from quadrl.rendering.video import VIDEOS, checked
 
 VIDEO, GIF, SHEET = (848, 480, 20.0), (640, 360, 12.5), (480, 270, 20.0)
 """What a kind of file is drawn with unless it is given: width and height [pixels], frames/s."""
@@ -43,10 +46,6 @@ class Render(Flown):
 
     def run(self) -> None:
         """Fly an episode of each and draw them."""
-        from quadrl.learning.show import render
-        from quadrl.rendering.sheet import SHEETS
-        from quadrl.rendering.video import VIDEOS, checked
-
         alone: dict[str, Any] = {"policy": "", "controller": ""}
         chosen = [alone | {"policy": name} for name in self.policy]
         chosen += [alone | {"controller": name, "algo": ""} for name in self.controller]

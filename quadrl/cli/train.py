@@ -27,6 +27,7 @@ from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import PAIRS, flat
 from quadrl.learning.plan import parse_seeds
+from quadrl.learning.show import curves
 from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
@@ -226,7 +227,6 @@ def _list_files(run: Run) -> None:
 def _compare(runs: list[Run], folder: Path) -> None:
     """Print the results of several seeds in a table, and draw their curves in one picture."""
     from quadrl.evaluation.plotting import save
-    from quadrl.learning.show import curves
 
     head = ("run", "successful", "error over the last 2 s", "return", "training")
     found = [(run, run.evaluation.metrics) for run in runs]

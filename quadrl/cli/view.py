@@ -16,6 +16,7 @@ from quadrl.core.task import Task
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.rollout import Controller
+from quadrl.rendering.live.flight import Flight
 from quadrl.tasks import TASKS
 
 
@@ -41,7 +42,6 @@ class View(Flown):
 
     def _native(self) -> None:
         from quadrl.rendering.live import native
-        from quadrl.rendering.live.flight import Flight
 
         native.check_screen()
         _, controller, scenario = self.setting()
@@ -58,7 +58,6 @@ class View(Flown):
             raise RenderingUnavailable(
                 f"quadrl view needs {error.name}: install the extra `view` of quadrl"
             ) from error
-        from quadrl.rendering.live.flight import Flight
 
         _, controller, scenario = self.setting()
         task, vehicle = scenario.task, scenario.aircraft

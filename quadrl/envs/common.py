@@ -13,7 +13,11 @@ from quadrl.base.rotation import norm
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
+from quadrl.core.trajectory import outcome
 from quadrl.engines import mjcf
+from quadrl.rendering import Renderer
+from quadrl.rendering.overlay import Panel, flight_lines, task_title
+from quadrl.rendering.pictures import LiveFlight
 
 OWN = ("num_threads", "seed", "reward_terms")
 """Keywords of every API beside those of a scenario."""
@@ -101,8 +105,6 @@ class Pictures:
         environment = self._environment
         if self._renderer is None:
             self._open()
-        from quadrl.rendering.pictures import LiveFlight
-
         flight = self._flights.setdefault(row, LiveFlight(self._camera))
         now, qpos = environment.snapshot, environment.engine.qpos[row]
         time, speeds = float(now.time[row]), now.state.rotor_speed[row]
@@ -114,9 +116,6 @@ class Pictures:
         return picture
 
     def _open(self) -> None:
-        from quadrl.rendering import Renderer
-        from quadrl.rendering.overlay import Panel, task_title
-
         vehicle, task = self._environment.vehicle, self._environment.task
         model = self._environment.scenario.compile_model()
         self._renderer = Renderer(model, self._width, self._height)
@@ -129,9 +128,6 @@ class Pictures:
 
     def _values(self, row: int, time: float) -> tuple[Any, ...]:
         """What the panel shows of a row: values, rotor speeds, attitude, outcome."""
-        from quadrl.core.trajectory import outcome
-        from quadrl.rendering.overlay import flight_lines
-
         environment = self._environment
         now, done, reward, end = environment.snapshot, environment.transition, 0.0, ""
         error = environment.task.error(now)[row]

@@ -17,7 +17,9 @@ from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO, write_json
+from quadrl.learning.show import curve
 from quadrl.learning.train import Training
+from quadrl.rendering import write_video
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -58,15 +60,12 @@ class Run:
             RenderingUnavailable: There is no graphics library to draw the video with.
         """
         from quadrl.evaluation import plotting  # it takes a second, and the result comes first
-        from quadrl.learning.show import curve
 
         flown = self.evaluation
         yield plotting.save(curve(self.folder), self.folder / LEARNING_CURVE)
         title = f"{flown.task.name}: mean action of the policy"
         yield plotting.save(plotting.trajectory(flown.rollout, title), self.folder / TRAJECTORY)
         if video:
-            from quadrl.rendering import write_video
-
             model, flight = flown.scenario.compile_model(), flown.rollout.trajectory(flown.vehicle)
             yield write_video(flight, model, self.folder / VIDEO, on_frame=on_frame)
 

@@ -15,6 +15,8 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import Evaluation, beside, evaluate
 from quadrl.learning.folder import METRICS, read_config, read_metrics
+from quadrl.rendering.sheet import SHEETS, write_contact_sheet
+from quadrl.rendering.video import VIDEOS, write_video
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,9 +65,6 @@ def render(
         QuadrlError: Something is unknown, out of range, or does not fit together.
         RenderingUnavailable: There is no graphics library.
     """
-    from quadrl.rendering.sheet import SHEETS, write_contact_sheet
-    from quadrl.rendering.video import VIDEOS, write_video
-
     sheet = choice("kind", kind, (*VIDEOS, *SHEETS)) in SHEETS
     asked = {"width": width, "height": height, "fps": fps}
     picture = PICTURES["sheet" if sheet else kind] | {
