@@ -209,10 +209,15 @@ def _differing(record: Any, usual: Any = None) -> dict[str, Any]:
     differs = {}
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
-        other = field.default if usual is None else getattr(usual, field.name)
+        other = _default(field) if usual is None else getattr(usual, field.name)
         if _json(value) != _json(other):
             differs[field.name] = _json(value)
     return differs
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    made = field.default_factory
+    return field.default if made is dataclasses.MISSING else made()
 
 
 def _json(value: Any) -> Any:
