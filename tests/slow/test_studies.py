@@ -204,9 +204,11 @@ def test_a_training_waits_until_a_lost_one_has_left_its_folder(tmp_path):
     run.folder.mkdir()
     unlock = lock_folder(run.folder)
     process = Process(executor.order(run, 2), tmp_path / "log.txt")
-    with once_begun(run.folder, unlock, awaited="../log.txt"):
-        time.sleep(8)  # it has been imported, and waits
+    try:
+        time.sleep(15)  # in which it would have ended, well or with an error
         assert process.poll() is None
+    finally:
+        unlock()
     assert process.wait() == executor.End() and run.done
 
 
