@@ -252,7 +252,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Take up what `save` gave."""
+        """Restore a state that `save` gave."""
 
     def _restore_state(self, saved: dict[str, np.ndarray]) -> None:
         table = np.ascontiguousarray(saved["parameters"]).view(parameters.AIRCRAFT)[:, 0]

@@ -107,7 +107,7 @@ class BatchEngine(Engine):
         return self._saved(self.batch.state.copy())
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Take up what `save` gave."""
+        """Restore a state that `save` gave."""
         self.batch.state[:] = saved["rows"]
         self._restore_state(saved)
 
@@ -171,7 +171,7 @@ class DataEngine(Engine):
         return self._saved(row[None])
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Take up what `save` gave."""
+        """Restore a state that `save` gave."""
         spec = mujoco.mjtState.mjSTATE_INTEGRATION
         mujoco.mj_setState(self.model, self.data, saved["rows"][0], spec)
         self._restore_state(saved)

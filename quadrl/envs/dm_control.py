@@ -51,7 +51,7 @@ class Physics(mujoco.Physics):
         return super().__getstate__(), self.engine, self.legacy_step, self.in_view
 
     def __setstate__(self, state: Any) -> None:
-        """Take up what was copied."""
+        """Restore what was copied."""
         data, self.engine, self.legacy_step, self.in_view = state
         super().__setstate__(data)
 
