@@ -10,6 +10,8 @@ from typing import Any
 from rich import progress
 from rich.console import Console
 
+from quadrl.base.units import duration
+
 
 @dataclasses.dataclass
 class Progress:
@@ -42,6 +44,7 @@ class ProgressBar:
         )
         self._row: progress.TaskID | None = None
         self._begun: tuple[int, float] | None = None  # iteration and seconds of the first update
+        self._first_update: tuple[int, float] | None = None  # how much was done, and when
         self._last_line = time.monotonic()
         self._metrics: dict[str, float] = {}
 
@@ -66,6 +69,7 @@ class ProgressBar:
             if last:
                 self._progress.stop()
             return
+        left = self._left(done, total)
         seconds = self.NOTEBOOK_SECONDS if self._console.is_jupyter else self.LINE_SECONDS
         now = time.monotonic()
         # A drawing that takes no time needs no line; a training always has its last one.
@@ -75,10 +79,19 @@ class ProgressBar:
         self._last_line = now
         if self._console.is_jupyter:
             filled = round(self.WIDTH * done / total)
-            self._display(f"{'━' * filled}{'╌' * (self.WIDTH - filled)}  {text}")
+            self._display(f"{'━' * filled}{'╌' * (self.WIDTH - filled)}  {text}{left}")
         else:
-            line = f"{100 * done / total:3.0f} %  {text}"
+            line = f"{100 * done / total:3.0f} %  {text}{left}"
             self._console.print(line, soft_wrap=True, highlight=False)
+
+    def _left(self, done: int, total: int) -> str:
+        """The time left, at the speed since the first update."""
+        now = time.monotonic()
+        self._first_update = self._first_update or (done, now)
+        before, since = self._first_update
+        if done in (before, total):
+            return ""
+        return f"  {duration((now - since) * (total - done) / (done - before))} left"
 
     def show(self, now: Progress) -> None:
         """Show steps, steps/s, return and success after an iteration of a training."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from quadrl.base.units import quantity
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
 from quadrl.cli.flown import Flown, yardstick
-from quadrl.evaluation.evaluate import evaluate, shown
+from quadrl.evaluation.evaluate import evaluate
 
 
 @choices.command
@@ -48,7 +49,9 @@ class Evaluate(Flown):
             console.print_json(data=first, indent=None)
             return
         columns = [evaluation.metrics for evaluation in evaluations.values()]
-        rows = [(metric, *(shown(column[metric]) for column in columns)) for metric in first]
+        rows = [
+            (metric, *(quantity(metric, column[metric]) for column in columns)) for metric in first
+        ]
         console.print(make_table(("", *evaluations), rows, numbers=len(columns)))
         if self.csv is not None:
             say(f"wrote {self.csv}")

@@ -14,6 +14,7 @@ from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
+from quadrl.base.units import length, percent, quantity
 from quadrl.base.validation import number
 from quadrl.control import CONTROLLERS
 from quadrl.control.feasibility import warn_of_unreached
@@ -65,13 +66,13 @@ class Evaluation:
         found = self.metrics
         return (
             f"{self.name} on {self.task.name}, {found['episodes']} episodes: "
-            f"{100 * found['survival_rate']:.0f} % to the end, "
-            f"{100 * found['success_rate']:.0f} % successful, error over the last 2 s "
-            f"{100 * found['position_error_m']:.1f} cm"
+            f"{percent(found['survival_rate'])} to the end, "
+            f"{percent(found['success_rate'])} successful, error over the last 2 s "
+            f"{length(found['position_error_m'])}"
         )
 
     def _repr_html_(self) -> str:
-        rows = [("", self.name), *((name, shown(x)) for name, x in self.metrics.items())]
+        rows = [("", self.name), *((name, quantity(name, x)) for name, x in self.metrics.items())]
         return html_table(rows)
 
     def save_csv(self, path: str | Path) -> Path:
@@ -216,8 +217,3 @@ def html_table(rows: list[tuple[str, ...]]) -> str:
 
     body = "".join(line(row, "td") for row in rows[1:])
     return f"<table><thead>{line(rows[0], 'th')}</thead><tbody>{body}</tbody></table>"
-
-
-def shown(value: object) -> str:
-    """A metric as text."""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

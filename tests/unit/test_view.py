@@ -207,7 +207,7 @@ def test_controls_act_on_the_flight(page):
     np.testing.assert_allclose(engine.qvel[:, 0] - place, [0.0, 3.0])
     np.testing.assert_array_equal(page.flight.time, was)
     page.flight.error[:] = (0.1, 0.25)
-    assert "10.0 cm" in readout.html(page.flight, 0) and "25.0 cm" in readout.html(page.flight, 1)
+    assert "10 cm" in readout.html(page.flight, 0) and "25 cm" in readout.html(page.flight, 1)
     assert readout.html(page.flight, 0).count("background:rgb(") == VEHICLE.rotor_count
 
 

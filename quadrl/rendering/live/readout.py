@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from quadrl.base.units import length
 from quadrl.engines.mjcf import rotor_colour
 from quadrl.rendering.live.flight import Flight
 
@@ -28,7 +29,7 @@ def html(flight: Flight, row: int) -> str:
         "time": f"{flight.time[row]:.2f} s",
         "speed": f"{np.linalg.norm(velocity):.2f} m/s",
         "height": f"{position[2]:.2f} m",
-        "error": f"{100 * flight.error[row]:.1f} cm",
+        "error": length(flight.error[row]),
         "reward of the step": f"{flight.reward[row]:+.2f}",
         "return": f"{flight.total[row]:.0f}",
         "episodes": f"{flight.episodes}, {flight.successes} successful",

@@ -1,0 +1,58 @@
+"""Quantities as text."""
+
+import math
+
+import pytest
+
+from quadrl.base import units
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"),
+    [
+        (0.0, "0 µm"),
+        (1e-9, "under 0.1 µm"),
+        (7.6e-7, "0.76 µm"),
+        (5.3e-5, "53 µm"),
+        (9.9996e-4, "1.00 mm"),
+        (0.0052, "5.2 mm"),
+        (0.0112, "1.1 cm"),
+        (-0.123, "-12 cm"),
+        (1234.0, "1,234 m"),
+        (math.nan, "nan µm"),
+    ],
+)
+def test_a_length_is_shown_in_the_unit_that_fits(metres, text):
+    assert units.length(metres) == text
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(1.0, "100 %"), (0.9999, "99.99 %"), (0.995, "99.5 %"), (0.12, "12 %"), (0.0, "0 %"),
+     (0.0004, "0.04 %")],
+)  # fmt: skip
+def test_only_all_is_a_hundred_percent(share, text):
+    assert units.percent(share) == text
+
+
+def test_a_metric_has_the_unit_of_its_name():
+    metrics = {
+        "position_error_m": (0.02, "2.0 cm"),
+        "success_rate": (0.5, "50 %"),
+        "heading_error_deg": (3.27, "3.3 °"),
+        "yaw_rate_rad_s": (7.4e-6, "under 0.001 rad/s"),
+        "touchdown_speed_median_m_s": (0.2, "0.20 m/s"),
+        "length_mean_s": (10.0, "10 s"),
+        "return_mean": (187.4, "187"),
+        "episodes": (100, "100"),
+        "task": ("hover", "hover"),
+    }
+    shown = {name: units.quantity(name, value) for name, (value, _) in metrics.items()}
+    assert shown == {name: text for name, (_, text) in metrics.items()}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (59.7, "1:00 min"), (725, "12:05 min"), (12000, "3:20 h")]
+)
+def test_a_time_is_short(seconds, text):
+    assert units.duration(seconds) == text
