@@ -16,10 +16,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from quadrl import tasks
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.progress import Progress
+from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
-from quadrl.engines import mjcf
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly
@@ -51,10 +50,10 @@ def pictures() -> None:
 
 def flown(flyer: Any, task: Task, seed: int = EVALUATION_SEED) -> tuple[Any, Any, bool]:
     """A flight, the model of what is drawn of it, and whether it ended early."""
-    vehicle = Vehicle()
-    rollout = fly(flyer, task, episodes=1, seed=seed)
-    model = mjcf.compile_model(vehicle, contact=task.contact, scene=task.scene)
-    return rollout.trajectory(vehicle), model, bool(rollout.terminated[0])
+    scenario = Scenario.of(task)
+    rollout = fly(flyer, scenario, episodes=1, seed=seed)
+    flight = rollout.trajectory(scenario.aircraft)
+    return flight, scenario.compile_model(), bool(rollout.terminated[0])
 
 
 def learning() -> Iterator[Image.Image]:

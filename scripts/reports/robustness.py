@@ -7,7 +7,6 @@ an integral of the position error is among the gains.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,13 @@ import numpy as np
 import quadrl
 from quadrl import tasks
 from quadrl.aircraft.aerodynamics import EFFECTS
-from quadrl.aircraft.presets import resolve, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm
 from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Randomization
 from quadrl.conditions.weather import WEATHERS
 from quadrl.control import Gains, GeometricController
 from quadrl.control.reading import Reading
+from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.card import wilson
 from quadrl.evaluation.evaluate import setting
@@ -40,6 +39,7 @@ UNCERTAIN = Randomization(
 NEAR, MOST = 0.5, 1.0  # [m]: errors within are summed up, a long way is none; the largest sum
 NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
 FRESH = 100_300  # first episode, beyond those that the gains were chosen by
+ALL_TOGETHER: Conditions = {"weather": "light", "randomization": "full", "aerodynamics": "full"}
 SEEDS = dict.fromkeys((*AIRBORNE, "landing"), range(242, 247))  # not used for tuning
 SEEDS |= {"hover": range(263, 268), "random_waypoint": range(388, 393)}
 
@@ -60,71 +60,48 @@ class Integrating(GeometricController):
         return super().action(reading, offset + self._sum, velocity)
 
 
-@dataclasses.dataclass(frozen=True)
-class Condition:
-    """What flights are disturbed by."""
-
-    weather: str = "calm"
-    randomization: Any = "none"
-    aerodynamics: str = "none"
-    wide: bool = False
-    """Whether the commands are as wide as for the policies for uncertain aircraft."""
-
-    def make_vehicle(self) -> Vehicle:
-        """The aircraft in its air."""
-        wide = {"action_scale": WIDE} if self.wide else None
-        return with_effects(resolve(None, wide), self.aerodynamics)
-
-
-UNSURE = {  # in which the policies for uncertain aircraft are flown
-    "uncertain": Condition("light", UNCERTAIN, wide=True),
-    "uncertain, in full air": Condition("light", UNCERTAIN, "full", True),
-    "nothing": Condition(wide=True),
-    "50 ms of delay": Condition("calm", Randomization(command_delay=0.05), wide=True),
-    "half the lag": Condition("calm", Randomization(lag=0.5), wide=True),
-    "twice the lag": Condition("calm", Randomization(lag=2.0), wide=True),
-    "all together": Condition("light", "full", "full", True),
-}
+UNDISTURBED: Conditions = {"weather": "calm", "randomization": "none", "aerodynamics": "none"}
+WIDER: Conditions = {"vehicle_options": {"action_scale": WIDE}}  # as the policies command
+UNSURE: dict[str, Conditions] = {  # in which the policies for uncertain aircraft are flown
+    "uncertain": {"weather": "light", "randomization": UNCERTAIN},
+    "uncertain, in full air": {
+        "weather": "light", "randomization": UNCERTAIN, "aerodynamics": "full"
+    },
+    "nothing": {},
+    "50 ms of delay": {"randomization": {"command_delay": 0.05}},
+    "half the lag": {"randomization": {"lag": 0.5}},
+    "twice the lag": {"randomization": {"lag": 2.0}},
+    "all together": ALL_TOGETHER,
+}  # fmt: skip
 
 
-def conditions() -> dict[str, Condition]:
+def conditions() -> dict[str, Conditions]:
     """The disturbances by name: each alone, and all together."""
-    found = {"nothing": Condition()}
-    found |= {f"aerodynamics {e}": Condition(aerodynamics=e) for e in (*EFFECTS, "full")}
-    found |= {f"weather {w}": Condition(w) for w in WEATHERS if w != "calm"}
-    full = RANDOMIZATIONS["full"]
-    for name in full.given():
+    found: dict[str, Conditions] = {"nothing": {}}
+    found |= {f"aerodynamics {e}": {"aerodynamics": e} for e in (*EFFECTS, "full")}
+    found |= {f"weather {w}": {"weather": w} for w in WEATHERS if w != "calm"}
+    for name, value in RANDOMIZATIONS["full"].given().items():
         if name not in NEEDS_AIR:
-            given: Any = {name: getattr(full, name)}
-            found[f"{name} as in `full`"] = Condition(randomization=Randomization(**given))
-    found |= {f"randomization {n}": Condition(randomization=n) for n in ("light", "full")}
-    return found | {"all together": Condition("light", "full", "full")}
+            found[f"{name} as in `full`"] = {"randomization": {name: value}}
+    found |= {f"randomization {n}": {"randomization": n} for n in ("light", "full")}
+    return found | {"all together": ALL_TOGETHER}
 
 
-def tuned(task: str, condition: str, vehicle: Vehicle | None = None) -> Integrating:
+def tuned(task: str, name: str, condition: Conditions) -> Integrating:
     """The controller with the gains that were found for a task in a condition; for one flight."""
-    bandwidth, integral = report.load("tuning")["tasks"][task][condition]
-    vehicle = vehicle or conditions()[condition].make_vehicle()
-    made = tasks.make(task)
-    gains = Gains(**{**made.gains, "level": bandwidth, "height": bandwidth})
-    return Integrating(vehicle, made, gains, integral)
+    bandwidth, integral = report.load("tuning")["tasks"][task][name]
+    scenario = Scenario.of(task, **condition)
+    gains = Gains(**{**scenario.task.gains, "level": bandwidth, "height": bandwidth})
+    return Integrating(scenario.aircraft, scenario.task, gains, integral)
 
 
-def engine(task: str) -> Any:
-    """Free flight, unless the task touches the ground."""
-    return "mujoco" if tasks.make(task).contact else "free_flight"
-
-
-def flown(flyer: Any, task: str, condition: Condition, episodes: int) -> Result:
+def flown(flyer: Any, task: str, condition: Conditions, episodes: int) -> Result:
     """What a policy, a known name or a tuned controller reaches in a condition."""
-    if isinstance(flyer, Integrating):
-        vehicle = flyer.vehicle
-    else:
-        _, flyer, scenario = setting(flyer, task, aerodynamics=condition.aerodynamics)
-        vehicle = scenario.aircraft
-    given: Any = {"weather": condition.weather, "randomization": condition.randomization}
-    given |= {"vehicle": vehicle, "engine": engine(task), "seed": FRESH}
-    each = flights(fly(flyer, tasks.make(task), episodes=episodes, **given))
+    made = tasks.make(task)
+    engine = "mujoco" if made.contact else "free_flight"
+    given: Any = UNDISTURBED | condition | {"engine": engine}
+    _, controller, scenario = setting(flyer, made, **given)
+    each = flights(fly(controller, scenario, episodes=episodes, seed=FRESH))
     error = float(np.median(each["position_error_m"]))
     return {"success": float(each["success"].mean()), "error_m": error}
 
@@ -148,7 +125,8 @@ def robust(only: tuple[str, ...] = (), seeds: int = 5, episodes: int = 1000, job
         gains = report.load("tuning")["tasks"][task]
         for seed in (*flyers, *(["controller"] if "uncertain" in gains else [])):
             for name, condition in UNSURE.items():
-                flyer = flyers.get(seed) or tuned(task, "uncertain", condition.make_vehicle())
+                condition = WIDER | condition
+                flyer = flyers.get(seed) or tuned(task, "uncertain", condition)
                 found = flown(flyer, task, condition, episodes)
                 rows.append({"task": task, "seed": str(seed), "condition": name} | found)
             say(f"{task}, {seed}: {rows[-1]}")
@@ -170,7 +148,8 @@ def robustness(only: tuple[str, ...] = (), episodes: int = 100) -> None:
         flyers = {"policy": task, "robust policy": f"{task}_robust", "controller": "geometric"}
         for name, condition in conditions().items():
             row: Result = {"task": task, "condition": name}
-            for label, flyer in (*flyers.items(), ("tuned controller", tuned(task, name))):
+            tuned_flyer = {"tuned controller": tuned(task, name, condition)}
+            for label, flyer in (flyers | tuned_flyer).items():
                 row[label] = flown(flyer, task, condition, episodes)["success"]
             alone.append(row)
         card = quadrl.robustness(flyers, task, episodes=episodes, aerodynamics="none")

@@ -1,4 +1,4 @@
-"""What mkdocs does besides: pages that may be missing, and the source files that pages link to."""
+"""Extend mkdocs: patterns in the navigation, and pages of the source files that pages link to."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ LANGUAGES = {".py": "python", ".c": "c", ".h": "c", ".xml": "xml", ".md": "markd
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Leave out of the navigation what there is not, and write out its patterns."""
-    config.nav = _present(config.nav, Path(config.docs_dir))
+    """Write out the patterns of the navigation."""
+    config.nav = _written_out(config.nav, Path(config.docs_dir))
     return config
 
 
-def _present(items: list[Any], docs: Path) -> list[Any]:
-    kept: list[Any] = []
+def _written_out(items: list[Any], docs: Path) -> list[Any]:
+    written: list[Any] = []
     for item in items:
         title, value = next(iter(item.items())) if isinstance(item, dict) else (None, item)
         if isinstance(value, list):
-            kept.append({title: _present(value, docs)})
+            written.append({title: _written_out(value, docs)})
         elif "*" in value:
             found = [path.relative_to(docs).as_posix() for path in sorted(docs.glob(value))]
-            kept += [{title: found}] if title and found else found
-        elif value != FLY and (docs / value).is_file():
-            kept.append(item)
-    return kept
+            written += [{title: found}] if title else found
+        else:
+            written.append(item)
+    return written
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -70,12 +70,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
-    """Link to the page that flies in the browser, where this checkout makes one."""
-    if (REPOSITORY / "scripts" / "web").exists():
-        link = Link("Fly it in the browser", FLY)
-        start: Any = nav.items[0]
-        link.parent = start
-        start.children.insert(1, link)
+    """Link to the page that flies in the browser."""
+    link, start = Link("Fly it in the browser", FLY), nav.items[0]
+    link.parent = start
+    start.children.insert(2, link)
     return nav
 
 

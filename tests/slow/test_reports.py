@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadrl.conditions.randomization import Randomization
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
 from quadrl.learning import benchmark
@@ -157,11 +156,11 @@ def test_every_policy_is_flown_in_every_condition(monkeypatch):
 
 
 def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass():
-    heavy = robustness.Condition(randomization=Randomization(mass=(1.1, 1.2)))
+    heavy = {"randomization": {"mass": (1.1, 1.2)}}
     found = {}
     for integral in (0.0, 1.0):
         report.save("tuning", {"tasks": {"hover": {"nothing": [1.3, integral]}}})
-        tuned = robustness.tuned("hover", "nothing")
+        tuned = robustness.tuned("hover", "nothing", {})
         found[integral] = robustness.flown(tuned, "hover", heavy, 4)
     # k_z k_v e = g (mass - 1), of the factor: the aircraft hangs e below the goal.
     assert found[0.0]["error_m"] > 0.1 > 5 * found[1.0]["error_m"]
