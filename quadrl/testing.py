@@ -1,4 +1,4 @@
-"""The contract of a task: what every engine and API takes for granted.
+"""The contract of a task: what every engine and API relies on.
 
     from quadrl.testing import check_task
     check_task(MyTask)
@@ -154,7 +154,7 @@ def check_gymnasium(task: Task) -> None:
 
 
 def check_torchrl(task: Task) -> None:
-    """TorchRL's own check of what is given against what is declared."""
+    """TorchRL's own check of values against their specs."""
     from torchrl.envs import check_env_specs
 
     from quadrl.envs.torchrl import QuadrotorEnv

@@ -31,7 +31,7 @@ WAITING_HEIGHT = 0.5  # [m], where they wait for the heading
 
 @dataclasses.dataclass(frozen=True)
 class Touchdown(TaskState):
-    """What has happened so far."""
+    """The touchdown so far."""
 
     down: Array  # (N,) 1 once a foot has touched, 0 before
     speed: Array  # (N,) [m/s], at the last control step

@@ -93,7 +93,7 @@ class StaticWaypoint(Task):
         return start, Route(goal=self._waypoint(0, position), leg=position[..., 0])
 
     def update(self, before: Snapshot, now: Snapshot) -> Route:
-        """On to the next waypoint when this one is reached."""
+        """Advance to the next waypoint when this one is reached."""
         xp, task = namespace(now.task.goal), now.task
         onward = (now.potentials.distance < self.reach) & (task.leg < len(self.waypoints) - 1)
         goal = task.goal

@@ -85,7 +85,7 @@ class StraightAndLevel(Task):
         return (along + self.lead)[..., None] * direction
 
     def target_velocity(self, now: Snapshot) -> Array:
-        """The line's."""
+        """The velocity along the line."""
         return self.line_speed * now.task.direction
 
     def measure(self, now: Snapshot) -> Potentials:
@@ -112,7 +112,7 @@ class StraightAndLevel(Task):
         return high | (now.potentials.distance > self.max_offset) | touches_ground(now)
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
-        """To the end."""
+        """Whether it flew to the end."""
         return end.truncated
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:

@@ -105,7 +105,7 @@ class TargetFollowing(Task):
         return _position(now.task, now.time)
 
     def target_velocity(self, now: Snapshot) -> Array:
-        """Of the target."""
+        """The velocity of the target."""
         path = now.task
         angle = path.frequency * now.time[..., None] + path.phase
         return _by_axis(path.amplitude * path.frequency * namespace(angle).cos(angle))
@@ -133,7 +133,7 @@ class TargetFollowing(Task):
         return lost | touches_ground(now)
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
-        """To the end, and near the distance on average."""
+        """Whether it flew to the end, near the distance on average."""
         return end.truncated & (end.mean_error < self.tolerance)
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:

@@ -1,1 +1,1 @@
-"""What is flown: rotors, the vehicle, the air about it, and the row of numbers that engines fly."""
+"""Aircraft: rotors, vehicles, effects of the air, and the rows of parameters that engines use."""

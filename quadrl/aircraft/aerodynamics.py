@@ -1,4 +1,4 @@
-"""What the air does to rotors beside equation 7, and which of it acts on an aircraft.
+"""Effects of the air on the rotors beyond equation 7, and which of them act on an aircraft.
 
 All of it is off by default, so that the paper's equations stay what they are. The forces stand in
 `engines/native/aero.h` and in `engines/dynamics.py`; docs/physics.md has the equations with their
@@ -95,7 +95,7 @@ class Aerodynamics:
 
     @property
     def effects(self) -> int:
-        """Which copy of the kernels an aircraft needs."""
+        """Which variant of the kernels an aircraft needs."""
         if self.ground_effect:
             return GROUND_EFFECT
         return ROTOR_EFFECTS if any(getattr(self, name) for name in SWITCHES) else STILL_AIR

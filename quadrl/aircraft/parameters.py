@@ -86,7 +86,7 @@ def limits(table: np.ndarray) -> np.ndarray:
 
 
 def refresh(table: np.ndarray, timestep: float) -> None:
-    """Work out again, in place, what follows from the other parameters of rows."""
+    """Recompute, in place, the parameters of rows that follow from the others."""
     count = int(table["rotor_count"][0])
     rotor = table["rotor"][:, :count]
     names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")

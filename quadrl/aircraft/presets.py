@@ -1,4 +1,4 @@
-"""The aircraft that are known by name, and their air, with the sources of all numbers."""
+"""Preset aircraft and their effects of the air, with the source of every number."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ REAL_AIR = {
 def resolve(
     vehicle: Vehicle | str | Mapping[str, Any] | None, options: Mapping[str, Any] | None = None
 ) -> Vehicle:
-    """A vehicle, the one of a name or of some fields, or the paper's for None.
+    """Make a vehicle from a name, a mapping of fields or a vehicle; None is the paper's.
 
     Args:
         vehicle: The vehicle; fields are changes to the known one of their `name`, else the paper's.
@@ -175,7 +175,7 @@ def in_real_air(vehicle: Vehicle) -> Vehicle:
 
 
 def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> Vehicle:
-    """A vehicle in the air that is asked for.
+    """A vehicle with the effects of the air that are asked for.
 
     Args:
         vehicle: The aircraft.

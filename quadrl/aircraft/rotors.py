@@ -1,4 +1,4 @@
-"""Rotors: their numbers, common arrangements, and what they give together."""
+"""Rotors: their parameters, common layouts, and their combined thrust and moments."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ class Vehicle:
 
     @property
     def rotor_count(self) -> int:
-        """R."""
+        """Number of rotors, R."""
         return len(self.rotors)
 
     @functools.cached_property

@@ -1,1 +1,1 @@
-"""What every other room stands on: errors, validation, rotations, records, files, the tracer."""
+"""The base of all other packages: errors, validation, rotations, records, files, the tracer."""

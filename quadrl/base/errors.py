@@ -1,4 +1,4 @@
-"""The exceptions of quadrl, for what the user can fix, keywords, C and renderer; and a warning."""
+"""The exceptions of quadrl, and its warning."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class QuadrlError(ValueError):
-    """Something that the caller can fix; the message is one line.
+    """An error that the caller can fix; the message is one line.
 
     Attributes:
         name: What was wrong: an option, a parameter, an argument; None where a file was.
@@ -28,7 +28,7 @@ class QuadrlError(ValueError):
 
 
 class UnknownKeyword(QuadrlError, TypeError):
-    """A keyword that nothing takes, in Python's words too: libraries try keywords and read them."""
+    """An unknown keyword; worded as a TypeError, since libraries try keywords and read it."""
 
 
 class NativeError(QuadrlError, RuntimeError):
@@ -40,7 +40,7 @@ class RenderingUnavailable(QuadrlError, RuntimeError):
 
 
 class QuadrlWarning(UserWarning):
-    """Something that the caller should know, although the work goes on; the message is one line.
+    """A warning to the caller; the work goes on, and the message is one line.
 
     The command line prints it as a line that begins with "quadrl: warning: ".
     """

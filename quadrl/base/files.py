@@ -46,7 +46,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def put(written: Path, path: Path) -> None:
-    """Move a file to its place in the same file system once it is on the disk, then the folder."""
+    """Move a file within its file system once it is on the disk, and sync the folder."""
     _sync(written)
     os.replace(written, path)
     with contextlib.suppress(OSError):  # not every file system can do that with a folder

@@ -18,7 +18,7 @@ WORTH_ASKING = 1 << 26  # [bytes]: less is not looked at, since the look takes t
 
 
 def machine() -> dict[str, str | int]:
-    """What the figures were measured on."""
+    """Describe the machine: processor, cores, system, and versions of packages."""
     versions: dict[str, str | int] = {}
     for name in ("mujoco", "gymnasium", "dm-control", "torch", "torchrl"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -29,7 +29,7 @@ def machine() -> dict[str, str | int]:
 
 
 def _cpuinfo() -> dict[str, str]:
-    """What Linux says of the first core; empty elsewhere."""
+    """Linux's description of the first core; empty elsewhere."""
     try:
         lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
     except OSError:
@@ -44,14 +44,14 @@ def processor() -> str:
 
 
 def processor_kind() -> str:
-    """What torch chooses its instructions by, and with them the last bits of its numbers."""
+    """The kind of processor, by which torch chooses its instructions, and so the last bits."""
     known = _cpuinfo()
     numbers = (f"{name} {known[name]}" for name in ("cpu family", "model") if name in known)
     return ", ".join((processor(), *numbers))
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

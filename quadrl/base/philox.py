@@ -28,7 +28,7 @@ Seed = int | Sequence[int | None] | None
 
 
 def check_seed(seed: Any) -> int:
-    """A seed as an int.
+    """Check a seed and return it as an int.
 
     Raises:
         QuadrlError: It is no whole number from 0 to `MAX_SEED`.
@@ -37,7 +37,7 @@ def check_seed(seed: Any) -> int:
 
 
 def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
-    """Those of some rows (n,) that get a seed, and their seeds.
+    """Select the rows (n,) that get a seed, and their seeds.
 
     Args:
         seed: Row i gets seed + i, or seed[i] unless that is None.

@@ -1,4 +1,4 @@
-"""Progress of a training, and a bar: redrawn in a terminal and a notebook, elsewhere lines."""
+"""Progress of a training, and a progress bar for terminals, notebooks and log files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Progress:
 
 
 class ProgressBar:
-    """Of a training or of anything else that is counted; use it in a `with`."""
+    """A progress bar for a training or any other count; use it in a `with`."""
 
     LINE_SECONDS = 5.0  # between two lines where nothing can be redrawn
     NOTEBOOK_SECONDS = 0.2  # between two updates in a notebook

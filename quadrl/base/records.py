@@ -74,7 +74,7 @@ def arrays(prefix: str, record: Any) -> dict[str, np.ndarray]:
 
 
 def of_arrays(prefix: str, like: Any, saved: Mapping[str, np.ndarray]) -> Any:
-    """The record of the kind of another that `arrays` took apart."""
+    """Make a record like another one from the arrays that `arrays` returned."""
     fields = dataclasses.fields(like)
     return type(like)(**{field.name: np.array(saved[f"{prefix}.{field.name}"]) for field in fields})
 

@@ -1,4 +1,4 @@
-"""Signals to a process: what ends in order, and what a training does at the end of an iteration.
+"""Signals: end a process cleanly, or stop a training at the end of an iteration.
 
 Handlers belong to whoever owns the process, the command line or the process of a study's training.
 A library leaves them alone.
@@ -46,12 +46,12 @@ def handling(handlers: Mapping[int, Handler]) -> Generator[None]:
 
 
 def ending(number: int, _: Any) -> None:
-    """End the program as an exception does: what was begun is cleaned up."""
+    """End the program through an exception, so that everything is cleaned up."""
     raise SystemExit(128 + number)
 
 
 def unheeded(*_: Any) -> None:
-    """Do nothing: what is meant for a training must end nothing where none is at work."""
+    """Ignore a signal that is meant for a training while none is running."""
 
 
 IN_ORDER: Mapping[int, Handler] = {signal.SIGTERM: ending, signal.SIGUSR1: unheeded}

@@ -74,12 +74,12 @@ MAX_OPERATIONS = 2000  # more would take the C compiler longer than they save
 
 
 class NotCompilable(TypeError):
-    """What was called with symbols does more than arithmetic, or looks at what may change."""
+    """A traced function does more than arithmetic, or reads what may change."""
 
 
 @contextlib.contextmanager
 def symbolic() -> Generator[None]:
-    """Report whatever functions raise that were not made for symbols as `NotCompilable`."""
+    """Raise `NotCompilable` for any error of a function that is called with symbols."""
     try:
         yield
     except NotCompilable:

@@ -84,7 +84,7 @@ class Quadrl:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command; an error that the user can mend is one line on stderr and exit code 2."""
+    """Run the command; an error that the user can fix is one line on stderr and exit code 2."""
     stderr = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
     words = sys.argv[1:] if arguments is None else arguments
     if words == ["--version"]:
@@ -114,7 +114,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def parse(words: list[str]) -> Quadrl:
-    """What the words of a command line ask for; prints what is wrong with them and exits with 2."""
+    """Parse a command line; print what is wrong with it and exit with 2."""
     if words[:1] == ["train"] and {"-h", "--help"} & {*words}:
         train.show_defaults(words[1:])
     return tyro.cli(Quadrl, args=words, prog="quadrl", config=(DisallowNone,))

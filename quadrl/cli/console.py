@@ -1,4 +1,4 @@
-"""What the commands print with."""
+"""Printing for the commands."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def make_table(head: Sequence[str], rows: Iterable[Sequence[str]] = (), numbers:
 
 
 def again(command: str, *folder: Path) -> str:
-    """A command as it has to be typed, with the files that register what the run needs."""
+    """A command line for a run, with the --import options that it needs."""
     own = [word for path in own_files for word in ("--import", str(path))]
     # A bare name may be that of a policy that comes with quadrl.
     where = [f"./{path}" if comes_with_quadrl(str(path)) else str(path) for path in folder]
@@ -42,7 +42,7 @@ def again(command: str, *folder: Path) -> str:
 
 
 def reason(error: OSError) -> str:
-    """What the system refused, in a shell's words."""
+    """The message of a system error, in a shell's words."""
     path = error.filename2 or error.filename
     return f"cannot read or write {path}: {error.strerror}" if path else str(error)
 
@@ -54,7 +54,7 @@ def is_of_memory(error: BaseException) -> bool:
 
 
 def in_a_line(error: BaseException) -> str:
-    """What an error says, in a line."""
+    """The message of an error in one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 

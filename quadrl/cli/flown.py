@@ -1,4 +1,4 @@
-"""What the commands share that fly a policy or a controller without learning."""
+"""Options that the commands which fly a policy or a controller share."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ ConditionOptions: Any = make_conditions()
 
 
 class Conditioned(ConditionOptions):
-    """The options of a command that say in which conditions is flown."""
+    """Options of a command for the conditions of flight."""
 
     def conditions(self) -> dict[str, Any]:
         """Those that are given, as `Scenario.of` takes them.
@@ -86,7 +86,7 @@ def parsed(given: Mapping[str, Any]) -> dict[str, Any]:
 
 @choices.command
 class Flown(Conditioned):
-    """What flies, and what it flies."""
+    """Options for a policy or a controller, and for what it flies."""
 
     policy: Annotated[Positional[str], arg(metavar="[POLICY]")] = ""
     """A run folder, a .safetensors file, or the name of a shipped policy: that of its task, or
@@ -102,12 +102,12 @@ class Flown(Conditioned):
 
     @property
     def label(self) -> str:
-        """What a flight is called beside others."""
+        """The name of a flight in a comparison."""
         path = Path(self.controller or self.policy)
         return path.parent.name if path.name == FILE and path.parent.name else path.name
 
     def flies(self) -> str | Path | Policy:
-        """What flies, as the functions of Python take it.
+        """The policy or controller, as the Python functions take it.
 
         Raises:
             QuadrlError: It is unknown, or the choice is ambiguous.
@@ -130,12 +130,12 @@ class Flown(Conditioned):
         return self.policy if comes_with_quadrl(self.policy) else Path(self.policy)
 
     def setting(self) -> tuple[str, Controller, Scenario]:
-        """A name for what flies, what flies, and what it flies; raises as `flies`."""
+        """Name, controller and scenario of the flight; raises as `flies`."""
         return setting(self.flies(), self.task or None, **self.conditions())
 
 
 def yardstick(scenario: Scenario) -> Scenario:
-    """What the yardstick flies beside a policy: its scenario, with rotor commands, seeing all."""
+    """The scenario of the geometric controller beside a policy: rotor commands, the true state."""
     return dataclasses.replace(scenario, control_mode="rotor", observe=Observing())
 
 

@@ -48,7 +48,7 @@ class View(Flown):
         native.run(Flight(controller, scenario, num_envs=self.num_envs, seed=self.seed))
 
     def setting(self) -> tuple[str, Controller, Scenario]:
-        """As of the others, but in calm air by default: there the wind is the spectator's."""
+        """As for other commands, but in calm air by default: the spectator sets the wind."""
         return super(View, dataclasses.replace(self, weather=self.weather or "calm")).setting()
 
     def _browser(self) -> None:

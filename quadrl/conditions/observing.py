@@ -74,7 +74,7 @@ class Observing:
         return {name: value for name, value in vars(self).items() if value != usual[name]}
 
     def for_policy(self) -> dict[str, Any]:
-        """Those of them that change what a policy sees."""
+        """The options that change what a policy observes."""
         return {name: value for name, value in self.given().items() if name != "privileged"}
 
 
@@ -83,7 +83,7 @@ Observed = Observing | Mapping[str, Any] | None
 
 
 def resolve(given: Observed) -> Observing:
-    """Options of the observation, from a mapping of some of them, or the usual ones for None.
+    """Make options of the observation from a mapping of some of them; None is the default.
 
     Raises:
         QuadrlError: It is something else, or an option is unknown or out of range.

@@ -224,7 +224,7 @@ Randomized = Randomization | Mapping[str, Any] | str | None
 
 
 def resolve(given: Randomized) -> Randomization:
-    """A randomization, the one of a name or of some fields, or none for None.
+    """Make a randomization from a name, a mapping of fields or a randomization; None is none.
 
     Raises:
         QuadrlError: It is something else, a name or field is unknown, or a value out of range.

@@ -56,7 +56,7 @@ class Randomizer:
     def sample(
         self, keys: np.ndarray, episodes: np.ndarray
     ) -> tuple[Array | None, np.ndarray | None]:
-        """What episodes (n,) draw, which changes nothing yet.
+        """Draw the numbers of episodes (n,); nothing changes yet.
 
         Returns:
             Numbers (n, k), None where nothing follows from them, and rows of parameters (n,), None
@@ -96,7 +96,7 @@ class Randomizer:
         return self.sampler.columns(self.drawn, name)[:, 0]
 
     def shown(self) -> dict[str, Array]:
-        """What differs from aircraft to aircraft, (N,) by name."""
+        """The drawn values that differ between aircraft, (N,) by name."""
         return {self.sampler.names[k]: self.drawn[:, k] for k in self.sampler.spread}
 
     def _set_delay(self) -> None:
@@ -110,7 +110,7 @@ class Randomizer:
         return weather.wind_speed * self.column("wind")[rows]
 
     def delayed(self, command: Array) -> Array:
-        """What the rotors get for a physics step, after a command, both (N, R) [rad/s]."""
+        """The delayed command for a physics step, given the present one, both (N, R) [rad/s]."""
         if not self.late:
             return command
         length = len(self.queue)

@@ -150,7 +150,7 @@ class Pose:
 
 @dataclasses.dataclass(slots=True)
 class Surroundings:
-    """What is about aircraft in a world with K solids, arrays (N, ...)."""
+    """The surroundings of aircraft in a world with K solids, arrays (N, ...)."""
 
     names: tuple[str, ...]  # of the solids
     position: Array  # (N, K, 3) [m] of their centres, task frame
@@ -242,7 +242,7 @@ class Scene:
         return tuple(solid.name for solid in self.solids)
 
     def nothing_near(self, count: int) -> Surroundings:
-        """What is about aircraft (n,) that are far from everything, before there is an engine."""
+        """The surroundings of aircraft (n,) far from everything, before there is an engine."""
         position = np.tile([solid.position for solid in self.solids], (count, 1, 1))
         touched = np.zeros((count, len(self.solids)), dtype=bool)
         far = np.full(count, FAR)
@@ -261,7 +261,7 @@ class Scene:
         return tuple(shown)
 
     def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
-        """What is about some aircraft (n,) of an engine now, or about all; arrays of their own."""
+        """The present surroundings of some aircraft (n,) of an engine, or of all; copies."""
         chosen = np.arange(engine.num_envs) if rows is None else rows
         table, (which, speed) = engine.solids.table[chosen], engine.hits[chosen].T
         first = np.cumsum([0, *(len(solid.parts) for solid in self.solids)])

@@ -203,7 +203,7 @@ class ActionHistory(Sensor):
 
 
 class Channel:
-    """What a sensor gives N aircraft: its samples with their errors, held and late."""
+    """The output of a sensor for N aircraft: its samples with errors, rate and delay."""
 
     def __init__(self, sensor: Sensor, width: int, randomizer: Randomizer, timestep: float) -> None:
         """Set up the arrays.

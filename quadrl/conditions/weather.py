@@ -67,7 +67,7 @@ class Weather:
 
     @classmethod
     def of(cls, weather: str | Weather | Mapping[str, Any] | None) -> Weather:
-        """The weather of a name, of the fields that a file holds, or as it is; None is calm.
+        """Make a weather from a name, a mapping of fields or a weather; None is calm.
 
         Raises:
             QuadrlError: There is no such weather, or it has no such field.

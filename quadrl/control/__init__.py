@@ -1,7 +1,6 @@
-"""What flies an aircraft: control modes and their loops, and the controllers that use them.
+"""Control modes with their loops, and the controllers that policies are compared with.
 
-Controllers see the same observations and give actions of the same form as policies, whose
-yardstick they are.
+Controllers take the same observations as policies and return actions of the same form.
 """
 
 from __future__ import annotations

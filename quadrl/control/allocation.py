@@ -12,7 +12,7 @@ TINY = 1e-12  # [N]
 
 
 class Allocation:
-    """Shares thrust and moments, the wrench w, out to R rotors: squares = inverse @ w.
+    """Distributes thrust and moments, the wrench w, over R rotors: squares = inverse @ w.
 
     What does not fit between `low` and `high` is cut: yaw first, then thrust, then roll and pitch
     together, in their proportion. Numbers per rotor are kept in units of thrust, x = squares /

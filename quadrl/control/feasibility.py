@@ -1,4 +1,4 @@
-"""What the actions of an aircraft can do: carry it, turn it, and answer in time.
+"""Feasibility: whether actions can carry an aircraft, turn it, and respond in time.
 
 Commands stay within hover plus and minus `Vehicle.action_scale` in every control mode
 (`Vehicle.rotor_command`), with the hover speeds of the specified aircraft. One that a randomization
@@ -134,7 +134,7 @@ def samples(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[np.ndarray, np.
 
 
 def unreached(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[float, str, float]:
-    """How many of the drawn aircraft cannot hover level and still.
+    """The share of drawn aircraft that cannot hover level and still.
 
     From a sample that is always the same; exact where nothing is drawn.
 
@@ -181,7 +181,7 @@ def warn_of_unreached(vehicle: Vehicle, randomization: Randomized) -> None:
 def limit(
     at: Callable[[float], Randomization | Weather], usual: float, end: float, vehicle: Vehicle
 ) -> float | None:
-    """From which level of a disturbance on no policy can hover, from the usual level outwards.
+    """The level of a disturbance beyond which no policy can hover, outwards from the usual one.
 
     Args:
         at: What a level is.

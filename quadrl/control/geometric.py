@@ -19,7 +19,7 @@ from quadrl.control.reading import Guide, Reading
 
 
 class Controller(abc.ABC):
-    """Flat observations of a task to actions, as a policy."""
+    """A controller maps flat observations of a task to actions, as a policy does."""
 
     control_mode = "rotor"
     """The control mode that it flies with."""

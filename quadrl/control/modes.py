@@ -46,7 +46,7 @@ class ActionTerm:
 
 
 class ControlMode(abc.ABC):
-    """How actions (N, k) fly aircraft of a vehicle; without a memory between control steps."""
+    """A map from actions (N, k) to rotor commands; it keeps no memory between control steps."""
 
     name: ClassVar[str]
     """The name in CONTROL_MODES."""
@@ -69,11 +69,11 @@ class ControlMode(abc.ABC):
         return len(self.terms)
 
     def values(self, action: Array) -> Array:
-        """What actions (N, k), clipped to [-1, 1], ask for: (N, k) in the terms' units."""
+        """The values that actions (N, k), clipped to [-1, 1], stand for, in the terms' units."""
         return self.centre + self.scale * within(np.asfortranarray(action), -1.0, 1.0)
 
     def setpoint(self, state: State, action: Array) -> Array:
-        """What is held for a control step, (N, n), from the state in which it begins."""
+        """The setpoint (N, n) held for a control step, from the state in which the step begins."""
         return self.values(action)
 
     @abc.abstractmethod
@@ -226,7 +226,7 @@ CONTROL_MODES: dict[str, type[ControlMode]] = {
 
 
 def make(name: str, vehicle: Vehicle) -> ControlMode:
-    """The control mode of a name for a vehicle.
+    """Make the control mode of a name for a vehicle.
 
     Raises:
         QuadrlError: Unknown name; the message lists the choices.

@@ -1,4 +1,4 @@
-"""What controllers and the guides of tasks know: a flat observation, taken apart."""
+"""Readings: flat observations decoded for controllers and for `Task.guide`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from quadrl.base.rotation import Array, heading_of, norm, rotation_of_angles, to
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
-    """What a flat observation says, in the frames that controllers use."""
+    """The quantities of a flat observation, in the frames that controllers use."""
 
     rotation: Array  # (N, 3, 3), body to world
     velocity: Array  # (N, 3) [m/s], world frame
@@ -67,7 +67,7 @@ class Reading:
 
 
 class Guide(Protocol):
-    """What a controller asks of a task: `quadrl.core.task.Task` answers it."""
+    """The part of a task that controllers use; `quadrl.core.task.Task` implements it."""
 
     observation: ClassVar[dict[str, Any]]
     """The terms of the flat observation."""

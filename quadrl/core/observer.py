@@ -1,4 +1,4 @@
-"""What is seen of N aircraft: the task's entries of the estimated state, sensors, histories."""
+"""Observations of N aircraft: the task's entries of the estimated state, sensors, histories."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from quadrl.engines.state import State
 def make(
     sampler: AircraftSampler, options: Observing, task: Task, engine: Engine, actions: int
 ) -> tuple[Randomizer, Observer | None, Mapping[str, ObservationTerm]]:
-    """What randomizes aircraft, what observes them, and the entries of the observation.
+    """Make the randomizer, the observer and the entries of the observation.
 
     Args:
         sampler: Samples what is drawn.
@@ -44,7 +44,7 @@ def make(
 
 
 class Observer:
-    """Observes N aircraft otherwise than their task alone would."""
+    """Observes N aircraft with errors, delays, further sensors and histories."""
 
     def __init__(
         self, options: Observing, task: Task, engine: Engine, actions: int, randomizer: Randomizer

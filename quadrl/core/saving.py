@@ -72,7 +72,7 @@ class Copied:
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """What of an environment is saved and restored."""
+    """The parts of an environment that are saved and restored."""
 
     engine: Engine
     seeds: Seeds

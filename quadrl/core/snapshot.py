@@ -52,7 +52,7 @@ class Snapshot:
 
     @property
     def clearance(self) -> Array:
-        """What is free between the aircraft and the nearest solid at least, (N,) [m]."""
+        """Lower bound of the distance from the aircraft to the nearest solid, (N,) [m]."""
         return self._surroundings.clearance
 
     @property

@@ -1,4 +1,4 @@
-"""What brings the snapshot of N rows forward by a control step: the task's functions, as written.
+"""The control step of a task, which advances the snapshot of N rows by the task's functions.
 
 `core/compiled.py` has the other implementation, and chooses between the two.
 """

@@ -209,7 +209,7 @@ class Task(abc.ABC):
         """Whether an episode that ends now did what was asked, (N,) bool."""
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
-        """What the yardstick controllers fly: to the goal, and along with it where it moves.
+        """Where controllers fly: to the goal, and along with it where it moves.
 
         Returns:
             Offset (N, 3) [m] from the aircraft to where it should be, and the velocity (N, 3)
@@ -218,7 +218,7 @@ class Task(abc.ABC):
         return reading.to_goal, reading.target_velocity
 
     def solids(self) -> Sequence[Solid]:
-        """What stands in the world; aircraft collide with it in both engines."""
+        """The solids of the world, with which aircraft collide in both engines."""
         return ()
 
     def place(self, rng: Rng, start: Start, state: TaskState) -> Mapping[str, Pose]:

@@ -1,4 +1,4 @@
-"""C of whole flights, for a page that flies them: what quadrl's own functions compute.
+"""Generate C for whole flights from quadrl's own functions, for the page in the browser.
 
 A task, an aircraft and the geometric controller are called with symbols (`quadrl.base.trace`), as
 the compiled step of `quadrl.core.compiled` is, and become C functions per task and aircraft:

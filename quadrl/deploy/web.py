@@ -1,4 +1,4 @@
-"""The page docs/fly, whole in one file: quadrl's C as WebAssembly, policies, aircraft, three.js.
+"""Build the page docs/fly in one file: quadrl's C as WebAssembly, policies, aircraft, three.js.
 
 `scripts/web` runs it, with emcc on the path. It exports what the page's JavaScript has to know
 (the book), compiles quadrl's kernels and the C of `quadrl.deploy.flights`, and puts everything into
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def make_book() -> tuple[dict[str, Any], str]:
-    """What the JavaScript has to know, as JSON can hold it, and the C of the flights."""
+    """Collect the data for the JavaScript, as JSON can hold it, and the C of the flights."""
     (slots,) = re.findall(r"export const SLOTS = (\d+)", (SOURCE / "flight.mjs").read_text())
     # Those that leave the air's laws alone: contact is MuJoCo's.
     tasks = {name: kind() for name, kind in TASKS.items() if not kind.contact}
@@ -192,7 +192,7 @@ def compile_flights(source: str) -> bytes:
 
 
 def join(book: dict[str, Any]) -> str:
-    """The whole page in one text.
+    """Join the whole page into one text.
 
     Raises:
         QuadrlError: The page has no place, or several, for one of its parts.

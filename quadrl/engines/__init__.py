@@ -1,1 +1,1 @@
-"""The engines: what advances rows of aircraft."""
+"""Engines: they advance rows of aircraft by physics steps."""

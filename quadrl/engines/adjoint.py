@@ -1,4 +1,4 @@
-"""Derivatives of free flight: how where an aircraft will be depends on where it is and its rotors.
+"""Derivatives of free flight by the state and by the rotor commands.
 
 `native/adjoint.c` is the reverse of the steps of `native/free_flight.c`, with every force: the
 paper's, wind, and what the air does to rotors. The reverse of the equations is written by
@@ -91,7 +91,7 @@ def kernel(effects: int, rotors: int) -> Callable[[int, int, int], None]:
 
 @dataclasses.dataclass(frozen=True)
 class Leg:
-    """What N aircraft flew from and in, for some physics steps."""
+    """A flight of N aircraft over some physics steps: its start, commands, air and parameters."""
 
     start: np.ndarray  # (N, 13 + R): qpos, qvel and rotor speeds side by side
     command: np.ndarray  # (N, R) of the rotors [rad/s]
@@ -101,14 +101,14 @@ class Leg:
     steps: int  # physics steps
 
     def fly(self) -> np.ndarray:
-        """Where it led, (N, 13 + R)."""
+        """The state at its end, (N, 13 + R)."""
         return self._run(None)[0]
 
     def vector_jacobian_product(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The derivatives of a number, of each aircraft, by `start` and by `command`.
+        """The derivatives of a scalar of each aircraft by `start` and by `command`.
 
         Args:
-            given: Those by where the leg led, (N, 13 + R).
+            given: Those by the state at its end, (N, 13 + R).
 
         Returns:
             (N, 13 + R) and (N, R). A quaternion counts as four numbers; only its direction matters.

@@ -52,7 +52,7 @@ def thrust_wrench(p: Parameters, speed: Array) -> tuple[Array, Array]:
 
 
 def aero_wrench(p: Parameters, airspeed: Array, body_rate: Array) -> tuple[Array, Array]:
-    """What acts beside thrust and reaction: equations 8 and 9.
+    """Drag and aerodynamic moment: equations 8 and 9.
 
     Args:
         p: Parameters.
@@ -139,7 +139,7 @@ def rotor_wrench(
     noise: Array | float = 0.0,
     effects: int = GROUND_EFFECT,
 ) -> tuple[Array, Array]:
-    """What the air does to the rotors beside equation 7, and their inertia.
+    """Force and moment of the air on the rotors beyond equation 7, and of their inertia.
 
     Args:
         p: Parameters.

@@ -1,4 +1,4 @@
-"""What every engine is: rows of coordinates, commands, air and parameters, and a State of them.
+"""The interface of engines: rows of coordinates, commands, air and parameters, and a State.
 
 An engine takes rotor commands, advances some physics steps, and says which aircraft diverged.
 """
@@ -26,7 +26,7 @@ ENGINES: tuple[EngineName, ...] = ("mujoco", "free_flight")
 
 
 class Engine(abc.ABC):
-    """What is common: the table of the state, filled from rows of generalised coordinates."""
+    """Base of the engines: the table of the state, filled from rows of generalised coordinates."""
 
     name: EngineName
     model: mujoco.MjModel
@@ -129,10 +129,10 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, steps: int) -> None:
-        """Some physics steps with the commands in `ctrl`."""
+        """Fly some physics steps with the commands in `ctrl`."""
 
     def leg(self, steps: int) -> Leg:
-        """What the next physics steps start from and fly in, copied, for their derivatives.
+        """Copy the start and the conditions of the next physics steps, for their derivatives.
 
         Raises:
             QuadrlError: The engine is not free flight.
@@ -147,7 +147,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def clear(self, rows: np.ndarray) -> None:
-        """Reset what MuJoCo remembers of some aircraft (warm starts, warnings), their air too."""
+        """Reset MuJoCo's warm starts and warnings of some aircraft, and their air."""
 
     def read(self) -> np.ndarray | None:
         """Compute the state after `advance`.
@@ -274,7 +274,7 @@ class Engine(abc.ABC):
 
     @property
     def clearance(self) -> np.ndarray:
-        """What is free about each aircraft at least, (N,) [m]; infinite without solids."""
+        """Lower bound of each aircraft's distance to a solid, (N,) [m]; infinite without solids."""
         return self.solids.clearance(self.qpos, self.parameters, self.vehicle.rotor_count)
 
     def _write(self, rows: np.ndarray, start: Start | State) -> None:

@@ -79,7 +79,7 @@ class BatchEngine(Engine):
         return self.batch.expand(name) if own else getattr(self.model, name)[None]
 
     def advance(self, steps: int) -> None:
-        """Some physics steps of every aircraft with the commands in `ctrl`.
+        """Fly some physics steps of every aircraft with the commands in `ctrl`.
 
         Raises:
             NativeError: The rotor callbacks were taken away.
@@ -97,7 +97,7 @@ class BatchEngine(Engine):
         self.batch.step(near, nstep=steps)
 
     def clear(self, rows: np.ndarray) -> None:
-        """Reset what MuJoCo remembers of some aircraft."""
+        """Reset MuJoCo's warm starts and warnings of some aircraft."""
         # What Batch.reset does, in a tenth of its time: a row is all that it keeps of an aircraft.
         self.batch.state[rows] = self._fresh
         self.batch.warning[rows] = 0
@@ -113,7 +113,7 @@ class BatchEngine(Engine):
 
 
 class DataEngine(Engine):
-    """One aircraft in an MjData, stepped by `mj_step` or by whoever owns the data."""
+    """One aircraft in an MjData, stepped by `mj_step` or by the owner of the data."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class DataEngine(Engine):
         return getattr(self.model, name)[None]
 
     def advance(self, steps: int) -> None:
-        """Some physics steps with the commands in `ctrl`.
+        """Fly some physics steps with the commands in `ctrl`.
 
         Raises:
             NativeError: The rotor callbacks were taken away.
@@ -194,7 +194,7 @@ def make(
     num_threads: int = 0,
     per_row: bool = False,
 ) -> Engine:
-    """The engine of a name for N aircraft in a world, as `BatchEngine` takes them.
+    """Make the engine of a name for N aircraft in a world, as `BatchEngine` takes them.
 
     Raises:
         QuadrlError: Unknown name or impossible count.

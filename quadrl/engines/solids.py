@@ -1,4 +1,4 @@
-"""Solids in the world of N aircraft: where they stand in each row, what is free, what was hit.
+"""Solids in the world of N aircraft: their poses in each row, clearances and touches.
 
 A solid is one or more geoms of the world that MuJoCo lets aircraft collide with. Their sizes are
 the model's; where they stand is a row's own, and a new one at each reset. `native/solids.h` knows
@@ -74,7 +74,7 @@ class Solids:
         return np.ascontiguousarray(np.concatenate(list(parts), axis=-1))
 
     def clearance(self, qpos: np.ndarray, parameters: np.ndarray, rotors: int) -> np.ndarray:
-        """What is free about each aircraft, (N,) [m]: to the nearest solid, at least.
+        """Lower bound of each aircraft's distance to the nearest solid, (N,) [m].
 
         Args:
             qpos: (N, 7), live.

@@ -53,7 +53,7 @@ def make(
 
 
 def episode_info(environment: Environment) -> dict[str, np.ndarray]:
-    """What `info` says of each episode, arrays (N, k); nothing in the usual case.
+    """Entries of `info` that last for an episode, arrays (N, k); by default there are none.
 
     Returns:
         drawn: what was drawn for each aircraft, with names; privileged: for the critic alone.

@@ -78,7 +78,7 @@ class _Shared:
         )
 
     def _values(self, now: Transition) -> Info:
-        """What the info of a step tells, arrays (N,)."""
+        """Entries of the info of a step, arrays (N,)."""
         values: Info = {"is_success": now.is_success, "error": now.error, "diverged": now.diverged}
         if self._terms_wanted:
             values["reward_terms"] = Named(now.reward_terms)

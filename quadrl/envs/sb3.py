@@ -106,7 +106,7 @@ class QuadrotorVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """What a method of each row's environment gives."""
+        """Call a method of each row's environment."""
         values = self.envs.call(method_name, *method_args, **method_kwargs)
         return self._of_rows(values, indices)
 

@@ -30,7 +30,7 @@ FORMAT = "quadrl-flown-2"
 
 
 class ResultCache:
-    """Calls functions that fly; what they gave is in a file, and is taken from there."""
+    """Calls functions that fly, and keeps their results in a file, from which it repeats them."""
 
     def __init__(self, folder: Path | None) -> None:
         """Read what is kept in a folder; None keeps nothing."""

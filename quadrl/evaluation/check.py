@@ -46,7 +46,7 @@ class Row:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Check:
-    """What was found about an aircraft; a table in a notebook."""
+    """The result of checking an aircraft; a table in a notebook."""
 
     vehicle: Vehicle
     rows: tuple[Row, ...]
@@ -91,7 +91,7 @@ def check(
 
 
 def _thrust(vehicle: Vehicle, sampler: AircraftSampler) -> Iterator[Row]:
-    """What carries it, and the action scale that follows."""
+    """Thrust, and the action scale that follows."""
     reach, scale = Reach(vehicle), vehicle.action_scale
     drawn = Reach(vehicle, np.concatenate(samples(vehicle, sampler)))
     needed, room = drawn.scale(), reach.room

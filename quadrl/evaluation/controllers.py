@@ -1,4 +1,4 @@
-"""The controllers that policies are held against, made by name."""
+"""Make the controllers that policies are compared with, by name."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def setting(
     algo: str = "ppo",
     **conditions: Unpack[Conditions],
 ) -> tuple[str, Controller, Scenario]:
-    """What flies, and what it flies.
+    """Resolve a controller, its name, and the scenario that it flies.
 
     Args:
         controller: A `Policy`; what `quadrl.train` returned; a run folder or a .safetensors file;
@@ -177,7 +177,7 @@ def beside(
     task: str | Task | Scenario | None = None,
     **conditions: Unpack[Conditions],
 ) -> list[tuple[Controller, Scenario]]:
-    """What several fly to be seen side by side: the same episode of one task in one world.
+    """Resolve several controllers for a view side by side: one episode of one task in one world.
 
     Each has the aircraft and the observation of its training. The task is that of the first; the
     weather and the randomization are the first that differ from calm air and from none.

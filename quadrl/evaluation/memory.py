@@ -37,7 +37,7 @@ class GRU:
         return candidate + update * (state - candidate)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """By their names in a file."""
+        """The arrays by their names in a file."""
         return {PREFIX + field.name: getattr(self, field.name) for field in FIELDS}
 
     def is_sound(self, size: int, largest: float) -> bool:

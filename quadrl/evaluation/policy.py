@@ -131,7 +131,7 @@ class Policy:
         return lambda observation: self._act(observation, state, generator)[0]
 
     def initial_state(self, n: int | None = None) -> np.ndarray:
-        """What it remembers as an episode begins: (n, state_size); (state_size,) without n."""
+        """The memory at the start of an episode: (n, state_size); (state_size,) without n."""
         rows = () if n is None else (int(number("n", n, 1, whole=True)),)
         return np.zeros((*rows, self.state_size), dtype=np.float32)
 
@@ -141,7 +141,7 @@ class Policy:
         state: np.ndarray,
         generator: np.random.Generator | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Actions, and what to remember until the next observation.
+        """Compute actions, and the memory to pass with the next observation.
 
         Args:
             observation: (n, size), or (size,) of one aircraft.
@@ -161,7 +161,7 @@ class Policy:
         return self._act(observation, state, generator)
 
     def flying(self, n: int | None = None, seed: int | None = None) -> PolicyInFlight:
-        """Any policy as a function of observations that remembers; its `reset` makes it forget.
+        """The policy as a function of observations that keeps its memory; `reset` clears it.
 
         Args:
             n: Aircraft that it flies: observations are (n, size). None for one, (size,).

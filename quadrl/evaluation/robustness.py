@@ -201,7 +201,7 @@ def robustness(
 
 
 def disturbed(scenario: Scenario, level: Randomization | Weather) -> Scenario:
-    """A scenario in which what a level says is different."""
+    """A scenario with the change that a level stands for."""
     name = "weather" if isinstance(level, Weather) else "randomization"
     usual, changes = type(level)(), vars(level).items()
     changes = {field: value for field, value in changes if value != getattr(usual, field)}

@@ -119,7 +119,7 @@ def scenario_of(
 def prepared(
     controller: Controller, scenario: Scenario, episodes: int, seed: int
 ) -> tuple[Environment, Controller]:
-    """An environment for a controller, and the controller with nothing remembered.
+    """Make an environment for a controller, and clear the controller's memory.
 
     Args:
         controller: What flies.
@@ -135,7 +135,7 @@ def prepared(
 
 
 def begun(controller: Controller, environment: Environment) -> Controller:
-    """A controller that has nothing remembered, to fly the aircraft of an environment.
+    """A controller with an empty memory, to fly the aircraft of an environment.
 
     Raises:
         QuadrlError: It is a policy that does not fit.
@@ -149,7 +149,7 @@ def begun(controller: Controller, environment: Environment) -> Controller:
 
 
 def flights(rollout: Rollout) -> dict[str, np.ndarray]:
-    """What each flight of a rollout reached, arrays (N,).
+    """The figures of each flight of a rollout, arrays (N,).
 
     Returns:
         success, survived and diverged (bool); position_error_m: mean error over the last 2 s [m];

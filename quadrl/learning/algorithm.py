@@ -1,4 +1,4 @@
-"""What the algorithms share: optimisers, the critic's epochs, saving, threads and generators."""
+"""The base of the algorithms: optimisers, the critic's epochs, saving, threads and generators."""
 
 from __future__ import annotations
 

@@ -81,9 +81,9 @@ class APG(Algorithm):
         return self._reward_scale * window.reward.sum() + value
 
     def _moves(self, by_action: Tensor) -> Tensor:
-        """How far actions are moved, (n, k): as `config.step` says, where the pull is the median.
+        """How far actions are moved, (n, k): by `config.step` where the gradient is the median.
 
-        The pull at some moments is a thousand times as strong as at others.
+        The gradient at some moments is a thousand times as strong as at others.
         """
         strength = by_action.norm(dim=-1, keepdim=True)
         moves = self.config.step * by_action / strength.median().clamp(min=1e-9)

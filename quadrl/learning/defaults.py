@@ -1,4 +1,4 @@
-"""What the settings of a training are where nothing is said: three layers, each over the last.
+"""Defaults of the settings of a training: three layers, each over the last.
 
 1. field: the default of a field of `TrainConfig` or of an algorithm, with what that algorithm
    changes of the former (`AlgorithmConfig.training`).

@@ -1,4 +1,4 @@
-"""What a task is, in words and numbers: for the command line and the documentation."""
+"""Describe tasks in words and numbers, for the command line and the documentation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from quadrl.learning.defaults import own_settings
 
 
 def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]:
-    """All that there is to know of a task before it is flown, as JSON can hold it.
+    """Describe a task before it is flown, as JSON can hold it.
 
     Args:
         task: The task.

@@ -53,7 +53,7 @@ class End:
 
 
 def order(run: PlannedRun, episodes: int, own: Iterable[Path] = ()) -> dict[str, Any]:
-    """What a process is to do: train, evaluate in `episodes`, with files that register tasks."""
+    """The order for a process: train, evaluate in `episodes`, with files that register tasks."""
     return {
         "config": dataclasses.asdict(run.config),
         "versions": run.config.resolved()["versions"],

@@ -150,7 +150,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def run_of(config: Mapping[str, Any]) -> str:
-    """What a run and its policies are known by: a digest of all that its result follows from."""
+    """The identity of a run and its policies: a digest of all that its result depends on."""
     free = (*CHANGEABLE, "run", "processors")
     fixed = {name: value for name, value in config.items() if name not in free}
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]

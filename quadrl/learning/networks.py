@@ -100,7 +100,7 @@ class HoldsGoal(nn.Module):
         return mean - self.mean_at_goal(), deviation
 
     def mean_at_goal(self) -> torch.Tensor:
-        """What is taken away, (k,)."""
+        """The output at the goal, which is subtracted, (k,)."""
         return self.last(self.network(self.looks * self.normaliser(self.at_goal)))[0]
 
 

@@ -24,7 +24,7 @@ from quadrl.rendering import write_video
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run:
-    """A training that has ended: what it was, where it is, and what its policy reached."""
+    """A finished training: its settings, its folder, and what its policy reached."""
 
     folder: Path
     """Holds the policy, the checkpoint, the settings, the metrics and the pictures."""
@@ -113,7 +113,7 @@ def train_in(
     show: Callable[[Progress], None],
     heed: Callable[[Training], AbstractContextManager[None]] = contextlib.nullcontext,
 ) -> Run:
-    """What `train` does once settings and folder are known, in the context `heed` of a training."""
+    """Train as `train` does, with settings and folder prepared, in the context `heed`."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = config.scenario
     warn_of_unreached(scenario.aircraft, scenario.randomization)

@@ -153,7 +153,7 @@ def study(
 
 
 def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
-    """What the trainings that are done reached."""
+    """Sum up what the finished trainings reached."""
     done = [run for run in plan.runs if run.done]
     runs = tuple(_known(run) for run in done)
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}

@@ -1,4 +1,4 @@
-"""A window of flight, and how what it earned follows from its actions.
+"""A window of flight, and the derivatives of its return by its actions.
 
 The task's own functions give rewards and observations once more, with tensors, for all steps of the
 window at once; the derivatives of the flight between are those of `quadrl.engines.adjoint`. They
@@ -43,7 +43,7 @@ class Moment:
 
 
 def fly(environment: Environment, action: np.ndarray) -> tuple[Moment, Transition]:
-    """`Environment.step`, and what has to be known of it for its derivatives."""
+    """Take an `Environment.step`, and record what its derivatives need."""
     was, engine = coordinates(environment.engine), environment.engine
     begun = records.copied(environment.snapshot), records.copied(environment.episode)
     environment.begin(action)
@@ -108,7 +108,7 @@ class Window:
         return truncated.ravel()
 
     def vector_jacobian_product(self, earned: Tensor, action: Tensor, gamma: float) -> np.ndarray:
-        """How what is earned from each step on follows from its action, (T, N, k).
+        """Derivatives of the return from each step on by its action, (T, N, k).
 
         Args:
             earned: A sum over the steps, (): of their rewards, and of what comes after the window.

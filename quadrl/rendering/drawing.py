@@ -1,4 +1,4 @@
-"""What is drawn, as one list of primitives: parts of a model, markers, trails, wind.
+"""Everything that is drawn, as one list of primitives: parts of a model, markers, trails, wind.
 
 MuJoCo (`scene.py`), the live viewer (`live/scene.py`) and the page in the browser (docs/fly) read
 it; none of them knows what a goal, a pad or a rotor looks like.

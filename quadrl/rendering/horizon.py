@@ -17,7 +17,7 @@ SYMBOL, RIM = (255, 176, 56), (30, 37, 48)  # of the aircraft that stays, and of
 
 
 def horizon(size: int, attitude: Array) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Draw it.
+    """Draw an artificial horizon.
 
     Args:
         size: Diameter [pixels].

@@ -1,4 +1,4 @@
-"""What is written over a picture: a panel in its corner, the outcome, a time stamp."""
+"""Overlays of a picture: a panel in its corner, the outcome, a time stamp."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OUTCOMES = {SUCCESS: (38, 148, 84), FAILURE: (196, 58, 54), TIME_OVER: (176, 124
 
 
 class Panel:
-    """Draws itself into pictures of one height."""
+    """A panel of values, drawn into pictures of one height."""
 
     def __init__(
         self, height: int, title: str, colours: Sequence[Sequence[float]], windy: bool = False

@@ -25,7 +25,7 @@ from quadrl.rendering.scene import Renderer
 
 
 class LiveFlight:
-    """What one picture of a flight hands on to the next: camera, trail, angles of the rotors."""
+    """What is kept between two pictures of a flight: camera, trail, angles of the rotors."""
 
     def __init__(self, camera: str) -> None:
         """Nothing has been seen yet."""

@@ -134,7 +134,7 @@ class Renderer(contextlib.AbstractContextManager):
             return self._renderer.render()
 
     def close(self) -> None:
-        """Give the graphics context back."""
+        """Free the graphics context."""
         self._close()
 
     def __exit__(self, *_: object) -> None:

@@ -160,7 +160,7 @@ def fields(kind: type) -> str:
         if found:
             rows.append((f"`{found[1]}`", found[3] or f"a `{found[2]}`"))
     for name, member in vars(kind).items():
-        if isinstance(member, property):
+        if isinstance(member, property) and member.__doc__:
             rows.append((f"`{name}`", (inspect.getdoc(member) or "").partition("\n")[0]))
     return table(("name", "shape, unit, frame"), rows)
 
