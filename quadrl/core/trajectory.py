@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,8 @@ class Trajectory:
     markers: Sequence[Shown] = ((),)
     outcome: str = ""  # how the episode ended, shown with the last state
     wind: Array | None = None  # (T, 3) [m/s], world frame; None for calm air
+    # What was flown, as `Scenario.to_json` gives it; pictures and videos carry it.
+    scenario: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def resampled(self, fps: float) -> Trajectory:
         """The same flight at `fps` states a second; a goal that jumps is not interpolated."""

@@ -21,6 +21,7 @@ from quadrl.control.feasibility import warn_of_unreached
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.snapshot import Rollout
 from quadrl.core.task import Task
+from quadrl.core.trajectory import Trajectory
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.rollout import (
@@ -74,6 +75,11 @@ class Evaluation:
     def _repr_html_(self) -> str:
         rows = [("", self.name), *((name, quantity(name, x)) for name, x in self.metrics.items())]
         return html_table(rows)
+
+    def trajectory(self, episode: int = 0) -> Trajectory:
+        """One of the flights, to be drawn; what it is drawn in carries the scenario."""
+        flight = self.rollout.trajectory(self.vehicle, episode)
+        return dataclasses.replace(flight, scenario=self.scenario.to_json())
 
     def save_csv(self, path: str | Path) -> Path:
         """Write one row per flight: its seed and what `quadrl.evaluation.rollout.flights` gives."""

@@ -55,31 +55,34 @@ styled = matplotlib.rc_context(STYLE)
 
 
 @styled
-def content(figure: Figure, kind: str, name: str = "kind") -> bytes:
+def content(figure: Figure, kind: str, name: str = "kind", comment: str = "") -> bytes:
     """The file of a figure; the same numbers make the same bytes.
 
     Args:
         figure: The figure.
         kind: The ending of the file, such as png, pdf or svg.
         name: What an error calls it.
+        comment: Written into a png, where it can be read again.
 
     Raises:
         QuadrlError: The kind is unknown.
     """
     choice(name, kind, sorted(FigureCanvasAgg(figure).get_supported_filetypes()))
     picture = io.BytesIO()
-    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    figure.savefig(picture, dpi=DPI, format=kind, metadata=undated)
+    said: Any = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}  # undated
+    said["png"] = {"comment": comment} if comment else {}
+    figure.savefig(picture, dpi=DPI, format=kind, metadata=said.get(kind))
     return picture.getvalue()
 
 
-def save(figure: Figure, path: Path) -> Path:
+def save(figure: Figure, path: Path, comment: str = "") -> Path:
     """Write a figure, whole or not at all; its kind is what the name ends in.
 
     Raises:
         QuadrlError: The name ends in no kind of picture.
     """
-    written = content(figure, path.suffix.removeprefix(".").lower(), f"ending of {path}")
+    kind = path.suffix.removeprefix(".").lower()
+    written = content(figure, kind, f"ending of {path}", comment)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, written)
     return path

@@ -20,6 +20,7 @@ from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training
 from quadrl.rendering import write_video
+from quadrl.rendering.scenarios import comment
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -64,9 +65,10 @@ class Run:
         flown = self.evaluation
         yield plotting.save(curve(self.folder), self.folder / LEARNING_CURVE)
         title = f"{flown.task.name}: mean action of the policy"
-        yield plotting.save(plotting.trajectory(flown.rollout, title), self.folder / TRAJECTORY)
+        drawn, carried = plotting.trajectory(flown.rollout, title), flown.scenario.to_json()
+        yield plotting.save(drawn, self.folder / TRAJECTORY, comment=comment([carried]))
         if video:
-            model, flight = flown.scenario.compile_model(), flown.rollout.trajectory(flown.vehicle)
+            model, flight = flown.scenario.compile_model(), flown.trajectory()
             yield write_video(flight, model, self.folder / VIDEO, on_frame=on_frame)
 
 

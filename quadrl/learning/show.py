@@ -15,6 +15,7 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import Evaluation, beside, evaluate
 from quadrl.learning.folder import METRICS, read_config, read_metrics
+from quadrl.rendering.scenarios import comment
 from quadrl.rendering.sheet import SHEETS, write_contact_sheet
 from quadrl.rendering.video import VIDEOS, write_video
 
@@ -75,7 +76,7 @@ def render(
         evaluate(one, scenario, episodes=1, seed=seed)
         for one, scenario in beside(several.values(), task, **conditions)
     ]
-    flights = [one.rollout.trajectory(one.vehicle) for one in flown]
+    flights = [one.trajectory() for one in flown]
     models = [one.scenario.compile_model() for one in flown]
     write = write_contact_sheet if sheet else write_video
     with ProgressBar() as bar, tempfile.TemporaryDirectory() as folder:
@@ -113,7 +114,8 @@ def plot(*what: Any, kind: str = "png") -> Media:
         allowed = "one for all runs of a picture"
         raise QuadrlError(name="task", value=sorted(figures), allowed=allowed)
     (figure,) = figures.values()
-    return Media(plotting.content(figure, kind), kind)
+    carried = comment(one.scenario.to_json() for one in flown) if flown else ""
+    return Media(plotting.content(figure, kind, comment=carried), kind)
 
 
 def curve(folder: Path) -> Figure:

@@ -6,6 +6,7 @@ never its dynamics: it needs no rotor callbacks and leaves the simulation's own 
 
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.core.trajectory import Trajectory
+from quadrl.rendering.scenarios import read_scenarios
 from quadrl.rendering.scene import Renderer
 from quadrl.rendering.sheet import write_contact_sheet
 from quadrl.rendering.video import help_notebooks, render_trajectory, write_video
@@ -14,6 +15,7 @@ __all__ = [
     "Renderer",
     "RenderingUnavailable",
     "Trajectory",
+    "read_scenarios",
     "render_trajectory",
     "write_contact_sheet",
     "write_video",

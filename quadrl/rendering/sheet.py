@@ -13,6 +13,7 @@ import numpy as np
 from quadrl.base.files import write_whole
 from quadrl.core.trajectory import Trajectory
 from quadrl.rendering.overlay import Panel, require
+from quadrl.rendering.scenarios import COMMENT, comment
 from quadrl.rendering.video import OneOrMore, OnFrame, checked, listed, render_trajectory
 
 SHEETS = ("png", "jpg", "jpeg")
@@ -32,6 +33,8 @@ def write_contact_sheet(
     **options: Any,
 ) -> Path:
     """Write moments of a flight, with their times, as one picture; of several, a row for each.
+
+    `quadrl.rendering.read_scenarios` reads from it what was flown.
 
     Args:
         trajectory: What was flown, or several.
@@ -72,7 +75,13 @@ def write_contact_sheet(
             rows.append(np.hstack(tiles[k : k + COLUMNS]))
     sheet, image = io.BytesIO(), require("PIL.Image", "Pillow").fromarray(np.vstack(rows))
     kind = "png" if path.suffix.lower() == ".png" else "jpeg"
-    image.save(sheet, format=kind, **({"quality": 90} if kind == "jpeg" else {}))
+    carried = comment(flight.scenario for flight in flights)
+    if kind == "png":
+        text = require("PIL.PngImagePlugin", "Pillow").PngInfo()
+        text.add_text(COMMENT, carried)
+        image.save(sheet, format=kind, pnginfo=text)
+    else:
+        image.save(sheet, format=kind, quality=90, comment=carried)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, sheet.getvalue())
     return path

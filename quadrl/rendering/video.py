@@ -7,7 +7,6 @@ import importlib.util
 import itertools
 import math
 import os
-import shutil
 import sys
 from collections.abc import Callable, Generator, Iterable, Sequence
 from pathlib import Path
@@ -31,6 +30,7 @@ from quadrl.rendering.camera import (
 )
 from quadrl.rendering.drawing import TRAIL_SECONDS, streaks
 from quadrl.rendering.overlay import Panel, flight_lines, grid, require, task_title
+from quadrl.rendering.scenarios import COMMENT, comment, ffmpeg, put_into_gif
 from quadrl.rendering.scene import Renderer
 
 T = TypeVar("T")
@@ -38,7 +38,7 @@ OneOrMore = T | Sequence[T]
 OnFrame = Callable[[int, int], object]
 """Is told how many pictures are drawn, and how many there will be."""
 MAX_FPS = 240
-FFMPEG = "-preset veryfast -movflags +faststart"
+FFMPEG = ("-preset", "veryfast", "-movflags", "+faststart")
 LEAST_RATE = 20.0  # [1/s], at which a flight is followed
 HOLD = 1.0  # [s], for which a video stays at its end, for the outcome to be read
 VIDEOS = ("mp4", "gif")
@@ -152,6 +152,8 @@ def write_video(
 ) -> Path:
     """Write a flight as an MP4 (H.264, yuv420p) or a GIF. An unfinished file has another name.
 
+    The file carries what was flown, which `quadrl.rendering.read_scenarios` reads from it.
+
     Several flights are shown side by side; one that is over waits for the others. Ten seconds of
     flight at the defaults cost about 10 s of CPU time without a graphics card.
 
@@ -183,8 +185,10 @@ def write_video(
     if any(flight.outcome for flight in flights):
         times = np.append(times, end + np.arange(1, 1 + round(HOLD * fps)) / fps)
     encoding: dict[str, Any] = {"codec": "gif"}
+    carried = comment(flight.scenario for flight in flights)
     if kind == "mp4":
-        encoding = dict(crf=20, encoded_format="yuv420p", ffmpeg_args=FFMPEG)
+        command = (*FFMPEG, "-metadata", f"{COMMENT}={carried}")
+        encoding = dict(crf=20, encoded_format="yuv420p", ffmpeg_args=command)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.{kind}")
     drawing = _together(flights, model, label, fps=fps, times=times, **options)
     with contextlib.closing(drawing) as frames:
@@ -198,6 +202,8 @@ def write_video(
                     writer.add_image(frame)
                     on_frame(k + 1, len(times))
             writer.close()
+            if kind == "gif":
+                put_into_gif(temporary, carried)
             os.replace(temporary, path)
         except RuntimeError as error:
             raise RenderingUnavailable(f"{path} could not be written: {error}") from error
@@ -254,8 +260,7 @@ def checked(path: str | os.PathLike[str], kinds: Sequence[str]) -> tuple[Path, s
 
 
 def _mediapy() -> Any:
-    """Mediapy with an ffmpeg: the system's, else the one that imageio-ffmpeg brings."""
+    """Mediapy with an ffmpeg that there is."""
     mediapy = require("mediapy", "mediapy")
-    if shutil.which("ffmpeg") is None:
-        mediapy.set_ffmpeg(require("imageio_ffmpeg", "imageio-ffmpeg").get_ffmpeg_exe())
+    mediapy.set_ffmpeg(ffmpeg())
     return mediapy

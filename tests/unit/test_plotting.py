@@ -12,6 +12,7 @@ from quadrl.evaluation import plotting
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.rollout import fly
 from quadrl.learning.folder import read_metrics
+from quadrl.rendering import read_scenarios
 
 STEPS = np.arange(1.0, 6.0)
 METRICS = {name: STEPS for name in ("steps", "seconds", "success", "error", "survival")}
@@ -103,6 +104,8 @@ def test_the_same_numbers_make_the_same_file_of_every_kind(tmp_path, kind, begin
     flown = quadrl.evaluate("geometric", "hover", episodes=1, time_limit=0.5)
     shown = quadrl.plot(flown, kind=kind)
     assert shown.content.startswith(begins) and kind in shown._repr_html_()
+    if kind == "png":
+        assert read_scenarios(shown.save(tmp_path / "flight.png")) == [flown.scenario]
 
 
 def test_other_kinds_are_refused(tmp_path):

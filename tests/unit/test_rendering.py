@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import dataclasses
 import functools
 import math
 import os
@@ -26,12 +27,14 @@ from quadrl.base.primitives import Primitive
 from quadrl.base.shield import shield_triton
 from quadrl.core.environment import Environment
 from quadrl.core.markers import Kind, Marker
+from quadrl.core.scenario import Scenario
 from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER, outcome
 from quadrl.engines import mjcf
 from quadrl.envs.common import Pictures
 from quadrl.rendering import (
     Renderer,
     gl,
+    read_scenarios,
     render_trajectory,
     write_contact_sheet,
     write_video,
@@ -444,6 +447,29 @@ def test_a_gif_and_contact_sheets(model):
     assert changed(first, last).mean() > 0.05
     refused = refusal(write_contact_sheet, two[0], model, "new/a.mp4", **SMALL)
     assert refused[:2] == ("path", "new/a.mp4") and not Path("new").exists()
+
+
+@leaves_pipes
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.png", "a.jpg"])
+def test_what_is_drawn_carries_its_scenarios(model, name):
+    odd = {"task": "landing", "task_options": {"start_height": 1.5}, "weather": {"wind_speed": 2.0}}
+    told = [Scenario.of(one) for one in (odd, {"task": "hover", "vehicle": "crazyflie"})]
+    flights = [dataclasses.replace(flight(2), scenario=one.to_json()) for one in told]
+    write = write_video if name in ("a.mp4", "a.gif") else write_contact_sheet
+    path = write(flights, model, name, **SMALL, fine=False)
+    assert [one.to_json() for one in read_scenarios(path)] == [one.to_json() for one in told]
+    with pytest.raises(QuadrlError, match=f"{name} carries no scenario .*quadrl render"):
+        path.write_bytes(b"no picture")
+        read_scenarios(path)
+
+
+@leaves_pipes
+def test_of_a_flight_made_by_hand_no_scenario_is_known(model):
+    write_video(flight(2), model, "a.gif", **SMALL)
+    with Image.open("a.gif") as gif:
+        assert gif.n_frames == 2  # with the comment before them
+    with pytest.raises(QuadrlError, match="a.gif carries no scenario .its comment holds none"):
+        read_scenarios("a.gif")
 
 
 @leaves_pipes
