@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import collections
 import contextlib
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, Unpack
 
 from quadrl.rendering import gl
-from quadrl.rendering.camera import FOLLOW, aircraft_scale, follow_cameras, in_view
+from quadrl.rendering.camera import FOLLOW, aircraft_scale, moving_views
 
 gl.choose()
 
@@ -43,8 +43,8 @@ class Physics(mujoco.Physics):
     inner_loop: Callable[[], None] | None = None
     """Commands the rotors before each physics step, during control steps in which they get more
     than one command."""
-    in_view: Callable[[], np.ndarray] | None = None
-    """What the camera "follow" keeps in view, (n, 3) [m]; None before the first episode."""
+    in_view: Callable[[], tuple[np.ndarray, Sequence[Any]]] | None = None
+    """The goal (3,) [m] and the markers that "follow" keeps in view; None before an episode."""
 
     def __getstate__(self) -> Any:
         """For pickle and deepcopy."""
@@ -61,11 +61,12 @@ class Physics(mujoco.Physics):
         """As in dm_control; "follow" moves with the aircraft and keeps the goal in view."""
         if camera_id != FOLLOW or self.in_view is None:
             return super().render(height, width, camera_id, **options)  # type: ignore[arg-type]
-        scale = aircraft_scale(self.model.ptr)
-        view = follow_cameras(self.data.qpos[None, :3], [self.in_view()], scale=scale)[0]
+        goal, markers = self.in_view()
+        pose, scale = self.data.qpos[None, :7], aircraft_scale(self.model.ptr)
+        view = moving_views(FOLLOW, pose, goal[None], [markers], scale)[0]
         callback = options.pop("scene_callback", None)
         camera = mujoco.MovableCamera(self, height, width, scene_callback=callback)
-        camera.set_pose(view.lookat, view.distance, view.azimuth, view.elevation)
+        camera.set_pose(view[:3], *view[3:])
         picture = camera.render(**options)
         camera._scene.free()
         return picture
@@ -140,9 +141,9 @@ class QuadrotorTask(base.Task):
         self._observation = now.observation
         super().after_step(physics)
 
-    def in_view(self) -> np.ndarray:
-        """What a camera should keep in view, (n, 3) [m], world frame."""
-        return in_view(self.environment.goals()[0], self.environment.markers())
+    def in_view(self) -> tuple[np.ndarray, Sequence[Any]]:
+        """The goal (3,) [m] and the markers, which a camera should keep in view, world frame."""
+        return self.environment.goals()[0], self.environment.markers()
 
     def get_observation(self, physics: Physics) -> dict[str, np.ndarray]:
         """Named terms, float64."""

@@ -40,24 +40,11 @@ class GRU:
         """The arrays by their names in a file."""
         return {PREFIX + field.name: getattr(self, field.name) for field in FIELDS}
 
-    def is_sound(self, size: int, largest: float) -> bool:
-        """Whether the arrays fit together and no input makes a state that is not finite.
-
-        Args:
-            size: Numbers in an input.
-            largest: Bound of an input's magnitude; a state's is 1.
-        """
-        arrays = tuple(self.arrays().values())
-        shapes = [(3 * self.width, size), (3 * self.width, self.width)] + 2 * [(3 * self.width,)]
-        if self.width == 0 or [array.shape for array in arrays] != shapes:
-            return False
-        if not all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays):
-            return False
-        inputs, states = (
-            bound * np.abs(weight, dtype=np.float64).sum(axis=1) + np.abs(bias)
-            for bound, weight, bias in ((largest, *arrays[::2]), (1.0, *arrays[1::2]))
-        )
-        return bool((inputs + states < np.finfo(np.float32).max / 2).all())
+    def fits(self, size: int) -> bool:
+        """Whether the arrays are those of one unit with some numbers in an input."""
+        rows, width = 3 * self.width, self.width
+        shapes = [(rows, size), (rows, width), (rows,), (rows,)]
+        return width > 0 and [array.shape for array in self.arrays().values()] == shapes
 
 
 FIELDS = dataclasses.fields(GRU)

@@ -35,8 +35,6 @@ def in_view(goal: Array, markers: Sequence[Marker | Primitive] = ()) -> Array:
     """What a camera should keep in view, (n, 3) [m]: the goal, spheres, rings, pads and paths.
 
     Of a primitive, which does not say what it is for, nothing has to be in view.
-
-    "chase" stays nearer, and keeps the goal alone in view.
     """
     return np.vstack([np.asarray(goal, dtype=float)[None], *map(_extent, markers)])
 
@@ -62,38 +60,38 @@ def _extent(marker: Marker | Primitive) -> Array:
     return np.stack([centre - half, centre + half])
 
 
-def headings(qpos: Array) -> Array:
-    """Bearing (T,) [rad] of the nose, from east to north, of poses (T, 7); it does not jump."""
-    w, x, y, z = np.moveaxis(qpos[..., 3:7], -1, 0)
-    return np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
-
-
 def moving_views(
-    position: Array,
-    shown: Sequence[Array],
+    camera: str,
+    qpos: Array,
+    goals: Array,
+    markers: Sequence[Sequence[Marker | Primitive]],
     scale: float = 1.0,
-    heading: Array | None = None,
     aspect: float = WIDE,
 ) -> Array:
-    """Where cameras look that step back to keep some points in view.
+    """Where a camera of MOVING looks, which steps back to keep some points in view.
+
+    The markers count up to a distance that suits the aircraft's size.
 
     Args:
-        position: (T, 3) [m], of the aircraft, world frame.
-        shown: T arrays (n, 3) [m], world frame, n at least 1; those after the first, which is the
-            goal, count up to a distance that suits the aircraft's size.
+        camera: Its name; "chase" stays nearer, and keeps the goal alone in view.
+        qpos: (T, 7) position [m] and attitude (w, x, y, z) of the aircraft, world frame.
+        goals: (T, 3) [m], world frame.
+        markers: What else is drawn in each of the T pictures, world frame.
         scale: Of the aircraft, see `aircraft_scale`.
-        heading: (T,) [rad], along which they look; None for the bearing of "follow".
         aspect: Of the pictures, width over height.
 
     Returns:
-        (T, 6): the point that they look at and the distance from it [m], azimuth and elevation
+        (T, 6): the point that it looks at and the distance from it [m], azimuth and elevation
         [deg].
     """
-    nearest, farthest = DISTANCE
+    position, (nearest, farthest) = qpos[:, :3], DISTANCE
+    chase = camera == CHASE
     # Else a small aircraft would be a dot before a long path. Of the goal no part is left out.
     reach = farthest / 2 * math.sqrt(scale)
-    near = [_drawn_near(at, points, reach) for at, points in zip(position, shown, strict=True)]
-    boxes = [np.vstack([at, points]) for at, points in zip(position, near, strict=True)]
+    boxes = []
+    for at, goal, also in zip(position, goals, markers, strict=True):
+        near = _drawn_near(at, in_view(goal, () if chase else also), reach)
+        boxes.append(np.vstack([at, near]))
     half = np.array([(box.max(0) - box.min(0)) / 2 for box in boxes])
     aside = np.array([box.min(0) for box in boxes]) + half - position
     radius = np.linalg.norm(half, axis=-1, keepdims=True)
@@ -103,11 +101,17 @@ def moving_views(
     distance = np.clip(0.75 * scale + room, nearest * scale, farthest)
     # The aircraft itself stays in view, however far away the rest is.
     aside = aside * np.minimum(1.0, farthest / 4 / np.maximum(radius, 1e-9))
-    azimuth, elevation = np.full(len(position), AZIMUTH), ELEVATION
-    if heading is not None:
-        azimuth, elevation = np.degrees(heading), CHASE_ELEVATION
-    angles = np.stack([azimuth, np.full(len(position), elevation)], axis=-1)
+    angles = np.empty((len(position), 2))
+    angles[:] = AZIMUTH, ELEVATION
+    if chase:
+        angles[:] = np.stack([_headings(qpos), np.full(len(qpos), CHASE_ELEVATION)], axis=-1)
     return np.concatenate([position + aside, distance, angles], axis=1)
+
+
+def _headings(qpos: Array) -> Array:
+    """Bearing (T,) [deg] of the nose, from east to north; it does not jump."""
+    w, x, y, z = np.moveaxis(qpos[..., 3:7], -1, 0)
+    return np.degrees(np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))))
 
 
 def _drawn_near(position: Array, points: Array, reach: float) -> Array:
@@ -118,25 +122,14 @@ def _drawn_near(position: Array, points: Array, reach: float) -> Array:
     return np.vstack([points[:1], pulled])
 
 
-def follow_cameras(
-    position: Array,
-    shown: Sequence[Array],
-    smoothing: float = 0.0,
-    scale: float = 1.0,
-    heading: Array | None = None,
-    aspect: float = WIDE,
-) -> list[mujoco.MjvCamera]:
-    """T cameras that follow a flight smoothly.
+def smoothed(views: Array, deviation: float) -> Array:
+    """Views (T, 6) of a whole flight through a low pass, which looks both ways: nothing lags.
 
-    Of the arguments, `smoothing` is the standard deviation of the low pass [states], which looks
-    both ways: nothing lags. The others are those of `moving_views`.
+    Its standard deviation is in views.
     """
     from scipy.ndimage import gaussian_filter1d
 
-    views = moving_views(position, shown, scale, heading, aspect)
-    if smoothing > 0:
-        views = np.asarray(gaussian_filter1d(views, smoothing, axis=0, mode="nearest"))
-    return [moving_camera(view) for view in views]
+    return np.asarray(gaussian_filter1d(views, deviation, axis=0, mode="nearest"))
 
 
 def moving_camera(view: Array) -> mujoco.MjvCamera:

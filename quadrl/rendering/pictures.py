@@ -11,15 +11,7 @@ import numpy as np
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.core.markers import Marker
-from quadrl.rendering.camera import (
-    CHASE,
-    MOVING,
-    eased,
-    headings,
-    in_view,
-    moving_camera,
-    moving_views,
-)
+from quadrl.rendering.camera import MOVING, eased, moving_camera, moving_views
 from quadrl.rendering.drawing import TRAIL_SECONDS, streaks
 from quadrl.rendering.scene import Renderer
 
@@ -73,10 +65,8 @@ class LiveFlight:
         self._trail = [point for point in self._trail if point[0] >= time - TRAIL_SECONDS]
         shown: Any = camera
         if camera in MOVING:
-            chase = camera == CHASE
-            heading = headings(qpos[None]) if chase else None
-            target = [in_view(goal, () if chase else markers)]
-            view = moving_views(position[None], target, renderer.scale, heading, renderer.aspect)[0]
+            seen = qpos[None], goal[None], [markers]
+            view = moving_views(camera, *seen, renderer.scale, renderer.aspect)[0]
             self._view = view if begins else eased(view, self._view, seconds)
             shown = moving_camera(self._view)
         if wind is not None:

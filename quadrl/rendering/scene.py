@@ -22,9 +22,8 @@ from quadrl.rendering.camera import (
     FOLLOW,
     MOVING,
     aircraft_scale,
-    follow_cameras,
-    headings,
-    in_view,
+    moving_camera,
+    moving_views,
 )
 
 MAX_SHAPES = 2000
@@ -115,11 +114,8 @@ class Renderer(contextlib.AbstractContextManager):
         position = data.qpos[:3].copy()
         target = position if goal is None else np.asarray(goal, dtype=float)
         if isinstance(camera, str) and camera in MOVING:
-            chase = camera == CHASE
-            heading = headings(data.qpos[None]) if chase else None
-            shown = [in_view(target, () if chase else markers)]
-            how = self.scale, heading, self.aspect
-            camera = follow_cameras(position[None], shown, 0.0, *how)[0]
+            seen = data.qpos[None], target[None], [markers]
+            camera = moving_camera(moving_views(camera, *seen, self.scale, self.aspect)[0])
         self._renderer.update_scene(data, camera)
         for geom in self._renderer.scene.geoms[: model.ngeom]:
             if geom.objid in self._painted:

@@ -20,13 +20,12 @@ from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.validation import number
 from quadrl.core.trajectory import Trajectory
 from quadrl.rendering.camera import (
-    CHASE,
     FOLLOW,
     MOVING,
     SMOOTHING,
-    follow_cameras,
-    headings,
-    in_view,
+    moving_camera,
+    moving_views,
+    smoothed,
 )
 from quadrl.rendering.drawing import TRAIL_SECONDS, streaks
 from quadrl.rendering.overlay import Panel, flight_lines, grid, require, task_title
@@ -106,12 +105,9 @@ def render_trajectory(
         angles = renderer.spins * turned
         cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
         if camera in MOVING:
-            heading = headings(flight.qpos) if camera == CHASE else None
-            also = [()] * len(position) if camera == CHASE else markers
-            shown = [in_view(*seen) for seen in zip(flight.goal, also, strict=True)]
-            smoothing = SMOOTHING * rate
-            how = renderer.scale, heading, renderer.aspect
-            cameras = follow_cameras(position, shown, smoothing, *how)
+            seen = flight.qpos, flight.goal, markers
+            views = moving_views(camera, *seen, renderer.scale, renderer.aspect)
+            cameras = [moving_camera(view) for view in smoothed(views, SMOOTHING * rate)]
         panel = None
         if overlay:
             colours = [model.mat(f"rotor_{k + 1}_paint").rgba[:3] for k in range(model.nu)]

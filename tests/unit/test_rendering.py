@@ -39,7 +39,14 @@ from quadrl.rendering import (
     write_contact_sheet,
     write_video,
 )
-from quadrl.rendering.camera import aircraft_scale, eased, follow_cameras, headings, in_view
+from quadrl.rendering.camera import (
+    aircraft_scale,
+    eased,
+    in_view,
+    moving_camera,
+    moving_views,
+    smoothed,
+)
 from quadrl.rendering.horizon import horizon
 from quadrl.rendering.overlay import Panel
 from quadrl.rendering.pictures import LiveFlight
@@ -195,23 +202,24 @@ def test_what_cannot_be_drawn_is_refused(model, renderer):
 
 
 def test_follow_keeps_what_matters_in_view():
-    def camera(*points, scale=1.0):
-        return follow_cameras(POSE[None, :3], [np.array(points, float)], scale=scale)[0]
+    def look(goal, *others, scale=1.0):
+        """The point that it looks at, and the distance from it."""
+        markers = [Marker("sphere", tuple(point)) for point in others]
+        view = moving_views("follow", POSE[None], np.array([goal], float), [markers], scale)
+        return view[0, :4]
 
     # It looks half way to the goal, from 0.75 m + twice half of the separation: 0.75 + 3 = 3.75.
-    near = camera((3, 0, 3))
-    np.testing.assert_allclose([*near.lookat, near.distance], [1.5, 0.0, 3.0, 3.75])
+    np.testing.assert_allclose(look((3, 0, 3)), [1.5, 0.0, 3.0, 3.75])
     # No farther than 7 m away, and then the aircraft stays within 7 / 4 m of the middle.
-    far = camera((0, 0, 10))
-    np.testing.assert_allclose([*far.lookat, far.distance], [0.0, 0.0, 4.75, 7.0])
+    np.testing.assert_allclose(look((0, 0, 10)), [0.0, 0.0, 4.75, 7.0])
     # Goals to come: a box of 1 m by 2 m, and half of its diagonal, twice, is sqrt(5).
-    assert camera((1, 0, 3), (0, 2, 3)).distance == pytest.approx(0.75 + math.sqrt(5))
+    assert look((1, 0, 3), (0, 2, 3))[3] == pytest.approx(0.75 + math.sqrt(5))
     # Arms of 0.046 m and the drawn ones of 0.23 m: it comes five times nearer than 1.35 m.
     assert aircraft_scale(mjcf.compile_model(VEHICLES["crazyflie"])) == pytest.approx(0.2)
-    assert camera(POSE[:3], scale=0.2).distance == pytest.approx(0.27)
+    assert look(POSE[:3], scale=0.2)[3] == pytest.approx(0.27)
     # Before a small aircraft only the near part counts: of 10 m sqrt(0.2) * 3.5 = 1.565 m.
-    small = camera(POSE[:3], POSE[:3] + (10, 0, 0), scale=0.2)
-    assert small.distance == pytest.approx(0.75 * 0.2 + 1.565, abs=1e-3)
+    small = look(POSE[:3], POSE[:3] + (10, 0, 0), scale=0.2)
+    assert small[3] == pytest.approx(0.75 * 0.2 + 1.565, abs=1e-3)
 
 
 def test_follow_frames_spheres_rings_pads_and_paths():
@@ -227,11 +235,10 @@ def test_follow_frames_spheres_rings_pads_and_paths():
 
 def test_chase_looks_where_the_aircraft_heads_and_does_not_jump():
     poses = np.stack([yawed(math.radians(a)) for a in (170, 179, 188, 197)])
-    goal = [np.array([[0.0, 0.0, 3.0]])] * 4
-    cameras = follow_cameras(poses[:, :3], goal, heading=headings(poses))
-    np.testing.assert_allclose([c.azimuth for c in cameras], [170, 179, 188, 197])
-    assert {c.elevation for c in cameras} == {-17.0}
-    smooth = [c.azimuth for c in follow_cameras(poses[:, :3], goal, 2.0, 1.0, headings(poses))]
+    views = moving_views("chase", poses, poses[:, :3], [[Marker("sphere", (9, 9, 9))]] * 4)
+    np.testing.assert_allclose(views[:, :3], poses[:, :3])  # the goal alone is in view
+    np.testing.assert_allclose(views[:, 4:], [[a, -17] for a in (170, 179, 188, 197)])
+    smooth = smoothed(views, 2.0)[:, 4]
     assert 0 < np.ptp(smooth) < 27 and np.all(np.diff(smooth) > 0)
 
 
@@ -241,8 +248,8 @@ def test_chase_looks_where_the_aircraft_heads_and_does_not_jump():
 )
 def test_moving_cameras_keep_aircraft_and_goal_in_view(renderer, camera, heading, goal):
     pose, away = yawed(heading), POSE + np.array([0, 0, 90, 0, 0, 0, 0])
-    chase, shown = headings(pose[None]) if camera == "chase" else None, [in_view(np.array(goal))]
-    (view,) = follow_cameras(pose[None, :3], shown, heading=chase, aspect=renderer.aspect)
+    seen = pose[None], np.array([goal], float), [()]
+    view = moving_camera(moving_views(camera, *seen, aspect=renderer.aspect)[0])
     pictures = [renderer.frame(pose, camera=view, goal=g) for g in (goal, None)]
     assert not changed(renderer.frame(pose, camera=camera, goal=goal), pictures[0]).any()
     # A goal fades and a ring on the ground may hide it: its ball and its line cover some pixels.
