@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import re
+import tomllib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -189,3 +190,28 @@ def read_safetensors(
         raise
     except UNREADABLE as error:
         raise QuadrlError(f"{path} is damaged or not a safetensors file: {error}") from error
+
+
+def read_table(path: Path, what: str) -> dict[str, Any]:
+    """The content of a .toml or .json file that holds a table.
+
+    Args:
+        path: The file.
+        what: It is, for the refusal of another kind of file.
+
+    Raises:
+        QuadrlError: It cannot be read, or is no such file.
+    """
+    if path.suffix not in (".toml", ".json"):
+        raise QuadrlError(name=what, value=str(path), allowed="a .toml or a .json file")
+    try:
+        text = path.read_text(encoding="utf-8")
+        content: Any = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+    except OSError as error:
+        raise QuadrlError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise QuadrlError(f"{path} is not {path.suffix[1:].upper()}: {reason}") from error
+    if not isinstance(content, dict):
+        raise QuadrlError(f"{path} must hold a table of names and values")
+    return cast(dict[str, Any], content)

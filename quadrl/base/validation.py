@@ -13,6 +13,7 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError, UnknownKeyword
 
+MAX_SEEDS = 1000
 MAX_OPTION = 1e9
 """Larger options of a task would take the digits from what is added to them."""
 
@@ -59,6 +60,42 @@ def numbers(
         many = "a sequence of numbers" if size is None else f"a sequence of {size} numbers"
         raise QuadrlError(name=name, value=value, allowed=many)
     return tuple(number(f"{name}[{k}]", item, low, high) for k, item in enumerate(items))
+
+
+def names(key: str, value: Any) -> list[str]:
+    """A list of different names.
+
+    Raises:
+        QuadrlError: It is no such list.
+    """
+    found: list[Any] = list(cast(Any, value)) if isinstance(value, (list, tuple)) else []
+    known = all(isinstance(name, str) and name for name in found)
+    if not found or not known or len(set(found)) < len(found):
+        allowed = 'a list of different names, such as ["hover"]'
+        raise QuadrlError(name=key, value=value, allowed=allowed)
+    return found
+
+
+def seeds(value: Any, largest: int) -> list[int]:
+    """Different seeds: "0:5" for 0 to 4, "3,5,8", or a list of numbers.
+
+    Raises:
+        QuadrlError: They are no such numbers.
+    """
+    found: Any = cast(Any, value) if isinstance(value, (list, tuple)) else []
+    whole: list[Any] = []
+    try:
+        if isinstance(value, str):
+            first, colon, last = value.partition(":")
+            found = range(int(first), int(last)) if colon else [*map(int, value.split(","))]
+        whole = list(found) if len(found) <= MAX_SEEDS else []
+    except (OverflowError, ValueError):
+        pass
+    known = all(type(seed) is int and 0 <= seed <= largest for seed in whole)
+    if not whole or not known or len(set(whole)) < len(whole):
+        allowed = f"FIRST:END such as 0:5, or numbers such as 3,5,8; at most {MAX_SEEDS}"
+        raise QuadrlError(name="seeds", value=value, allowed=allowed)
+    return whole
 
 
 def choice(name: str, value: Any, choices: Iterable[str]) -> Any:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
-from collections.abc import Iterable, Sequence
+import signal
+import sys
+from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from quadrl.base.signals import Stopped, handling
 from quadrl.evaluation.evaluate import comes_with_quadrl
 
 console = Console()
@@ -39,6 +44,22 @@ def again(command: str, *folder: Path) -> str:
     # A bare name may be that of a policy that comes with quadrl.
     where = [f"./{path}" if comes_with_quadrl(str(path)) else str(path) for path in folder]
     return shlex.join(["quadrl", *own, *command.split(), *where])
+
+
+@contextlib.contextmanager
+def going_on(words: Sequence[str] = ()) -> Generator[None]:
+    """Say, after a Ctrl-C or a SIGTERM, which command goes on: by default the same one."""
+
+    def stop(number: int, _: Any) -> None:
+        raise Stopped(number)
+
+    try:
+        with handling({signal.SIGTERM: stop}):
+            yield
+    except KeyboardInterrupt as stopped:
+        words = ["quadrl", *(words or sys.argv[1:])]
+        stopped.args = (f"stopped; the same command goes on: {shlex.join(words)}",)
+        raise
 
 
 def reason(error: OSError) -> str:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 from quadrl.base.units import quantity
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
-from quadrl.cli.flown import Flown, yardstick
+from quadrl.cli.flown import Flown
+from quadrl.conditions.observing import Observing
 from quadrl.evaluation.evaluate import evaluate
 
 
@@ -27,31 +29,23 @@ class Evaluate(Flown):
 
     def run(self) -> None:
         """Print the metrics, beside those of the geometric controller."""
-        _, controller, scenario = self.setting()
+        flight: dict[str, Any] = {"episodes": self.episodes, "seed": self.seed}
         name = self.controller or "policy"
-        flown: dict[str, Any] = {name: controller}
-        if self.controller != "geometric" and not self.json:
-            flown["geometric controller"] = "geometric"
-        evaluations = {
-            name: evaluate(
-                one,
-                scenario if one is controller else yardstick(scenario),
-                episodes=self.episodes,
-                seed=self.seed,
-                sampled=self.sampled and one is controller,
-            )
-            for name, one in flown.items()
-        }
-        first = evaluations[name].metrics
+        flown = evaluate(
+            self.flies(), self.task or None, sampled=self.sampled, **flight, **self.conditions()
+        )
+        first, columns = flown.metrics, {name: flown.metrics}
+        if self.controller != "geometric" and not self.json:  # it has rotor commands, and sees all
+            other = dataclasses.replace(flown.scenario, control_mode="rotor", observe=Observing())
+            columns["geometric controller"] = evaluate("geometric", other, **flight).metrics
         if self.csv is not None:
-            evaluations[name].save_csv(self.csv)
+            flown.save_csv(self.csv)
         if self.json:
             console.print_json(data=first, indent=None)
             return
-        columns = [evaluation.metrics for evaluation in evaluations.values()]
         rows = [
-            (metric, *(quantity(metric, column[metric]) for column in columns)) for metric in first
+            (name, *(quantity(name, column[name]) for column in columns.values())) for name in first
         ]
-        console.print(make_table(("", *evaluations), rows, numbers=len(columns)))
+        console.print(make_table(("", *columns), rows, numbers=len(columns)))
         if self.csv is not None:
             say(f"wrote {self.csv}")

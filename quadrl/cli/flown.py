@@ -16,13 +16,11 @@ from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, tuples
 from quadrl.cli import choices
-from quadrl.conditions.observing import Observing
 from quadrl.control import CONTROLLERS
-from quadrl.core.scenario import Conditions, Scenario
-from quadrl.evaluation.evaluate import comes_with_quadrl, setting
+from quadrl.core.scenario import Conditions
+from quadrl.evaluation.evaluate import comes_with_quadrl
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE
-from quadrl.evaluation.rollout import Controller
 from quadrl.learning.defaults import PAIRS
 
 HELP = {
@@ -128,15 +126,6 @@ class Flown(Conditioned):
             return Policy.pretrained(self.policy, self.algo)
         # The name of a controller is no policy here: a folder may be called so.
         return self.policy if comes_with_quadrl(self.policy) else Path(self.policy)
-
-    def setting(self) -> tuple[str, Controller, Scenario]:
-        """Name, controller and scenario of the flight; raises as `flies`."""
-        return setting(self.flies(), self.task or None, **self.conditions())
-
-
-def yardstick(scenario: Scenario) -> Scenario:
-    """The scenario of the geometric controller beside a policy: rotor commands, the true state."""
-    return dataclasses.replace(scenario, control_mode="rotor", observe=Observing())
 
 
 def parse_named(name: str, text: Any) -> Any:

@@ -16,9 +16,6 @@ from quadrl.learning.show import render
 from quadrl.rendering.sheet import SHEETS
 from quadrl.rendering.video import VIDEOS, checked
 
-VIDEO, GIF, SHEET = (848, 480, 20.0), (640, 360, 12.5), (480, 270, 20.0)
-"""What a kind of file is drawn with unless it is given: width and height [pixels], frames/s."""
-
 
 @choices.command
 class Render(Flown):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
 from quadrl.cli import choices
-from quadrl.cli.console import console, make_table, say
+from quadrl.cli.console import console, going_on, make_table, say
 from quadrl.cli.flown import Conditioned
 from quadrl.control import CONTROLLERS
 from quadrl.evaluation.evaluate import comes_with_quadrl
@@ -57,7 +55,7 @@ class Robustness(Conditioned):
             choice("controller", name, CONTROLLERS)
         # The name of a controller is no policy here: a folder may be called so.
         flown = [name if comes_with_quadrl(name) else Path(name) for name in self.policies]
-        try:
+        with going_on():
             card = robustness(
                 [*flown, *(str(name) for name in self.controller)],
                 self.task or None,
@@ -68,9 +66,6 @@ class Robustness(Conditioned):
                 disturbances=self.disturbances or None,
                 **self.conditions(),
             )
-        except KeyboardInterrupt:
-            words = shlex.join(["quadrl", *sys.argv[1:]])
-            raise KeyboardInterrupt(f"stopped; the same command goes on: {words}") from None
         head, *rows = card.table
         console.print(make_table(head, rows, numbers=len(head) - 1))
         if card.reach:

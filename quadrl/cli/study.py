@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from tyro.conf import Positional
 
 from quadrl.base.errors import QuadrlError
 from quadrl.cli import choices
 from quadrl.cli import console as shared
-from quadrl.cli.console import console, make_table, say
+from quadrl.cli.console import console, going_on, make_table, say
 
 
 @choices.command
@@ -30,24 +30,18 @@ class Study:
 
     def run(self) -> None:
         """Train what is missing, print the table, write the files."""
-        from quadrl.learning.executor import complaint
-        from quadrl.learning.study import study
+        carry_out(self.file, jobs=self.jobs, out=self.out, ray=self.ray or None)
 
-        try:
-            found = study(
-                self.file,
-                jobs=self.jobs,
-                out=self.out,
-                ray=self.ray or None,
-                own=tuple(shared.own_files),
-                on_line=say,
-            )
-        except KeyboardInterrupt:
-            words = shlex.join(["quadrl", *sys.argv[1:]])
-            raise KeyboardInterrupt(f"stopped; the same command goes on: {words}") from None
-        head, *rows = found.table
-        console.print("", make_table(head, rows, numbers=4))
-        say("\nmeans over the seeds, with their 95 % intervals in brackets")
-        say(f"in {found.folder}: table.csv, study.json, learning_curves_TASK.png, the runs")
-        if found.failed:
-            raise QuadrlError(complaint(found.failed))
+
+def carry_out(what: Path | Mapping[str, Any], **given: Any) -> None:
+    """Carry out a study, as `quadrl.study` takes it, and print what it reached."""
+    from quadrl.learning.study import complaint, study
+
+    with going_on():
+        found = study(what, own=tuple(shared.own_files), on_line=say, **given)
+    head, *rows = found.table
+    console.print("", make_table(head, rows, numbers=4))
+    say("\nmeans over the seeds, with their 95 % intervals in brackets")
+    say(f"in {found.folder}: table.csv, study.json, learning_curves_TASK.png, the runs")
+    if found.failed:
+        raise QuadrlError(complaint(found.failed))

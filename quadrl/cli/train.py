@@ -18,16 +18,15 @@ from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.progress import ProgressBar
 from quadrl.base.signals import heeded
-from quadrl.base.validation import number
+from quadrl.base.validation import number, seeds
 from quadrl.cli import choices
 from quadrl.cli.console import again, console, make_table, reason, say
 from quadrl.cli.flown import parsed
-from quadrl.evaluation.rollout import MAX_EPISODES
+from quadrl.cli.study import carry_out
+from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import PAIRS, flat
-from quadrl.learning.plan import parse_seeds
-from quadrl.learning.show import curves
 from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
@@ -101,13 +100,13 @@ class Train:
     settings: Annotated[Settings, arg(name="")]  # pyright: ignore[reportInvalidTypeForm]
     out: Path | None = None
     """Folder of the run; by default runs/TASK-ALGO-SEED, numbered if that holds a run already. With
-    --seeds the folder of the runs."""
+    --seeds the folder of the runs; by default runs/TASK-ALGO-seeds."""
     resume: Path | None = None
     """Continue the run in this folder, with its own settings; --steps may ask for more than it was
     begun with."""
     seeds: str = ""
-    """Train several seeds one after another and draw their curves in one picture: 0:5 for 0 to 4,
-    or 3,5,8."""
+    """Train several seeds side by side, as a study, and sum up: 0:5 for 0 to 4, or 3,5,8. The same
+    command goes on after a stop."""
     episodes: int = 100
     """Episodes of the evaluation at the end."""
     video: bool = True
@@ -124,22 +123,23 @@ class Train:
             rows = ((name, str(value), origin) for name, value, origin in config.sources())
             console.print(make_table(("setting", "value", "from"), rows))
             return
-        if not self.seeds:
-            run = self._train(*prepare(task, self.out, self.resume, settings))
-            _draw(run, video=self.video)
-            _list_files(run)
+        if self.seeds:
+            self._study(task, settings)
             return
+        run = self._train(*prepare(task, self.out, self.resume, settings))
+        _draw(run, video=self.video)
+        _list_files(run)
+
+    def _study(self, task: str | None, settings: dict[str, Any]) -> None:
+        """Train the seeds as a study of one configuration."""
         for name, other in (("--seed", settings.get("seed")), ("--resume", self.resume)):
             if other is not None:
                 raise QuadrlError(name=name, value=str(other), allowed="left out beside --seeds")
-        seeds, where = parse_seeds(self.seeds), self.out or Path("runs")
-        configs = [TrainConfig(task or "hover", seed=seed, **settings) for seed in seeds]
-        runs = []
-        for config in configs:
-            folder = names.free_folder(where / f"{config.task}-{config.algo}-{config.seed}")
-            runs.append(self._train(config, folder))
-            _draw(runs[-1], video=False)
-        _compare(runs, where)
+        given, config = seeds(self.seeds, MAX_SEED), TrainConfig(task or "hover", **settings)
+        settings.pop("algo", None)
+        what = {"tasks": [config.task], "algorithms": [config.algo], "seeds": given,
+                "episodes": self.episodes, "settings": settings}  # fmt: skip
+        carry_out(what, out=self.out or Path("runs", f"{config.task}-{config.algo}-seeds"))
 
     def _train(self, config: TrainConfig, folder: Path) -> Run:
         """Train and evaluate, and print the result."""
@@ -222,22 +222,3 @@ def _list_files(run: Run) -> None:
         f"      {again('evaluate', folder)} --episodes 1000\n"
         f"      {again('tasks')}"
     )
-
-
-def _compare(runs: list[Run], folder: Path) -> None:
-    """Print the results of several seeds in a table, and draw their curves in one picture."""
-    from quadrl.evaluation.plotting import save
-
-    head = ("run", "successful", "error over the last 2 s", "return", "training")
-    found = [(run, run.evaluation.metrics) for run in runs]
-    rows = [
-        (str(run.folder), f"{100 * reached['success_rate']:.0f} %",
-         f"{100 * reached['position_error_m']:.1f} cm", f"{reached['return_mean']:.0f}",
-         f"{run.seconds:.1f} s")
-        for run, reached in found
-    ]  # fmt: skip
-    console.print("", make_table(head, rows, numbers=4))
-    config = runs[0].config
-    path = folder / f"{config.task}-{config.algo}-seeds.png"
-    (figure,) = curves([run.folder for run in runs]).values()
-    say(f"\nwrote {save(figure, path)}")

@@ -156,18 +156,20 @@ class Scenario:
         options = {**whole.pop("task_options", {}), **new.pop("task_options", {})}
         vehicle_options = {**whole.pop("vehicle_options", {}), **new.pop("vehicle_options", {})}
         whole |= new
-        options |= {name: whole.pop(name) for name in list(whole) if name not in KEYWORDS}
+        others = {name: whole.pop(name) for name in list(whole) if name not in KEYWORDS}
         vehicle = presets.resolve(whole.get("vehicle"), vehicle_options)
         if (timestep := whole.pop("control_timestep", None)) is not None:
             vehicle = dataclasses.replace(vehicle, control_timestep=timestep)
         if (steps := whole.pop("max_episode_steps", None)) is not None:
             steps = validation.number("max_episode_steps", steps, 1, whole=True)
-            options["time_limit"] = steps * vehicle.control_timestep
-        made, options = catalogue.make(whole["task"]), validation.tuples(options)
-        known = [*KEYWORDS, *also, *(field.name for field in dataclasses.fields(made))]
+            others["time_limit"] = steps * vehicle.control_timestep
+        made = catalogue.make(whole["task"])
+        known = [field.name for field in dataclasses.fields(made)]
         validation.keys(f"{made.name} option", options, known)
+        validation.keys(f"{made.name} option", others, [*KEYWORDS, *also, *known])
         parts = {name: value for name, value in whole.items() if value is not None}
-        return cls(**parts | {"task": made.replace(**options), "vehicle": vehicle})
+        made = made.replace(**validation.tuples(options | others))
+        return cls(**parts | {"task": made, "vehicle": vehicle})
 
     def to_json(self) -> dict[str, Any]:
         """What differs from the defaults, as JSON can hold it; `of` makes the same scenario."""

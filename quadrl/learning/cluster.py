@@ -1,4 +1,8 @@
-"""Trainings on the nodes of a Ray cluster, in a folder that all machines share."""
+"""Trainings on the nodes of a Ray cluster, in a folder that all machines share.
+
+Ray begins a training again where the node that it was on is lost; it goes on from its last
+checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +13,13 @@ import os
 import socket
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import write_whole
 from quadrl.base.machine import cores
-from quadrl.learning.executor import End, Local, Process, order
-from quadrl.learning.plan import PlannedRun
+from quadrl.learning.executor import End, Local, PlannedRun, Process, order
 
 REACH_SECONDS = 5.0
-STORE_BYTES = 100 << 20  # of Ray's store on this machine, in which nothing is kept
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",  # nothing is sent anywhere
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
@@ -28,79 +29,61 @@ QUIET = {
 
 def carry_out_here(what: dict[str, Any], log: Path) -> End:
     """On a node: carry out a training in a process, which dies with this one."""
-    if not Path(what["folder"]).is_dir():
-        allowed = "a folder that all machines share (--out)"
-        return End(f"{socket.gethostname()} has no {what['folder']}: the study needs {allowed}")
+    for path in (what["folder"], *what["own"]):
+        if not Path(path).exists():
+            shared = "a folder that all machines share (--out), and files there (--import)"
+            return End(f"{socket.gethostname()} has no {path}: the study needs {shared}")
     return Process(what, log).wait()
 
 
-class Task:
+class Task(NamedTuple):
     """A training on some node, as a task of Ray."""
 
-    def __init__(self, task: Any, log: Path) -> None:
-        """Follow a task, which writes the log as soon as it runs."""
-        self._task, self._log = task, log
+    ray: Any
+    task: Any
 
     def poll(self) -> End | None:
         """How it ended; None while it works or waits for a node."""
-        import ray
-        import ray.exceptions
-
-        if not ray.wait([self._task], timeout=0)[0]:
+        if not self.ray.wait([self.task], timeout=0)[0]:
             return None
         try:
-            return ray.get(self._task)
-        except ray.exceptions.RayError as error:
+            return self.ray.get(self.task)
+        except self.ray.exceptions.RayError as error:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-            ran = self._log.name in os.listdir(self._log.parent)
-            return End(f"its node or its process there was lost ({reason})", lost=True, ran=ran)
+            return End(f"its node or its process there was lost ({reason})", lost=True)
 
     def stop(self) -> None:
         """Kill the task: its process ends with it."""
-        import ray
-
-        ray.cancel(self._task, force=True)
+        self.ray.cancel(self.task, force=True)
 
 
 @dataclasses.dataclass(frozen=True)
 class Nodes(Local):
     """The nodes of a cluster. They see the folders of the runs under the same paths."""
 
+    ray: Any = None
+
     def slots(self) -> int:
         """How many at the same time: one per CPU of the cluster as it is now."""
-        import ray
-
-        return self.jobs or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        return self.jobs or max(1, int(self.ray.cluster_resources().get("CPU", 1)))
 
     def begin(self, run: PlannedRun, log: Path) -> Task:
         """Begin a training, or continue it, on a node with a CPU to spare."""
-        import ray
-
-        own = run.folder.absolute().parent / "own"
-        for folder in (run.folder, log.parent, *([own] if self.own else [])):
+        for folder in (run.folder, log.parent):
             folder.mkdir(parents=True, exist_ok=True)
-        for path in self.own:
-            write_whole(own / path.name, path.read_bytes())
-        log.unlink(missing_ok=True)
-        what = order(run, self.episodes, [own / path.name for path in self.own])
-        gpus = 1 if run.config.device.startswith("cuda") else 0
-        # Ray does not begin a task again: that it was lost is counted, and said.
-        remote: Any = ray.remote(max_retries=0, num_cpus=1, num_gpus=gpus)(carry_out_here)
-        return Task(remote.remote(what, log.absolute()), log)
+        needs = {"num_cpus": 1, "num_gpus": int(run.config.device.startswith("cuda"))}
+        remote = self.ray.remote(max_retries=-1, **needs)(carry_out_here)
+        return Task(self.ray, remote.remote(order(run, self.episodes, self.own), log.absolute()))
 
 
 @contextlib.contextmanager
-def on_ray(
-    address: str, episodes: int, jobs: int | None, own: tuple[Path, ...]
-) -> Generator[Nodes]:
+def on_ray(address: str, local: Local) -> Generator[Nodes]:
     """The nodes of the cluster at an address.
 
     Args:
         address: HOST:PORT; "auto" for the cluster that this machine belongs to; "local" for a
             cluster of this machine alone that ends with the study.
-        episodes: Of the evaluation of each training.
-        jobs: Trainings at the same time; None for one per CPU of the cluster.
-        own: Files that register what the trainings need; copies are put beside the runs.
+        local: What the processes of one machine would be.
 
     Raises:
         QuadrlError: Ray is not installed, or there is no cluster at the address.
@@ -114,9 +97,9 @@ def on_ray(
         ) from error
     mine = not ray.is_initialized()
     if mine:
-        _connect(ray, address, jobs)
+        _connect(ray, address, local.jobs)
     try:
-        yield Nodes(episodes, jobs, own)
+        yield Nodes(local.episodes, local.jobs, local.own, ray)
     finally:
         if mine:
             ray.shutdown()
@@ -125,23 +108,20 @@ def on_ray(
 def _connect(ray: Any, address: str, jobs: int | None) -> None:
     """Join a cluster, or begin one on this machine."""
     given: dict[str, Any] = {"address": address}
+    if address == "local":
+        given |= {"num_cpus": jobs or cores(), "include_dashboard": False}
     nobody = (
         f"there is no Ray cluster at {address}: start one with ray start --head, join machines to "
         "it with ray start --address, and give the address that it prints"
     )
-    if address == "local":
-        given |= {"num_cpus": jobs or cores(), "object_store_memory": STORE_BYTES}
-        given |= {"include_dashboard": False}
-    elif address != "auto":
-        host, colon, port = address.rpartition(":")
+    host, colon, port = address.rpartition(":")
+    if address not in ("local", "auto"):
         if not colon or not host or "/" in host or not port.isdecimal():
             allowed = "HOST:PORT such as 10.0.0.1:6379, auto, or local"
             raise QuadrlError(name="ray", value=address, allowed=allowed)
-        try:
-            socket.create_connection((host, int(port)), REACH_SECONDS).close()
-        except (OSError, OverflowError) as error:
-            raise QuadrlError(nobody) from error
     try:
+        if colon:  # Ray itself waits for minutes
+            socket.create_connection((host, int(port)), REACH_SECONDS).close()
         ray.init(**given, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, OSError, RuntimeError, ValueError) as error:
+    except (ConnectionError, OSError, OverflowError, RuntimeError, ValueError) as error:
         raise QuadrlError(f"{nobody} ({str(error).splitlines()[0]})") from error

@@ -23,21 +23,52 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.machine import cores
 from quadrl.base.signals import Stopped, heeded, unheeded
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import CONFIG, EVALUATION, METRICS, lock_folder
-from quadrl.learning.plan import PlannedRun
+from quadrl.learning.folder import CONFIG, EVALUATION, FREE, METRICS, lock_folder
 
 ATTEMPTS = 3
 """Times that a training is begun or continued before it counts as failed."""
-BEGINNINGS = 10
-"""Times that its machine may be gone before it runs; these are no attempts."""
-PAUSE_SECONDS = 5.0
-"""After each of them. A cluster needs half a minute to see that a machine is gone."""
 LOCKED_SECONDS = 120.0
 """For which a training waits until a lost one has left its folder, as a shared file system sees."""
-POLL_SECONDS = 0.1
-NEWS_SECONDS = 10.0  # between two lines of progress
+STOP_SECONDS = 30.0
+"""That a training has for its last iteration and checkpoint when the study is stopped."""
+POLL_SECONDS, NEWS_SECONDS = 0.1, 10.0  # the latter between two lines of progress
 FAILED = 2
 """Exit code of a process: the training ended with an error that the log tells."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedRun:
+    """One training of a study."""
+
+    config: TrainConfig
+    folder: Path
+    variant: str = ""
+    """The name of its settings in the study."""
+
+    @property
+    def name(self) -> str:
+        """The name of its folder."""
+        return self.folder.name
+
+    @property
+    def done(self) -> bool:
+        """Whether it is trained and evaluated.
+
+        Raises:
+            QuadrlError: The folder holds a run with other settings.
+        """
+        # A listing, since a shared file system remembers for a while which files are not there.
+        files = os.listdir(self.folder) if self.folder.is_dir() else []
+        if CONFIG not in files:
+            return False
+        free = {name: getattr(TrainConfig, name) for name in FREE}
+        found = dataclasses.replace(TrainConfig.of_folder(self.folder), **free)
+        if found != dataclasses.replace(self.config, **free):
+            raise QuadrlError(
+                f"{self.folder} holds a run with other settings than this study's: "
+                "choose another folder (--out), or move that run away"
+            )
+        return EVALUATION in files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +79,6 @@ class End:
     """Why it failed; empty if it did not."""
     lost: bool = False
     """Whether its process or its machine died, and another attempt may succeed."""
-    ran: bool = True
-    """Whether it ran at all; if not, its machine was gone before."""
 
 
 def order(run: PlannedRun, episodes: int, own: Iterable[Path] = ()) -> dict[str, Any]:
@@ -81,29 +110,21 @@ def carry_out(what: dict[str, Any]) -> None:
         allowed = f"{what['versions'].get(name)}, as where the study was started"
         raise QuadrlError(name=f"version of {name}", value=here[name], allowed=allowed)
     folder.mkdir(parents=True, exist_ok=True)
-    _await(folder)
-    if PlannedRun(config, folder).done:
+    until = time.monotonic() + LOCKED_SECONDS
+    while True:  # a training that is lost may work here for a while
+        try:
+            lock_folder(folder)()
+            break
+        except QuadrlError:
+            if time.monotonic() > until:
+                raise
+        time.sleep(POLL_SECONDS)
+    if PlannedRun(config, folder).done:  # by the one that was lost
         return
     given: Any = {"resume": (folder / CONFIG).exists(), "episodes": what["episodes"]}
     finished = train_in(folder, config, **given, show=lambda progress: None, heed=heeded)
     for _ in finished.draw(video=False):
         pass
-
-
-def _await(folder: Path) -> None:
-    """Wait until no other training works in a folder, as one that is lost may for a while.
-
-    Raises:
-        QuadrlError: Another training still does.
-    """
-    until = time.monotonic() + LOCKED_SECONDS
-    while True:
-        try:
-            return lock_folder(folder)()
-        except QuadrlError:
-            if time.monotonic() > until:
-                raise
-        time.sleep(POLL_SECONDS)
 
 
 def main() -> None:
@@ -165,9 +186,13 @@ class Process:
         return End(lines[-1].strip().removeprefix("quadrl: ") if code else "")
 
     def stop(self) -> None:
-        """Kill it, and wait for that."""
-        self._process.kill()
-        self._process.wait()
+        """Let it write a checkpoint at the end of its iteration and end; kill it if it does not."""
+        self._process.terminate()
+        try:
+            self._process.wait(STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
         with contextlib.suppress(BrokenPipeError):
             assert self._process.stdin
             self._process.stdin.close()
@@ -197,11 +222,7 @@ class _Job:
 
     run: PlannedRun
     worker: Any = None
-    attempt: int = 1
-    never_ran: int = 0
-    """Beginnings that were none."""
-    after: float = 0.0
-    """When it may be begun, on the clock `time.monotonic` [s]."""
+    attempt: int = 0
 
     @property
     def log(self) -> Path:
@@ -211,22 +232,9 @@ class _Job:
     @property
     def share(self) -> float:
         """How much of it is done, by the rows that it has written."""
-        try:
-            rows = (self.run.folder / METRICS).read_bytes().count(b"\n") - 1
-        except OSError:
-            rows = 0
+        file = self.run.folder / METRICS
+        rows = file.read_bytes().count(b"\n") - 1 if file.exists() else 0
         return max(0, rows) / self.run.config.iterations
-
-    def follows(self, end: End) -> str:
-        """Decide what follows an end that is no success: what is next; empty if it has failed."""
-        self.never_ran += not end.ran
-        if not end.ran and self.never_ran < BEGINNINGS:
-            self.after = time.monotonic() + PAUSE_SECONDS
-            return f"it never ran, and begins again in {PAUSE_SECONDS:g} s"
-        if end.ran and end.lost and self.attempt < ATTEMPTS:
-            self.attempt += 1
-            return "it goes on from its last checkpoint"
-        return ""
 
 
 def train_all(
@@ -254,10 +262,10 @@ def train_all(
         say(f"{done} of {len(given)} trainings are done already")
     try:
         while waiting or going:
-            ready = [job for job in waiting if job.after <= time.monotonic()]
-            for job in ready[: max(0, executor.slots() - len(going))]:
+            while waiting and len(going) < executor.slots():
+                job = waiting.pop(0)
+                job.attempt += 1
                 job.worker = executor.begin(job.run, job.log)
-                waiting.remove(job)
                 going.append(job)
                 again = f" (attempt {job.attempt} of {ATTEMPTS})" if job.attempt > 1 else ""
                 say(f"{job.run.name}: begun{again}, {len(waiting)} waiting")
@@ -269,12 +277,11 @@ def train_all(
                 if not end.message and job.run.done:
                     done += 1
                     say(f"{name}: done, {done} of {len(given)}")
-                elif follows := job.follows(end):
-                    say(f"{name}: {why}; {follows}")
+                elif end.lost and job.attempt < ATTEMPTS:
                     waiting.insert(0, job)
+                    say(f"{name}: {why}; it goes on from its last checkpoint")
                 else:
-                    times = "" if end.ran else f"; begun {job.never_ran} times, it never ran"
-                    failed[name] = f"{why}{times} (see {job.log})"
+                    failed[name] = f"{why} (see {job.log})"
                     say(f"{name}: failed: {failed[name]}")
             if time.monotonic() - news > NEWS_SECONDS:
                 news = time.monotonic()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -132,27 +133,39 @@ def curve(folder: Path) -> Figure:
 
 
 def curves(
-    folders: Iterable[Path], on_missing: Callable[[QuadrlError], None] | None = None
+    folders: Iterable[Path] | Mapping[Path, str],
+    on_missing: Callable[[QuadrlError], None] | None = None,
 ) -> dict[str, Figure]:
-    """The learning curves of several runs: a figure for each task, a curve for each algorithm.
+    """The learning curves of several runs: a figure for each task, a curve for each label.
 
     Args:
-        folders: Of the runs.
-        on_missing: Is told of a folder without a run that has begun, which is then left out.
+        folders: Of the runs, maybe with a label each; by default that is the algorithm.
+        on_missing: Is told of a folder without a run that has begun, and of a task of which no
+            episode has ended, which are then left out.
 
     Raises:
-        QuadrlError: A folder holds no such run, and `on_missing` is None.
+        QuadrlError: There is such a folder or task, and `on_missing` is None.
     """
     from quadrl.evaluation import plotting
 
     runs: dict[str, dict[str, list[plotting.Metrics]]] = {}
-    for folder in folders:
+    figures: dict[str, Figure] = {}
+
+    @contextlib.contextmanager
+    def told() -> Generator[None]:
         try:
-            config, metrics = read_config(folder), read_metrics(folder / METRICS)
+            yield
         except QuadrlError as error:
             if on_missing is None:
                 raise
             on_missing(error)
-            continue
-        runs.setdefault(config["task"], {}).setdefault(config["algo"], []).append(metrics)
-    return {task: plotting.learning_curves(groups, task) for task, groups in runs.items()}
+
+    for folder in folders:
+        with told():
+            config, metrics = read_config(folder), read_metrics(folder / METRICS)
+            label = folders[folder] if isinstance(folders, Mapping) else config["algo"]
+            runs.setdefault(config["task"], {}).setdefault(label, []).append(metrics)
+    for task, groups in runs.items():
+        with told():
+            figures[task] = plotting.learning_curves(groups, task)
+    return figures

@@ -1,4 +1,7 @@
-"""Studies: trainings of several tasks, algorithms, settings and seeds, and what they reached."""
+"""Studies: trainings of several tasks, algorithms, settings and seeds, and what they reached.
+
+A study goes on where it was stopped, since each of its trainings does: see `executor`.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +9,55 @@ import contextlib
 import csv
 import dataclasses
 import io
+import itertools
 import json
 import math
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import write_whole
-from quadrl.base.validation import number
+from quadrl.base.files import read_table, write_whole
+from quadrl.base.validation import keys, names, number
+from quadrl.base.validation import seeds as seeds_of
 from quadrl.evaluation.evaluate import html_table
+from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning.cluster import on_ray
-from quadrl.learning.executor import Local, complaint, train_all
-from quadrl.learning.folder import EVALUATION, METRICS, read_metrics, write_json
-from quadrl.learning.plan import Plan, PlannedRun, read_plan
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.defaults import merged
+from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
+from quadrl.learning.folder import EVALUATION, write_json
+from quadrl.learning.show import curves
 
-MAX_JOBS = 4096
-FIGURES = {"success_rate": (0.0, 1.0), "position_error_m": (0.0, math.inf),
-           "training_s": (0.0, math.inf)}  # fmt: skip
-"""What is compared, and the range in which it lies."""
+KEYS = ("tasks", "algorithms", "seeds", "episodes", "settings", "variants")
+OWN = {
+    "task": "the key tasks",
+    "algo": "the key algorithms",
+    "seed": "the key seeds",
+    "num_threads": "left out: a training of a study has one thread",
+}
+"""Settings of a training that no table of a study may hold, and what to write instead."""
+MAX_RUNS, MAX_JOBS = 10_000, 4096
+EPISODES = 100
+FIGURES = {
+    "success_rate": (1.0, 100, "%"),
+    "position_error_m": (math.inf, 100, "cm"),
+    "training_s": (math.inf, 1, "s"),
+}
+"""What is compared: its largest value (the least is zero), and factor and unit in the table."""
 TABLE, STUDY = "table.csv", "study.json"
 GROUP = ("task", "algo", "variant")
 CONFIDENCE = 0.95
+
+
+class Plan(NamedTuple):
+    """All trainings of a study."""
+
+    folder: Path
+    runs: tuple[PlannedRun, ...]
+    episodes: int
+    """Of the evaluation at the end of each."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -39,7 +67,7 @@ class StudyResult:
     folder: Path
     """Holds the run folders, table.csv, study.json and the pictures."""
     runs: tuple[dict[str, Any], ...]
-    """Of each training that is done: name, task, algo, variant, seed, and its metrics."""
+    """Of each that is done: name, task, algo, variant, seed, scenario, metrics and settings."""
     rows: tuple[dict[str, Any], ...]
     """Of each task, algorithm and variant: seeds, and of `success_rate`, `position_error_m` over
     the last 2 s and `training_s` the mean over the seeds, with its 95 % interval `_low`, `_high`
@@ -50,19 +78,11 @@ class StudyResult:
     @property
     def table(self) -> list[tuple[str, ...]]:
         """Rows of text, the head first."""
-        head = (*GROUP, "seeds", "successful", "error over the last 2 s", "training")
-        lines = []
-        for row in self.rows:
-            shown = (
-                _between(row, name, factor, unit)
-                for name, factor, unit in (
-                    ("success_rate", 100, "%"),
-                    ("position_error_m", 100, "cm"),
-                    ("training_s", 1, "s"),
-                )
-            )
-            lines.append((*(str(row[name]) for name in GROUP), str(row["seeds"]), *shown))
-        return [head, *lines]
+        known = (*GROUP, "seeds")
+        head = (*known, "successful", "error over the last 2 s", "training")
+        figures = ([_text(row, name) for name in FIGURES] for row in self.rows)
+        named = ([str(row[name]) for name in known] for row in self.rows)
+        return [head, *((*one, *other) for one, other in zip(named, figures, strict=True))]
 
     def __repr__(self) -> str:
         many = f"{len(self.runs)} trainings in {self.folder}"
@@ -72,36 +92,32 @@ class StudyResult:
         return html_table(self.table)
 
     def save(self) -> list[Path]:
-        """Write table.csv, study.json, and the learning curves of each task.
-
-        Returns:
-            The files.
-        """
+        """Write table.csv, study.json, and the learning curves of each task; returns the paths."""
         text = io.StringIO(newline="")
-        rows = csv.DictWriter(text, [*GROUP, "seeds", *_columns()])
-        rows.writeheader()
-        rows.writerows(self.rows)
+        table = csv.DictWriter(text, [*GROUP, "seeds", *itertools.chain(*map(_columns, FIGURES))])
+        table.writeheader()
+        table.writerows(self.rows)
         write_whole(self.folder / TABLE, text.getvalue().encode())
         content = {"rows": self.rows, "runs": self.runs, "failed": self.failed}
-        write_json(self.folder / STUDY, json.loads(json.dumps(content), parse_constant=_nothing))
+        # JSON has no NaN.
+        known = json.loads(json.dumps(content), parse_constant=lambda constant: None)
+        write_json(self.folder / STUDY, known)
         return [self.folder / TABLE, self.folder / STUDY, *self._draw()]
 
     def _draw(self) -> list[Path]:
         """A picture for each task, with a curve for each algorithm and variant."""
-        from quadrl.evaluation.plotting import learning_curves, save
+        from quadrl.evaluation.plotting import save
 
-        tasks: dict[str, dict[str, list[Any]]] = {}
-        for run in self.runs:
-            label = f"{run['algo']} {run['variant']}".strip()
-            metrics = read_metrics(self.folder / run["name"] / METRICS)
-            tasks.setdefault(run["task"], {}).setdefault(label, []).append(metrics)
-        drawn = []
-        for task, groups in tasks.items():
-            # In the shortest trainings no episode ends: there is no curve to draw.
-            if any(np.isfinite(m["return"]).any() for runs in groups.values() for m in runs):
-                path = self.folder / f"learning_curves_{task}.png"
-                drawn.append(save(learning_curves(groups, task), path))
-        return drawn
+        labels = {
+            self.folder / run["name"]: f"{run['algo']} {run['variant']}".strip()
+            for run in self.runs
+        }
+        # In the shortest trainings no episode ends: there is no curve to draw.
+        figures = curves(labels, on_missing=lambda error: None)
+        return [
+            save(figure, self.folder / f"learning_curves_{task}.png")
+            for task, figure in figures.items()
+        ]
 
 
 def study(
@@ -127,7 +143,8 @@ def study(
             machines share it.
         ray: Address of a Ray cluster that carries out the trainings (HOST:PORT, or "auto" for the
             one that this machine belongs to), or "local" for Ray on this machine.
-        own: Python files that register tasks and aircraft of your own.
+        own: Python files that register tasks and aircraft of your own. With Ray all machines have
+            them under these paths.
         on_line: Is called with what happens, a line each.
 
     Returns:
@@ -142,8 +159,8 @@ def study(
         number("jobs", jobs, 1, MAX_JOBS, whole=True)
     for run in plan.runs:
         _ = run.done  # refuses other settings before anything starts
-    here = contextlib.nullcontext(Local(plan.episodes, jobs, own))
-    with on_ray(ray, plan.episodes, jobs, own) if ray else here as executor:
+    here = Local(plan.episodes, jobs, own)
+    with on_ray(ray, here) if ray else contextlib.nullcontext(here) as executor:
         failed = train_all(plan.runs, executor, on_line)
     found = sum_up(plan, failed)
     if not found.runs:
@@ -154,19 +171,25 @@ def study(
 
 def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
     """Sum up what the finished trainings reached."""
-    done = [run for run in plan.runs if run.done]
-    runs = tuple(_known(run) for run in done)
+    runs: list[dict[str, Any]] = []
+    for run in plan.runs:
+        if run.done:
+            config, metrics = run.config, json.loads((run.folder / EVALUATION).read_text())
+            known = {"name": run.name, "task": config.task, "algo": config.algo}
+            known |= {"variant": run.variant, "seed": config.seed}
+            known |= {"scenario": metrics.pop("scenario"), "metrics": metrics}
+            runs.append(known | {"settings": dataclasses.asdict(config)})
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for run in runs:
         groups.setdefault(tuple(run[name] for name in GROUP), []).append(run)
     rows = []
     for key, members in groups.items():
         row = dict(zip(GROUP, key, strict=True)) | {"seeds": len(members)}
-        for name, span in FIGURES.items():
+        for name, (most, *_) in FIGURES.items():
             values = [run["metrics"][name] for run in members]
-            row |= dict(zip(_columns(name), interval(values, *span), strict=True))
+            row |= dict(zip(_columns(name), interval(values, 0.0, most), strict=True))
         rows.append(row)
-    return StudyResult(plan.folder, runs, tuple(rows), failed)
+    return StudyResult(plan.folder, tuple(runs), tuple(rows), failed)
 
 
 def interval(
@@ -178,34 +201,98 @@ def interval(
     """
     from scipy.stats import t
 
-    known = np.array([x for x in values if x is not None and math.isfinite(x)], dtype=float)
-    if not len(known):
-        return None, None, None
-    mean = float(known.mean())
-    if len(known) == 1:
-        return mean, None, None
-    half = t.ppf((1 + CONFIDENCE) / 2, len(known) - 1) * known.std(ddof=1) / math.sqrt(len(known))
-    return mean, max(low, mean - float(half)), min(high, mean + float(half))
+    known = [x for x in values if x is not None and math.isfinite(x)]
+    if len(known) < 2:
+        return (known[0] if known else None), None, None
+    mean, deviation = statistics.fmean(known), statistics.stdev(known)
+    half = float(t.ppf((1 + CONFIDENCE) / 2, len(known) - 1)) * deviation / math.sqrt(len(known))
+    return mean, max(low, mean - half), min(high, mean + half)
 
 
-def _known(run: PlannedRun) -> dict[str, Any]:
-    config = run.config
-    known = {"name": run.name, "task": config.task, "algo": config.algo, "variant": run.variant}
-    metrics = json.loads((run.folder / EVALUATION).read_text())
-    return known | {"seed": config.seed, "metrics": metrics, "settings": dataclasses.asdict(config)}
+def _columns(name: str) -> list[str]:
+    return [name, f"{name}_low", f"{name}_high"]
 
 
-def _columns(*names: str) -> list[str]:
-    return [f"{name}{end}" for name in names or FIGURES for end in ("", "_low", "_high")]
-
-
-def _between(row: dict[str, Any], name: str, factor: float, unit: str) -> str:
-    mean, low, high = (row[column] for column in _columns(name))
+def _text(row: dict[str, Any], name: str) -> str:
+    """A mean and its interval."""
+    (mean, low, high), (_, factor, unit) = (row[column] for column in _columns(name)), FIGURES[name]
     if mean is None:
         return "none"
     around = "" if low is None else f" ({factor * low:.3g} to {factor * high:.3g})"
     return f"{factor * mean:.3g} {unit}{around}"
 
 
-def _nothing(constant: str) -> None:
-    """JSON has no NaN."""
+def read_plan(what: str | Path | Mapping[str, Any], out: Path | None) -> Plan:
+    """Expand a study file (.toml or .json), or a dict with the same keys, to its trainings.
+
+    Args:
+        what: The file, or the dict.
+        out: Folder of the run folders; by default runs/NAME, NAME that of the file.
+
+    Raises:
+        QuadrlError: The file cannot be read, or something in it is unknown, out of range, or does
+            not fit together; the line names the file and the key.
+    """
+    if isinstance(what, Mapping):
+        source, name, content = "the study", "study", what
+    else:
+        source, name, content = str(what), Path(what).stem, read_table(Path(what), "study")
+    try:
+        return _plan(content, out or Path("runs", name))
+    except QuadrlError as error:
+        raise QuadrlError(f"{source}: {error}") from error
+
+
+def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
+    """The trainings of a study's content: seed by seed, so that a stopped one has whole seeds."""
+    keys("key", content, KEYS)
+    if "tasks" not in content:
+        raise QuadrlError('tasks is missing: name what to train, such as tasks = ["hover"]')
+    tasks = names("tasks", content["tasks"])
+    algorithms = names("algorithms", content.get("algorithms", ["ppo"]))
+    seeds = seeds_of(content.get("seeds", [0]), MAX_SEED)
+    episodes = number("episodes", content.get("episodes", EPISODES), 1, MAX_EPISODES, whole=True)
+    common = _settings("settings", content.get("settings", {}))
+    variants = _variants(content.get("variants", []))
+    number("trainings", len(tasks) * len(algorithms) * len(seeds) * len(variants), 1, MAX_RUNS)
+    runs: list[PlannedRun] = []
+    known: dict[str, str] = {}
+    for seed, task, algo, variant in itertools.product(seeds, tasks, algorithms, variants):
+        name = "-".join([task, algo, *filter(None, [variant]), str(seed)])
+        settings = merged(common, variants[variant])
+        try:
+            config = TrainConfig(task, algo=algo, seed=seed, num_threads=1, **settings)
+        except QuadrlError as error:
+            raise QuadrlError(f"{name}: {error}") from error
+        other = known.setdefault(json.dumps(dataclasses.asdict(config), sort_keys=True), name)
+        if other != name:
+            raise QuadrlError(f"{other} and {name} have the same settings: remove one of them")
+        runs.append(PlannedRun(config, folder / name, variant))
+    return Plan(folder, tuple(runs), episodes)
+
+
+def _settings(key: str, given: Any) -> dict[str, Any]:
+    """A table of settings; `TrainConfig` judges their values."""
+    if not isinstance(given, dict):
+        raise QuadrlError(name=key, value=given, allowed="a table of settings of a training")
+    for name in OWN.keys() & given.keys():
+        raise QuadrlError(name=f"{key}.{name}", value=given[name], allowed=OWN[name])
+    known = [field.name for field in dataclasses.fields(TrainConfig) if field.name not in OWN]
+    keys(f"setting in {key}", given, known)
+    return given
+
+
+def _variants(given: Any) -> dict[str, dict[str, Any]]:
+    """Settings by the name of the variant; one without a name where there are none."""
+    if not isinstance(given, (list, tuple)) or not all(isinstance(one, dict) for one in given):
+        raise QuadrlError(name="variants", value=given, allowed="a list of tables: [[variants]]")
+    variants: dict[str, dict[str, Any]] = {}
+    for one in given:
+        name = one.get("name")
+        plain = isinstance(name, str) and name.replace("_", "").replace(".", "").isalnum()
+        if not plain or name in variants or name.startswith("."):
+            allowed = "a name of its own, of letters, digits, _ and ."
+            raise QuadrlError(name="variants.name", value=name, allowed=allowed)
+        rest = {key: value for key, value in one.items() if key != "name"}
+        variants[name] = _settings(f"variants.{name}", rest)
+    return variants or {"": {}}

@@ -27,9 +27,8 @@ from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import EVALUATION_SEED, Controller, flights, fly, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.executor import Local, complaint, train_all
+from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
 from quadrl.learning.folder import EVALUATION, FREE, METRICS, read_metrics, write_json
-from quadrl.learning.plan import PlannedRun
 from scripts.reports import report
 from scripts.reports.report import Result, asked, factor, number, say, table
 

@@ -19,12 +19,13 @@ import quadrl
 from quadrl import cli
 from quadrl.base.errors import QuadrlError
 from quadrl.core.rules import import_own
+from quadrl.core.scenario import Scenario
 from quadrl.learning import executor
-from quadrl.learning.cluster import carry_out_here, on_ray
+from quadrl.learning.cluster import carry_out_here
 from quadrl.learning.executor import Process
 from quadrl.learning.folder import lock_folder
-from quadrl.learning.plan import read_plan
 from quadrl.learning.run import train
+from quadrl.learning.study import read_plan
 
 SETTINGS = {
     "num_envs": 8,
@@ -133,7 +134,10 @@ def test_a_killed_worker_goes_on_and_ends_as_if_alone(alone, tmp_path, begun):
     errors = [run["metrics"]["position_error_m"] for run in found.runs]
     assert float(row["position_error_m"]) == pytest.approx(sum(errors) / 2)
     assert float(row["position_error_m_low"]) <= min(errors)  # t is 12.7 for two seeds
-    assert json.loads((tmp_path / "study.json").read_text())["rows"][0]["task"] == "hover"
+    study = json.loads((tmp_path / "study.json").read_text())
+    assert study["rows"][0]["task"] == "hover"
+    flown = [run.config.scenario for run in read_plan(STUDY, tmp_path).runs]
+    assert [Scenario.of(run["scenario"]) for run in study["runs"]] == flown
     lines.clear()
     again = quadrl.study(STUDY, out=tmp_path, on_line=lines.append)
     assert len(begun) == 3 and lines == ["2 of 2 trainings are done already"]
@@ -244,7 +248,7 @@ def patiently(start):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("graceful", [True, False], ids=["told to go", "killed"])
-def test_a_node_that_dies_changes_no_policy_and_costs_one_attempt(
+def test_a_node_that_dies_changes_no_policy_and_costs_no_attempt(
     alone, tmp_path, cluster, graceful
 ):
     """Of one that is killed the cluster knows late: it sends trainings there for a while."""
@@ -254,31 +258,18 @@ def test_a_node_that_dies_changes_no_policy_and_costs_one_attempt(
         tmp_path / "hover-ppo-0", lambda: made.remove_node(nodes[0], allow_graceful=graceful)
     ):
         found = quadrl.study(STUDY, out=tmp_path, ray=made.address, on_line=lines.append)
-    assert any("was lost" in line for line in lines), lines
-    assert not any("attempt 3" in line for line in lines), lines
+    assert not any("attempt" in line for line in lines), lines
     assert [digest(tmp_path / f"hover-ppo-{seed}") for seed in (0, 1)] == alone
     assert not found.failed and (tmp_path / "hover-ppo-1" / "learning_curve.png").exists()
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_what_died_before_it_ran_is_told_from_what_ran(tmp_path):
-    """Two trainings on one CPU: the second one waits for it."""
-    pytest.importorskip("ray")
-    plan = read_plan(STUDY, tmp_path)
-    with on_ray("local", 2, 1, ()) as nodes:
-        first, second = (nodes.begin(run, tmp_path / f"{run.name}.txt") for run in plan.runs)
-        checkpoint = plan.runs[0].folder / "checkpoint.safetensors"
-        wait_for(lambda: first.poll() or checkpoint.exists(), "a checkpoint")
-        for one in (second, first):
-            one.stop()
-        ends = [wait_for(one.poll, "an end") for one in (first, second)]
-    assert [(end.lost, end.ran) for end in ends] == [(True, True), (True, False)]
-
-
 def test_a_folder_that_the_machines_do_not_share_is_named(tmp_path):
     (run, _) = read_plan(STUDY, tmp_path / "elsewhere").runs
-    end = carry_out_here(executor.order(run, 2), tmp_path / "log.txt")
-    assert str(run.folder) in end.message and "--out" in end.message and not end.lost
+    own = Path("own.py").absolute()
+    for missing in (run.folder, own):
+        end = carry_out_here(executor.order(run, 2, [own]), tmp_path / "log.txt")
+        assert str(missing) in end.message and "--out" in end.message and not end.lost
+        run.folder.mkdir(parents=True, exist_ok=True)
 
 
 @pytest.mark.filterwarnings("ignore")

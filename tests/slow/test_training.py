@@ -26,21 +26,26 @@ from quadrl.learning.config import TrainConfig
 REPOSITORY = Path(quadrl.__file__).parents[1]
 
 
-# -------------------------------------------------------------------------- several seeds
-
-
-def test_several_seeds(tmp_path, monkeypatch, capsys):
+def test_several_seeds_are_a_study(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     short = "--num-envs 8 --rollout 4 --steps 192 --episodes 2 --task-options time_limit=0.5"
-    short = [*short.split(), "--no-video"]
-    cli.main(["train", "hover", *short, "--out", "runs", "--seeds", "0:2"])
-    said = capsys.readouterr().out
-    folders = [Path("runs") / f"hover-ppo-{seed}" for seed in (0, 1)]
-    assert all(str(folder) in said for folder in folders)
-    assert Path("runs", "hover-ppo-seeds.png").exists()
-    cli.main(["train", "hover", *short, "--seed", "1", "--out", "alone"])
-    trained = [Path(f, "policy.safetensors").read_bytes() for f in (folders[1], Path("alone"))]
-    assert trained[0] == trained[1]  # whatever was trained before it
+    words = ["train", "hover", *short.split(), "--no-video"]
+    cli.main([*words, "--seeds", "0:2"])
+    folder = Path("runs/hover-ppo-seeds")
+    assert f"in {folder}: table.csv" in capsys.readouterr().out
+    kept = {path.name for path in folder.iterdir()}
+    runs = {"hover-ppo-0", "hover-ppo-1"}
+    assert kept == {*runs, "logs", "table.csv", "study.json", "learning_curves_hover.png"}
+    cli.main([*words, "--seeds", "0:2"])
+    assert "2 of 2 trainings are done already" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        cli.main([*words, "--seeds", "0:2", "--gamma", "0.5"])
+    assert "holds a run with other settings" in capsys.readouterr().err
+    cli.main([*words, "--seed", "1", "--out", "alone"])
+    trained = [
+        Path(f, "policy.safetensors").read_bytes() for f in (folder / "hover-ppo-1", "alone")
+    ]
+    assert trained[0] == trained[1]
 
 
 # ------------------------------------------------------------------- on any number of cores
@@ -288,7 +293,11 @@ def test_stopped_it_has_a_checkpoint_and_says_how_to_go_on(tmp_path, number, see
     code, error = stopped([*RARELY, *seeds], tmp_path, number, awaited)
     assert code == 128 + number
     (line,) = error.splitlines()
-    assert line == f"quadrl: stopped; the run is kept, continue it: quadrl train --resume {folder}"
+    if seeds:
+        assert line.startswith("quadrl: stopped; the same command goes on: quadrl train hover ")
+    else:
+        advice = f"continue it: quadrl train --resume {folder}"
+        assert line == f"quadrl: stopped; the run is kept, {advice}"
     steps = 32 * len(metrics(folder))  # to the last iteration that was begun
     assert steps and Policy.load(folder).metadata["steps"] == steps
     assert checkpoint.load(folder / "checkpoint.safetensors")[1]["iteration"] * 32 == steps

@@ -1,6 +1,5 @@
 """Studies: what a file expands to or is refused for, and what follows when trainings die."""
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -8,12 +7,12 @@ import pytest
 
 import quadrl
 from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import seeds
 from quadrl.learning import executor
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.executor import End, train_all
+from quadrl.learning.executor import End, PlannedRun, train_all
 from quadrl.learning.folder import EVALUATION, write_config, write_json
-from quadrl.learning.plan import PlannedRun, parse_seeds, read_plan
-from quadrl.learning.study import interval
+from quadrl.learning.study import interval, read_plan
 
 STUDY = """
 tasks = ["hover", "landing"]
@@ -70,7 +69,7 @@ def test_json_and_a_dict_are_the_same(write):
         (("tasks =", "task ="), "did you mean tasks"),
         (('tasks = ["hover", "landing"]', ""), "tasks is missing"),
         (('"hover", "landing"', '"hower"'), "did you mean hover"),
-        (('"hover", "landing"', ""), "tasks = .*a list of names"),
+        (('"hover", "landing"', ""), "tasks = .*a list of different names"),
         (('"hover", "landing"', '"hover", "hover"'), "different names"),
         (('"ppo", "gae"', '"gae", "vpg"'), "hover-gae-narrow-3 and hover-vpg-narrow-3"),
         (("3:5", "5:5"), "seeds = '5:5'"),
@@ -115,18 +114,18 @@ def test_a_run_with_other_settings_stops_the_study_before_it_begins(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["hover-ppo-1"]
 
 
-WRONG = ["", "a", "1,1", "2:2", "5:1", "1:2:3", "-1:2", "0:99999999999999999999", "4294967296"]
+WRONG = ["", "a", "1,1", "2:2", "5:1", "1:2:3", "-1:2", "0:99999999999999999999", "8"]
 
 
 @pytest.mark.parametrize("given", [*WRONG, [], [0.5], [True], 3])
 def test_wrong_seeds(given):
     with pytest.raises(QuadrlError, match="seeds"):
-        parse_seeds(given)
+        seeds(given, largest=7)
 
 
 def test_seeds():
-    assert parse_seeds("3,5,8") == parse_seeds([3, 5, 8]) == [3, 5, 8]
-    assert parse_seeds("2:4") == [2, 3]
+    assert seeds("3,5,8", 8) == seeds([3, 5, 8], 8) == [3, 5, 8]
+    assert seeds("2:4", 8) == [2, 3]
 
 
 def test_intervals_by_hand():
@@ -143,26 +142,7 @@ def test_the_file_on_the_page(write):
     assert len(plan.runs) == 40 and {run.config.seed for run in plan.runs[:8]} == {0}
 
 
-DIED = End("its machine was lost", lost=True)
-NEVER_RAN = dataclasses.replace(DIED, ran=False)
-DONE = End()
-
-
-class Worker:
-    """Ends at once, in a given way."""
-
-    def __init__(self, run, end):
-        self.run, self.end = run, end
-
-    def poll(self):
-        if self.end == DONE:
-            self.run.folder.mkdir(exist_ok=True)
-            write_config(self.run.folder, self.run.config.resolved())
-            write_json(self.run.folder / EVALUATION, {})
-        return self.end
-
-    def stop(self):
-        pass
+DIED, WRONG_END, DONE = End("its machine was lost", lost=True), End("it diverged"), End()
 
 
 class Pretended:
@@ -176,45 +156,37 @@ class Pretended:
 
     def begin(self, run, log):
         self.begun.append(run.name)
-        ends = self.ends[run.name]
-        return Worker(run, ends.pop(0) if len(ends) > 1 else ends[0])
+        self.run = run
+        return self
+
+    def poll(self):
+        end = self.ends[self.run.name].pop(0)
+        if end == DONE:
+            self.run.folder.mkdir(exist_ok=True)
+            write_config(self.run.folder, self.run.config.resolved())
+            write_json(self.run.folder / EVALUATION, {})
+        return end
 
 
-@pytest.fixture
-def study(tmp_path, monkeypatch):
-    """Trains what ends in these ways; returns what failed, what was begun, and the lines."""
+@pytest.mark.parametrize(
+    ("ends", "begun", "failed"),
+    [
+        ({"one": [DIED, DIED, DONE], "two": [DONE]}, ["one", "one", "one", "two"], {}),
+        ({"one": [DIED] * 3}, ["one"] * 3, {"one": "its machine was lost (see "}),
+        ({"one": [WRONG_END], "two": [DONE]}, ["one", "two"], {"one": "it diverged (see "}),
+        ({"one": [None, None, DONE]}, ["one"], {}),
+    ],
+    ids=["twice lost", "given up", "a fault of its own", "it takes a while"],
+)
+def test_what_follows_the_end_of_a_training(tmp_path, monkeypatch, ends, begun, failed):
     monkeypatch.setattr(executor, "POLL_SECONDS", 0.0)
-    monkeypatch.setattr(executor, "PAUSE_SECONDS", 0.01)
-
-    def trained(**ends):
-        runs = [
-            PlannedRun(TrainConfig("hover", seed=k), tmp_path / name) for k, name in enumerate(ends)
-        ]
-        pretended, lines = Pretended(**ends), []
-        return train_all(runs, pretended, lines.append), pretended.begun, lines
-
-    return trained
-
-
-def test_only_what_ran_and_died_is_an_attempt(study):
-    failed, begun, lines = study(one=[NEVER_RAN, DIED, NEVER_RAN, NEVER_RAN, DIED, DONE])
-    assert not failed and len(begun) == 6
-    assert "one: begun (attempt 3 of 3), 0 waiting" in lines
-
-
-def test_after_three_attempts_it_has_failed_whatever_never_ran_in_between(study):
-    failed, begun, _ = study(one=[DIED, NEVER_RAN, DIED, NEVER_RAN, DIED, DONE])
-    assert len(begun) == 5 and failed["one"].startswith("its machine was lost (see ")
-
-
-def test_what_never_runs_is_given_up(study):
-    failed, begun, lines = study(one=[NEVER_RAN])
-    assert len(begun) == executor.BEGINNINGS
-    assert failed["one"].startswith("its machine was lost; begun 10 times, it never ran (see ")
-    assert not [line for line in lines if "attempt" in line]
-
-
-def test_while_one_pauses_the_others_are_trained(study, monkeypatch):
-    monkeypatch.setattr(executor, "PAUSE_SECONDS", 0.3)
-    failed, begun, _ = study(one=[NEVER_RAN, DONE], two=[DONE], three=[DONE])
-    assert not failed and begun == ["one", "two", "three", "one"]
+    runs = [
+        PlannedRun(TrainConfig("hover", seed=k), tmp_path / name) for k, name in enumerate(ends)
+    ]
+    pretended, lines = Pretended(**ends), []
+    found = train_all(runs, pretended, lines.append)
+    assert pretended.begun == begun and found.keys() == failed.keys()
+    assert all(found[name].startswith(words) for name, words in failed.items())
+    attempts = [line for line in lines if "attempt" in line]
+    assert len(attempts) == len(begun) - len(runs)
+    assert len(runs) == sum(run.done for run in runs) + len(failed)

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from quadrl import cli, tasks
 from quadrl.aircraft.presets import resolve
 from quadrl.base.primitives import Mesh, Primitive
-from quadrl.cli.view import others
 from quadrl.core.markers import Marker
 from quadrl.core.scenario import Scenario
 from quadrl.engines import mjcf
@@ -23,6 +22,7 @@ from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.policy import Policy
 from quadrl.rendering.live import readout
 from quadrl.rendering.live.flight import Flight, Keyboard
+from quadrl.rendering.live.view import others
 
 VEHICLE = resolve(None)
 STEP = VEHICLE.control_timestep
@@ -225,9 +225,10 @@ def test_what_flies_can_be_changed_for_what_fits(page):
 @pytest.mark.parametrize("scale", [None, 90.0])
 def test_what_is_offered_commands_what_it_did_in_its_training(scale):
     task, vehicle = tasks.make("hover"), resolve(None, {"action_scale": scale} if scale else {})
-    offered = {name: make() for name, make in others(task, vehicle).items()}
+    scenario = Scenario.of(task, vehicle=vehicle)
+    offered = {name: make() for name, make in others(scenario).items()}
     assert ("hover_ppo" in offered) == (scale is None)
-    flight = Flight(offered["geometric"], Scenario.of(task, vehicle=vehicle))
+    flight = Flight(offered["geometric"], scenario)
     for controller in offered.values():
         flight.fly_with(controller)
         flight.step()

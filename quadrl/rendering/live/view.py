@@ -1,0 +1,87 @@
+"""Show a flight live: on a page in the browser, or in MuJoCo's own window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Unpack
+
+from quadrl.base.errors import RenderingUnavailable
+from quadrl.control import CONTROLLERS
+from quadrl.core.scenario import Conditions, Scenario
+from quadrl.core.task import Task
+from quadrl.evaluation.controllers import make_controller
+from quadrl.evaluation.evaluate import setting
+from quadrl.evaluation.policy import Policy, shipped
+from quadrl.evaluation.rollout import Controller
+from quadrl.rendering.live.flight import Flight
+
+
+def view(
+    controller: Any,
+    task: str | Task | Scenario | None = None,
+    *,
+    label: str = "",
+    num_envs: int = 1,
+    seed: int = 0,
+    host: str = "localhost",
+    port: int = 8080,
+    native: bool = False,
+    on_open: Callable[[str], None] = print,
+    **conditions: Unpack[Conditions],
+) -> None:
+    """Fly and draw until interrupted, or until the window is closed.
+
+    The air is calm unless it is asked for: there the wind is the spectator's.
+
+    Args:
+        controller: What flies, as `quadrl.evaluate` takes it.
+        task: As `quadrl.evaluate` takes it.
+        label: Its name on the page; by default that of `quadrl.evaluate`.
+        num_envs: Aircraft that fly at the same time.
+        seed: Of the episodes.
+        host: Address that the page is served at.
+        port: Port that the page is served at; 0 for any that is free.
+        native: Whether to open MuJoCo's own viewer, on this machine's screen, in place of the page.
+        on_open: Is told where the page is.
+        **conditions: As `quadrl.evaluate` takes them.
+
+    Raises:
+        QuadrlError: Something is unknown, out of range, or does not fit together.
+        RenderingUnavailable: There is no screen, or the page's library is not installed.
+    """
+    conditions["weather"] = conditions.get("weather") or "calm"
+    if native:
+        from quadrl.rendering.live import native as window
+
+        window.check_screen()
+        _, flown, scenario = setting(controller, task, **conditions)
+        window.run(Flight(flown, scenario, num_envs=num_envs, seed=seed))
+        return
+    try:
+        from quadrl.rendering.live.browser import Page
+    except ImportError as error:
+        raise RenderingUnavailable(
+            f"quadrl view needs {error.name}: install the extra `view` of quadrl"
+        ) from error
+    name, flown, scenario = setting(controller, task, **conditions)
+    flight, name = Flight(flown, scenario, num_envs=num_envs, seed=seed), label or name
+    page = Page(flight, {name: lambda: flown} | others(scenario), host=host, port=port)
+    try:
+        on_open(f"{name} flies {scenario.task.name}: open {page.address} (Ctrl-C ends it)")
+        page.run()
+    finally:
+        page.close()
+
+
+def others(scenario: Scenario) -> dict[str, Callable[[], Controller]]:
+    """Policies that come with quadrl for the task of a scenario, and controllers, by name."""
+    task, vehicle, policies = scenario.task, scenario.aircraft, {}
+    for file in shipped():
+        policy = Policy.load(file)
+        # The aircraft stays the same, so that its commands have to mean what they did in training.
+        scale = policy.scenario.aircraft.action_scale
+        if policy.task == task.name and scale == vehicle.action_scale:
+            policies[file.stem] = lambda policy=policy: policy
+    return policies | {
+        name: lambda name=name: make_controller(name, task, vehicle) for name in CONTROLLERS
+    }
