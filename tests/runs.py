@@ -4,8 +4,11 @@ import contextlib
 import csv
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+from tensordict import TensorDict
 
 from quadrl.base.errors import QuadrlError
 from quadrl.evaluation.evaluate import evaluate
@@ -59,6 +62,36 @@ def metrics(folder: Path) -> list[dict[str, str]]:
     """The rows of metrics.csv but for the wall clock."""
     with open(folder / "metrics.csv", newline="") as file:
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+@pytest.fixture
+def one_thread():
+    """As in a training: on a busy machine a second one costs more than it gives."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def disturbed(actor: Any) -> Any:
+    """A policy away from the start, where the mean hardly depends on the weights."""
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter += 0.3 * torch.randn_like(parameter)
+    return actor
+
+
+def batch_of(actor: Any, size: int, seed: int = 0, rows: int = 24) -> Any:
+    """What an actor did with observations of a size."""
+    torch.manual_seed(seed)
+    batch = TensorDict({"observation": torch.randn(rows, size)}, [rows])
+    with torch.no_grad():
+        batch = actor(batch)
+    # Better the nearer the first action is to 0.5: an advantage that a policy can climb.
+    advantage = -(batch["action"][:, :1] - 0.5).square()
+    batch["advantage"] = (advantage - advantage.mean()) / advantage.std()
+    batch["value_target"] = batch["observation"][:, :1].clone()
+    return batch
 
 
 def contents(folder: Path) -> dict[str, bytes]:

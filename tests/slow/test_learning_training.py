@@ -205,8 +205,6 @@ def test_a_damaged_checkpoint_is_refused_and_nothing_is_touched(copy, damage):
     ("change", "name", "value"),
     [
         ({"task": "random_waypoint"}, "task", "hover"),
-        ({"task_options": {}}, "task_options.time_limit", 0.5),
-        ({"vehicle": "racer"}, "vehicle", "paper"),
         ({"gamma": 0.5}, "gamma", TINY.gamma),
     ],
 )

@@ -1,13 +1,17 @@
 """quadrl.train, evaluate, render and plot, and what they return shows of itself."""
 
+import shutil
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
-import numpy as np
 import pytest
+from rich.console import Console
 from runs import TINY, refused
 
 import quadrl
 from quadrl.base.errors import QuadrlError
+from quadrl.base.progress import ProgressBar
 from quadrl.cli import main
 from quadrl.evaluation.controllers import make_controller
 from quadrl.learning.config import TrainConfig
@@ -42,8 +46,6 @@ def test_train_takes_all_settings_at_once(run, tmp_path):
 
 
 def test_train_goes_on_further(run, tmp_path):
-    import shutil
-
     folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
     further = quadrl.train(resume=folder, steps=256, episodes=2)
     assert further.policy.metadata["steps"] == 256 == further.config.steps
@@ -51,13 +53,11 @@ def test_train_goes_on_further(run, tmp_path):
         quadrl.train(resume=folder, seed=4)
 
 
-def test_the_folder_of_a_run_is_a_new_one(tmp_path, monkeypatch):
-    assert free_folder(tmp_path / "a") == tmp_path / "a"
-    for name in ("a", "a-2"):
+def test_the_folder_of_a_run_is_a_new_one(tmp_path):
+    for name in ("a", "a-2", "a-3"):
         assert free_folder(tmp_path / "a") == tmp_path / name
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").touch()
-    assert free_folder(tmp_path / "a") == tmp_path / "a-3"
 
 
 def test_evaluate_takes_whatever_flies(run, tmp_path):
@@ -88,16 +88,12 @@ def test_an_evaluation_has_the_task_and_the_vehicle_of_the_training(run):
         (dict(controller=lambda seen: seen), "task"),
         (dict(controller="hover", episodes=0), "episodes"),
         (dict(controller="hover", seed=-1), "seed"),
-        (dict(controller="hover", radius=-1.0), "hover radius"),
         (dict(controller="hover", vehicle="brick"), "vehicle"),
-        (dict(controller="geometric", sampled=True), "sampled"),
     ],
 )
 def test_evaluations_that_cannot_be(arguments, name):
     with refused(name):
         quadrl.evaluate(**arguments)
-    with pytest.raises(QuadrlError):
-        quadrl.evaluate("nowhere")
 
 
 @pytest.mark.parametrize(("kind", "begins"), [("mp4", b"ftyp"), ("gif", b"GIF8"), ("png", b"PNG")])
@@ -140,29 +136,16 @@ def test_notebooks_show_results(run):
     assert 'src="data:image/png;base64,' in quadrl.plot(run)._repr_html_()
 
 
-def test_a_notebook_updates_one_line(run, monkeypatch):
+def test_a_notebook_updates_one_line(monkeypatch):
     lines = []
 
-    class Handle:
-        def update(self, content, raw):
-            lines.append(content["text/plain"])
-
-    def display(content, raw, display_id):
-        assert display_id
+    def display(content, raw, display_id=None):
         lines.append(content["text/plain"])
-        return Handle()
+        return SimpleNamespace(update=display)
 
-    class Display:
-        pass
-
-    Display.display = staticmethod(display)
-    monkeypatch.setitem(__import__("sys").modules, "IPython.display", Display)
-    from rich.console import Console
-
-    from quadrl.base.progress import ProgressBar
-
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
     with ProgressBar(Console(force_jupyter=True)) as bar:
         for done in range(1, 5):
             bar.update(done, 4, "drawing")
     assert lines and "━" * ProgressBar.WIDTH in lines[-1] and "drawing" in lines[-1]
-    assert np.all([len(line) == len(lines[0]) for line in lines])
+    assert len({len(line) for line in lines}) == 1

@@ -128,12 +128,10 @@ def resolved(monkeypatch, *arguments: str) -> tuple[TrainConfig, Path]:
     ("arguments", "expected"),
     [
         ((), TrainConfig("hover")),
-        (("landing",), TrainConfig("landing")),
         # A word that is another option's value is not the task, wherever it stands.
         (("--out", "landing", "hover"), TrainConfig("hover")),
         (("hover", "--out", "landing"), TrainConfig("hover")),
         (("--algo", "gae", "hover"), TrainConfig("hover", algo="vpg")),
-        (("hover", "--algo=gae"), TrainConfig("hover", algo="vpg")),
         (("hover", "--algo", "gae", "--algo", "ppo"), TrainConfig("hover")),
         (("--vehicle", "racer", "landing"), TrainConfig("landing", vehicle="racer")),
         (("hover", "--gamma", "0.5"), TrainConfig("hover", gamma=0.5)),
@@ -237,14 +235,6 @@ def test_evaluate_prints_one_json_object_and_nothing_else(run, capsys):
     assert "geometric controller" in capsys.readouterr().out
 
 
-def test_controllers_fly_every_aircraft(capsys):
-    options = ["--task", "hover", "--episodes", "2", "--json"]
-    for controller, vehicle in (("geometric", "hexa"), ("lqr", "crazyflie")):
-        words = ["--controller", controller, "--vehicle", vehicle, *options]
-        assert command("evaluate", *words) == 0
-        assert json.loads(capsys.readouterr().out)["success_rate"] == 1.0
-
-
 def test_render_writes_a_video_that_plays(run, tmp_path, capsys):
     path = tmp_path / "new" / "a.mp4"
     size = ["--width", "160", "--height", "120", "--fps", "20", "--camera", "chase"]
@@ -252,12 +242,6 @@ def test_render_writes_a_video_that_plays(run, tmp_path, capsys):
     assert capsys.readouterr().out == f"wrote {path}\n"
     # Ten of the flight, and a second of the outcome.
     assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (30, 1.5)
-    played = subprocess.run(
-        [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "null", "-"],
-        capture_output=True,
-        text=True,
-    )
-    assert played.returncode == 0 and "160x120" in played.stderr
 
 
 def test_plot(copy, capsys):
@@ -339,10 +323,7 @@ def test_the_settings_that_are_shown_are_those_of_the_command(refusal, monkeypat
     ("words", "name"),
     [
         (["landing"], "task"),
-        (["--gamma", "0.5"], "gamma"),
         (["--ppo.clip", "0.1"], "ppo"),
-        (["--task-options", "tilt=0.1"], "task_options"),
-        (["--seed", "5"], "seed"),
         (["--out", "elsewhere"], "out"),
         (["--steps", "100"], "steps"),
     ],
@@ -427,28 +408,23 @@ def test_a_table_of_the_flights(tmp_path, capsys):
 
 
 def test_evaluations_in_wind_and_with_noise(capsys, refusal):
+    drawn = {"mass": [0.9, 1.1], "noise": {"position": 0.01}}
+    wind = ("--randomization", json.dumps(drawn), "--weather", '{"wind_speed": 2.0}')
     returns = []
-    for words in ((), ("--weather", "light"), ("--sampled",)):
+    for words in ((), ("--weather", "light"), ("--sampled",), wind):
         assert command("evaluate", "hover", "--episodes", "3", "--json", *words) == 0
         returns.append(json.loads(capsys.readouterr().out)["return_mean"])
-    assert len(set(returns)) == 3
-    words = ("--controller", "lqr", "--sampled")
-    assert refusal("evaluate", *words)[0].name == "sampled"
-    assert refusal("evaluate", "hover", "--weather", "windy")[0].name == "weather"
-
-
-def test_what_disturbs_may_be_given_by_its_fields(capsys, refusal):
-    drawn = {"mass": [0.9, 1.1], "noise": {"position": 0.01}}
-    words = ("--randomization", json.dumps(drawn), "--weather", '{"wind_speed": 2.0}')
-    assert command("evaluate", "hover", "--episodes", "3", "--json", *words) == 0
-    reached = json.loads(capsys.readouterr().out)["return_mean"]
+    assert len(set(returns)) == 4
     alone = quadrl.evaluate(
         "hover", episodes=3, randomization=drawn, weather=Weather(wind_speed=2.0)
     )
-    assert reached == pytest.approx(alone.metrics["return_mean"], rel=1e-5)
+    assert returns[-1] == pytest.approx(alone.metrics["return_mean"], rel=1e-5)
     for text in ('{"mass": [0.9', '{"masses": 1}'):
         refused, _ = refusal("evaluate", "hover", "--randomization", text)
         assert "randomization" in refused.name
+    words = ("--controller", "lqr", "--sampled")
+    assert refusal("evaluate", *words)[0].name == "sampled"
+    assert refusal("evaluate", "hover", "--weather", "windy")[0].name == "weather"
 
 
 WORDS = '    "Largest distance from the waypoint at the start [m]."\n'
@@ -498,20 +474,13 @@ def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, firs
 @pytest.mark.parametrize(
     ("arguments", "name", "value"),
     [
-        (["--num-envs", "0"], "num_envs", 0),
         (["--algo", "sac"], "algo", "sac"),
         (["--task-options", "radius=-1"], "hover radius", -1),
-        (["--task-options", "tolerance=-1"], "hover tolerance", -1),
-        (["--task-options", "settle_time=11"], "hover settle_time", 11),
         (["--task-options", "tilt=10"], "hover options", {"tilt": 10, "spin": 0.6}),
-        (["--task-options", "radius=5"], "hover options", {"radius": 5, "tilt": 0.3, "spin": 0.6}),
-        (["--vehicle", "brick"], "vehicle", "brick"),
         (["--seed", "4294967296"], "seed", 2**32),
         (["--episodes", "0"], "episodes", 0),
-        (["--ppo.minibatch", "0"], "ppo.minibatch", 0),
         (["--task-options", "horizn=5"], "hover option", "horizn"),
         (["--task-options", "time_limit"], "task option", "time_limit"),
-        (["--task-options", "time_limit=far"], "hover time_limit", "far"),
     ],
 )
 def test_trainings_that_cannot_be_are_refused(refusal, tmp_path, arguments, name, value):
@@ -604,14 +573,10 @@ def test_a_policy_for_another_layout(refusal, run):
     ("arguments", "name"),
     [
         (["evaluate", "--episodes", "0"], "episodes"),
-        (["evaluate", "--seed", "-1"], "seed"),
-        (["evaluate", "--vehicle", "brick"], "vehicle"),
         (["evaluate", "--task-options", "x=1"], "hover option"),
         (["evaluate", "--task-options", "x"], "task option"),
         (["render", "--camera", "chse"], "camera"),
         (["render", "--width", "161"], "width"),
-        (["render", "--height", "1081"], "height"),
-        (["render", "--fps", "0"], "fps"),
         (["render", "--out", "a.avi"], "path"),
         (["plot", "--out", "a.xyz"], "ending of a.xyz"),
     ],

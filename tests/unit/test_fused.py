@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from runs import refused
+from runs import one_thread, refused  # noqa: F401
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import set_recurrent_mode
@@ -18,6 +18,7 @@ from quadrl.learning.networks import make_actor_critic
 from quadrl.learning.ppo import PPO
 from quadrl.learning.settings import PPOConfig
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 ROWS = 60
 CASES = {
     "plain": {},
@@ -28,14 +29,6 @@ CASES = {
     "both": {"holds_goal": True, "privileged": 3},
 }
 SETTINGS = [{}, {"clip": 0.1, "entropy": 0.25, "critic": 0.75}, {"critic": 0.0}]
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def networks(privileged=0, **settings):
@@ -133,11 +126,10 @@ def test_in_single_precision_it_is_rounding():
     compare(actor, critic.float(), batch, digits=1e-4, clip=0.8)
 
 
-@pytest.mark.parametrize("case", ["plain", "both"])
-def test_twenty_steps_end_with_the_same_weights(case):
+def test_twenty_steps_end_with_the_same_weights():
     ends = []
     for fused in (True, False):
-        actor, critic, normalisers = networks(**CASES[case])
+        actor, critic, normalisers = networks(**CASES["both"])
         config = PPOConfig(epochs=5, minibatch=16, entropy=0.25, fused=fused)
         algorithm = PPO(actor, critic, config)
         batch = batch_of(actor, normalisers, rows=64)

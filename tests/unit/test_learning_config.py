@@ -92,7 +92,6 @@ def test_a_training_has_at_least_the_steps_that_are_asked_for():
     [
         ({"gamma": 2.0}, "gamma", 2.0),
         ({"seed": 2**32}, "seed", 2**32),
-        ({"seed": 1.0}, "seed", 1.0),
         ({"num_envs": 0}, "num_envs", 0),
         ({"num_envs": 1, "rollout": 1}, "num_envs * rollout", 1),
         ({"steps": -5}, "steps", -5),
@@ -104,7 +103,6 @@ def test_a_training_has_at_least_the_steps_that_are_asked_for():
         ({"control_mode": "thrust"}, "control_mode", "thrust"),
         ({"ppo": {"minibatch": -1}}, "ppo.minibatch", -1),
         ({"ppo": {"learning_rate": math.inf}}, "ppo.learning_rate", math.inf),
-        ({"ppo": {"clip": 0.0}}, "ppo.clip", 0.0),
         ({"ppo": {"entropy": -0.1}}, "ppo.entropy", -0.1),
         ({"trpo": {"iterations": 0.5}}, "trpo.iterations", 0.5),
         ({"randomization": "much"}, "randomization", "much"),
@@ -118,7 +116,6 @@ def test_a_training_has_at_least_the_steps_that_are_asked_for():
         ({"task": "hovver"}, "task", "hovver"),
         ({"gama": 0.9}, "setting", "gama"),
         ({"ppo": {"clp": 0.2}}, "setting of ppo", "clp"),
-        ({"ppo": {"epochs": 0}}, "ppo.epochs", 0),
         ({"ppo": 3}, "ppo", 3),
         ({"task_options": {"horizn": 5}}, "hover option", "horizn"),
         ({"task_options": {"time_limit": "long"}}, "hover time_limit", "long"),

@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
+from runs import batch_of, disturbed, one_thread  # noqa: F401
 from tensordict import TensorDict
 
 import quadrl
@@ -15,17 +16,9 @@ from quadrl.learning.settings import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.trpo import TRPO, flat
 from quadrl.learning.vpg import VPG
 
-SIZE, ACTIONS, ROWS = 5, 2, 24
+SIZE, ACTIONS = 5, 2
+pytestmark = pytest.mark.usefixtures("one_thread")
 ALGORITHMS = {PPO: PPOConfig(minibatch=64), TRPO: TRPOConfig(), VPG: VPGConfig(minibatch=64)}
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """As in a training: on a busy machine a second one costs more than it gives."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def actor_critic(seed=0, size=SIZE, actions=ACTIONS, hidden=(6,)):
@@ -33,26 +26,6 @@ def actor_critic(seed=0, size=SIZE, actions=ACTIONS, hidden=(6,)):
     config = TrainConfig(hidden=hidden, critic_hidden=(6,), initial_deviation=0.5, holds_goal=False)
     actor, critic, normalisers = make_actor_critic(size, actions, config)
     return actor, critic, normalisers["observation"]
-
-
-def disturbed(actor):
-    """Away from the start, where the mean hardly depends on the weights."""
-    with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter += 0.3 * torch.randn_like(parameter)
-    return actor
-
-
-def batch_of(actor, seed=0, rows=ROWS):
-    torch.manual_seed(seed)
-    batch = TensorDict({"observation": torch.randn(rows, SIZE)}, [rows])
-    with torch.no_grad():
-        batch = actor(batch)
-    # Better the nearer the first action is to 0.5: an advantage that a policy can climb.
-    advantage = -(batch["action"][:, :1] - 0.5).square()
-    batch["advantage"] = (advantage - advantage.mean()) / advantage.std()
-    batch["value_target"] = batch["observation"][:, :1].clone()
-    return batch
 
 
 # ---------------------------------------------------------------- the normaliser and the networks
@@ -115,7 +88,7 @@ def test_an_update_learns_and_its_optimisers_are_restored_bit_for_bit(kind):
 
     one = made(0)
     actor = disturbed(actor_critic(1)[0])
-    batch = batch_of(actor, rows=256)
+    batch = batch_of(actor, SIZE, rows=256)
     first = one.update(batch, remaining=1.0)["critic_loss"]
     weights = [parameter.detach().clone() for parameter in one.parameters]
     other = made(2)
@@ -137,7 +110,7 @@ def test_without_remaining_training_only_trpo_moves_the_policy(kind):
     """Learning rates are zero then; the length of TRPO's step is its bound on the divergence."""
     actor, critic, _ = actor_critic()
     algorithm = kind(actor, critic, ALGORITHMS[kind])
-    batch = batch_of(disturbed(actor), rows=256)
+    batch = batch_of(disturbed(actor), SIZE, rows=256)
     before = [
         parameter.detach().clone() for parameter in (*actor.parameters(), *critic.parameters())
     ]
@@ -153,7 +126,7 @@ def test_a_critic_that_is_far_off_does_not_hold_the_policy_back():
     policies = []
     for target in (0.0, 1e6):
         actor, critic, _ = actor_critic()
-        batch = batch_of(disturbed(actor), rows=256)
+        batch = batch_of(disturbed(actor), SIZE, rows=256)
         batch["value_target"][:] = target
         algorithm = PPO(actor, critic, PPOConfig(minibatch=64, max_gradient=0.01))
         algorithm.update(batch, remaining=1.0)
@@ -166,7 +139,7 @@ def test_a_critic_that_is_far_off_does_not_hold_the_policy_back():
 
 def test_a_critic_without_weight_stays_as_it_is():
     actor, critic, _ = actor_critic()
-    batch = batch_of(disturbed(actor))
+    batch = batch_of(disturbed(actor), SIZE)
     before = [flat(list(network.parameters())).detach().clone() for network in (actor, critic)]
     metrics = PPO(actor, critic, PPOConfig(critic=0.0)).update(batch, remaining=1.0)
     after = [flat(list(network.parameters())) for network in (actor, critic)]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from runs import batch_of, disturbed, one_thread  # noqa: F401
 from tensordict import TensorDict
 from torch.func import functional_call, jacrev
 from torchrl.modules import set_recurrent_mode
@@ -13,19 +14,11 @@ from quadrl.learning.settings import TRPOConfig
 from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
 
 SIZE, ACTIONS, ROWS = 5, 2, 24
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """As in a training: on a busy machine a second one costs more than it gives."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def trpo(seed=0, memory="none", **settings):
-    """A policy away from the start, where the mean hardly depends on the weights."""
+    """A policy away from the start, and its update."""
     torch.manual_seed(seed)
     config = TrainConfig(
         holds_goal=False,
@@ -36,22 +29,8 @@ def trpo(seed=0, memory="none", **settings):
         memory_width=4,
     )
     actor, critic, _ = make_actor_critic(SIZE, ACTIONS, config)
-    with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter += 0.3 * torch.randn_like(parameter)
+    disturbed(actor)
     return actor, TRPO(actor, critic, TRPOConfig(**settings))
-
-
-def batch_of(actor, seed=0, rows=ROWS):
-    torch.manual_seed(seed)
-    batch = TensorDict({"observation": torch.randn(rows, SIZE)}, [rows])
-    with torch.no_grad():
-        batch = actor(batch)
-    # Better the nearer the first action is to 0.5: an advantage that a policy can climb.
-    advantage = -(batch["action"][:, :1] - 0.5).square()
-    batch["advantage"] = (advantage - advantage.mean()) / advantage.std()
-    batch["value_target"] = batch["observation"][:, :1].clone()
-    return batch
 
 
 def explicit_fisher(actor, observation):
@@ -77,7 +56,7 @@ def explicit_fisher(actor, observation):
 
 def test_fisher_product_is_the_explicit_fisher_matrix():
     actor, algorithm = trpo()
-    batch = batch_of(actor)
+    batch = batch_of(actor, SIZE)
     _, kl = algorithm.loss.surrogate_and_kl(batch)
     product = fisher_product(kl, algorithm.policy, damping=0.0)
     fisher = explicit_fisher(actor, batch["observation"])
@@ -87,22 +66,6 @@ def test_fisher_product_is_the_explicit_fisher_matrix():
     torch.testing.assert_close(product(vector), expected, rtol=1e-4, atol=1e-4)
     damped = fisher_product(kl, algorithm.policy, damping=0.5)
     torch.testing.assert_close(damped(vector), expected + 0.5 * vector, rtol=1e-4, atol=1e-4)
-
-
-def test_kl_of_two_normals_in_closed_form():
-    """Per state and action: log(s2/s1) + (s1^2 + (m1 - m2)^2) / (2 s2^2) - 1/2."""
-    actor, algorithm = trpo()
-    batch = batch_of(actor)
-    mean, deviation = batch["loc"].double(), batch["scale"].double()
-    batch["loc"], batch["scale"] = batch["loc"] + 0.1, batch["scale"] * 1.5
-    first, spread = batch["loc"].double(), batch["scale"].double()
-    _, kl = algorithm.loss.surrogate_and_kl(batch)
-    expected = (deviation / spread).log() - 0.5
-    expected = expected + (spread**2 + (first - mean) ** 2) / (2 * deviation**2)
-    np.testing.assert_allclose(kl.item(), expected.sum(-1).mean().item(), rtol=1e-5)
-    losses = algorithm.loss(batch)
-    assert losses["kl"] == kl
-    assert losses["loss_critic"] == algorithm.critic_loss(batch)
 
 
 def test_conjugate_gradients_solve():
@@ -119,7 +82,7 @@ def test_conjugate_gradients_solve():
 def test_the_step_is_the_exact_natural_gradient():
     """sqrt(2 delta / g^T F^-1 g) F^-1 g, with F the explicit matrix and all iterations."""
     actor, algorithm = trpo(max_kl=1e-4, damping=0.1, iterations=400)
-    batch = batch_of(actor)
+    batch = batch_of(actor, SIZE)
     surrogate, _ = algorithm.loss.surrogate_and_kl(batch)
     gradient = flat(torch.autograd.grad(surrogate, algorithm.policy)).double()
     fisher = explicit_fisher(actor, batch["observation"]) + 0.1 * torch.eye(len(gradient))
@@ -132,11 +95,11 @@ def test_the_step_is_the_exact_natural_gradient():
     torch.testing.assert_close(moved, metrics["step"] * expected, rtol=1e-2, atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_step_breaks_the_bound_or_loses(seed):
     actor, algorithm = trpo(seed, max_kl=0.01)
     for k in range(6):
-        batch = batch_of(actor, seed=100 * seed + k, rows=256)
+        batch = batch_of(actor, SIZE, seed=100 * seed + k, rows=256)
         with torch.no_grad():
             before, _ = algorithm.loss.surrogate_and_kl(batch)
         metrics = algorithm.natural_step(batch)
@@ -146,13 +109,6 @@ def test_no_step_breaks_the_bound_or_loses(seed):
         assert after.item() >= before.item()
         assert metrics["kl"] == pytest.approx(kl.item(), abs=1e-6)
         assert metrics["step"] > 0 and metrics["surrogate_gain"] > 0
-
-
-def counted(algorithm):
-    """The list to which each vector that the line search sets is added."""
-    tried, put = [], algorithm._set
-    algorithm._set = lambda vector: (tried.append(vector.clone()), put(vector))
-    return tried
 
 
 @pytest.mark.parametrize("beyond", [1.02, 1.5, 4.0, 1e3, 1e6])
@@ -165,28 +121,11 @@ def test_a_step_beyond_the_bound_is_followed_by_one_at_it(beyond):
     assert algorithm.shorter(float("inf")) == algorithm.shorter(float("nan")) == 0.7
 
 
-def test_the_search_goes_straight_to_the_bound(monkeypatch):
-    """Even to a bound so wide that the divergence is not quadratic; 0.9 each time takes longer."""
-    trials = {}
-    for straight in (True, False):
-        total = 0
-        for seed in range(6):
-            actor, algorithm = trpo(seed, max_kl=3.0, backtracks=40)
-            if not straight:
-                monkeypatch.setattr(algorithm, "shorter", lambda _: 0.9)
-            tried = counted(algorithm)
-            metrics = algorithm.natural_step(batch_of(actor, rows=256))
-            assert metrics["step"] > 0 and metrics["kl"] <= 3.0
-            total += len(tried)
-        trials[straight] = total
-    assert trials[True] <= 15 and trials[False] >= 20  # of 6 searches
-
-
 @pytest.mark.parametrize("cause", ["no iteration", "no gain", "not a number", "a bound too wide"])
 def test_without_a_step_the_policy_stays_bit_for_bit(cause):
     wide = {"max_kl": 1e4, "backtracks": 1} if cause == "a bound too wide" else {}
     actor, algorithm = trpo(**{"max_kl": 0.02, "backtracks": 3} | wide)
-    batch = batch_of(actor)
+    batch = batch_of(actor, SIZE)
     if cause == "no gain":
         batch["advantage"] = torch.zeros(ROWS, 1)
     if cause == "not a number":
