@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import resource
+from collections.abc import Mapping
 from pathlib import Path
 
 from quadrl.base.errors import QuadrlError
@@ -26,6 +27,14 @@ def machine() -> dict[str, str | int]:
     system = f"{platform.system()} {platform.machine()}"
     known = {"cpu": processor(), "cores": cores(), "system": system}
     return known | {"python": platform.python_version()} | versions
+
+
+def in_a_line(known: Mapping[str, str | int]) -> str:
+    """What `machine` returned, as text."""
+    rest = dict(known)
+    cpu, count, system = (rest.pop(name) for name in ("cpu", "cores", "system"))
+    versions = ", ".join(f"{name} {version}" for name, version in rest.items())
+    return f"{cpu}, {count} core{'s' if count != 1 else ''}, {system}, {versions}"
 
 
 def _cpuinfo() -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from quadrl.base.machine import in_a_line
 from quadrl.base.validation import number
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
@@ -25,7 +26,7 @@ class Benchmark:
 
     def run(self) -> None:
         """Measure and print."""
-        from quadrl.learning.benchmark import benchmark, rows, summary
+        from quadrl.learning.benchmark import benchmark, rows
 
         number("seconds", self.seconds, positive=True)
         number("repeats", self.repeats, 1, whole=True)
@@ -37,4 +38,4 @@ class Benchmark:
             return
         head = ("what", "control steps/s", "median", "share", "of", "target")
         console.print(make_table(head, rows(measured), numbers=3))
-        say(f"\n{summary(measured)}")
+        say(f"\n{in_a_line(measured['machine'])}")

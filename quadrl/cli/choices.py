@@ -8,20 +8,22 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import typing
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.base.docstrings import docstrings
 from quadrl.conditions.randomization import RANDOMIZATIONS
 from quadrl.conditions.weather import WEATHERS
 from quadrl.control import CONTROL_MODES, CONTROLLERS
 from quadrl.engines.mujoco import ENGINES
 from quadrl.learning.config import ALGORITHMS, ALIASES, MEMORIES
-from quadrl.learning.defaults import VARIANTS
+from quadrl.learning.defaults import PAIRS, VARIANTS
 from quadrl.tasks import TASKS
 
 Kind = TypeVar("Kind")
@@ -63,6 +65,7 @@ SETTINGS = {
     "weather": WeatherName,
     "randomization": RandomizationName,
     "memory": MemoryName,
+    "aerodynamics": str,
 }
 """Of settings and conditions, by name."""
 
@@ -77,6 +80,45 @@ def enforced() -> Generator[None]:
     finally:
         for spec, _ in _OFFERED:
             object.__setattr__(spec, "choices", None)
+
+
+def optional(
+    hints: Mapping[str, Any],
+    texts: Mapping[str, str],
+    default: Callable[[str], str],
+    within: str = "",
+) -> Any:
+    """A dataclass of options that are empty by default: "not given".
+
+    Args:
+        hints: The type of each option; a dataclass is a group of options.
+        texts: What help says of each.
+        default: What help says is used where an option is not given, from its whole name.
+        within: The group that they are in, with a dot.
+    """
+    fields: list[tuple[str, Any, Any]] = []
+    for name, hint in hints.items():
+        show = functools.partial(lambda whole, _: default(whole), within + name)
+        told = arg(help=texts[name], help_behavior_hint=show)
+        if name in PAIRS:
+            fields.append((name, Annotated[tuple[str, ...], told], ()))
+        elif name in SETTINGS:
+            word = Positional[SETTINGS[name]] if name == "task" else SETTINGS[name]
+            fields.append((name, Annotated[word, told], ""))
+        elif dataclasses.is_dataclass(hint):
+            words_of = docstrings(typing.cast(type, hint))
+            group = optional(types_of(hint), words_of, default, f"{within}{name}.")
+            made = dataclasses.field(default_factory=group)
+            fields.append((name, Annotated[group, arg(help=texts[name])], made))
+        else:
+            fields.append((name, Annotated[hint | None, told], None))
+    return dataclasses.make_dataclass("Options", fields, frozen=True)
+
+
+def types_of(kind: Any) -> dict[str, Any]:
+    """The types of the fields of a dataclass."""
+    hints = typing.get_type_hints(kind)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
 
 @dataclass_transform(frozen_default=True)

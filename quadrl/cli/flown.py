@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import typing
 from collections.abc import Mapping
@@ -37,24 +36,12 @@ HELP = {
 """Of conditions that Python takes in more forms than a command line."""
 
 
-def make_conditions() -> type:
-    """A dataclass with an option for each condition, empty by default: "not given"."""
-    hints, texts = typing.get_type_hints(Conditions), docstrings(Conditions)
-    fields = []
-    for name, hint in hints.items():
-        kind: Any = choices.SETTINGS.get(name, str)
-        default: Any = ""
-        if hint == Mapping[str, Any] | None or name == "observe":
-            kind, default = tuple[str, ...], ()
-        elif hint in (float | None, int | None):
-            kind, default = hint, None
-        text = HELP.get(name, texts[name])
-        text += "" if "by default" in text else "; by default the policy's, or the usual one"
-        fields.append((name, Annotated[kind, arg(help=text, help_behavior_hint="")], default))
-    return dataclasses.make_dataclass("ConditionOptions", fields, frozen=True)
-
-
-ConditionOptions: Any = make_conditions()
+USUAL = "; by default the policy's, or the usual one"
+TEXTS = {
+    name: text if "by default" in text else text + USUAL
+    for name, text in (docstrings(Conditions) | HELP).items()
+}
+ConditionOptions: Any = choices.optional(typing.get_type_hints(Conditions), TEXTS, lambda name: "")
 
 
 class Conditioned(ConditionOptions):
@@ -78,7 +65,7 @@ def parsed(given: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: parse_options(value) if name in PAIRS else parse_named(name, value)
         for name, value in given.items()
-        if value not in (None, "", (), {})
+        if value not in (None, "", {}) and (value or name not in PAIRS)
     }
 
 

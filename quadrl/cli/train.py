@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import functools
 import time
-import typing
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
@@ -26,7 +24,7 @@ from quadrl.cli.study import carry_out
 from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
-from quadrl.learning.defaults import PAIRS, flat
+from quadrl.learning.defaults import flat
 from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
@@ -61,32 +59,8 @@ def _default(name: str) -> str:
     return "" if text in ("", "{}") else f"(default: {text})"
 
 
-def optional(config: type, prefix: str = "") -> type:
-    """A dataclass with the fields of another, all None by default: "not given".
-
-    Only after everything is parsed does `TrainConfig` fill in the defaults of the task.
-    """
-    hints, texts, fields = typing.get_type_hints(config), docstrings(config), []
-    for field in dataclasses.fields(config):
-        kind, help_text = choices.SETTINGS.get(field.name, hints[field.name]), texts[field.name]
-        if dataclasses.is_dataclass(kind):
-            inner: Any = optional(typing.cast(type, kind), f"{field.name}.")
-            factory = dataclasses.field(default_factory=inner)
-            fields.append((field.name, Annotated[inner, arg(help=help_text)], factory))
-            continue
-        if field.name in PAIRS:
-            kind = tuple[str, ...]
-        hint = functools.partial(lambda name, _: _default(name), prefix + field.name)
-        hint = arg(help=help_text, help_behavior_hint=hint)
-        if field.name in choices.SETTINGS:
-            word = Positional[kind] if field.name == "task" else kind
-            fields.append((field.name, Annotated[word, hint], ""))
-        else:
-            fields.append((field.name, Annotated[kind | None, hint], None))
-    return dataclasses.make_dataclass(f"{config.__name__}Settings", fields, frozen=True)
-
-
-Settings: Any = optional(TrainConfig)
+Settings: Any = choices.optional(choices.types_of(TrainConfig), docstrings(TrainConfig), _default)
+"""Only after everything is parsed does `TrainConfig` fill in the defaults of the task."""
 
 
 @choices.command

@@ -15,6 +15,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -109,14 +110,6 @@ def rows(measured: dict[str, Any]) -> list[tuple[str, ...]]:
     return written
 
 
-def summary(measured: dict[str, Any]) -> str:
-    """The machine in a line."""
-    computer = dict(measured["machine"])
-    cpu, cores, system = (computer.pop(name) for name in ("cpu", "cores", "system"))
-    versions = ", ".join(f"{name} {version}" for name, version in computer.items())
-    return f"{cpu}, {cores} core{'s' * (cores > 1)}, {system}, {versions}"
-
-
 def _measure(works: list[Work], seconds: float, repeats: int) -> list[list[float]]:
     """Control steps per second of each, `repeats` times over."""
     for work in works:
@@ -144,47 +137,37 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
     for env in (alone, loaded, vectors):
         stack.callback(env.close)
     batch = _batched_mj_step(vehicle, model, num_envs)
-    on_cores, on_core = (_mj_step(vehicle, model, pool, count) for count in (cores(), 1))
-    many = _environment(task, num_envs=num_envs)
-    flying, windy, differing, drawn = (
-        _environment(task, num_envs=FREE_FLIGHT_ENVS, engine="free_flight", **settings)
-        for settings in (
-            {},
-            {"vehicle": air, "weather": "light"},
-            {"randomization": DIFFERENT},
-            {"randomization": FULL},
-        )
-    )
-    one = _single(alone, model.nu, lambda step: step[2] or step[3])
-    ours = _single(loaded, model.nu, lambda step: step.last())
+    flying = partial(_environment, task, num_envs=FREE_FLIGHT_ENVS, engine="free_flight")
     layers = [
-        Layer("mj_step, a loop on each core", ALL_CORES, on_cores, None, ALL_CORES),
+        Layer("mj_step, a loop on each core", ALL_CORES,
+              _mj_step(vehicle, model, pool, cores()), None, ALL_CORES),
         Layer(f"mj_step, mujoco.batch of {size}", ALL_CORES, batch, None, ALL_CORES),
         Layer("the same with mujoco's own stage clock", ALL_CORES, _with_clock(batch)),
-        Layer(f"Environment of {size}", ALL_CORES, many, 0.90),
-        Layer(f"Environment of {free}, {FREE_FLIGHT}", ALL_CORES, flying, 20.0, FREE_FLIGHT),
-        Layer("the same in real air and wind", FREE_FLIGHT, windy, 1 / 3),
-        Layer("the same, different aircraft", FREE_FLIGHT, differing, 0.90),
-        Layer("the same, all that is drawn", FREE_FLIGHT, drawn),
+        Layer(f"Environment of {size}", ALL_CORES, _environment(task, num_envs=num_envs), 0.90),
+        Layer(f"Environment of {free}, {FREE_FLIGHT}", ALL_CORES, flying(), 20.0, FREE_FLIGHT),
+        Layer("the same in real air and wind", FREE_FLIGHT,
+              flying(vehicle=air, weather="light"), 1 / 3),
+        Layer("the same, different aircraft", FREE_FLIGHT, flying(randomization=DIFFERENT), 0.90),
+        Layer("the same, all that is drawn", FREE_FLIGHT, flying(randomization=FULL)),
         Layer(f"Gymnasium make_vec of {size}", ALL_CORES, _vectors(vectors)),
-    ]
+    ]  # fmt: skip
     if importlib.util.find_spec("torchrl"):
-        collector = _collector(task, num_envs, stack)
-        layers.append(
-            Layer(f"TorchRL collector of {size} with a policy", ALL_CORES, collector, 0.75)
-        )
+        what = f"TorchRL collector of {size} with a policy"
+        layers.append(Layer(what, ALL_CORES, _collector(task, num_envs, stack), 0.75))
     return [
         *layers,
-        Layer("mj_step, a loop on one core", ONE_CORE, on_core, None, ONE_CORE),
-        Layer("Gymnasium make, one aircraft", ONE_CORE, one, 0.35),
-        Layer("dm_control load, one aircraft", ONE_CORE, ours),
+        Layer("mj_step, a loop on one core", ONE_CORE,
+              _mj_step(vehicle, model, pool, 1), None, ONE_CORE),
+        Layer("Gymnasium make, one aircraft", ONE_CORE,
+              _single(alone, model.nu, lambda step: step[2] or step[3]), 0.35),
+        Layer("dm_control load, one aircraft", ONE_CORE,
+              _single(loaded, model.nu, lambda step: step.last())),
         Layer(KERNEL, ONE_CORE, _free_flight(vehicle, HEIGHT), None, KERNEL),
         Layer(f"{KERNEL} in air", KERNEL, _free_flight(air, HEIGHT), 1 / 3),
         Layer(f"{KERNEL} near the ground", KERNEL, _free_flight(air, LOW), 1 / 3),
-        Layer(
-            f"{KERNEL}, different aircraft", KERNEL, _free_flight(vehicle, HEIGHT, DIFFERENT), 0.90
-        ),
-    ]
+        Layer(f"{KERNEL}, different aircraft", KERNEL,
+              _free_flight(vehicle, HEIGHT, DIFFERENT), 0.90),
+    ]  # fmt: skip
 
 
 def _actions(*shape: int) -> Iterator[np.ndarray]:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from quadrl import tasks
+from quadrl.base.machine import in_a_line, machine
 from quadrl.core.task import Target
-from quadrl.learning import benchmark
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS, RUNS = REPOSITORY / "docs", REPOSITORY / "runs"
@@ -55,7 +55,7 @@ def commit() -> str:
 
 def save(name: str, result: Result) -> None:
     """Keep a result, with the machine and the commit that it was measured on."""
-    whole = {"machine": benchmark.machine(), "commit": commit(), **result}
+    whole = {"machine": machine(), "commit": commit(), **result}
     # A line for each list and object.
     text = re.sub(r"(?<=[\[,:]) (?=[\[{])", "\n", json.dumps(packed(whole)))
     RESULTS.mkdir(parents=True, exist_ok=True)
@@ -93,7 +93,7 @@ def beside(name: str, rows: Mapping[str, list[Result]], only: Collection[str]) -
 def source(result: Result, rows: Iterable[Result] = ()) -> str:
     """Where and at which commits a result, or rows of it, was measured, in one line."""
     at = " and ".join(sorted({row["commit"] for row in rows})) or result["commit"]
-    return f"Machine: {benchmark.summary(result)}. Measured at commit {at}."
+    return f"Machine: {in_a_line(result['machine'])}. Measured at commit {at}."
 
 
 def table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
