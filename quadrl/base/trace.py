@@ -148,17 +148,13 @@ class Trace:
         return self.known.setdefault((name, *names), symbol)
 
     def name_of(self, value: Any) -> str:
-        """How C names an operand; numbers are constants, so that options change no code."""
+        """How C names an operand; each number is a constant, so that options change no code."""
         if isinstance(value, Symbol):
             return value.name
         if _is_flag(value):
             return str(int(value))
-        number = float(value)
-        same = (k for k, x in enumerate(self.constants) if str(x) == str(number))
-        k = next(same, len(self.constants))
-        if k == len(self.constants):
-            self.constants.append(number)
-        return f"c[{k}]"
+        self.constants.append(float(value))
+        return f"c[{len(self.constants) - 1}]"
 
     def vector_jacobian_product(
         self, results: Iterable[Any], given: Iterable[Any], arguments: Iterable[Any]

@@ -193,6 +193,23 @@ def test_a_fault_of_the_task_is_raised_as_if_it_was_not_compiled():
         helpers.idle(environment)
 
 
+def test_options_change_the_numbers_and_not_the_code(monkeypatch):
+    # Also where two numbers happen to be equal: a wheel brings each task's code, for all options.
+    sources = set()
+
+    def note(source):
+        sources.add(source)
+        raise NativeError("noted")
+
+    monkeypatch.setattr(compiling, "compile_generated", note)
+    weights = {name: 1.0 for name in vars(Hover()) if name.endswith("_weight")} | {"altitude": 1.0}
+    weights["smoothness_weight"] = 0.0
+    for options in ({}, weights, {"time_limit": 1.0, "max_distance": 1.0}):
+        with pytest.warns(QuadrlWarning, match="not compiled: noted"):
+            helpers.begun(variant(options=options))
+    assert len(sources) == 1
+
+
 def test_without_a_compiler_a_task_is_run_as_it_is_written(monkeypatch):
     def fail(source):
         raise NativeError("there is no C compiler\nof any name")
