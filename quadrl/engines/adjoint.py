@@ -16,6 +16,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -69,6 +70,11 @@ def reverse(effects: int, rotors: int) -> str:
     return SOURCE.format(effects=effects, rotors=rotors, constants=constants, body=body)
 
 
+def build(effects: int, rotors: int) -> Path:
+    """Compile native/adjoint.c as `compiling.build` does, for what `kernel` takes."""
+    return compiling.build(("adjoint.c",), "adjoint", {"reverse.h": reverse(effects, rotors)})
+
+
 @functools.cache
 def kernel(effects: int, rotors: int) -> Callable[[int, int, int], None]:
     """`quadrl_adjoint` of native/adjoint.c, compiled where the cache does not hold it.
@@ -80,10 +86,7 @@ def kernel(effects: int, rotors: int) -> Callable[[int, int, int], None]:
     Raises:
         NativeError: There is no compiler, or it refused the sources.
     """
-    written = {"reverse.h": reverse(effects, rotors)}
-    function = compiling.open_library(
-        compiling.build(("adjoint.c",), "adjoint", written)
-    ).quadrl_adjoint
+    function = compiling.open_library(build(effects, rotors)).quadrl_adjoint
     function.restype = None
     function.argtypes = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64]
     return function

@@ -117,6 +117,44 @@ def test_the_other_kinds_of_library_are_checked_as_well(copying_compiler, cache,
     assert compiling.build(name=name) == path and path.read_bytes() == whole
 
 
+@pytest.fixture
+def prebuilt(copying_compiler, cache, monkeypatch, tmp_path):
+    """The libraries that a wheel brings: that of the callbacks, and one of generated C."""
+    folder = tmp_path / "prebuilt"
+    monkeypatch.setenv("QUADRL_CACHE", str(folder))
+    compiling.build(), compiling.build_generated("int f;")
+    monkeypatch.setenv("QUADRL_CACHE", str(cache))
+    monkeypatch.setattr(compiling, "PREBUILT", folder)
+    return folder
+
+
+@pytest.fixture
+def no_compiler(prebuilt, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC")
+
+
+def test_what_a_wheel_brings_needs_neither_compiler_nor_cache(prebuilt, no_compiler, cache):
+    assert {compiling.build(), compiling.build_generated("int f;")} == {*prebuilt.iterdir()}
+    assert not cache.exists()
+    with pytest.raises(native.NativeError, match="no C compiler found"):
+        compiling.build_generated("int g;")
+
+
+def test_what_a_wheel_brings_is_checked_as_well(prebuilt, cache):
+    path = compiling.build()
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    again = compiling.build()
+    assert again.parent == cache and again.read_bytes() == whole
+
+
+def test_for_another_mujoco_it_is_said_which_one_needs_no_compiler(no_compiler, monkeypatch):
+    monkeypatch.setattr(mujoco, "__version__", "3.99.0")
+    with pytest.raises(native.NativeError, match=r"with mujoco 3\.\d+\.\d+ none would be needed"):
+        compiling.build()
+
+
 def test_a_library_without_a_digest_of_an_earlier_version_is_built_anew(copying_compiler, cache):
     path = compiling.build()
     path.unlink()

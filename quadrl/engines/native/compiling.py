@@ -5,6 +5,8 @@ it reads the structs of exactly that version. A library is kept in a cache folde
 else the user's cache folder), one for each version of mujoco, of the sources and of the flags;
 `$QUADRL_CFLAGS` adds flags at the end of these (`scripts/sanitize` does). Its name ends with a
 digest of its bytes, so that one that was damaged is known before it is loaded, and built anew.
+A wheel for one kind of machine brings libraries of the same names, which come first: they need no
+compiler (`quadrl.deploy.wheels` makes them).
 `layout.h`, which declares a row of parameters and the rows of the state and of the weather, is
 written into the build from `quadrl.aircraft.parameters`, `quadrl.engines.state` and
 `quadrl.engines.air`.
@@ -50,6 +52,8 @@ FLAGS = (
 )
 
 _FOLDER = Path(__file__).parent
+PREBUILT = _FOLDER / "prebuilt"
+"""Libraries that a wheel for this kind of machine brings; there is no such folder without one."""
 _SCRATCH = "quadrl-build-"
 _ALONE: dict[Path, contextlib.ExitStack] = {}
 """Libraries of this process alone that are not loaded yet, and what removes each."""
@@ -78,10 +82,13 @@ def compiler() -> str:
     for name in filter(None, (os.environ.get("CC"), "cc", "gcc", "clang")):
         if path := shutil.which(name):
             return path
+    prebuilt = sorted({path.name.split("-")[2] for path in PREBUILT.glob("quadrl-mujoco-*.so")})
+    other = prebuilt and mujoco.__version__ not in prebuilt
     raise NativeError(
         "no C compiler found (looked for $CC, cc, gcc, clang); install one: "
         "`apt-get install build-essential` on Debian or Ubuntu, `dnf install gcc` on Fedora, "
         "`xcode-select --install` on macOS"
+        + (f"; with mujoco {' or '.join(prebuilt)} none would be needed" if other else "")
     )
 
 
@@ -91,7 +98,7 @@ def build(
     generated: Mapping[str, str] | None = None,
     include: Path | None = None,
 ) -> Path:
-    """Compile a library unless the cache holds it.
+    """Compile a library unless it is prebuilt or the cache holds it.
 
     Args:
         sources: Files beside this one.
@@ -106,7 +113,7 @@ def build(
         NativeError: There is no compiler, or it refused the sources.
     """
     include = include or Path(mujoco.__file__).parent / "include"
-    digest = hashlib.sha256(" ".join((*flags(), platform.machine(), str(include))).encode())
+    digest = hashlib.sha256(" ".join((*flags(), platform.machine())).encode())
     written = {"layout.h": c_structs() + c_rows() + c_weather()} | dict(generated or {})
     digest.update("".join(written.values()).encode())
     for file in (*HEADERS, *sources):
@@ -117,20 +124,28 @@ def build(
     return _cached(whole, [f"-I{include}", *paths], written)
 
 
-@functools.cache
-def compile_generated(source: str) -> ctypes.CDLL:
-    """A library of C that was generated, compiled unless the cache holds it.
+def build_generated(source: str) -> Path:
+    """Compile a library of C that was generated, unless it is prebuilt or the cache holds it.
+
+    Returns:
+        Its path.
 
     Raises:
         NativeError: There is no compiler, or it refused the source.
     """
     digest = hashlib.sha256(" ".join((*flags(), platform.machine(), source)).encode())
     name = digest.hexdigest()[:16]
-    return open_library(_cached(f"quadrl-generated-{name}", [], {f"{name}.c": source}))
+    return _cached(f"quadrl-generated-{name}", [], {f"{name}.c": source})
+
+
+@functools.cache
+def compile_generated(source: str) -> ctypes.CDLL:
+    """Open the library of C that was generated, as `build_generated` makes it."""
+    return open_library(build_generated(source))
 
 
 def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
-    """A library of the cache, compiled first where there is no sound one.
+    """A library, prebuilt or of the cache, compiled first where there is no sound one.
 
     Args:
         name: Of its file, without digest and ending; another one for other contents.
@@ -138,10 +153,11 @@ def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
         written: Files that are written first, by name: headers, and sources to compile.
     """
     folder = cache_folder()
-    with contextlib.suppress(OSError):  # a folder that may not be looked into
-        for path in folder.glob(f"{name}-*.so"):
-            if path == _place(path, name):
-                return path
+    for place in (PREBUILT, folder):
+        with contextlib.suppress(OSError):  # a folder that may not be looked into
+            for path in place.glob(f"{name}-*.so"):
+                if path == _place(path, name):
+                    return path
     with contextlib.ExitStack() as stack:
         try:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
