@@ -327,13 +327,9 @@ def test_the_panel_shows_rotor_speeds_in_its_corner_and_the_outcome_below(rotors
     panel = Panel(240, "x" * 200, [(1.0, 0.42, 0.1)] * rotors)  # a title that is cut
     assert not panel.fits(160, 120) and (rotors == 8 or panel.fits(360, 280))
     blank = np.full((240, 400, 3), 128, np.uint8)
-    slow, fast, good, bad = (blank.copy() for _ in range(4))
-    for picture, share, end in (
-        (slow, 0, ""),
-        (fast, 1, ""),
-        (good, 0, SUCCESS),
-        (bad, 0, FAILURE),
-    ):
+    slow, fast, good, bad = pictures = [blank.copy() for _ in range(4)]
+    shown = (0, ""), (1, ""), (0, SUCCESS), (0, FAILURE)
+    for picture, (share, end) in zip(pictures, shown, strict=True):
         panel.draw(picture, ["0.10 s", "0.12 m"], np.full(rotors, share), outcome=end)
     rows, columns = np.nonzero(changed(blank, slow, by=3))
     # 18 pixels of margin, 138 of height and 310 + 21 a rotor of width, times 0.72.
@@ -399,8 +395,7 @@ def test_what_cannot_be_a_video_is_refused_before_anything_is_written(model, nam
 
 
 @leaves_pipes
-@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit])
-def test_what_is_written_tells_its_progress_and_can_be_stopped(model, stop):
+def test_what_is_written_tells_its_progress_and_can_be_stopped(model):
     done = []
 
     def stopping(*progress):
@@ -408,10 +403,10 @@ def test_what_is_written_tells_its_progress_and_can_be_stopped(model, stop):
         if len(done) == 2:
             raise stop
 
-    for write, path, total in (
-        (write_video, "b.mp4", 5),
-        (write_video, "b.gif", 5),
-        (write_contact_sheet, "b.png", 12),
+    for write, path, total, stop in (
+        (write_video, "b.mp4", 5, KeyboardInterrupt),
+        (write_video, "b.gif", 5, SystemExit),
+        (write_contact_sheet, "b.png", 12, KeyboardInterrupt),
     ):
         done.clear()
         with pytest.raises(stop):
@@ -586,10 +581,7 @@ def test_no_graphics_library_is_reported(model, monkeypatch):
         Renderer(model, **SMALL)
 
 
-headless = pytest.mark.skipif(sys.platform != "linux", reason="only Linux draws without a screen")
-
-
-@headless
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux draws without a screen")
 def test_triton_is_loaded_with_its_own_symbols(monkeypatch, tmp_path):
     library = tmp_path / "triton" / "_C" / "libtriton.so"
     library.parent.mkdir(parents=True)

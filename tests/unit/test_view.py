@@ -38,31 +38,12 @@ def hover(count=1, vehicle=VEHICLE, **options):
 def page():
     """A page of two aircraft, served to nobody."""
     browser = pytest.importorskip("quadrl.rendering.live.browser", exc_type=ModuleNotFoundError)
-    task = tasks.make("hover")
-    geometric = make_controller("geometric", task, VEHICLE)
-    choices = {
-        "geometric": lambda: geometric,
-        "policy": lambda: Policy.pretrained("hover"),
-        "of another task": lambda: Policy.pretrained("target_following"),
-    }
-    flight = Flight(geometric, Scenario.of(task, vehicle=VEHICLE), num_envs=2)
+    flight = hover(2)
+    geometric = flight.controller
+    choices = {"geometric": lambda: geometric, "policy": lambda: Policy.pretrained("hover")}
+    choices["of another task"] = lambda: Policy.pretrained("target_following")
     with contextlib.closing(browser.Page(flight, choices, port=0)) as page:
         yield page
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return probe.getsockname()[1]
-
-
-def command(*arguments):
-    """Exit code of the command in this process."""
-    try:
-        cli.main([str(argument) for argument in arguments])
-    except SystemExit as end:
-        return end.code
-    return 0
 
 
 def test_time_passes_as_fast_as_it_is_told_to():
@@ -182,11 +163,8 @@ def test_meshes_are_those_of_the_model(vehicle):
         checked += 1
     assert [rgba[3] < 1 for _, rgba in seen.clear] == [True] * 3  # the discs: front, side, back
     assert checked > 4 * model.nu  # arm, sleeve, two blades and rim of each rotor
-    wall_corners = corners(seen.world)
-    assert (wall_corners.min(0), wall_corners.max(0)) == (
-        pytest.approx([2.9, -2, 0]),
-        pytest.approx([3.1, 2, 2]),
-    )
+    ends = [getattr(corners(seen.world), end)(0) for end in ("min", "max")]
+    np.testing.assert_allclose(ends, [[2.9, -2, 0], [3.1, 2, 2]], rtol=1e-6)
     assert meshes.of_model(mjcf.compile_model(resolve(vehicle))).world is None
 
 
@@ -308,7 +286,8 @@ def test_what_cannot_be_shown_is_said_in_one_line(capsys, monkeypatch):
     pytest.importorskip("viser")
 
     def said(*words):
-        assert command("view", "hover", *words) == 2
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(["view", "hover", *words])
         text = capsys.readouterr().err
         assert text.count("\n") == 1
         return text
@@ -316,8 +295,8 @@ def test_what_cannot_be_shown_is_said_in_one_line(capsys, monkeypatch):
     with socket.socket() as taken:
         taken.bind(("localhost", 0))
         taken.listen()
-        port = taken.getsockname()[1]
-        assert str(port) in said("--port", port)
+        port = str(taken.getsockname()[1])
+        assert port in said("--port", port)
     if sys.platform == "linux":  # other systems always have a screen
         for name in ("DISPLAY", "WAYLAND_DISPLAY"):
             monkeypatch.delenv(name, raising=False)
@@ -329,21 +308,16 @@ def test_what_cannot_be_shown_is_said_in_one_line(capsys, monkeypatch):
 
 def test_the_command_serves_until_it_is_interrupted(capsys, monkeypatch):
     browser = pytest.importorskip("quadrl.rendering.live.browser", exc_type=ModuleNotFoundError)
-    frames = []
+    served = []
 
     def frame(page, seconds):
-        frames.append(fetch(page.address))
+        with urllib.request.urlopen(page.address, timeout=10) as answer:
+            served.append((page.address, answer.read()))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(browser.Page, "frame", frame)
-    port = free_port()
-    assert command("view", "--controller", "lqr", "--num-envs", 3, "--port", port) == 0
-    assert b"<html" in frames[0]
-    assert str(port) in capsys.readouterr().out
+    cli.main("view --controller lqr --num-envs 3 --port 0".split())
+    ((address, text),) = served
+    assert b"<html" in text and address in capsys.readouterr().out
     with socket.socket() as probe:
-        assert probe.connect_ex(("localhost", port)) != 0
-
-
-def fetch(address):
-    with urllib.request.urlopen(address, timeout=10) as answer:
-        return answer.read()
+        assert probe.connect_ex(("localhost", int(address.rpartition(":")[2]))) != 0

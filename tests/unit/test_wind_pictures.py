@@ -1,6 +1,5 @@
 """Wind in pictures: streaks that go where the air goes, its strength in the panel."""
 
-import dataclasses
 import types
 
 import helpers
@@ -25,6 +24,12 @@ def heads(lines):
     return (np.array([line.points[end] for line in seen]) for end in (-1, 0))
 
 
+def assert_moved(before, after, way, share=2, atol=1e-12):
+    """Of the streaks that are seen before (n, 3), one of `share` is found again, a way further."""
+    apart = np.linalg.norm(after[:, None] - (before + way), axis=-1).min(axis=0)
+    assert np.sort(apart)[: len(apart) // share].max() < atol
+
+
 def test_streaks_point_where_the_air_goes_and_drift_with_it():
     wind = np.array([6.0, -3.0, 0.5])
     shown = streaks(HIGH, wind, np.zeros(3), 1.0)
@@ -35,12 +40,9 @@ def test_streaks_point_where_the_air_goes_and_drift_with_it():
     assert (np.diff(shown[0].rgba[:, 3]) >= 0).all() and shown[0].rgba[0, 3] > 0  # the head leads
     # A centimetre of drift moves each by a centimetre, and so does none of the aircraft's ways.
     moved, _ = heads(streaks(HIGH, wind, np.array([0.01, 0, 0]), 1.0))
-    shifted = ends + (0.01, 0, 0)
-    apart = np.linalg.norm(moved[:, None] - shifted, axis=-1).min(axis=0)
-    assert np.sort(apart)[: len(apart) // 2].max() < 1e-12
+    assert_moved(ends, moved, (0.01, 0, 0))
     still, _ = heads(streaks(HIGH + (0.01, 0, 0), wind, np.zeros(3), 1.0))
-    apart = np.linalg.norm(still[:, None] - ends, axis=-1).min(axis=0)
-    assert np.sort(apart)[: len(apart) // 2].max() < 1e-12
+    assert_moved(ends, still, 0.0)
 
 
 def test_streaks_are_short_in_a_storm_small_with_a_small_aircraft_and_above_the_ground():
@@ -62,11 +64,8 @@ def flown():
 
 def test_a_flight_is_drawn_in_its_wind(flown, monkeypatch, cheap_pictures):
     asked, written = [], []
-    monkeypatch.setattr(
-        Renderer,
-        "frame",
-        lambda self, *_, **o: asked.append(o) or np.zeros((120, 160, 3), np.uint8),
-    )
+    blank = np.zeros((120, 160, 3), np.uint8)
+    monkeypatch.setattr(Renderer, "frame", lambda self, *_, **o: asked.append(o) or blank)
     monkeypatch.setattr(overlay.Panel, "draw", lambda self, _, lines, *__: written.append(lines))
     model = mjcf.compile_model(flown[0].vehicle)
     for one in flown:
@@ -81,9 +80,7 @@ def test_a_flight_is_drawn_in_its_wind(flown, monkeypatch, cheap_pictures):
         np.testing.assert_allclose(ends - begins, np.tile(wind[k] * 0.05, (len(ends), 1)))
     # From one picture to the next the air goes on by its wind.
     one, other = (next(heads(windy[k]["markers"])) for k in (4, 5))
-    way = 0.05 * (wind[4] + wind[5]) / 2
-    apart = np.linalg.norm(other[:, None] - (one + way), axis=-1).min(axis=0)
-    assert np.sort(apart)[: len(apart) // 3].max() < 1e-9
+    assert_moved(one, other, 0.05 * (wind[4] + wind[5]) / 2, share=3, atol=1e-9)
     assert all(one["markers"] == () for one in calm) and len(written[-1]) == 4
 
 
@@ -114,8 +111,7 @@ def test_a_flight_in_progress_hands_on_how_far_the_air_has_come():
     wind = np.array([4.0, 0, 0])
     times, still = (0.0, 0.01, 0.0), np.zeros(4)
     seen = [flying.picture(recorder, t, pose, still, HIGH, (), wind) for t in times]
-    apart = np.linalg.norm(seen[1][:, None] - (seen[0] + 0.01 * wind), axis=-1).min(axis=0)
-    assert np.sort(apart)[: len(apart) // 2].max() < 1e-12
+    assert_moved(seen[0], seen[1], 0.01 * wind)
     np.testing.assert_array_equal(seen[2], seen[0])  # another flight begins anew
 
 
@@ -124,4 +120,3 @@ def test_a_resampled_flight_has_its_wind(flown):
     assert calm.wind is None and calm.resampled(40).wind is None
     np.testing.assert_array_equal(flight.wind, flown[0].rollout.wind[:, 0])
     np.testing.assert_allclose(flight.resampled(40).wind[::2], flight.wind, atol=1e-12)
-    assert dataclasses.replace(flight, wind=None).resampled(20).wind is None
