@@ -21,8 +21,10 @@ from quadrl.evaluation.evaluate import html_table
 NORMAL_95 = 1.959963984540054  # the normal distribution's quantile of 97.5 %
 QUARTILES = (0.25, 0.5, 0.75)
 FORMAT = "quadrl-robustness-1"
-FILE = "robustness"
-"""What the files of a card are called, without their endings."""
+FILE, RECOVERY = "robustness", "recovery"
+"""What the files of a card are called, and the pictures of its maps, without their endings."""
+KINDS = ("png", "pdf")
+"""What these endings are, of pictures."""
 
 
 def wilson(successes: float, flights: int) -> tuple[float, float]:
@@ -106,9 +108,7 @@ class Card:
     @property
     def figure(self) -> Media:
         """Success and error over every disturbance."""
-        from quadrl.evaluation import card_figures, plotting
-
-        return Media(plotting.content(card_figures.card(self.found), "png"), "png")
+        return Media(*self._drawn(FILE, "png"), "png")
 
     @property
     def maps(self) -> Media:
@@ -117,29 +117,22 @@ class Card:
         Raises:
             QuadrlError: None were flown.
         """
-        from quadrl.evaluation import card_figures, plotting
-
         if not self.found["recovery"]:
             raise QuadrlError("there are no recovery maps: recovery was False")
-        return Media(plotting.content(card_figures.maps(self.found), "png"), "png")
+        return Media(*self._drawn(RECOVERY, "png"), "png")
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write numbers (.json, .csv) and pictures (.png, .pdf) into a folder; returns the paths.
 
         The pictures of the recovery maps are called recovery.png and recovery.pdf.
         """
-        from quadrl.evaluation import card_figures, plotting
-
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"format": FORMAT, **self.found}, indent=1, allow_nan=False) + "\n"
         contents = {f"{FILE}.json": text.encode(), f"{FILE}.csv": self._csv().encode()}
-        pictures = {FILE: card_figures.card(self.found)}
-        if self.found["recovery"]:
-            pictures["recovery"] = card_figures.maps(self.found)
-        for name, picture in pictures.items():
-            for kind in ("png", "pdf"):
-                contents[f"{name}.{kind}"] = plotting.content(picture, kind)
+        for name in [FILE, *[RECOVERY] * bool(self.found["recovery"])]:
+            for kind, picture in zip(KINDS, self._drawn(name, *KINDS), strict=True):
+                contents[f"{name}.{kind}"] = picture
         for name, content in contents.items():
             write_whole(folder / name, content)
         if self.kept:
@@ -163,6 +156,14 @@ class Card:
         if written != FORMAT:
             raise QuadrlError(name=f"format of {file}", value=written, allowed=FORMAT)
         return cls(found)
+
+    def _drawn(self, name: str, *kinds: str) -> list[bytes]:
+        """One of its pictures, as files of some kinds."""
+        from quadrl.evaluation import card_figures, plotting  # they take a second
+
+        draw = card_figures.maps if name == RECOVERY else card_figures.card
+        figure = draw(self.found)
+        return [plotting.content(figure, kind) for kind in kinds]
 
     def _csv(self) -> str:
         text = io.StringIO(newline="")

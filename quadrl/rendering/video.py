@@ -175,7 +175,7 @@ def write_video(
         if kind == "mp4" and options.get(name, 0) % 2:
             raise QuadrlError(name=name, value=options[name], allowed="even for a video")
     flights = listed(trajectory)
-    start, end = _span(flights)
+    start, end = min(one.time[0] for one in flights), max(one.time[-1] for one in flights)
     number("fps", fps, 1, MAX_FPS)
     times = np.arange(start, end + 1e-9, 1 / fps)
     if any(flight.outcome for flight in flights):
@@ -238,11 +238,6 @@ def listed(one_or_more: Any, count: int = 1) -> list[Any]:
     """Several as they are, and one as often as it is needed."""
     several = isinstance(one_or_more, Iterable) and not isinstance(one_or_more, str)
     return list(one_or_more) if several else [one_or_more] * count
-
-
-def _span(flights: Sequence[Trajectory]) -> tuple[float, float]:
-    """From the first state to the last of all flights [s]."""
-    return min(f.time[0] for f in flights), max(f.time[-1] for f in flights)
 
 
 def checked(path: str | os.PathLike[str], kinds: Sequence[str]) -> tuple[Path, str]:

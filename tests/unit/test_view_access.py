@@ -29,11 +29,8 @@ from websockets.sync.client import connect  # noqa: E402
 from quadrl.rendering.live import access, browser  # noqa: E402
 
 VEHICLE = resolve(None)
-CAMERA = {
-    **{"wxyz": (1, 0, 0, 0), "position": (0, -3, 2), "look_at": (0, 0, 2)},
-    **{"up_direction": (0, 0, 1), "fov": 0.7, "near": 0.01, "far": 1000},
-    **{"image_height": 480, "image_width": 640},
-}
+CAMERA = dict(wxyz=(1, 0, 0, 0), position=(0, -3, 2), look_at=(0, 0, 2), up_direction=(0, 0, 1))
+CAMERA |= dict(fov=0.7, near=0.01, far=1000, image_height=480, image_width=640)
 WRONG = (
     *(None, True, "", "nobody", "up2", "nan", "1e400", "9" * 400, [], [1.0, 2.0], {"a": 1}, b"\0"),
     *(0, -1, 10**6, 2**64 - 1, -(2**63), 1e300, -1e300, np.inf, -np.inf, np.nan, 1e-320),
@@ -83,6 +80,11 @@ def send(connection, kind, **parts):
     connection.send(msgspec.msgpack.encode({"type": kind} | parts))
 
 
+def put(connection, uuid, value):
+    """Move a control."""
+    send(connection, "GuiUpdateMessage", uuid=uuid, updates={"value": value})
+
+
 def join(connection):
     """Be a client as viser counts them; returns what the page can be asked by: ids by labels."""
     send(connection, "ViewerCameraMessage", **CAMERA)
@@ -107,7 +109,7 @@ def until(fulfilled):
 def heard(page, connection, ids):
     """Wait until the page has heard all that was sent, by changing what is heard last."""
     sought = page.apart.value % 20.0 + 0.5
-    send(connection, "GuiUpdateMessage", uuid=ids["apart [m]"], updates={"value": sought})
+    put(connection, ids["apart [m]"], sought)
     until(lambda: page.apart.value == sought)
 
 
@@ -156,7 +158,7 @@ def test_only_the_page_itself_may_steer():
 def test_who_may_not_steer_is_not_let_in(served):
     with client(served, "localhost:9000", "https://localhost:9000") as connection:  # a tunnel
         ids = join(connection)
-        send(connection, "GuiUpdateMessage", uuid=ids["north"], updates={"value": 3})
+        put(connection, ids["north"], 3)
         heard(served, connection, ids)
         served.frame(VEHICLE.control_timestep)
     engine = served.flight.environment.engine
@@ -201,9 +203,8 @@ def test_messages_that_no_control_sends_do_nothing(page, monkeypatch):
         opened = []
         monkeypatch.setattr(page.server, "request_share_url", lambda: opened.append("tunnel"))
         kept = len(page.server._websock_server._broadcast_buffer.message_from_id)
-        connection.send("text")
-        connection.send(b"\xc1")
-        connection.send(msgspec.msgpack.encode([1, 2]))
+        for content in ("text", b"\xc1", msgspec.msgpack.encode([1, 2])):
+            connection.send(content)
         send(connection, "ShareUrlRequest")
         for count in range(200):
             send(connection, "GuiFormDirtyMessage", uuid=str(count))
@@ -211,13 +212,13 @@ def test_messages_that_no_control_sends_do_nothing(page, monkeypatch):
             send(connection, "GuiUpdateMessage", uuid=ids["paused"], updates={name: value})
             both = {"value": False, name: value}
             send(connection, "GuiUpdateMessage", uuid=ids["east"], updates=both)
-        send(connection, "GuiUpdateMessage", uuid="of nobody", updates={"value": 1})
+        put(connection, "of nobody", 1)
         heard(page, connection, ids)
         for _ in range(3):
             page.frame(VEHICLE.control_timestep)
         now = len(page.server._websock_server._broadcast_buffer.message_from_id)
         assert now < kept + 20 and not opened
-        send(connection, "GuiUpdateMessage", uuid=ids["paused"], updates={"value": True})
+        put(connection, ids["paused"], True)
         heard(page, connection, ids)
         page.frame(0.0)
     assert page.flight.paused
@@ -232,18 +233,15 @@ def test_whatever_a_client_sends_the_flight_goes_on(page):
         assert set(LABELS) <= set(ids)
         for _ in range(60):
             send(connection, "ViewerCameraMessage", **(CAMERA | draw.choice(cameras)))
-            choice = {"value": draw.choice(browser.CAMERAS)}
-            send(connection, "GuiUpdateMessage", uuid=ids["camera"], updates=choice)
+            put(connection, ids["camera"], draw.choice(browser.CAMERAS))
             for _ in range(20):
-                label = draw.choice(LABELS)
-                wrong = {"value": draw.choice(WRONG)}
-                send(connection, "GuiUpdateMessage", uuid=ids[label], updates=wrong)
+                put(connection, ids[draw.choice(LABELS)], draw.choice(WRONG))
                 send(connection, "CommandTriggerMessage", uuid=draw.choice([*ids.values(), "x"]))
             page.frame(VEHICLE.control_timestep)
             check_sound(page)
         heard(page, connection, ids)
         page.frame(0.0)
-        send(other, "GuiUpdateMessage", uuid=ids["paused"], updates={"value": False})
+        put(other, ids["paused"], False)
         heard(page, other, ids)
         flown = page._clock
         page.frame(1.0)
@@ -261,8 +259,8 @@ def test_numbers_beyond_a_slider_are_its_ends_and_what_is_no_choice_changes_noth
     with client(page) as connection:
         ids = join(connection)
         for label, value in (("east", 1e8), ("north", -20), ("up", "nan"), ("camera", "nobody")):
-            send(connection, "GuiUpdateMessage", uuid=ids[label], updates={"value": value})
-        send(connection, "GuiUpdateMessage", uuid=ids["aircraft"], updates={"value": 10**6})
+            put(connection, ids[label], value)
+        put(connection, ids["aircraft"], 10**6)
         heard(page, connection, ids)
         camera = page.camera.value
         page.frame(VEHICLE.control_timestep)
@@ -276,10 +274,8 @@ def test_key_presses_beyond_some_are_dropped(page):
     with client(page) as connection:
         ids = join(connection)
         for label in ("keyboard: forward", "one step"):
-            press = {"type": "CommandTriggerMessage", "uuid": ids[label]}
-            press = msgspec.msgpack.encode(press)
             for _ in range(2_000):
-                connection.send(press)
+                send(connection, "CommandTriggerMessage", uuid=ids[label])
         heard(page, connection, ids)
         assert page._asked.qsize() == browser.MOST_ASKED
         page.frame(VEHICLE.control_timestep)
