@@ -108,7 +108,7 @@ class Card:
     @property
     def figure(self) -> Media:
         """Success and error over every disturbance."""
-        return Media(*self._drawn(FILE, "png"), "png")
+        return Media(self._drawn(FILE, "png")[0], "png")
 
     @property
     def maps(self) -> Media:
@@ -119,7 +119,7 @@ class Card:
         """
         if not self.found["recovery"]:
             raise QuadrlError("there are no recovery maps: recovery was False")
-        return Media(*self._drawn(RECOVERY, "png"), "png")
+        return Media(self._drawn(RECOVERY, "png")[0], "png")
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write numbers (.json, .csv) and pictures (.png, .pdf) into a folder; returns the paths.

@@ -19,7 +19,7 @@ from quadrl.core.contact import touches_ground
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.engines.state import State
-from quadrl.evaluation.rollout import FINAL_STRETCH, Controller, prepared
+from quadrl.evaluation.rollout import FINAL_STRETCH, Controller, begun
 
 RECOVERED = 0.5  # [m], largest final error of a flight that has recovered; chosen
 
@@ -122,7 +122,8 @@ def recovered(
     y, x = np.meshgrid(chart.y.levels, chart.x.levels, indexing="ij")
     shape = (*x.shape, episodes)
     x, y = (np.broadcast_to(part[..., None], shape).reshape(-1) for part in (x, y))
-    environment, flown = prepared(controller, scenario, x.size, seed)
+    environment = Environment(scenario, num_envs=x.size, seed=seed)
+    flown = begun(controller, environment)
     observation = begin(environment, chart, x, y, seed)
     steps = environment.time_limit_steps
     last = min(steps, round(FINAL_STRETCH / environment.vehicle.control_timestep))

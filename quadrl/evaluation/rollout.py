@@ -52,7 +52,8 @@ def fly(
             is out of range.
     """
     scenario = scenario_of(controller, task, **conditions)
-    environment, controller = prepared(controller, scenario, episodes, seed)
+    environment = Environment(scenario, num_envs=episodes, seed=seed)
+    controller = begun(controller, environment)
     flown, timestep = environment.task, environment.vehicle.control_timestep
     steps, numbers = environment.time_limit_steps, 21 + len(environment.vehicle.rotors)
     machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
@@ -114,24 +115,6 @@ def scenario_of(
     if own not in (None, mode := scenario.control_mode):
         raise QuadrlError(name="control_mode", value=mode, allowed=f"{own!r}, as trained")
     return scenario
-
-
-def prepared(
-    controller: Controller, scenario: Scenario, episodes: int, seed: int
-) -> tuple[Environment, Controller]:
-    """Make an environment for a controller, and clear the controller's memory.
-
-    Args:
-        controller: What flies.
-        scenario: What is flown.
-        episodes: N.
-        seed: Of the first aircraft.
-
-    Raises:
-        QuadrlError: As `fly`.
-    """
-    environment = Environment(scenario, num_envs=episodes, seed=seed)
-    return environment, begun(controller, environment)
 
 
 def begun(controller: Controller, environment: Environment) -> Controller:
