@@ -29,7 +29,7 @@ SEED = 3
 
 
 def check_task(task: str | Task | type[Task]) -> None:
-    """Check everything that a task has to be, alone and in every API.
+    """Check the whole contract of a task, alone and in every API.
 
     Args:
         task: A task, its class, or a name of the catalogue.

@@ -133,7 +133,7 @@ def check_air(
         mass: Its mass [kg].
         inertia: Its principal moments [kg m^2].
         max_speed: Largest speeds of the rotors (R,) [rad/s].
-        timestep: Of the physics [s].
+        timestep: Physics timestep [s].
 
     Raises:
         QuadrlError: The message says what would be allowed.

@@ -80,8 +80,8 @@ def ring(
     """Level rotors on a circle around the centre of mass.
 
     Args:
-        bearings: Of each rotor [deg], counter-clockwise from ahead.
-        spins: Of each rotor, 1 or -1.
+        bearings: Bearings of each rotor [deg], counter-clockwise from ahead.
+        spins: Spins of each rotor, 1 or -1.
         arm_length: Radius of the circle [m].
         **rotor: The other parameters of `Rotor`, the same for all.
     """

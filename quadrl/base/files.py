@@ -149,7 +149,7 @@ def write_safetensors(
 
     Args:
         path: The file.
-        arrays: Of one framework, by name.
+        arrays: Arrays of one framework, by name.
         header: What JSON can hold; its `format` says what the file is.
         to_bytes: `save` of the framework's module of safetensors.
     """

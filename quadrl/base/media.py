@@ -15,7 +15,7 @@ class Media:
     """A picture or a video."""
 
     content: bytes
-    """Of the file."""
+    """Content of the file."""
     kind: str
     """The file's ending: png, mp4, gif, pdf or svg."""
 

@@ -46,7 +46,7 @@ class Primitive:
     points: Array | Sequence[Numbers] = ()
     """(n, 3) [m]: of a line, or the two ends of an arrow."""
     mesh: Mesh | None = None
-    """Of the shape mesh."""
+    """Triangles of the shape "mesh"."""
     name: str = ""
     """Name of a part; the text of a label."""
 

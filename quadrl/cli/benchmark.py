@@ -18,7 +18,7 @@ class Benchmark:
     """Length of each measurement; short, since the speed of a machine drifts."""
     repeats: int = 30
     """Measurements of each layer, in turns. The rate is the fastest; the share is the median of the
-    ratios to what it is a share of, within a turn."""
+    ratios to its reference within a turn."""
     task: choices.TaskName = "hover"
     """The task that is flown."""
     json: bool = False

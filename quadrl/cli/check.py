@@ -12,7 +12,7 @@ from quadrl.evaluation.check import check
 
 @choices.command
 class Check(Conditioned):
-    """Check an aircraft: what its thrust, moments, steps and delays leave to a policy."""
+    """Check whether thrust, moments, steps and delays of an aircraft let a policy fly it."""
 
     task: choices.TaskName = "hover"
     """The task; some ask for a turn of the heading within their time."""

@@ -34,13 +34,7 @@ HELP = {
     "engine": "The engine: mujoco, or free_flight (MuJoCo only near what can be touched)",
 }
 """Of conditions that Python takes in more forms than a command line."""
-
-
-USUAL = "; by default the policy's, or the usual one"
-TEXTS = {
-    name: text if "by default" in text else text + USUAL
-    for name, text in (docstrings(Conditions) | HELP).items()
-}
+TEXTS = docstrings(Conditions) | HELP
 ConditionOptions: Any = choices.optional(typing.get_type_hints(Conditions), TEXTS, lambda name: "")
 
 
@@ -75,9 +69,10 @@ class Flown(Conditioned):
 
     policy: Annotated[Positional[str], arg(metavar="[POLICY]")] = ""
     """A run folder, a .safetensors file, or the name of a shipped policy: that of its task, or
-    one such as hover_robust (write ./NAME for a folder of that name)."""
+    one such as hover_robust (write ./NAME for a folder of that name). Conditions that are not given
+    are those of its training."""
     algo: choices.Algorithm = ""
-    """The algorithm that trained the policy that comes with quadrl; ppo by default."""
+    """Algorithm of the policy that comes with quadrl; ppo by default."""
     controller: choices.ControllerName = ""
     """A controller instead of a policy: geometric or lqr."""
     task: choices.TaskName = ""

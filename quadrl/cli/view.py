@@ -11,7 +11,7 @@ from quadrl.tasks import TASKS
 
 @choices.command
 class View(Flown):
-    """Watch a policy or a controller fly, live in the browser: push it, let the wind blow, fly."""
+    """Watch a policy or a controller fly live in the browser; push it, add wind, or steer."""
 
     num_envs: int = 1
     """Aircraft that fly at the same time."""

@@ -40,7 +40,7 @@ class Part:
     size: Vector
     """As MuJoCo has it: radius; radius and half the height; halves of the edges [m]."""
     offset: Vector = (0.0, 0.0, 0.0)
-    """Of its centre from the solid's, in the solid's frame [m]."""
+    """Offset of its centre from the solid's, in the solid's frame [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,9 +48,9 @@ class Solid(abc.ABC):
     """Something that an aircraft can hit."""
 
     name: str
-    """By which the task places it."""
+    """Name by which the task places it."""
     position: Vector = dataclasses.field(default=(0.0, 0.0, 0.0), kw_only=True)
-    """Of its centre where `Task.place` says nothing, task frame [m]."""
+    """Position of its centre where `Task.place` says nothing, task frame [m]."""
     rgba: tuple[float, float, float, float] = dataclasses.field(
         default=(0.55, 0.58, 0.62, 1.0), kw_only=True
     )

@@ -291,7 +291,7 @@ def felt(disturbance: Array, last: Array, now: Array, timestep: float) -> Array:
         disturbance: The last one, (n, 3) [m/s^2], world frame.
         last: What `moving` gave a control step ago, (n, 6).
         now: What it gives now.
-        timestep: Of control [s].
+        timestep: Control timestep [s].
     """
     rate = (now[:, :3] - last[:, :3]) / timestep
     rate = rate - (0.5 * (now[:, 3:] + last[:, 3:]) + WEIGHT)

@@ -136,7 +136,7 @@ class WeatherProcess:
         Args:
             weather: The weather.
             engine: Whose air it writes.
-            time_limit: Of an episode [s]: the gust blows within it.
+            time_limit: Time limit of an episode [s]: the gust blows within it.
             noise_time: Correlation time of the noise of each rotor's lift [s]; 0 for none.
         """
         self.weather = weather

@@ -207,7 +207,7 @@ def cascade(lag: float, bandwidth: float, integrators: int, timestep: float) -> 
     (Ackermann's formula).
 
     Args:
-        lag: Of the rotors [1/s].
+        lag: Lag of the rotors [1/s].
         bandwidth: [rad/s].
         integrators: n, between what the rotors give and what is controlled.
         timestep: Between two commands [s].

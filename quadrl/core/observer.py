@@ -31,7 +31,7 @@ def make(
 
     Args:
         sampler: Samples what is drawn.
-        options: Of the observation.
+        options: Options of the observation.
         task: The task.
         engine: Flies the aircraft.
         actions: Numbers in an action.
@@ -52,11 +52,11 @@ class Observer:
         """Lay out the observation.
 
         Args:
-            options: Of the observation.
+            options: Options of the observation.
             task: The task.
             engine: Flies the aircraft.
             actions: Numbers in an action.
-            randomizer: Of those aircraft.
+            randomizer: Randomizer of those aircraft.
 
         Raises:
             QuadrlError: The delay or the rate of a sensor does not fit the control step, or it has

@@ -58,8 +58,8 @@ class Step(abc.ABC):
 
         Args:
             task: The task.
-            clock: Of its episodes.
-            engine: Of the aircraft.
+            clock: Clock of its episodes.
+            engine: Engine of the aircraft.
             inputs: Read live.
             estimate: Table of the state that is observed, read live; None for the true one.
             scene: The solids in the world.

@@ -49,7 +49,7 @@ class Target:
     at_least: bool = False
     """Whether the figure must reach the limit, or stay under it."""
     unit: Literal["%", "cm", "m/s", "deg", "s"] = "%"
-    """To show it in."""
+    """Unit in which it is shown."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,7 +226,7 @@ class Task(abc.ABC):
 
         Args:
             rng: Random numbers of their own.
-            start: Of the episodes, as `begin` gives it.
+            start: Start of the episodes, as `begin` gives it.
             state: What the task remembers, as `begin` gives it.
         """
         return {}

@@ -51,7 +51,7 @@ class Episode:
 
 @dataclasses.dataclass(slots=True)
 class Transition:
-    """What one control step gave, arrays (N, ...), one row per aircraft.
+    """The result of one control step, arrays (N, ...), one row per aircraft.
 
     The entries of the observation are live views: copy them before the next step or reset.
     """
@@ -90,9 +90,9 @@ def begin(
 
     Args:
         task: The task.
-        state: Of the aircraft, (n, ...).
+        state: State of the aircraft, (n, ...).
         task_state: What the task remembers, (n, ...).
-        parameters: Of the aircraft.
+        parameters: Parameters of the aircraft.
         actions: Numbers in an action.
         around: The solids about the aircraft; None where there are none.
     """
@@ -123,7 +123,7 @@ def finish(
 
     Args:
         task: The task.
-        clock: Of its episodes.
+        clock: Clock of its episodes.
         episode: How far they were.
         before: The snapshot before the control step.
         state: After it.
@@ -200,9 +200,9 @@ def check_task(
 
     Args:
         task: The task.
-        parameters: Of the aircraft, one row.
+        parameters: Parameters of the aircraft, one row.
         actions: Numbers in an action.
-        origin_height: Of the origin of the task's frame above the ground [m].
+        origin_height: Height of the origin of the task's frame above the ground [m].
 
     Returns:
         Names of the reward's terms, in their order.

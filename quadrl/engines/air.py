@@ -51,8 +51,8 @@ def fixed_of(
     Args:
         wind_speed: W20, a number or (n,) [m/s].
         roughness: z0 [m].
-        altitude: Of the task [m], for the turbulence.
-        timestep: Of the control [s].
+        altitude: Altitude of the task [m], for the turbulence.
+        timestep: Control timestep [s].
         noise_time: Correlation time of the noise of the lift [s]; 0 for none.
     """
     shear = wind_speed / math.log(REFERENCE / roughness)

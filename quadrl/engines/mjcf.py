@@ -30,7 +30,7 @@ def spec(
     """The vehicle over the ground as an MjSpec, to add to or to compile.
 
     Args:
-        vehicle: What flies.
+        vehicle: The aircraft.
         contact: Let feet, hull and rotors collide with the ground and with what `scene` adds.
         drawn: Include what is only seen (geoms, lights, cameras, textures).
         scene: Adds geoms to the world; those that the aircraft can hit have contype 1.

@@ -126,7 +126,7 @@ class Rng:
 
         Args:
             position: (n, 3) [m], task frame.
-            parameters: Of the aircraft.
+            parameters: Parameters of the aircraft.
             velocity: (n, 3) [m/s], world frame; None for at rest.
         """
         xp = namespace(position)

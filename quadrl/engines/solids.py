@@ -42,7 +42,7 @@ class Solids:
 
         Args:
             model: With the geoms.
-            count: N.
+            count: Number of aircraft, N.
         """
         self.geoms = geoms_of_solids(model)
         self.table = np.zeros((count, len(self.geoms)), dtype=SOLID)

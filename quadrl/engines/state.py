@@ -97,7 +97,7 @@ class State:
             velocity: (N, 3) [m/s], world frame.
             body_rate: (N, 3) [rad/s], body frame.
             rotor_speed: (N, R) [rad/s].
-            origin_height: Of the origin of the task's frame above the ground [m].
+            origin_height: Height of the origin of the task's frame above the ground [m].
         """
         rotation = rotation_matrix(quaternion)
         sines, cosines = sin_cos_attitude(rotation)

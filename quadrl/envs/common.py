@@ -38,10 +38,10 @@ def make(
 
     Args:
         task: A name of the catalogue, a task, or a whole scenario.
-        num_envs: N.
+        num_envs: Number of aircraft, N.
         also: Keywords that the API takes itself.
         seed: Row i is seeded with seed + i; None for one from the system.
-        num_threads: Of the simulation; 0 for every core.
+        num_threads: Threads of the simulation; 0 for every core.
         **conditions: `vehicle`, `weather`, `randomization` and the others, as
             `quadrl.core.scenario.Conditions` has them, and options of the task.
 

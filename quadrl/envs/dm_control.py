@@ -176,7 +176,7 @@ def make(
 
     Args:
         task: A name of the catalogue, a task, or a whole scenario.
-        time_limit: Of an episode [s]; None for the task's.
+        time_limit: Time limit of an episode [s]; None for the task's.
         random: Seed, RandomState or None.
         environment_kwargs: As in `quadrl.suite.load`.
         **conditions: `vehicle`, `weather`, `randomization` and the others, as

@@ -40,7 +40,7 @@ class QuadrotorVecEnv(VecEnv):
 
         Args:
             task: A name of the catalogue or a task.
-            num_envs: N.
+            num_envs: Number of aircraft, N.
             reward_terms: Whether infos hold the terms of the reward.
             **settings: Those of `quadrl.envs.gymnasium.QuadrotorVectorEnv`, but `autoreset_mode`.
 

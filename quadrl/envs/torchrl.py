@@ -43,13 +43,13 @@ class QuadrotorEnv(EnvBase):
 
         Args:
             task: A name of the catalogue or a task.
-            num_envs: N.
+            num_envs: Number of aircraft, N.
             seed: Row i is seeded with seed + i; None for one from the system.
-            device: Of the tensors.
+            device: Device of the tensors.
             reward_terms: Whether to give the named terms of the reward (they cost time).
             from_pixels: Whether to give pictures, `pixels` (N, height, width, 3) uint8.
-            width: Of a picture [pixels].
-            height: Of a picture [pixels].
+            width: Width of a picture [pixels].
+            height: Height of a picture [pixels].
             camera: A name of `quadrl.rendering`.
             **settings: Those of `quadrl.envs.common.make`.
 

@@ -40,7 +40,7 @@ def half_level(levels: Sequence[float], shares: Sequence[float | None]) -> float
 
     Args:
         levels: From where nothing is disturbed outwards.
-        shares: Of the flights that succeed; None for a level at which no aircraft can hover.
+        shares: Shares of the flights that succeed; None for a level at which no aircraft can hover.
 
     Returns:
         The level, the first one if half fail there already; None where no level takes half.

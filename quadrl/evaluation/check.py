@@ -71,7 +71,7 @@ def check(
     task: str | Task | Scenario = "hover",
     **conditions: Any,
 ) -> Check:
-    """Check what an aircraft's thrust, moments, steps and delays leave to a policy; flies nothing.
+    """Check whether an aircraft's thrust, moments, steps and delays let a policy fly it.
 
     Args:
         vehicle: The aircraft or its name; None for the paper's.

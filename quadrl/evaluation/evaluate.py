@@ -47,7 +47,7 @@ class Evaluation:
     scenario: Scenario
     """What it flew."""
     seed: int
-    """Of the episodes."""
+    """Seed of the episodes."""
     metrics: dict[str, Any]
     """Names of task and vehicle, the seed, and what `quadrl.evaluation.rollout.summarize` gives."""
     rollout: Rollout
@@ -112,11 +112,11 @@ def evaluate(
     They are flown in MuJoCo unless `engine` says otherwise.
 
     Args:
-        controller: What flies, as `setting` takes it.
+        controller: A policy or a controller, as `setting` takes it.
         task: A task or its name, or a whole scenario; by default the task that the policy was
             trained for.
-        episodes: Their number.
-        seed: Of the episodes; the same ones for every controller.
+        episodes: Number of episodes.
+        seed: Seed of the episodes; the same for every controller.
         sampled: Whether to draw the actions of a policy, as in training, instead of their mean.
         **conditions: `vehicle`, `weather`, `randomization` and the others, as
             `quadrl.core.scenario.Conditions` has them, and options of the task; what is left out
@@ -189,7 +189,7 @@ def beside(
     weather and the randomization are the first that differ from calm air and from none.
 
     Args:
-        controllers: What flies, each as `setting` takes it.
+        controllers: Policies or controllers, each as `setting` takes it.
         task: As `setting` takes it.
         **conditions: As `setting` takes them.
 

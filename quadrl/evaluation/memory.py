@@ -52,7 +52,7 @@ NAMES = tuple(PREFIX + field.name for field in FIELDS)
 
 
 class PolicyInFlight:
-    """A policy in flight: a function of observations that keeps what the policy remembers."""
+    """A policy in flight: a function of observations that keeps the policy's memory."""
 
     def __init__(self, policy: Any, count: int | None, seed: int | None) -> None:
         """Begin with the state of a policy at an episode's begin; see `Policy.flying`."""

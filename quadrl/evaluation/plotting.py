@@ -141,8 +141,8 @@ def learning_curves(
 
     Args:
         groups: The metrics of the runs of each algorithm.
-        title: Of the figure.
-        clocks: Of CLOCKS, a row each.
+        title: Title of the figure.
+        clocks: Names of CLOCKS, a row each.
 
     Raises:
         QuadrlError: No episode has ended in any of the runs.

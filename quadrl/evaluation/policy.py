@@ -42,13 +42,13 @@ class Policy:
     """The mean action of a trained network."""
 
     weights: tuple[np.ndarray, ...]
-    """Of each layer, (outputs, inputs); the last gives k means and k log-variances, (2 k, ...)."""
+    """Weights of each layer, (outputs, inputs); outputs of the last: k means, k log-variances."""
     biases: tuple[np.ndarray, ...]
-    """Of each layer, (outputs,)."""
+    """Biases of each layer, (outputs,)."""
     mean: np.ndarray
-    """Of the observations in training, (size,)."""
+    """Mean of the observations in training, (size,)."""
     deviation: np.ndarray
-    """Of the observations in training, (size,)."""
+    """Deviation of the observations in training, (size,)."""
     task: str
     """The task that it was trained for."""
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -147,7 +147,7 @@ class Policy:
             observation: (n, size), or (size,) of one aircraft.
             state: What the last step gave, (n, state_size) or (state_size,); `initial_state` in the
                 rows whose episode begins.
-            generator: Of the draws of the stochastic policy; None for the mean action.
+            generator: Generator of the draws of the stochastic policy; None for the mean action.
 
         Returns:
             Actions (n, k) or (k,), within [-1, 1]; the next state, of the shape of the present one.
@@ -165,7 +165,7 @@ class Policy:
 
         Args:
             n: Aircraft that it flies: observations are (n, size). None for one, (size,).
-            seed: Of the draws of the stochastic policy; None for the mean action.
+            seed: Seed of the draws of the stochastic policy; None for the mean action.
         """
         return PolicyInFlight(self, n, seed)
 

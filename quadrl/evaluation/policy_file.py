@@ -38,8 +38,8 @@ def write(
 
     Args:
         path: The file.
-        weights: Of each layer.
-        biases: Of each layer.
+        weights: Weights of each layer.
+        biases: Biases of each layer.
         memory: What it remembers with.
         header: Its task and its metadata.
         **arrays: Its other arrays by name.

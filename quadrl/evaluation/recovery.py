@@ -113,11 +113,11 @@ def recovered(
     """Share of the flights that recover, (levels of y, levels of x).
 
     Args:
-        controller: What flies.
+        controller: A policy or a controller.
         scenario: What is flown.
         chart: The map.
         episodes: Flights of each pair of levels, different ones for each pair.
-        seed: Of the first aircraft.
+        seed: Seed of the first aircraft.
     """
     y, x = np.meshgrid(chart.y.levels, chart.x.levels, indexing="ij")
     shape = (*x.shape, episodes)

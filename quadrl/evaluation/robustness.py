@@ -134,11 +134,11 @@ def robustness(
     is all that disturbs its flights.
 
     Args:
-        controller: What flies, as `quadrl.evaluate` takes it; a list of such; or a mapping of names
-            to such.
+        controller: A policy or a controller, as `quadrl.evaluate` takes it; a list of them; or a
+            mapping of names to them.
         task: A task or its name, or a whole scenario; by default the task of the first.
         episodes: Flights of each level; a cell of a recovery map has a tenth of them.
-        seed: Of the episodes.
+        seed: Seed of the episodes.
         disturbances: Names of `DISTURBANCES`; by default all.
         recovery: Whether to fly the recovery maps.
         progress: Whether to show a progress bar.

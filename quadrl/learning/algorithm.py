@@ -62,7 +62,7 @@ class Algorithm(abc.ABC):
 
         Args:
             loss: A scalar, or several whose sum it is.
-            *names: Of the optimisers.
+            *names: Names of the optimisers.
         """
         for name in names:
             self._optimisers[name][0].zero_grad()

@@ -42,7 +42,7 @@ class APG(Algorithm):
 
         Args:
             actor: The policy.
-            critic: Of the windows' ends.
+            critic: Critic of the windows' ends.
             config: Settings.
             env: Flies the windows.
             gamma: Discount per control step.

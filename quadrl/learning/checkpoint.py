@@ -62,7 +62,7 @@ def check_same(
         path: The checkpoint.
         saved: Its resolved configuration.
         present: The one that it is to be continued with.
-        prefix: Of the names: these are settings within a setting.
+        prefix: Prefix of the names: these are settings within a setting.
 
     Raises:
         QuadrlError: A setting differs.

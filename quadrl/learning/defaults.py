@@ -87,7 +87,7 @@ def training_defaults(
         algo: Name of the algorithm.
         vehicle: Name of the aircraft.
         variant: A name of `VARIANTS`.
-        memory: Of the policy; None for that of the layers.
+        memory: Memory of the policy; None for that of the layers.
 
     Returns:
         The values; and a label of the layer by the name of the setting, as in `flat`.

@@ -204,7 +204,7 @@ class Local:
 
     episodes: int
     jobs: int | None = None
-    """At a time; None for one per core."""
+    """Trainings at a time; None for one per core."""
     own: tuple[Path, ...] = ()
 
     def slots(self) -> int:
@@ -245,7 +245,7 @@ def train_all(
     Args:
         runs: The runs.
         executor: Where they are carried out.
-        say: Is called with what happens, a line each.
+        say: Called with a line about each event.
 
     Returns:
         Why trainings failed, by name; empty if all are done.

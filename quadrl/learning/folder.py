@@ -160,7 +160,7 @@ def write_config(folder: Path, config: Mapping[str, Any], processors: Sequence[s
     """Write the resolved configuration of a run, and the processor that it is trained on.
 
     Args:
-        folder: Of the run.
+        folder: Folder of the run.
         config: As `TrainConfig.resolved` gives it.
         processors: Those that it was trained on before.
     """

@@ -95,7 +95,7 @@ def mean_and_log_variance(output: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     Args:
         output: (count, 2 * k), or with one row more: that of the goal, whose mean is taken away.
-        count: Of observations.
+        count: Number of observations.
     """
     mean, free = output.chunk(2, -1)
     if len(output) > count:

@@ -34,7 +34,7 @@ class Run:
     policy: Policy
     """The trained policy: flat observations to the mean action."""
     evaluation: Evaluation
-    """In MuJoCo, in episodes that the training has not seen."""
+    """Metrics in MuJoCo, in episodes that the training has not seen."""
     seconds: float
     """Wall clock of the training [s], without imports and evaluation."""
 
@@ -55,7 +55,7 @@ class Run:
 
         Args:
             video: Whether to draw a flight as the last of them.
-            on_frame: Is told how many frames of it are drawn, and of how many.
+            on_frame: Called with the number of frames drawn, and of all.
 
         Raises:
             RenderingUnavailable: There is no graphics library to draw the video with.
@@ -89,8 +89,8 @@ def train(
             holds a run already.
         resume: Continue the run in this folder, with its own settings. Of the settings only
             `steps`, `device`, `num_threads` and `checkpoint_seconds` may be given.
-        episodes: Of the evaluation at the end.
-        on_progress: Is called after each iteration; by default a progress bar is shown.
+        episodes: Episodes of the evaluation at the end.
+        on_progress: Called after each iteration; by default a progress bar is shown.
         **settings: Fields of `TrainConfig`: `seed`, `algo`, `vehicle`, `steps`, ...
 
     Returns:

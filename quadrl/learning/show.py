@@ -48,17 +48,17 @@ def render(
     """Draw a flight of a policy or a controller, or of several; `quadrl render` in Python.
 
     Args:
-        controller: What flies, as `quadrl.evaluate` takes it; or a mapping of labels to such, which
-            are shown side by side, as `quadrl.evaluation.evaluate.beside` lets them fly.
+        controller: A policy or a controller, as `quadrl.evaluate` takes it; or a mapping of labels
+            to several, which fly the same episode and are shown side by side.
         task: A task or its name, or a whole scenario; by default the task that the (first) policy
             was trained for.
-        seed: Of the episode.
+        seed: Seed of the episode.
         kind: "mp4", "gif", or "png" or "jpg" for moments of the flight in one picture.
         camera: "follow" keeps the goal in view, "chase" is behind the aircraft; or a camera of the
             model.
-        width: Of a picture [pixels]; by default 848, 640 for gif, 480 for png and jpg. Each of
-            several flights has a picture of this size.
-        height: Of a picture [pixels]; by default 480, 360 for gif, 270 for png and jpg.
+        width: Width of a picture [pixels]; by default 848, 640 for gif, 480 for png and jpg. Each
+            of several flights has a picture of this size.
+        height: Height of a picture [pixels]; by default 480, 360 for gif, 270 for png and jpg.
         fps: Frames a second; by default 20, and 12.5 for gif.
         progress: Whether to show a progress bar.
         **conditions: As `quadrl.evaluate` takes them.
@@ -95,7 +95,7 @@ def plot(*what: Any, kind: str = "png") -> Media:
         *what: What `quadrl.train` returned, or run folders; or one thing that `quadrl.evaluate`
             returned. Several runs must be of one task; there is a curve for each algorithm, with
             the spread over its runs.
-        kind: Of the picture: "png", "pdf", "svg" or another that matplotlib knows.
+        kind: Kind of the picture: "png", "pdf", "svg" or another that matplotlib knows.
 
     Raises:
         QuadrlError: There is nothing to draw, the runs are of several tasks, or the kind is
@@ -139,9 +139,9 @@ def curves(
     """The learning curves of several runs: a figure for each task, a curve for each label.
 
     Args:
-        folders: Of the runs, maybe with a label each; by default that is the algorithm.
-        on_missing: Is told of a folder without a run that has begun, and of a task of which no
-            episode has ended, which are then left out.
+        folders: Folders of the runs, maybe with a label each; by default that is the algorithm.
+        on_missing: Called with a folder without a run that has begun, and for a task of which no
+            episode has ended; they are then left out.
 
     Raises:
         QuadrlError: There is such a folder or task, and `on_missing` is None.

@@ -57,21 +57,21 @@ class Plan(NamedTuple):
     folder: Path
     runs: tuple[PlannedRun, ...]
     episodes: int
-    """Of the evaluation at the end of each."""
+    """Episodes of the evaluation at the end of each."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class StudyResult:
-    """The trainings of a study that are done, and what they reached over their seeds."""
+    """The finished trainings of a study, and what they reached over their seeds."""
 
     folder: Path
     """Holds the run folders, table.csv, study.json and the pictures."""
     runs: tuple[dict[str, Any], ...]
-    """Of each that is done: name, task, algo, variant, seed, scenario, metrics and settings."""
+    """A row a training: name, task, algo, variant, seed, scenario, metrics and settings."""
     rows: tuple[dict[str, Any], ...]
-    """Of each task, algorithm and variant: seeds, and of `success_rate`, `position_error_m` over
-    the last 2 s and `training_s` the mean over the seeds, with its 95 % interval `_low`, `_high`
-    (None with one seed)."""
+    """A row for each task, algorithm and variant: seeds, and of `success_rate`, `position_error_m`
+    over the last 2 s and `training_s` the mean over the seeds, with its 95 % interval `_low`,
+    `_high` (None with one seed)."""
     failed: dict[str, str]
     """Why trainings failed, by name."""
 
@@ -145,7 +145,7 @@ def study(
             one that this machine belongs to), or "local" for Ray on this machine.
         own: Python files that register tasks and aircraft of your own. With Ray all machines have
             them under these paths.
-        on_line: Is called with what happens, a line each.
+        on_line: Called with a line about each event.
 
     Returns:
         What the trainings reached. One that failed is in its `failed`.

@@ -81,7 +81,7 @@ def make_algorithm(config: TrainConfig, env: QuadrotorEnv, actor: Any, critic: A
 
 
 class Training:
-    """A run in its folder."""
+    """A training in its folder."""
 
     @one_thread()  # the first weights are numbers, too
     def __init__(self, config: TrainConfig, folder: Path, *, resume: bool = False) -> None:

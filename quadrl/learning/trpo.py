@@ -27,7 +27,7 @@ def conjugate_gradients(
     Args:
         product: x (n,) to A x (n,).
         target: b (n,), float64.
-        iterations: Their largest number.
+        iterations: Largest number of iterations.
         tolerance: On the squared residual over that of b.
 
     Returns:
@@ -56,7 +56,7 @@ def fisher_product(
 
     Args:
         kl: Scalar with a graph, at the policy that acted.
-        parameters: Of the policy, n numbers in all.
+        parameters: Parameters of the policy, n numbers in all.
         damping: Added to the diagonal.
 
     Returns:

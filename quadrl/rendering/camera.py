@@ -77,8 +77,8 @@ def moving_views(
         qpos: (T, 7) position [m] and attitude (w, x, y, z) of the aircraft, world frame.
         goals: (T, 3) [m], world frame.
         markers: What else is drawn in each of the T pictures, world frame.
-        scale: Of the aircraft, see `aircraft_scale`.
-        aspect: Of the pictures, width over height.
+        scale: Scale of the aircraft, see `aircraft_scale`.
+        aspect: Aspect of the pictures, width over height.
 
     Returns:
         (T, 6): the point that it looks at and the distance from it [m], azimuth and elevation

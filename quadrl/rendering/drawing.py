@@ -172,7 +172,7 @@ def streaks(position: Array, wind: Array, drift: Array, scale: float) -> tuple[P
         position: (3,) [m], of the aircraft, world frame.
         wind: (3,) [m/s], world frame.
         drift: (3,) [m], how far the air has come since the flight began.
-        scale: Of the aircraft, see `quadrl.rendering.camera.aircraft_scale`.
+        scale: Scale of the aircraft, see `quadrl.rendering.camera.aircraft_scale`.
     """
     speed = float(np.linalg.norm(wind))
     if speed < STILL:

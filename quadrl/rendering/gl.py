@@ -44,8 +44,8 @@ def open_renderer(
 
     Args:
         model: What is drawn.
-        width: Of the pictures [pixels].
-        height: Of the pictures [pixels].
+        width: Width of the pictures [pixels].
+        height: Height of the pictures [pixels].
         max_geom: Most shapes in a picture.
         fine: With the smooth edges and the shadows that the model asks for, or without.
 

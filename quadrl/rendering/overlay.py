@@ -34,7 +34,7 @@ class Panel:
         """Lay it out.
 
         Args:
-            height: Of the pictures [pixels].
+            height: Height of the pictures [pixels].
             title: Its first line; cut where it is too long.
             colours: Red, green and blue (0 to 1) of each rotor's bar.
             windy: Whether it has a line for the wind.

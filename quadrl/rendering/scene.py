@@ -47,8 +47,8 @@ class Renderer(contextlib.AbstractContextManager):
 
         Args:
             model: What is drawn.
-            width: Of the pictures [pixels].
-            height: Of the pictures [pixels].
+            width: Width of the pictures [pixels].
+            height: Height of the pictures [pixels].
             fine: Draw smooth edges and true shadows, which cost a processor six times the rest of
                 a picture; None: only where a graphics card draws.
 

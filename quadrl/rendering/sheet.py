@@ -37,13 +37,13 @@ def write_contact_sheet(
     `quadrl.rendering.read_scenarios` reads from it what was flown.
 
     Args:
-        trajectory: What was flown, or several.
+        trajectory: The flight, or several.
         model: The drawn model of the aircraft that flew it; one for all, or one for each.
         path: The file, ending in .png, .jpg or .jpeg.
-        width: Of a moment [pixels].
-        height: Of a moment [pixels].
+        width: Width of a moment [pixels].
+        height: Height of a moment [pixels].
         label: Written beside the first moment, one for each flight.
-        on_frame: Is called after each moment with the number of those drawn and of all.
+        on_frame: Called after each moment with the number of those drawn and of all.
         **options: Others of `render_trajectory`: camera, fine.
 
     Returns:

@@ -60,10 +60,10 @@ def render_trajectory(
     """Draw a flight.
 
     Args:
-        trajectory: What was flown.
+        trajectory: The flight.
         model: The drawn model of the aircraft that flew it.
-        width: Of the pictures [pixels].
-        height: Of the pictures [pixels].
+        width: Width of the pictures [pixels].
+        height: Height of the pictures [pixels].
         fps: Pictures a second; the recorded states are interpolated.
         camera: "follow", "chase", or a camera of the model.
         overlay: Show time, error, speed, reward, wind, horizon, rotor speeds and the outcome.
@@ -154,12 +154,12 @@ def write_video(
     flight at the defaults cost about 10 s of CPU time without a graphics card.
 
     Args:
-        trajectory: What was flown, or several.
+        trajectory: The flight, or several.
         model: The drawn model of the aircraft that flew it; one for all, or one for each.
         path: The file, ending in .mp4 or .gif.
         fps: Frames a second.
         label: Titles in place of the task's name; one for each flight.
-        on_frame: Is called after each frame with the number of those drawn and of all.
+        on_frame: Called after each frame with the number of those drawn and of all.
         **options: The others of `render_trajectory`; width and height are those of one flight, and
             must be even for an MP4.
 

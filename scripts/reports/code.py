@@ -15,6 +15,7 @@ from quadrl.aircraft import presets, rotors
 from quadrl.aircraft.rotors import GRAVITY, Rotor
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
+from quadrl.cli.flown import Conditioned, ConditionOptions
 from quadrl.cli.tasks import observation_rows, reward_rows
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
@@ -131,15 +132,7 @@ def written_sources(name: str) -> dict[str, str]:
 
 def command(name: str) -> str:
     """What a command does, and its options."""
-    kind, rows = COMMANDS[name], []
-    # The shared conditions have no docstrings there: their help is part of their type.
-    hints = typing.get_type_hints(kind, include_extras=True)
-    meanings = docstrings(kind) | {
-        option: one.help
-        for option, hint in hints.items()
-        for one in getattr(hint, "__metadata__", ())
-        if getattr(one, "help", None)
-    }
+    kind, rows, meanings = COMMANDS[name], [], docstrings(COMMANDS[name])
     for field in dataclasses.fields(kind):
         if not (meaning := meanings.get(field.name)):
             continue
@@ -148,8 +141,19 @@ def command(name: str) -> str:
             option = field.name.upper()
         none = field.default in (dataclasses.MISSING, "", (), None)
         rows.append((f"`{option}`", "" if none else f"`{field.default}`", f"{meaning}."))
+    if issubclass(kind, Conditioned):
+        rows.insert(0, ("`--CONDITION`", "", "See [conditions](#conditions)."))
     text = inspect.cleandoc(kind.__doc__ or "")
     return f"{text}\n\n{table(('option', 'default', 'meaning'), rows)}"
+
+
+def conditions() -> str:
+    """The options that every command which flies has."""
+    hints, rows = typing.get_type_hints(ConditionOptions, include_extras=True), []
+    for name, hint in hints.items():
+        (text,) = (one.help for one in hint.__metadata__ if getattr(one, "help", None))
+        rows.append((f"`--{name.replace('_', '-')}`", f"{text}."))
+    return table(("option", "meaning"), rows)
 
 
 def fields(kind: type) -> str:
@@ -209,6 +213,7 @@ PARTS: Parts = {
     **{f"aircraft-{name}": functools.partial(aircraft, name) for name in VEHICLES},
     **{f"command-{name}": functools.partial(command, name) for name in COMMANDS},
     **{f"fields-{name}": functools.partial(fields, kind) for name, kind in RECORDS.items()},
+    "conditions": conditions,
     "randomization": randomization,
     "observing": observing,
 }

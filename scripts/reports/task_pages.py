@@ -102,9 +102,6 @@ def page(name: str) -> str:
         ("action space", f"`Box(-1.0, 1.0, ({vehicle.rotor_count},), float32)`"),
         ("observation space", f"`Box(-inf, inf, ({size},), float32)`"),
         ("time limit", f"{limit:g} s: {round(limit / step)} control steps of {step:g} s"),
-        ("Gymnasium", f'`gymnasium.make("quadrl/{camel}-v0")`, `gymnasium.make_vec(...)`'),
-        ("dm_control", f'`quadrl.load("{name}")`'),
-        ("TorchRL", f'`QuadrotorEnv("{name}", num_envs=1024)`'),
         ("source", f"[tasks/{name}.py](../tasks/{name}.py)"),
     ]
     fast = "or flies faster than the physics step resolves (`diverged`)"
@@ -117,7 +114,7 @@ def page(name: str) -> str:
         (f"`{x['name']}`", "" if x["weight"] is None else f"{x['weight']:g}", line(x["meaning"]))
         for x in known["reward"]
     ]
-    usual = {"name": "time_limit", "value": limit, "meaning": "Of an episode [s]"}
+    usual = {"name": "time_limit", "value": limit, "meaning": "Time limit of an episode [s]"}
     options = [
         (f"`{x['name']}`", f"`{shown(x['value'])}`", line(x["meaning"]))
         for x in (usual, *known["options"])

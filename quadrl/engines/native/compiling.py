@@ -102,7 +102,7 @@ def build(
 
     Args:
         sources: Files beside this one.
-        name: Of the library, with the version of mujoco behind it.
+        name: Name of the library, with the version of mujoco behind it.
         generated: Headers that they include besides, by name.
         include: Folder with mujoco's headers; None for those of the installed package.
 
@@ -148,7 +148,7 @@ def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
     """A library, prebuilt or of the cache, compiled first where there is no sound one.
 
     Args:
-        name: Of its file, without digest and ending; another one for other contents.
+        name: Name of its file, without digest and ending; another one for other contents.
         arguments: Further ones of the compiler.
         written: Files that are written first, by name: headers, and sources to compile.
     """

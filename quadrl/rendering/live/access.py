@@ -83,7 +83,7 @@ def refusal(headers: Headers, host: str) -> str | None:
     """Why a request does not come from the page itself.
 
     Args:
-        headers: Of the request.
+        headers: Headers of the request.
         host: Address that the page is served at.
 
     Returns:

@@ -34,11 +34,11 @@ def view(
     The air is calm unless it is asked for: there the wind is the spectator's.
 
     Args:
-        controller: What flies, as `quadrl.evaluate` takes it.
+        controller: A policy or a controller, as `quadrl.evaluate` takes it.
         task: As `quadrl.evaluate` takes it.
         label: Its name on the page; by default that of `quadrl.evaluate`.
         num_envs: Aircraft that fly at the same time.
-        seed: Of the episodes.
+        seed: Seed of the episodes.
         host: Address that the page is served at.
         port: Port that the page is served at; 0 for any that is free.
         native: Whether to open MuJoCo's own viewer, on this machine's screen, in place of the page.
