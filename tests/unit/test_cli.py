@@ -136,6 +136,7 @@ def resolved(monkeypatch, *arguments: str) -> tuple[TrainConfig, Path]:
         (("--vehicle", "racer", "landing"), TrainConfig("landing", vehicle="racer")),
         (("hover", "--gamma", "0.5"), TrainConfig("hover", gamma=0.5)),
         (("hover", "--ppo.clip", "0.1"), TrainConfig("hover", ppo={"clip": 0.1})),
+        (("hover", "--hidden"), TrainConfig("hover", hidden=())),
         (
             ("hover", "--hidden", "8", "4", "--task-options", "time_limit=2"),
             TrainConfig("hover", hidden=(8, 4), task_options={"time_limit": 2}),
