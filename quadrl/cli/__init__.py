@@ -6,17 +6,16 @@ import contextlib
 import os
 import signal
 import sys
+import typing
 import warnings
 from collections.abc import Generator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
 from rich.console import Console
 from tyro.conf import (
     CascadeSubcommandArgs,
-    DisallowNone,
     Positional,
     UseAppendAction,
     arg,
@@ -26,7 +25,7 @@ from tyro.conf import (
 from quadrl import __version__
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.signals import IN_ORDER, Stopped, handling
-from quadrl.cli import choices, console, train
+from quadrl.cli import choices, console, parsing, train
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
 from quadrl.cli.evaluate import Evaluate
@@ -70,10 +69,16 @@ Command = (
     | Annotated[Completion, subcommand("completion")]
 )
 
+COMMANDS = tuple(kind.__metadata__[0].name for kind in typing.get_args(Command))
+
 
 @choices.command
 class Quadrl:
-    """Reinforcement learning for quadrotors on MuJoCo. quadrl --version prints the versions."""
+    """Reinforcement learning for quadrotors on MuJoCo. quadrl --version prints the versions.
+
+    Begin with quadrl train hover, which takes seconds and ends with a video. The documentation is
+    in docs/ of the source; scripts/docs makes a site of it, with a search.
+    """
 
     command: Annotated[Command, arg(name="")]
     own: Annotated[
@@ -114,10 +119,10 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def parse(words: list[str]) -> Quadrl:
-    """Parse a command line; print what is wrong with it and exit with 2."""
+    """Parse a command line; raise what is wrong with it in one line."""
     if words[:1] == ["train"] and {"-h", "--help"} & {*words}:
         train.show_defaults(words[1:])
-    return tyro.cli(Quadrl, args=words, prog="quadrl", config=(DisallowNone,))
+    return parsing.parse(Quadrl, words or ["--help"], COMMANDS)
 
 
 @contextlib.contextmanager

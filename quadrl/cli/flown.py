@@ -129,7 +129,7 @@ def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
     """Options given as NAME=VALUE; a value is read as JSON where it is valid, lists as tuples.
 
     Raises:
-        QuadrlError: One has no equals sign.
+        QuadrlError: One has no equals sign, or stands there twice.
     """
     options: dict[str, Any] = {}
     for pair in pairs:
@@ -137,6 +137,8 @@ def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
         if not equals:
             allowed = "NAME=VALUE, such as time_limit=5"
             raise QuadrlError(name="task option", value=pair, allowed=allowed)
+        if name in options:
+            raise QuadrlError(name=name, value=pair, allowed="given once")
         try:
             options[name] = tuples(json.loads(text))
         except (ValueError, RecursionError):

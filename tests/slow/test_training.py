@@ -218,7 +218,16 @@ def test_a_shipped_policy_still_reaches_its_metrics(file):
 TINY = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16", "--episodes", "2"]
 
 
-LONG = ["train", "hover", *TINY, "--steps", str(32 * 100_000), "--checkpoint-seconds", "0"]
+LONG = [
+    "train",
+    "hover",
+    *TINY[:4],
+    *TINY[6:],
+    "--steps",
+    str(32 * 100_000),
+    "--checkpoint-seconds",
+    "0",
+]
 
 
 def stopped(words, folder, signal_number, awaited):

@@ -39,6 +39,12 @@ FILES = {
 METRICS = {"success_rate", "survival_rate", "position_error_m", "return_mean", "return_std"}
 
 
+def without(option: str, words: list[str]) -> list[str]:
+    """Options that each have one value, but for one of them."""
+    pairs = zip(words[::2], words[1::2], strict=True)
+    return [word for pair in pairs if pair[0] != option for word in pair]
+
+
 def command(*arguments: object) -> int:
     """Exit code of the command in this process."""
     try:
@@ -132,7 +138,7 @@ def resolved(monkeypatch, *arguments: str) -> tuple[TrainConfig, Path]:
         (("--out", "landing", "hover"), TrainConfig("hover")),
         (("hover", "--out", "landing"), TrainConfig("hover")),
         (("--algo", "gae", "hover"), TrainConfig("hover", algo="vpg")),
-        (("hover", "--algo", "gae", "--algo", "ppo"), TrainConfig("hover")),
+        (("hover", "--algo=gae"), TrainConfig("hover", algo="vpg")),
         (("--vehicle", "racer", "landing"), TrainConfig("landing", vehicle="racer")),
         (("hover", "--gamma", "0.5"), TrainConfig("hover", gamma=0.5)),
         (("hover", "--ppo.clip", "0.1"), TrainConfig("hover", ppo={"clip": 0.1})),
@@ -486,7 +492,7 @@ def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, firs
 )
 def test_trainings_that_cannot_be_are_refused(refusal, tmp_path, arguments, name, value):
     folder = tmp_path / "run"
-    error, _ = refusal("train", "hover", *TINY, "--out", folder, *arguments)
+    error, _ = refusal("train", "hover", *without(arguments[0], TINY), "--out", folder, *arguments)
     assert (error.name, error.value) == (name, value)
     assert not folder.exists()
 
@@ -497,12 +503,39 @@ def test_unknown_tasks_are_refused(refusal, run):
         assert (error.name, error.value) == ("task", "hovr") and "hover" in error.allowed
 
 
-def test_what_the_parser_reports(capsys, tmp_path):
-    for arguments in (["train", "hover", "--bogus"], ["train", "--steps", "many"], ["fly"], []):
-        assert command(*arguments) == 2
-        said = capsys.readouterr()
-        assert said.err and "Traceback" not in said.err
+MISTYPED = {
+    "trian hover": "did you mean train?",
+    "train hover --bogus": "--bogus is an unknown option; see quadrl train --help",
+    "train hover --stepz 5": "did you mean --steps?",
+    "train hover landing": "landing is one word too many; see quadrl train --help",
+    "train --steps many": "steps = 'many': must be a whole number",
+    "train --steps 1.5": "steps = '1.5': must be a whole number",
+    "train --gamma x": "gamma = 'x': must be a number",
+    "train --hidden a b": "hidden = 'a', 'b': must be whole numbers",
+    "evaluate hover --episodes": "--episodes needs a value; see quadrl evaluate --help",
+    "evaluate hover --seed 1 --seed 2": "option = '--seed': must be given once",
+    "evaluate hover --task-options radius=1 radius=2": "radius = 'radius=2': must be given once",
+    "study": "missing: PATH The study: a .toml or .json file",
+    "--import": "--import needs a value; see quadrl --help",
+}
+
+
+@pytest.mark.parametrize("words", MISTYPED)
+def test_a_mistyped_command_is_answered_in_a_line(capsys, tmp_path, words):
+    assert command(*words.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("quadrl: ") and MISTYPED[words] in line
     assert not list(tmp_path.iterdir())
+
+
+def test_steps_may_be_written_as_1e6(capsys):
+    assert command("train", "hover", "--steps", "1e6", "--dry-run") == 0
+    assert "1000000" in capsys.readouterr().out
+
+
+def test_no_words_ask_for_help(capsys):
+    assert command() == 0
+    assert "quadrl train hover" in capsys.readouterr().out
 
 
 def test_folders_that_cannot_be_used(refusal, copy, tmp_path):
