@@ -107,7 +107,7 @@ def _refuse_repetition(words: Sequence[str]) -> None:
 
 def _in_a_line(box: str, words: Sequence[str]) -> str:
     """What the parser draws in a box of several lines, in one."""
-    text = " ".join(re.sub(r"[╭╮╰╯│─]", " ", box).split())
+    text = " ".join(re.sub(r"[╭╮╰╯│─|+]|-{3,}", " ", box).split())
     command = _command(words) or "-"
     where = f"{PROGRAM} --help" if command.startswith("-") else f"{PROGRAM} {command} --help"
     if found := re.search(r"Error parsing --(\S+): .*? matching (.*?) could .*? \[(.*?)\]", text):
