@@ -99,6 +99,11 @@ def load(
     return suite.load(suite.DOMAIN, task_name, task_kwargs, environment_kwargs, visualize_reward)
 
 
+def __dir__() -> list[str]:
+    """List the public names, as tab completion shows them."""
+    return [*__all__, "__version__"]
+
+
 def __getattr__(name: str) -> Any:
     """Import on first use what brings more libraries."""
     if name in LAZY:

@@ -197,6 +197,9 @@ def action(given: Any, shape: tuple[int, ...]) -> np.ndarray:
     Raises:
         QuadrlError: Wrong shape or kind, or a number that is not finite.
     """
+    if given is None:
+        reason = "does the function that flies return its action?"
+        raise QuadrlError(reason, name="action", value=None, allowed=f"an array {shape}")
     try:
         array = np.asarray(given)
     except (TypeError, ValueError, RuntimeError) as error:

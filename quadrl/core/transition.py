@@ -23,6 +23,9 @@ Observation = dict[str, Array]
 SAMPLE = 64  # episodes that are begun to check a task
 STARTS = "such that episodes begin within the bounds that end them"
 
+OFF = 0.05
+"""Share of a time limit by which whole control steps may differ from it."""
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Clock:
@@ -34,8 +37,18 @@ class Clock:
 
     @classmethod
     def of(cls, task: Task, control_timestep: float) -> Clock:
-        """The clock of a task, in whole control steps [s]."""
-        limit = max(1, round(task.time_limit / control_timestep))
+        """The clock of a task, in whole control steps [s].
+
+        Raises:
+            QuadrlError: The time limit is farther from whole control steps than it may be rounded.
+        """
+        limit = round(task.time_limit / control_timestep)
+        if abs(limit * control_timestep - task.time_limit) > OFF * task.time_limit:
+            raise QuadrlError(
+                name=f"{task.name} time_limit",
+                value=task.time_limit,
+                allowed=f"whole control steps of {control_timestep:g} s",
+            )
         settle = min(max(1, round(task.settle_time / control_timestep)), limit)
         return cls(control_timestep, limit, settle)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.rotation import norm
+from quadrl.base.validation import number
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
@@ -85,7 +86,8 @@ class Pictures:
     ) -> None:
         """Note what to draw, on pictures of width x height pixels, with or without the panel."""
         self._environment, self._camera = environment, camera
-        self._width, self._height = width, height
+        self._width = number("width", width, 1, whole=True)
+        self._height = number("height", height, 1, whole=True)
         self._overlay = overlay
         self._renderer: Any = None
         self._panel: Any = None

@@ -9,6 +9,7 @@ import numpy as np
 
 from quadrl.base import machine
 from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import action
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.snapshot import Rollout
@@ -60,11 +61,12 @@ def fly(
     observation = environment.flatten(environment.reset())
     history: dict[str, list[np.ndarray]] = {name: [] for name in HISTORY}
     alive = np.ones(episodes, dtype=bool)
+    shape = episodes, environment.action_size
     length = np.zeros(episodes, dtype=int)
     ends = {name: np.zeros(episodes, bool) for name in ("terminated", "is_success", "diverged")}
     markers = []
     while alive.any():
-        taken = np.clip(controller(observation), -1.0, 1.0)
+        taken = np.clip(action(controller(observation), shape), -1.0, 1.0)
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         markers.append(environment.markers())

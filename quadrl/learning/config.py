@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import warnings
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from quadrl import __version__
-from quadrl.base.errors import QuadrlError
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.validation import choice, keys, number, tuples
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.observing import resolve as resolve_observing
@@ -136,6 +137,9 @@ class TrainConfig(TrainSettings):
             number("width of a hidden layer", width, 1, MAX_WIDTH, whole=True)
         batch = self.num_envs * self.rollout  # the advantage of a single one has no deviation
         number("num_envs * rollout", batch, 2, MAX_BATCH, whole=True)
+        if self.gamma == 1.0:
+            said = "gamma = 1: what is far counts as much as what is near; usual are 0.9 to 0.99"
+            warnings.warn(said, QuadrlWarning, stacklevel=4)
         choice("memory", self.memory, MEMORIES)
         if not isinstance(self.holds_goal, bool) or (self.holds_goal and self.memory != "none"):
             allowed = "True or False; False for a policy with a memory"
