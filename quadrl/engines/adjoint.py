@@ -30,6 +30,8 @@ from quadrl.engines.native import compiling
 
 COORDINATES = 13
 """Numbers of a motion beside its rotor speeds: 7 of qpos, 6 of qvel."""
+STEP_ROWS = 4 * (COORDINATES + MAX_ROTORS) + 4
+"""Of `Step` in native/adjoint.c, LANES numbers each."""
 PLACES = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
 """A row whose numbers say where they stand."""
 SOURCE = """enum {{ EFFECTS = {effects}, ROTORS = {rotors} }};
@@ -121,9 +123,10 @@ class Leg:
     def _run(self, given: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         end, from_start = np.empty_like(self.start), np.empty_like(self.start)
         from_command = np.empty_like(self.command)
-        path = np.empty((self.steps, COORDINATES + MAX_ROTORS, LANES))
+        path = np.empty((self.steps, STEP_ROWS, LANES))
+        left = np.ones(-(-len(end) // LANES), dtype=np.int8)
         taken = (self.start, self.command, self.air, self.parameters)
-        filled = (self.world, end, from_start, from_command, path)
+        filled = (self.world, end, from_start, from_command, path, left)
         block = self.parameters[0].size if self.parameters.ndim > 1 else 0
         # As `Legs` in native/adjoint.c.
         legs = np.array(
@@ -134,7 +137,8 @@ class Leg:
         own = self.parameters[:, column] if block else self.parameters["effects"]
         # A row that names another number is a damaged one, and not a number afterwards.
         found = (kind for kind in (ROTOR_EFFECTS, GROUND_EFFECT) if (own == kind).any())
-        kernel(max(found, default=STILL_AIR), self.command.shape[1])(
-            legs.ctypes.data, len(end), self.steps
-        )
+        most = max(found, default=STILL_AIR)
+        for effects in (min(most, ROTOR_EFFECTS), most):  # few come near the ground
+            if left.any():
+                kernel(effects, self.command.shape[1])(legs.ctypes.data, len(end), self.steps)
         return end, from_start, from_command

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import warnings
@@ -173,14 +174,13 @@ class TrainConfig(TrainSettings):
 
     def resolved(self) -> dict[str, Any]:
         """The settings and everything that their names stand for, as JSON gives them back."""
-        packages = ("mujoco", "torch", "torchrl", "numpy")
         flown = self.training_scenario
         whole = dataclasses.asdict(self) | {
             "resolved_task": dataclasses.asdict(flown.task),
             "resolved_vehicle": dataclasses.asdict(flown.aircraft),
             "resolved_weather": dataclasses.asdict(flown.weather),
             "resolved_randomization": dataclasses.asdict(flown.randomization),
-            "versions": {"quadrl": __version__} | {name: version(name) for name in packages},
+            "versions": _versions(),
         }
         return json.loads(json.dumps(whole))
 
@@ -249,3 +249,10 @@ def _fields() -> dict[str, Any]:
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value is not None}
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    """Of quadrl and of what a training runs on; each is looked up in a file, and never changes."""
+    packages = ("mujoco", "torch", "torchrl", "numpy")
+    return {"quadrl": __version__} | {name: version(name) for name in packages}

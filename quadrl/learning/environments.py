@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Unbounded
 from torchrl.modules import ProbabilisticActor
 
+from quadrl.aircraft.aerodynamics import ROTOR_EFFECTS
 from quadrl.base.errors import QuadrlError
 from quadrl.core.transition import Transition
 from quadrl.engines.adjoint import kernel
@@ -60,7 +61,7 @@ class RecordingEnv(QuadrotorEnv):
         """Make the environments, and compile the reverse of their flight where it is missing."""
         super().__init__(*given, **settings)
         vehicle = self.environment.vehicle
-        kernel(vehicle.aerodynamics.effects, vehicle.rotor_count)
+        kernel(min(vehicle.aerodynamics.effects, ROTOR_EFFECTS), vehicle.rotor_count)
         self._moments: list[Moment] = []
 
     def taken(self) -> list[Moment]:

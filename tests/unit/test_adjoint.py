@@ -4,19 +4,31 @@ The one is the C step itself, the other the same equations in `quadrl/engines/dy
 """
 
 import dataclasses
+import math
 
 import helpers
 import numpy as np
 import pytest
 
+from quadrl.aircraft.presets import VEHICLES, in_real_air
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.engines.mujoco import BatchEngine
 
 COUNT = 19  # more than the kernel takes at a time, and no whole lanes
 STEPS = 5
-# In air with four and with five rotors: for more of them the compiler takes ten seconds and more.
-IN_AIR = {name: it for name, it in helpers.IN_AIR.items() if it.rotor_count < 6}
+# In air with four rotors: for more of them the compiler takes ten seconds and more.
+LEANING = dataclasses.replace(
+    VEHICLES["paper"],
+    rotors=[
+        dataclasses.replace(rotor, axis=(0.6 * x - 0.3 * y, 0.6 * y + 0.3 * x, z))
+        for rotor in VEHICLES["paper"].rotors
+        for x, y in [rotor.position[:2]]
+        for z in [math.sqrt(1 - 0.45 * (x**2 + y**2))]
+    ],
+)
+IN_AIR = {name: it for name, it in helpers.IN_AIR.items() if it.rotor_count == 4}
+IN_AIR |= {"leaning in air": in_real_air(LEANING)}
 EVERY = helpers.LAYOUTS | IN_AIR
 every_layout = pytest.mark.parametrize("name", EVERY)
 

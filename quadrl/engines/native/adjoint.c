@@ -18,37 +18,46 @@
 
 #include "reverse.h"  // written by quadrl/engines/adjoint.py for EFFECTS of the air and ROTORS
 
-// A function of its own, which spares the compiler the copies that a loop over stages would make.
-VECTORISED static void rate_at(const Aircraft* restrict a, const Setting* restrict s,
-                               double gravity, const Lanes* restrict m, Lanes* restrict rate) {
-  derivative(a, s, EFFECTS, ROTORS, gravity, m, rate);
+// What the way back has to know of a step: where its stages were, and the quaternion that it made
+// one of unit length at its end.
+typedef struct {
+  Lanes at[4][ROWS], quaternion[4];
+} Step;
+
+// Flies some steps from m.
+VECTORISED static void there(const Aircraft* a, const World* world, Setting* s, Lanes* m,
+                             int64_t steps, Step* path) {
+  Stages t;
+  prepare(a, EFFECTS, ROTORS, s);
+  for (Step* now = path; now < path + steps; ++now) {
+    memcpy(now->at[0], m, sizeof now->at[0]);
+    for (int n = 0; n < 4; ++n) {
+      do_stage(a, s, EFFECTS, ROTORS, world, n, m, &t);
+      if (n < 3) memcpy(now->at[n + 1], t.at, sizeof t.at);
+    }
+    move(4, m + QUATERNION, world->timestep / 6, t.sum + QUATERNION, now->quaternion);
+    finish_step(ROTORS, world, &t, m);
+  }
 }
 
-// Of one Runge-Kutta step from m: m_, the derivatives by where it leads, become those by m.
-INLINE void back_step(const Aircraft* a, const World* world, const Setting* s, const Lanes* m,
+// Of one Runge-Kutta step: m_, the derivatives by where it leads, become those by where it began.
+INLINE void back_step(const Aircraft* a, const World* world, const Setting* s, const Step* step,
                       Lanes* m_, Lanes* command_) {
   const double h = world->timestep, ahead[3] = {0.5 * h, 0.5 * h, h};
   const double share[4] = {h / 6, h / 3, h / 3, h / 6};
   const int rows = SPEED + ROTORS;
-  Lanes at[4][ROWS], rate[4][ROWS], end_[ROWS], rate_[ROWS], at_[ROWS];
-  memcpy(at[0], m, sizeof at[0]);
-  for (int n = 0; n < 4; ++n) {
-    rate_at(a, s, world->gravity, at[n], rate[n]);
-    if (n < 3) move(rows, m, ahead[n], rate[n], at[n + 1]);
-  }
+  Lanes end_[ROWS], rate_[ROWS], at_[ROWS];
   // The quaternion is made one of unit length at the end.
   for (int i = 0; i < LANES; ++i) {
-    double q[4], square = 0, along = 0;
+    double square = 0, along = 0;
     for (int k = 0; k < 4; ++k) {
-      const int row = QUATERNION + k;
-      q[k] = m[row][i] + h / 6 * (rate[0][row][i] + 2 * rate[1][row][i] + 2 * rate[2][row][i] +
-                                  rate[3][row][i]);
-      square += q[k] * q[k];
-      along += q[k] * m_[row][i];
+      square += step->quaternion[k][i] * step->quaternion[k][i];
+      along += step->quaternion[k][i] * m_[QUATERNION + k][i];
     }
     const double over = 1 / square, scale = sqrt(over);
     for (int k = 0; k < 4; ++k) {
-      m_[QUATERNION + k][i] = scale * (m_[QUATERNION + k][i] - over * along * q[k]);
+      Lanes* q_ = m_ + QUATERNION + k;
+      (*q_)[i] = scale * ((*q_)[i] - over * along * step->quaternion[k][i]);
     }
   }
   memcpy(end_, m_, sizeof end_);
@@ -58,37 +67,46 @@ INLINE void back_step(const Aircraft* a, const World* world, const Setting* s, c
         rate_[k][i] = share[n] * end_[k][i] + (n < 3 ? ahead[n] * at_[k][i] : 0);
       }
     }
-    back_derivative((const Lanes*)a, at[n], s->command, s->air, rate_, at_, command_);
+    back_derivative((const Lanes*)a, step->at[n], s->command, s->air, rate_, at_, command_);
     move(rows, m_, 1, at_, m_);
   }
 }
 
-// Flies some steps from m, whose beginnings it keeps in `path`; then, if m_ holds the derivatives
-// by where they lead, it makes them those by m.
-VECTORISED static void there_and_back(const Aircraft* a, const World* world, Setting* s, Lanes* m,
-                                      int64_t steps, Lanes* path, Lanes* m_, Lanes* command_) {
-  for (int64_t step = 0; step < steps; ++step) {
-    memcpy(path + ROWS * step, m, ROWS * sizeof(Lanes));
-    runge_kutta(a, EFFECTS, ROTORS, world, s, m, 1);
+VECTORISED static void back(const Aircraft* a, const World* world, const Setting* s, int64_t steps,
+                            const Step* path, Lanes* m_, Lanes* command_) {
+  while (steps-- > 0) back_step(a, world, s, path + steps, m_, command_);
+}
+
+// Whether a stage was where the ground has an effect that EFFECTS leave out.
+static int misses_ground(const Aircraft* a, const Step* path, int64_t steps, int filled) {
+  if (EFFECTS == GROUND_EFFECT) return 0;
+  for (const Step* step = path; step < path + steps; ++step) {
+    for (int i = 0; i < filled; ++i) {
+      for (int n = 0; n < 4; ++n) {
+        if (is_near_ground(a, ROTORS, step->at[n][POSITION + 2][i], i)) return 1;
+      }
+    }
   }
-  for (int64_t step = steps; m_ && step-- > 0;) {
-    back_step(a, world, s, path + ROWS * step, m_, command_);
-  }
+  return 0;
 }
 
 // Where the rows are, all contiguous: motions (7 of qpos, 6 of qvel, one per rotor), commands (one
 // per rotor), air (AIR) and parameters as in free_flight.c. given: the derivatives by the motions
-// at the end, or NULL to fly alone. Filled: end, from_start and from_command. path has room for
-// ROWS * LANES numbers per step. Filled by quadrl/engines.
+// at the end, or NULL to fly alone. Filled: end, from_start and from_command. path: room for the
+// steps. left: 1 for each LANES aircraft that are to be flown; what is done becomes 0. Filled by
+// quadrl/engines.
 typedef struct {
   const double *start, *command, *air, *parameters, *given;
   const World* world;
-  double *end, *from_start, *from_command, *path;
+  double *end, *from_start, *from_command;
+  Step* path;
+  char* left;
   int64_t block;
 } Legs;
 
 // Flies `count` aircraft some steps, and goes back. It knows no ground: the derivatives are those
-// of a flight that touches nothing. Nothing of one whose parameters are not sound is a number.
+// of a flight that touches nothing. Nothing of one whose parameters are not sound is a number. Those
+// that come where the ground has an effect are left, if this kernel does not have it.
 QUADRL_EXPORT void quadrl_adjoint(const Legs* legs, int64_t count, int64_t steps) {
   const Legs r = *legs;
   Setting s;
@@ -102,6 +120,7 @@ QUADRL_EXPORT void quadrl_adjoint(const Legs* legs, int64_t count, int64_t steps
   const Aircraft* a = r.block ? (const Aircraft*)r.parameters : &same;
   const int rows = SPEED + ROTORS;
   for (int64_t row = 0; row < count; row += LANES) {
+    if (!r.left[row / LANES]) continue;
     const int filled = count - row < LANES ? (int)(count - row) : LANES;
     if (r.block) a = (const Aircraft*)(r.parameters + row / LANES * r.block);
     for (int i = 0; i < LANES; ++i) {
@@ -113,7 +132,10 @@ QUADRL_EXPORT void quadrl_adjoint(const Legs* legs, int64_t count, int64_t steps
       if (!is_sound(a, ROTORS, i)) m[QUATERNION][i] = NAN;
     }
     memset(command_, 0, sizeof command_);
-    there_and_back(a, r.world, &s, m, steps, (Lanes*)r.path, r.given ? m_ : 0, command_);
+    there(a, r.world, &s, m, steps, r.path);
+    if (misses_ground(a, r.path, steps, filled)) continue;
+    r.left[row / LANES] = 0;
+    if (r.given) back(a, r.world, &s, steps, r.path, m_, command_);
     for (int i = 0; i < filled; ++i) {
       for (int k = 0; k < rows; ++k) r.end[(row + i) * rows + k] = m[k][i];
       if (!r.given) continue;

@@ -35,18 +35,6 @@ VECTORISED static void fly_near_ground(const Aircraft* a, int rotors, const Worl
   runge_kutta(a, GROUND_EFFECT, rotors, world, s, m, steps);
 }
 
-// Distance of the farthest rotor from the centre of mass [m], and the largest disc.
-static void extent(const Aircraft* a, int rotors, double* reach, double* radius, int i) {
-  *reach = *radius = 0;
-  for (int k = 0; k < rotors; ++k) {
-    const Rotor* rotor = a->rotor + k;
-    const double r[3] = {rotor->position[0][i], rotor->position[1][i], rotor->position[2][i]};
-    const double distance = aero_length(r);
-    *reach = distance > *reach ? distance : *reach;
-    *radius = rotor->disc_radius[i] > *radius ? rotor->disc_radius[i] : *radius;
-  }
-}
-
 // Largest acceleration that the aircraft of a lane can have in `time` [s], whatever it does.
 static double strongest_pull(const Aircraft* a, int rotors, const World* world, const Setting* s,
                              const Lanes* m, double time, int i) {
@@ -96,11 +84,7 @@ static int effects_of(const Aircraft* a, int rotors, const double low[LANES]) {
   int effects = STILL_AIR;
   for (int i = 0; i < LANES; ++i) {
     int own = aero_effects(a, i);
-    if (own == GROUND_EFFECT) {
-      double reach, radius;
-      extent(a, rotors, &reach, &radius, i);
-      if (low[i] - reach > 8 * radius) own = ROTOR_EFFECTS;
-    }
+    if (own == GROUND_EFFECT && !is_near_ground(a, rotors, low[i], i)) own = ROTOR_EFFECTS;
     if (own > effects) effects = own;
   }
   return effects;

@@ -36,6 +36,18 @@ INLINE int is_sound(const Aircraft* a, int rotors, int i) {
   return a->rotor_count[i] == rotors && aero_effects(a, i) >= 0;
 }
 
+// Distance of the farthest rotor from the centre of mass [m], and the largest disc.
+static inline void extent(const Aircraft* a, int rotors, double* reach, double* radius, int i) {
+  *reach = *radius = 0;
+  for (int k = 0; k < rotors; ++k) {
+    const Rotor* rotor = a->rotor + k;
+    const double r[3] = {rotor->position[0][i], rotor->position[1][i], rotor->position[2][i]};
+    const double distance = aero_length(r);
+    *reach = distance > *reach ? distance : *reach;
+    *radius = rotor->disc_radius[i] > *radius ? rotor->disc_radius[i] : *radius;
+  }
+}
+
 // Body to world. Between the stages the quaternion is not quite of unit length; its direction
 // counts.
 INLINE void rotation(const Lanes* q, double turn[3][3], int i) {
@@ -149,6 +161,17 @@ INLINE void prepare(const Aircraft* a, int effects, int rotors, Setting* s) {
   }
 }
 
+// What the stages give, and a quaternion of unit length.
+INLINE void finish_step(int rotors, const World* world, const Stages* t, Lanes* m) {
+  move(SPEED + rotors, m, world->timestep / 6, t->sum, m);
+  Lanes* q = m + QUATERNION;
+  for (int i = 0; i < LANES; ++i) {
+    const double scale = 1 / sqrt(q[0][i] * q[0][i] + q[1][i] * q[1][i] + q[2][i] * q[2][i] +
+                                  q[3][i] * q[3][i]);
+    for (int k = 0; k < 4; ++k) q[k][i] *= scale;
+  }
+}
+
 INLINE void runge_kutta(const Aircraft* a, int effects, int rotors, const World* world,
                         Setting* s, Lanes* m, int64_t steps) {
   Stages t;
@@ -162,14 +185,16 @@ INLINE void runge_kutta(const Aircraft* a, int effects, int rotors, const World*
     } else {
       for (int n = 0; n < 4; ++n) do_stage(a, s, effects, rotors, world, n, m, &t);
     }
-    move(SPEED + rotors, m, world->timestep / 6, t.sum, m);
-    Lanes* q = m + QUATERNION;
-    for (int i = 0; i < LANES; ++i) {
-      const double scale = 1 / sqrt(q[0][i] * q[0][i] + q[1][i] * q[1][i] + q[2][i] * q[2][i] +
-                                    q[3][i] * q[3][i]);
-      for (int k = 0; k < 4; ++k) q[k][i] *= scale;
-    }
+    finish_step(rotors, world, &t, m);
   }
+}
+
+// Whether the ground has an effect, on an aircraft that has it, with the centre of mass at a height.
+static inline int is_near_ground(const Aircraft* a, int rotors, double height, int i) {
+  double reach, radius;
+  if (a->effects[i] != GROUND_EFFECT) return 0;
+  extent(a, rotors, &reach, &radius, i);
+  return height - reach <= 8 * radius;
 }
 
 #endif  // QUADRL_RUNGE_KUTTA_H_
