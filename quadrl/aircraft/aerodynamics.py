@@ -5,6 +5,8 @@ All of it is off by default, so that the paper's equations stay what they are. T
 sources.
 """
 
+# pyright: reportUnnecessaryIsInstance=false
+# What users give is checked, whatever its annotation promises.
 from __future__ import annotations
 
 import dataclasses

@@ -1,10 +1,12 @@
 """Preset aircraft and their effects of the air, with the source of every number."""
 
+# pyright: reportUnnecessaryIsInstance=false
+# What users give is checked, whatever its annotation promises.
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from quadrl.aircraft.aerodynamics import EFFECTS, FULL, NONE, SWITCHES, Aerodynamics
@@ -154,7 +156,8 @@ def _of_fields(given: Mapping[str, Any]) -> Vehicle:
     """A vehicle from fields that differ from a known one's, as JSON has them."""
     keys("field of vehicle", given, [field.name for field in dataclasses.fields(Vehicle)])
     changes = dict(given)
-    if isinstance(rotors := changes.get("rotors"), (list, tuple)):
+    rotors: Sequence[Any] | None = changes.get("rotors")
+    if isinstance(rotors, (list, tuple)):
         changes["rotors"] = tuple(record("rotors", rotor, Rotor) for rotor in rotors)
     if "aerodynamics" in changes:
         changes["aerodynamics"] = record("aerodynamics", changes["aerodynamics"], Aerodynamics)

@@ -5,6 +5,8 @@ that are known by name, `parameters` makes the rows of numbers that the engines 
 `quadrl.engines.mjcf` the MuJoCo model.
 """
 
+# pyright: reportUnnecessaryIsInstance=false
+# What users give is checked, whatever its annotation promises.
 from __future__ import annotations
 
 import dataclasses
