@@ -125,7 +125,7 @@ class Reach:
         return max(high, min(math.ceil(high / digit - SURE) * digit, self.room))
 
 
-def samples(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[np.ndarray, np.ndarray]:
+def samples(sampler: AircraftSampler) -> tuple[np.ndarray, np.ndarray]:
     """Rows of parameters of aircraft that are drawn, and of some at corners of the ranges."""
     keys = np.arange(SAMPLES)
     shares = uniform(keys, np.zeros_like(keys), PARAMETERS, 0, len(sampler.names))
@@ -145,7 +145,7 @@ def unreached(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[float, str, f
     """
     if not sampler.randomization.per_row:
         return 0.0, "", vehicle.action_scale
-    drawn, corners = samples(vehicle, sampler)
+    drawn, corners = samples(sampler)
     reach, scale = Reach(vehicle, drawn), vehicle.action_scale
     share = 1 - float(reach.carries(scale).mean())
     if share == 0:

@@ -93,7 +93,7 @@ def check(
 def _thrust(vehicle: Vehicle, sampler: AircraftSampler) -> Iterator[Row]:
     """Thrust, and the action scale that follows."""
     reach, scale = Reach(vehicle), vehicle.action_scale
-    drawn = Reach(vehicle, np.concatenate(samples(vehicle, sampler)))
+    drawn = Reach(vehicle, np.concatenate(samples(sampler)))
     needed, room = drawn.scale(), reach.room
     hover = vehicle.hover_speed / vehicle.max_speed
     yield Row("hover speed", float(vehicle.hover_speed.max()), "rad/s")
@@ -135,7 +135,7 @@ def _moments(vehicle: Vehicle, task: Task) -> Iterator[Row]:
 
 def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Iterator[Row]:
     """What the steps resolve, and how soon the aircraft answers; what does not is refused."""
-    table = np.concatenate(samples(vehicle, sampler))
+    table = np.concatenate(samples(sampler))
     rotor = table["rotor"][:, : vehicle.rotor_count]
     rates = np.stack([rotor["lag_up"], rotor["lag_down"]])
     step, control = vehicle.physics_timestep, vehicle.control_timestep

@@ -132,7 +132,7 @@ def test_the_scale_that_is_named_is_enough():
         share, lack, enough = unreached(PAPER, AircraftSampler(drawn, PAPER))
         wide = resolve("paper", {"action_scale": enough})
         assert unreached(wide, AircraftSampler(drawn, wide))[0] == 0
-        table = np.concatenate(feasibility.samples(wide, AircraftSampler(drawn, wide)))
+        table = np.concatenate(feasibility.samples(AircraftSampler(drawn, wide)))
         assert Reach(wide, table).loads(enough)[1].min() >= MARGIN * (1 - 1e-6)
         if drawn == {"mass": (1.0, 1.5)}:
             assert share == pytest.approx((1.5 - MOST) / 0.5, abs=0.03)
