@@ -54,19 +54,30 @@ class Observing:
         own = {name: dict(options) for name, options in self.sensors.items()}
         object.__setattr__(self, "sensors", own)
 
-    def made(self, further: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Sensor]:
-        """The sensors by name, in the order of their entries.
+    def made(
+        self, further: Mapping[str, Mapping[str, Any]] | None = None, *, uncertain: bool = False
+    ) -> dict[str, Sensor]:
+        """The sensors by name, in the order in which they sense.
 
         Args:
             further: Those that the task asks for, where the options do not name them.
+            uncertain: Whether the randomization gives the state estimate errors.
         """
-        given: dict[str, Any] = {"state": {}}
-        given |= {name: {} for name in ("airspeed", "disturbance") if getattr(self, name)}
-        if self.action_history:
-            given["action_history"] = {"length": self.action_history}
+        lengths = "action_history", "observation_history"
+        given: dict[str, Any] = {"rotor_speed": {}, "estimate": {}, "state": {}}
+        given |= {k: {} for k in ("airspeed", "disturbance", "privileged") if getattr(self, k)}
+        given |= {k: {"length": length} for k in lengths if (length := getattr(self, k))}
         for own in (further or {}, self.sensors):
             given |= {name: given.get(name, {}) | dict(options) for name, options in own.items()}
-        return {name: sensors.make(name, options) for name, options in given.items()}
+        seen = self.rotor_speed
+        modelled = seen == "estimated" or (seen == "none" and "disturbance" in given)
+        speeds = {"source": "estimated" if modelled else "true", "entry": seen != "none"}
+        given["rotor_speed"] = speeds | given["rotor_speed"]
+        made = {name: sensors.make(name, options) for name, options in given.items()}
+        truth = sensors.RotorSpeed(entry=seen != "none"), sensors.StateEstimate()
+        if not uncertain and (made["rotor_speed"], made["estimate"]) == truth:
+            del made["estimate"]
+        return dict(sorted(made.items(), key=lambda item: item[1].last))
 
     def given(self) -> dict[str, Any]:
         """The options that differ from the usual."""
@@ -75,7 +86,8 @@ class Observing:
 
     def for_policy(self) -> dict[str, Any]:
         """The options that change what a policy observes."""
-        return {name: value for name, value in self.given().items() if name != "privileged"}
+        own = {name: options for name, options in self.sensors.items() if name != "privileged"}
+        return dataclasses.replace(self, privileged=False, sensors=own).given()
 
 
 Observed = Observing | Mapping[str, Any] | None

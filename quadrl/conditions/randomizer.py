@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.philox import PARAMETERS, PUSHES
+from quadrl.base.philox import NOISE, PARAMETERS, PUSHES
 from quadrl.base.rotation import Array
+from quadrl.conditions.randomization import NONE
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.engines import native
@@ -52,6 +54,8 @@ class Randomizer:
         self.queue = np.zeros((longest + 1, count, rotors))  # [rad/s]
         self.newest = np.zeros(1, np.int64)  # where in the queue
         self._delay = np.zeros(count, np.int64)  # [physics steps]
+        self.age = np.zeros(count, np.int64)
+        """Of what is measured where it is seen [control steps], drawn for each episode."""
 
     def sample(
         self, keys: np.ndarray, episodes: np.ndarray
@@ -99,9 +103,19 @@ class Randomizer:
         """The drawn values that differ between aircraft, (N,) by name."""
         return {self.sampler.names[k]: self.drawn[:, k] for k in self.sampler.spread}
 
+    def scaled(self, rows: np.ndarray | None = None) -> Array:
+        """The same of some aircraft (n,), or of all, (n, d) from -1 at the lowest to 1."""
+        return self.sampler.scaled(self.drawn if rows is None else self.drawn[rows])
+
     def _set_delay(self) -> None:
-        steps = self.column("command_delay") / self._engine.vehicle.physics_timestep
-        self._delay = np.rint(steps).astype(np.int64)
+        vehicle = self._engine.vehicle
+        self._delay, self.age = (
+            np.rint(self.column(name) / timestep).astype(np.int64)
+            for name, timestep in (
+                ("command_delay", vehicle.physics_timestep),
+                ("observation_delay", vehicle.control_timestep),
+            )
+        )
 
     def wind_speed(self, rows: np.ndarray, weather: Weather) -> Array | None:
         """Wind speed of some aircraft (n,) [m/s]; None where it is the weather's."""
@@ -117,6 +131,35 @@ class Randomizer:
         self.newest[0] = newest = (self.newest[0] + 1) % length
         self.queue[newest] = command
         return self.queue[(newest - self._delay) % length, self._rows]
+
+    def estimated(self, rows: np.ndarray | None, rotor_speed: Array) -> Array:
+        """Coordinates with the noise and the bias of the randomization, (n, 13 + R).
+
+        Args:
+            rows: Of some aircraft (n,), or of all for None.
+            rotor_speed: That is estimated, (n, R) [rad/s].
+
+        Returns:
+            Position [m], world frame, quaternion, velocity [m/s], world frame, body rate [rad/s],
+            body frame, rotor speeds.
+        """
+        chosen: Any = slice(None) if rows is None else rows
+        given, engine = self.sampler.randomization, self._engine
+        true = np.concatenate([engine.qpos[chosen], engine.qvel[chosen]], axis=1)
+        count, rotors = rotor_speed.shape
+        found = np.empty((count, 13 + rotors))
+        bias = self.sampler.columns(self.drawn[chosen], "position_bias_x", 12)
+        rotor_speed = np.ascontiguousarray(rotor_speed)
+        place = (part[chosen] for part in (*self.place, self.steps))
+        noise = given.noise.sizes
+        arrays = *place, true, true[:, 7:], rotor_speed, noise, bias, found
+        strides = (array.strides[0] // 8 for array in (true, rotor_speed, bias, found))
+        # As `Rows` in native/disturbances.c.
+        noisy = given.noise != NONE.noise
+        addresses = (array.ctypes.data for array in arrays)
+        where = np.array([*addresses, *strides, rotors, noisy, NOISE])
+        native.library().quadrl_estimate(where.ctypes.data, count)
+        return found
 
     def begin_step(self) -> None:
         """Count a control step that begins, and push the aircraft that chance hits."""

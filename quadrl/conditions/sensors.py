@@ -1,136 +1,123 @@
-"""Sensors: what is measured on board, each with its own errors, delay and rate.
+"""Sensors: what is estimated, measured and remembered, each with its own errors, delay and rate.
 
 A sensor is a frozen dataclass: its fields are its options, its methods are pure functions of a
-`Moment`. One of your own is a class with `sense`, registered by its name.
+`Moment`. One of your own is a class with `sense`, registered by its name. In a control step they
+sense one after the other: rotor speeds, the estimate, what is measured; then, after the task's
+functions, the task's entries, the history, and what the critic alone sees.
 """
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import math
-import zlib
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Literal
 
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.rotors import GRAVITY, MAX
+from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
-from quadrl.base.philox import SENSORS as STREAMS
 from quadrl.base.rotation import Array, to_body, to_world
-from quadrl.base.validation import choice, keys, number
-from quadrl.conditions.randomization import LONGEST_DELAY
-from quadrl.conditions.randomizer import Randomizer
-from quadrl.conditions.sampler import whole_steps
+from quadrl.base.validation import choice, number
+from quadrl.conditions.sensor import SENSORS as SENSORS
+from quadrl.conditions.sensor import Channel as Channel
+from quadrl.conditions.sensor import Memory, Moment, Sensor, Sizes, register_sensor
+from quadrl.conditions.sensor import make as make
 from quadrl.engines.dynamics import thrust_wrench
-from quadrl.engines.rng import normal, uniform
 from quadrl.engines.state import State
 
-Memory = dict[str, Array]
 LONGEST_HISTORY = 1000
 SMOOTHING = 0.1  # [s], of the acceleration that thrust does not explain
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
 
 
-@dataclasses.dataclass(slots=True)
-class Moment:
-    """All that a sensor may look at, at the end of a control step; arrays (N, ...)."""
+@register_sensor
+class RotorSpeed(Sensor):
+    """Rotor speeds, for the estimate."""
 
-    true: State
-    state: State  # that is estimated on board; the true one where nothing disturbs the estimate
-    wind: Array  # (N, 3) [m/s], world frame
-    action: Array  # (N, k), as it was given; zero at the start
-    parameters: Parameters  # of the specified aircraft
-    entries: Array  # (N, e), the task's own entries of the estimated state
-    memory: Memory  # what the sensor itself remembers, arrays (N, ...)
+    name, unit, measured, shown = "rotor_speed", "rad/s", False, False
 
-
-@dataclasses.dataclass(frozen=True)
-class Sensor(abc.ABC):
-    """A sensor of N aircraft. Every number of it has the same errors."""
-
-    name: ClassVar[str]
-    """The name in the registry and of the entry in the observation."""
-    size: ClassVar[int] = 1
-    """Numbers that it gives."""
-    unit: ClassVar[str] = "1"
-    measured: ClassVar[bool] = True
-    """Whether the delay of the observation and its history hold for it."""
-
-    noise: float = 0.0
-    """Standard deviation of the error of each sample, in the sensor's unit."""
-    bias: float = 0.0
-    """Largest error that lasts for an episode."""
-    delay: float = 0.0
-    """Age of what is seen [s], in whole control steps."""
-    rate: float = 0.0
-    """Samples in a second, each held until the next one; 0 for one at each control step."""
+    source: Literal["true", "estimated"] = "true"
+    """True, or what follows from the commands with the lag that is specified."""
+    entry: bool = True
+    """Whether the task's entry of them is seen."""
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        for name in ("noise", "bias", "rate", "delay"):
-            most = LONGEST_DELAY if name == "delay" else MAX
-            value = number(f"{self.name} {name}", getattr(self, name), 0, most)
-            object.__setattr__(self, name, value)
+        super().__post_init__()
+        choice("rotor_speed source", self.source, ("true", "estimated"))
 
-    def width(self, actions: int) -> int:
-        """Numbers that it gives on an aircraft with some numbers in an action."""
-        return self.size
+    @property
+    def hides(self) -> tuple[str, ...]:
+        """The task's own entry, on demand."""
+        return () if self.entry else ("rotor_speed",)
+
+    def width(self, sizes: Sizes) -> int:
+        """One for each rotor."""
+        return sizes.rotors
 
     def begin(self, now: Moment) -> Memory:
-        """What it remembers at the start of episodes, arrays (n, ...) by name."""
-        return {}
+        """The model starts from the true ones."""
+        return {"speed": now.true.rotor_speed}
 
-    def update(self, now: Moment) -> Memory:
-        """What it remembers after a control step, in place of `now.memory`."""
-        return now.memory
+    def follow(
+        self, memory: Memory, specified: Parameters, command: Array, seconds: float
+    ) -> Memory:
+        """Each approaches its command, no faster than the rotor turns at most."""
+        speed, rotor = memory["speed"], specified.rotor
+        goal = np.minimum(command, rotor.max_speed)
+        up, down = (1 - np.exp(-seconds * lag) for lag in (rotor.lag_up, rotor.lag_down))
+        return {"speed": speed + np.where(goal > speed, up, down) * (goal - speed)}
 
-    @abc.abstractmethod
     def sense(self, now: Moment) -> Array:
-        """What it measures, (n, size)."""
+        """True or modelled."""
+        return now.true.rotor_speed if self.source == "true" else now.memory["speed"]
+
+    def tell(self, now: Moment, seen: Array) -> None:
+        """To the estimate."""
+        now.rotor_speed = seen if now.rows is None else seen[now.rows]
 
 
-SENSORS: dict[str, type[Sensor]] = {}
-"""Every registered sensor by name."""
+@register_sensor
+class StateEstimate(Sensor):
+    """Coordinates of the state as they are estimated on board, which all that is seen follows from.
 
-
-def register_sensor(kind: type[Sensor]) -> type[Sensor]:
-    """Add a sensor to the registry, so that `observe` knows it by its name.
-
-    Raises:
-        QuadrlError: It is not a Sensor subclass with a name, or another sensor has the name.
+    Its errors are the randomization's `noise` and `bias`.
     """
-    name = getattr(kind, "name", None)
-    named = isinstance(kind, type) and issubclass(kind, Sensor) and isinstance(name, str)
-    if not named or not name.isidentifier():  # type: ignore[union-attr]
-        allowed = "a Sensor subclass with a string `name` such as 'my_sensor'"
-        raise QuadrlError(name="sensor", value=kind, allowed=allowed)
-    if SENSORS.get(name, kind) is not kind:  # type: ignore[arg-type]
-        raise QuadrlError(name="sensor name", value=name, allowed="one that no other sensor has")
-    SENSORS[name] = kind = dataclasses.dataclass(frozen=True)(kind)  # type: ignore[index]
-    return kind
 
+    name, unit, measured, shown = "estimate", "", False, False
 
-def make(name: str, options: Any) -> Sensor:
-    """The sensor of a name with some options.
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        super().__post_init__()
+        for name in ("noise", "bias"):
+            if value := getattr(self, name):
+                allowed = f"0; its errors are `{name}` of the randomization"
+                raise QuadrlError(name=f"estimate {name}", value=value, allowed=allowed)
 
-    Raises:
-        QuadrlError: An unknown sensor or option; the message lists the choices.
-    """
-    kind = SENSORS[choice("sensor", name, SENSORS)]
-    if not isinstance(options, Mapping):
-        raise QuadrlError(name=f"sensor {name}", value=options, allowed="a mapping of its options")
-    keys(f"option of {name}", options, [field.name for field in dataclasses.fields(kind)])
-    return kind(**options)
+    def width(self, sizes: Sizes) -> int:
+        """Position, quaternion, velocity, body rate, rotor speeds."""
+        return 13 + sizes.rotors
+
+    def sense(self, now: Moment) -> Array:
+        """With the errors that are drawn."""
+        return now.randomizer.estimated(now.rows, now.rotor_speed)
+
+    def tell(self, now: Moment, seen: Array) -> None:
+        """To all that looks at the estimated state."""
+        if now.frame is not None:
+            now.state = now.frame.fill(seen, now.rows)
 
 
 @register_sensor
 class Entries(Sensor):
     """The task's own entries of the observation."""
 
-    name, unit = "state", ""
+    name, unit, last = "state", "", True
+
+    def width(self, sizes: Sizes) -> int:
+        """All of them that are seen."""
+        return sizes.entries
 
     def sense(self, now: Moment) -> Array:
         """As the task gives them."""
@@ -170,11 +157,11 @@ class Disturbance(Sensor):
         return to_body(now.state.rotation, now.memory["felt"])
 
 
-@register_sensor
-class ActionHistory(Sensor):
-    """The last actions, the newest first."""
+@dataclasses.dataclass(frozen=True)
+class History(Sensor):
+    """The last of something, the newest first."""
 
-    name, measured = "action_history", False
+    measured = False
 
     length: int = 1
     """How many; zeros before the first."""
@@ -182,99 +169,77 @@ class ActionHistory(Sensor):
     def __post_init__(self) -> None:
         """Validate the options."""
         super().__post_init__()
-        number("action_history length", self.length, 1, LONGEST_HISTORY, whole=True)
+        number(f"{self.name} length", self.length, 1, LONGEST_HISTORY, whole=True)
 
-    def width(self, actions: int) -> int:
+
+@register_sensor
+class ActionHistory(History):
+    """The last actions, the newest first."""
+
+    name = "action_history"
+
+    def width(self, sizes: Sizes) -> int:
         """All numbers of all actions."""
-        return self.length * actions
+        return self.length * sizes.actions
 
     def begin(self, now: Moment) -> Memory:
         """No action was taken."""
-        return {"actions": np.zeros((len(now.action), self.width(now.action.shape[1])))}
+        return {"actions": np.zeros((len(now.action), self.length * now.action.shape[1]))}
 
     def update(self, now: Moment) -> Memory:
         """Put the last one before the others, of which the oldest goes."""
-        older = now.memory["actions"][:, : -now.action.shape[1]]
-        return {"actions": np.concatenate([np.clip(now.action, -1.0, 1.0), older], axis=-1)}
+        return {"actions": pushed(now.memory["actions"], np.clip(now.action, -1.0, 1.0))}
 
     def sense(self, now: Moment) -> Array:
         """As they were taken."""
         return now.memory["actions"]
 
 
-class Channel:
-    """The output of a sensor for N aircraft: its samples with errors, rate and delay."""
+@register_sensor
+class ObservationHistory(History):
+    """The observations before, the newest first; the first one stands for those before it."""
 
-    def __init__(self, sensor: Sensor, width: int, randomizer: Randomizer, timestep: float) -> None:
-        """Set up the arrays.
+    name, unit, last = "observation_history", "", True
 
-        Raises:
-            QuadrlError: The delay or the time between two samples is not a multiple of the time
-                step [s].
-        """
-        self.sensor, self._width, self._randomizer = sensor, width, randomizer
-        times = sensor.delay, 1 / sensor.rate if sensor.rate else timestep
-        names = f"{sensor.name} delay and time of a sample [s]"
-        self._delay, self._period = whole_steps(names, times, timestep, "control")
-        self._stream = STREAMS + 2 * (zlib.crc32(sensor.name.encode()) >> 3)
-        count = len(randomizer.steps)
-        self._values = np.zeros((1 + self._delay, count, width))  # the newest first
-        self._bias = np.zeros((count, width))
-        self._memory: Memory = {}
+    def width(self, sizes: Sizes) -> int:
+        """All numbers of what is measured."""
+        return self.length * sizes.observed
 
-    @property
-    def seen(self) -> Array:
-        """What is seen of it now, (N, size)."""
-        return self._values[self._delay]
+    def begin(self, now: Moment) -> Memory:
+        """There is none but the first."""
+        return {"past": np.tile(now.observed, 1 + self.length)}
 
-    def begin(self, rows: np.ndarray, now: Moment) -> None:
-        """Begin episodes (n,); the first sample is seen until the next one arrives."""
-        now.memory = self.sensor.begin(now)
-        kept = {name: np.array(array) for name, array in self._memory.items()}
-        for name, array in now.memory.items():
-            kept.setdefault(name, np.zeros((len(self._bias), *array.shape[1:])))[rows] = array
-        if self.sensor.bias:
-            keys, episodes = self._randomizer.place[:, rows]
-            shares = uniform(keys, episodes, self._stream + 1, 0, self._width)
-            self._bias[rows] = self.sensor.bias * (2 * shares - 1)
-        values = self._values.copy()
-        values[:, rows] = self._sample(rows, now)
-        self._memory, self._values = kept, values
+    def update(self, now: Moment) -> Memory:
+        """Put the present one before the others, of which the oldest goes."""
+        return {"past": pushed(now.memory["past"], now.observed)}
 
-    def step(self, now: Moment) -> None:
-        """Sense all after a control step."""
-        now.memory = self._memory
-        self._memory = now.memory = self.sensor.update(now)
-        sample = self._sample(np.arange(len(self._bias)), now)
-        if self._period > 1:
-            fresh = self._randomizer.steps % self._period == 0
-            sample = np.where(fresh[:, None], sample, self._values[0])
-        self._values = np.concatenate([sample[None], self._values[:-1]])
+    def sense(self, now: Moment) -> Array:
+        """Those before the present one."""
+        return now.memory["past"][:, now.observed.shape[1] :]
 
-    def _sample(self, rows: np.ndarray, now: Moment) -> Array:
-        """A sample of some aircraft (n,) with its errors."""
-        sample, sensor, source = self.sensor.sense(now), self.sensor, self._randomizer
-        if np.shape(sample) != (len(rows), self._width):
-            allowed = f"an array {(len(rows), self._width)}"
-            raise QuadrlError(name=f"sense of {sensor.name}", value=sample, allowed=allowed)
-        if sensor.bias:
-            sample = sample + self._bias[rows]
-        if sensor.noise:
-            (keys, episodes), steps = source.place[:, rows], source.steps[rows]
-            errors = normal(keys, episodes, steps, self._stream, self._width)
-            sample = sample + sensor.noise * errors
-        return sample
 
-    def save(self) -> dict[str, np.ndarray]:
-        """Copies of what the next steps depend on, by the sensor's name."""
-        own = {"values": self._values, "bias": self._bias, **self._memory}
-        return {f"{self.sensor.name}.{name}": np.array(array) for name, array in own.items()}
+@register_sensor
+class Privileged(Sensor):
+    """For the critic alone: the task's true entries, what was drawn, and the wind.
 
-    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Restore what `save` returned."""
-        start = f"{self.sensor.name}."
-        own = {k.removeprefix(start): np.array(v) for k, v in saved.items() if k.startswith(start)}
-        self._values, self._bias, self._memory = own.pop("values"), own.pop("bias"), own
+    What was drawn lies between -1 and 1 in its range; the wind [m/s] is in the body frame.
+    """
+
+    name, unit, measured, shown, last = "privileged", "", False, False, True
+
+    def width(self, sizes: Sizes) -> int:
+        """All of that."""
+        return sizes.truth + sizes.drawn + 3
+
+    def sense(self, now: Moment) -> Array:
+        """Side by side."""
+        wind, drawn = to_body(now.true.rotation, now.wind), now.randomizer.scaled(now.rows)
+        return np.concatenate([*now.truth.values(), drawn, wind], axis=-1)
+
+
+def pushed(past: Array, newest: Array) -> Array:
+    """Numbers (n, k) of the past with the newest (n, m) before them; the oldest m go."""
+    return np.concatenate([newest, past[:, : -newest.shape[1]]], axis=-1)
 
 
 def moving(specified: Parameters, state: State) -> Array:

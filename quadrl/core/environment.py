@@ -365,7 +365,7 @@ class Environment(saving.Copied):
             now.around = self.scene.surroundings(self.engine)
         now.potentials = self.task.measure(now)
         self._take(now, episode)
-        return self.observer.again(now) if self.observer else self.task.observe(now)
+        return self.observer.again() if self.observer else self.task.observe(now)
 
 
 def row_memory(task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Observing) -> float:

@@ -12,8 +12,9 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SOLIDS
 from quadrl.base.rotation import Array, namespace, square_norm
-from quadrl.conditions import sensors
+from quadrl.conditions import sensor
 from quadrl.conditions.scene import Scene, Surroundings
+from quadrl.conditions.sensor import Sizes
 from quadrl.core.rewards import total
 from quadrl.core.task import EpisodeEnd, Snapshot, Task
 from quadrl.engines.rng import Rng
@@ -247,7 +248,7 @@ def check_task(
     state = State.of_coordinates(**start_state, origin_height=origin_height)
     now, _ = begin(task, state, task_state, parameters, actions, around)
     for name, options in task.sensors.items():
-        sensed = np.zeros((rows, sensors.make(name, options).width(actions)))
+        sensed = np.zeros((rows, sensor.make(name, options).width(Sizes(rotors, actions))))
         now.sensed = {**now.sensed, name: sensed}
     terminated = task.terminated(now)
     _check_array(task, "terminated", terminated, (rows,), "b")

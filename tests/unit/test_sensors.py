@@ -83,21 +83,40 @@ WILD = {
 WILD |= {"disturbance": True, "action_history": 1, "observation_history": 1}
 
 
-@pytest.mark.parametrize("name", ["state", "airspeed"])
-def test_samples_are_held_and_as_late_as_the_sensor_says(name):
+@pytest.mark.parametrize(
+    ("name", "entry"),
+    [
+        ("state", "velocity"),
+        ("estimate", "velocity"),
+        ("rotor_speed", "rotor_speed"),
+        ("airspeed", "airspeed"),
+        ("privileged", "privileged"),
+    ],
+)
+def test_samples_are_held_and_as_late_as_the_sensor_says(name, entry):
     # A step is 0.05 s: every fourth gives a sample, which is seen two steps later.
-    environment = Environment(
-        "hover", num_envs=3, seed=1, observe={"sensors": {name: {"delay": 0.1, "rate": 5}}}
-    )
-    plain = Environment("hover", num_envs=3, seed=1, observe={"airspeed": True})
-    entry = "velocity" if name == "state" else name
-    found, true = [environment.reset()[entry].copy()], [plain.reset()[entry].copy()]
-    fresh = np.array([1])
+    late = {"sensors": {name: {"delay": 0.1, "rate": 5}}}
+    environments = [
+        Environment("hover", num_envs=3, seed=1, observe=observe)
+        for observe in (late, {"airspeed": True, "privileged": True})
+    ]
+    found, true = shown = [], []
+
+    def look(step, rows=slice(None)):
+        for environment, log in zip(environments, shown, strict=True):
+            seen = step(environment)
+            if entry == "privileged":
+                seen = {entry: environment.privileged[rows]}
+            log.append(np.array(seen[entry]))
+
+    look(Environment.reset)
     for t, action in enumerate(ACTIONS):
-        found.append(environment.step(action).observation[entry].copy())
-        true.append(plain.step(action).observation[entry].copy())
+        look(lambda one, action=action: one.step(action).observation)
         if t == 4:  # an episode of its own, whose samples count from its start
-            found[-1][1], true[-1][1] = (one.reset(fresh)[entry][0] for one in (environment, plain))
+            look(lambda one: one.reset(np.array([1])), [1])
+            for log in shown:
+                fresh = log.pop()
+                log[-1][1] = fresh[0]
     for row, start in ((0, 0), (1, 5), (2, 0)):
         for t in range(len(ACTIONS) + 1 - start):
             sample = start + max(0, (t - 2) // 4 * 4)
@@ -227,6 +246,8 @@ class Velocity(Compass):
         ({"compass": {"delay": 0.07}}, "compass delay and time", "control steps of 0.05 s"),
         ({"compass": {"rate": 50}}, "compass delay and time", "control steps of 0.05 s"),
         ({"action_history": {"length": 0}}, "action_history length", "between 1"),
+        ({"estimate": {"noise": 0.1}}, "estimate noise", "`noise` of the randomization"),
+        ({"rotor_speed": {"source": "none"}}, "rotor_speed source", "true, estimated"),
         ({"velocity": {}}, "sensor", "no entry of the task hover has"),
         ({"narrow": {}}, "sense of narrow", "(1, 2)"),
     ],

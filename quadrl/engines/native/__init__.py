@@ -67,7 +67,7 @@ def load(path: Path) -> ctypes.CDLL:
     real, stride = ctypes.c_double, integer
     opened.quadrl_estimate.restype = opened.quadrl_push.restype = None
     opened.quadrl_normal.restype = None
-    opened.quadrl_estimate.argtypes = [_POINTER, integer, _POINTER]
+    opened.quadrl_estimate.argtypes = [_POINTER, integer]
     opened.quadrl_push.argtypes = [
         *(integer, _POINTER, _POINTER, _POINTER, integer, real, real, real, _POINTER, stride),
     ]

@@ -1,7 +1,7 @@
 // What disturbs many aircraft at a control step: errors of the estimated state, and pushes.
 //
 // Random numbers are those of quadrl/engines/rng.py: a stream of each episode, BLOCKS of four words for each
-// control step. The numbers of quadrl/conditions/randomizer.py and quadrl/conditions/estimate.py say which.
+// control step. The numbers of quadrl/conditions/randomizer.py say which.
 #include <math.h>
 #include <stdint.h>
 
@@ -10,7 +10,7 @@
 
 enum { ERRORS = 12, NOISE_BLOCKS = 6, PUSH_BLOCKS = 2 };
 
-// Where the rows are. Filled by quadrl/conditions/estimate.py.
+// Where the rows are. Filled by quadrl/conditions/randomizer.py.
 typedef struct {
   const int64_t *keys, *episodes, *steps;
   const double *qpos, *qvel, *act;  // of aircraft i at i * stride doubles, act at i * act_stride
@@ -48,10 +48,9 @@ QUADRL_EXPORT void quadrl_normal(int64_t n, const int64_t* keys, const int64_t* 
 }
 
 // The estimate (qpos, qvel, act) of n aircraft: position, attitude, velocity and body rate with
-// three errors each. ids lists them, or is NULL for the first n.
-QUADRL_EXPORT void quadrl_estimate(const Rows* rows, int64_t n, const int64_t* ids) {
-  for (int64_t j = 0; j < n; ++j) {
-    const int64_t i = ids ? ids[j] : j;
+// three errors each.
+QUADRL_EXPORT void quadrl_estimate(const Rows* rows, int64_t n) {
+  for (int64_t i = 0; i < n; ++i) {
     const double *p = rows->qpos + i * rows->stride, *v = rows->qvel + i * rows->stride;
     const double *speed = rows->act + i * rows->act_stride, *bias = rows->bias + i * rows->bias_stride;
     double e[ERRORS], *out = rows->estimate + i * rows->estimate_stride;

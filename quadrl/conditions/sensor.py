@@ -1,0 +1,282 @@
+"""Base class and registry of sensors, and the output of one for a batch of aircraft."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import zlib
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeVar, dataclass_transform
+
+import numpy as np
+
+from quadrl.aircraft import parameters
+from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.rotors import MAX
+from quadrl.base.errors import QuadrlError
+from quadrl.base.philox import SENSORS as STREAMS
+from quadrl.base.rotation import Array
+from quadrl.base.validation import choice, keys, number
+from quadrl.conditions.randomization import LONGEST_DELAY
+from quadrl.conditions.randomizer import Randomizer
+from quadrl.conditions.sampler import whole_steps
+from quadrl.engines import native
+from quadrl.engines.engine import Engine, Frame
+from quadrl.engines.rng import normal, uniform
+from quadrl.engines.state import State
+
+Memory = dict[str, Array]
+Kind = TypeVar("Kind", bound=type)
+
+
+@dataclasses.dataclass(slots=True)
+class Moment:
+    """All that a sensor may look at, at the end of a control step; arrays (n, ...)."""
+
+    true: State
+    state: State  # that is estimated on board; the true one where nothing disturbs the estimate
+    rotor_speed: Array  # (n, R) [rad/s], that the estimate takes
+    wind: Array  # (n, 3) [m/s], world frame
+    action: Array  # (n, k), as it was given; zero at the start
+    parameters: Parameters  # of the specified aircraft
+    randomizer: Randomizer
+    rows: np.ndarray | None  # (n,) which aircraft; None for all
+    frame: EstimatedState | None  # where the estimate is kept; None where it is the truth
+    entries: Array = None  # (n, e), the task's entries of the estimated state, that are seen
+    truth: Mapping[str, Array] = dataclasses.field(default_factory=dict)
+    """Its entries of the true state, (n, k) by name."""
+    observed: Array = None  # (n, m), what is measured, as late as it is seen
+    memory: Memory = dataclasses.field(default_factory=dict)  # what the sensor itself remembers
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """Numbers in what sensors look at, for one aircraft."""
+
+    rotors: int
+    actions: int
+    entries: int = 0
+    truth: int = 0
+    drawn: int = 0
+    observed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor(abc.ABC):
+    """A sensor of N aircraft. Every number of it has the same errors."""
+
+    name: ClassVar[str]
+    """The name in the registry and of the entry in the observation."""
+    size: ClassVar[int] = 1
+    """Numbers that it gives."""
+    unit: ClassVar[str] = "1"
+    measured: ClassVar[bool] = True
+    """Whether the delay of the observation and its history hold for it."""
+    shown: ClassVar[bool] = True
+    """Whether it is an entry of the observation."""
+    last: ClassVar[bool] = False
+    """Whether it looks at the task's entries or at what is observed, which tasks cannot see."""
+
+    noise: float = 0.0
+    """Standard deviation of the error of each sample, in the sensor's unit."""
+    bias: float = 0.0
+    """Largest error that lasts for an episode."""
+    delay: float = 0.0
+    """Age of what is seen [s], in whole control steps."""
+    rate: float = 0.0
+    """Samples in a second, each held until the next one; 0 for one at each control step."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        for name in ("noise", "bias", "rate", "delay"):
+            most = LONGEST_DELAY if name == "delay" else MAX
+            value = number(f"{self.name} {name}", getattr(self, name), 0, most)
+            object.__setattr__(self, name, value)
+
+    def width(self, sizes: Sizes) -> int:
+        """Numbers that it gives on an aircraft."""
+        return self.size
+
+    @property
+    def hides(self) -> tuple[str, ...]:
+        """Entries of the task that are not seen with it."""
+        return ()
+
+    def begin(self, now: Moment) -> Memory:
+        """What it remembers at the start of episodes, arrays (n, ...) by name."""
+        return {}
+
+    def follow(
+        self, memory: Memory, specified: Parameters, command: Array, seconds: float
+    ) -> Memory:
+        """What it remembers after commands (N, R) [rad/s] to the rotors for a time [s]."""
+        return memory
+
+    def update(self, now: Moment) -> Memory:
+        """What it remembers after a control step, in place of `now.memory`."""
+        return now.memory
+
+    @abc.abstractmethod
+    def sense(self, now: Moment) -> Array:
+        """What it measures, (n, size)."""
+
+    def tell(self, now: Moment, seen: Array) -> None:
+        """Put what is seen of all aircraft (N, size) where the sensors after it look."""
+        return
+
+
+SENSORS: dict[str, type[Sensor]] = {}
+"""Every registered sensor by name."""
+
+
+@dataclass_transform(frozen_default=True)
+def register_sensor(kind: Kind) -> Kind:
+    """Add a sensor to the registry, so that `observe` knows it by its name.
+
+    Raises:
+        QuadrlError: It is not a Sensor subclass with a name, or another sensor has the name.
+    """
+    name = getattr(kind, "name", None)
+    named = isinstance(kind, type) and issubclass(kind, Sensor) and isinstance(name, str)
+    if not named or not name.isidentifier():  # type: ignore[union-attr]
+        allowed = "a Sensor subclass with a string `name` such as 'my_sensor'"
+        raise QuadrlError(name="sensor", value=kind, allowed=allowed)
+    if SENSORS.get(name, kind) is not kind:  # type: ignore[arg-type]
+        raise QuadrlError(name="sensor name", value=name, allowed="one that no other sensor has")
+    SENSORS[name] = kind = dataclasses.dataclass(frozen=True)(kind)  # type: ignore[index]
+    return kind
+
+
+def make(name: str, options: Any) -> Sensor:
+    """The sensor of a name with some options.
+
+    Raises:
+        QuadrlError: An unknown sensor or option; the message lists the choices.
+    """
+    kind = SENSORS[choice("sensor", name, SENSORS)]
+    if not isinstance(options, Mapping):
+        raise QuadrlError(name=f"sensor {name}", value=options, allowed="a mapping of its options")
+    keys(f"option of {name}", options, [field.name for field in dataclasses.fields(kind)])
+    return kind(**options)
+
+
+class Channel:
+    """The output of a sensor for N aircraft: its samples with errors, rate and delay."""
+
+    def __init__(
+        self, sensor: Sensor, sizes: Sizes, randomizer: Randomizer, timestep: float
+    ) -> None:
+        """Set up the arrays.
+
+        Raises:
+            QuadrlError: The delay or the time between two samples is not a multiple of the time
+                step [s].
+        """
+        self.sensor, self.width, self._randomizer = sensor, sensor.width(sizes), randomizer
+        times = sensor.delay, 1 / sensor.rate if sensor.rate else timestep
+        names = f"{sensor.name} delay and time of a sample [s]"
+        self._delay, self._period = whole_steps(names, times, timestep, "control")
+        self._stream = STREAMS + 2 * (zlib.crc32(sensor.name.encode()) >> 3)
+        self._rows = np.arange(len(randomizer.steps))
+        further = randomizer.sampler.delays[1][1] if sensor.measured else 0
+        shape = 1 + self._delay + further, len(self._rows), self.width
+        self._values = np.zeros(shape)  # the newest first
+        self._bias = np.zeros(shape[1:])
+        self._memory: Memory = {}
+
+    @property
+    def seen(self) -> Array:
+        """What is seen of it now, (N, width)."""
+        return self._values[self._delay]
+
+    @property
+    def observed(self) -> Array:
+        """The same later by the delay of the observation, where that holds for it."""
+        if len(self._values) == 1 + self._delay:
+            return self.seen
+        return self._values[self._delay + self._randomizer.age, self._rows]
+
+    def begin(self, now: Moment) -> None:
+        """Begin episodes; the first sample is seen until the next one arrives."""
+        rows = self._rows if now.rows is None else now.rows
+        now.memory = self.sensor.begin(now)
+        kept = {name: np.array(array) for name, array in self._memory.items()}
+        for name, array in now.memory.items():
+            kept.setdefault(name, np.zeros((len(self._bias), *array.shape[1:])))[rows] = array
+        if self.sensor.bias:
+            keys, episodes = self._randomizer.place[:, rows]
+            shares = uniform(keys, episodes, self._stream + 1, 0, self.width)
+            self._bias[rows] = self.sensor.bias * (2 * shares - 1)
+        values = self._values.copy()
+        values[:, rows] = self._sample(rows, now)
+        self._memory, self._values = kept, values
+        self.sensor.tell(now, self.seen)
+
+    def follow(self, specified: Parameters, command: Array, seconds: float) -> None:
+        """Take commands (N, R) [rad/s] to the rotors for a time [s]."""
+        self._memory = self.sensor.follow(self._memory, specified, command, seconds)
+
+    def step(self, now: Moment) -> None:
+        """Sense all after a control step."""
+        now.memory = self._memory
+        self._memory = now.memory = self.sensor.update(now)
+        sample = self._sample(self._rows, now)
+        if self._period > 1:
+            fresh = self._randomizer.steps % self._period == 0
+            sample = np.where(fresh[:, None], sample, self._values[0])
+        self._values = np.concatenate([sample[None], self._values[:-1]])
+        self.sensor.tell(now, self.seen)
+
+    def _sample(self, rows: np.ndarray, now: Moment) -> Array:
+        """A sample of some aircraft (n,) with its errors."""
+        sample, sensor, source = self.sensor.sense(now), self.sensor, self._randomizer
+        if np.shape(sample) != (len(rows), self.width):
+            allowed = f"an array {(len(rows), self.width)}"
+            raise QuadrlError(name=f"sense of {sensor.name}", value=sample, allowed=allowed)
+        if sensor.bias:
+            sample = sample + self._bias[rows]
+        if sensor.noise:
+            (keys, episodes), steps = source.place[:, rows], source.steps[rows]
+            errors = normal(keys, episodes, steps, self._stream, self.width)
+            sample = sample + sensor.noise * errors
+        return sample
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Copies of what the next steps depend on, by the sensor's name."""
+        own = {"values": self._values, "bias": self._bias, **self._memory}
+        return {f"{self.sensor.name}.{name}": np.array(array) for name, array in own.items()}
+
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Restore what `save` returned."""
+        start = f"{self.sensor.name}."
+        own = {k.removeprefix(start): np.array(v) for k, v in saved.items() if k.startswith(start)}
+        self._values, self._bias, self._memory = own.pop("values"), own.pop("bias"), own
+
+
+class EstimatedState(Frame):
+    """A table of states by other coordinates than the engine's."""
+
+    def __init__(self, engine: Engine) -> None:
+        """Lay it out for the aircraft of an engine."""
+        count, rotors = engine.ctrl.shape
+        super().__init__(count, rotors)
+        self._coordinates = np.zeros((count, 13 + rotors))
+        self._limits = parameters.limits(parameters.rows(engine.vehicle))
+        first = self._coordinates.ctypes.data
+        places = [first, first + 7 * 8, first + 13 * 8, engine.origin.ctypes.data]
+        places += [self._limits.ctypes.data, engine.air.ctypes.data]
+        places += [self._coordinates.shape[1], 0, self.columns, rotors]
+        self._rows = np.array(places)  # as `Rows` in native/state.c
+
+    def fill(self, coordinates: np.ndarray, rows: np.ndarray | None) -> State:
+        """The state of some aircraft (n,), or of all.
+
+        Args:
+            coordinates: Of all, (N, 13 + R): position [m], world frame, quaternion, velocity
+                [m/s], world frame, body rate [rad/s], body frame, and rotor speeds [rad/s].
+            rows: Which aircraft; None for all.
+        """
+        self._coordinates[:] = coordinates
+        ids, count = (None, len(coordinates)) if rows is None else (rows.ctypes.data, len(rows))
+        native.library().quadrl_state(self._rows.ctypes.data, count, ids, self.address)
+        return self.state if rows is None else State.of_table(self.table[:, rows])
