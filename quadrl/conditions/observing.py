@@ -34,7 +34,9 @@ class Observing:
     privileged: bool = False
     """Whether there is an observation for the critic alone: the true one, what was drawn, and the
     wind in the body frame."""
-    sensors: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    sensors: Mapping[str, Mapping[str, Any]] = dataclasses.field(
+        default_factory=dict[str, Mapping[str, Any]]
+    )
     """Further sensors by name, each with its options: noise, bias, delay [s], rate [Hz]."""
 
     def __post_init__(self) -> None:
@@ -46,9 +48,10 @@ class Observing:
         for name in ("airspeed", "disturbance", "privileged"):
             if not isinstance(value := getattr(self, name), bool):
                 raise QuadrlError(name=name, value=value, allowed="True or False")
-        if not isinstance(self.sensors, Mapping):
+        given: Any = self.sensors
+        if not isinstance(given, Mapping):
             allowed = "a mapping of their names to their options"
-            raise QuadrlError(name="sensors", value=self.sensors, allowed=allowed)
+            raise QuadrlError(name="sensors", value=given, allowed=allowed)
         for name, options in self.sensors.items():
             sensors.make(name, options)
         own = {name: dict(options) for name, options in self.sensors.items()}
@@ -102,7 +105,8 @@ def resolve(given: Observed) -> Observing:
     """
     if given is None or isinstance(given, Observing):
         return given or Observing()
-    if not isinstance(given, Mapping):
+    some: Any = given
+    if not isinstance(some, Mapping):
         raise QuadrlError(name="observe", value=given, allowed="an Observing, or a mapping")
     keys("option of observe", given, [field.name for field in dataclasses.fields(Observing)])
     return Observing(**given)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -90,6 +90,7 @@ def _record(name: str, given: Any, kind: type, also: str = "") -> Any:
     if not isinstance(given, Mapping):
         allowed = f"a {kind.__name__}, or a mapping of its fields{also}"
         raise QuadrlError(name=name, value=given, allowed=allowed)
+    given = cast(Mapping[str, Any], given)
     keys(f"field of {name}", given, [field.name for field in dataclasses.fields(kind)])
     return kind(**given)
 

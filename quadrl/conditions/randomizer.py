@@ -39,7 +39,7 @@ class Randomizer:
         self.sampler, self._engine, self.active = sampler, engine, active
         count, rotors = engine.ctrl.shape
         given, vehicle = sampler.randomization, engine.vehicle
-        self._rows = np.arange(count)
+        self._rows: np.ndarray = np.arange(count)
         self.drawn = np.tile(sampler.low, (count, 1))
         """Numbers of the present episodes, (N, k), by `sampler.names`; replaced, never changed."""
         self.place = np.zeros((2, count), np.int64)

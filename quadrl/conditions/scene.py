@@ -11,6 +11,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -58,7 +59,7 @@ class Solid(abc.ABC):
 
     def __post_init__(self) -> None:
         """Validate the name and the lengths."""
-        if not isinstance(self.name, str) or not self.name.isidentifier():
+        if not isinstance(name := cast(Any, self.name), str) or not name.isidentifier():
             raise QuadrlError(name="solid", value=self.name, allowed="a name such as 'post'")
         for field in dataclasses.fields(self):
             if field.type == "float":
@@ -177,7 +178,7 @@ class Scene:
         """
         self.solids = tuple(solids)
         for solid in self.solids:
-            if not isinstance(solid, Solid):
+            if not isinstance(cast(Any, solid), Solid):
                 allowed = "Sphere, Cylinder, Box and Gate of quadrl.conditions.scene"
                 raise QuadrlError(name="solids", value=solid, allowed=allowed)
         if len(set(self.names)) < len(self.names):
@@ -219,7 +220,7 @@ class Scene:
         """
         if unknown := set(placed) - set(self.names):
             raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(self.names))
-        made = []
+        made: list[Array] = []
         for solid in self.solids:
             pose = placed.get(solid.name) or Pose(np.tile(solid.position, (count, 1)))
             turn = pose.quaternion
@@ -251,7 +252,7 @@ class Scene:
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
         """The solids as pictures show them, where they stand in the world of a row."""
         parts = ((solid, part) for solid in self.solids for part in solid.parts)
-        shown = []
+        shown: list[Primitive] = []
         for (solid, part), placed in zip(parts, engine.solids.table[row], strict=True):
             turn = np.empty(4)
             mujoco.mju_mat2Quat(turn, placed["turn"])

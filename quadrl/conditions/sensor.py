@@ -6,7 +6,7 @@ import abc
 import dataclasses
 import zlib
 from collections.abc import Mapping
-from typing import Any, ClassVar, TypeVar, dataclass_transform
+from typing import Any, ClassVar, TypeVar, cast, dataclass_transform
 
 import numpy as np
 
@@ -43,10 +43,10 @@ class Moment:
     rows: np.ndarray | None  # (n,) which aircraft; None for all
     frame: EstimatedState | None  # where the estimate is kept; None where it is the truth
     entries: Array = None  # (n, e), the task's entries of the estimated state, that are seen
-    truth: Mapping[str, Array] = dataclasses.field(default_factory=dict)
+    truth: Mapping[str, Array] = dataclasses.field(default_factory=dict[str, Array])
     """Its entries of the true state, (n, k) by name."""
     observed: Array = None  # (n, m), what is measured, as late as it is seen
-    memory: Memory = dataclasses.field(default_factory=dict)  # what the sensor itself remembers
+    memory: Memory = dataclasses.field(default_factory=Memory)  # what the sensor itself remembers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,14 +136,14 @@ def register_sensor(kind: Kind) -> Kind:
     Raises:
         QuadrlError: It is not a Sensor subclass with a name, or another sensor has the name.
     """
-    name = getattr(kind, "name", None)
-    named = isinstance(kind, type) and issubclass(kind, Sensor) and isinstance(name, str)
+    given, name = cast(Any, kind), getattr(kind, "name", None)
+    named = isinstance(given, type) and issubclass(given, Sensor) and isinstance(name, str)
     if not named or not name.isidentifier():  # type: ignore[union-attr]
         allowed = "a Sensor subclass with a string `name` such as 'my_sensor'"
         raise QuadrlError(name="sensor", value=kind, allowed=allowed)
     if SENSORS.get(name, kind) is not kind:  # type: ignore[arg-type]
         raise QuadrlError(name="sensor name", value=name, allowed="one that no other sensor has")
-    SENSORS[name] = kind = dataclasses.dataclass(frozen=True)(kind)  # type: ignore[index]
+    SENSORS[name] = kind = dataclasses.dataclass(frozen=True)(given)  # type: ignore[index]
     return kind
 
 
@@ -156,8 +156,9 @@ def make(name: str, options: Any) -> Sensor:
     kind = SENSORS[choice("sensor", name, SENSORS)]
     if not isinstance(options, Mapping):
         raise QuadrlError(name=f"sensor {name}", value=options, allowed="a mapping of its options")
-    keys(f"option of {name}", options, [field.name for field in dataclasses.fields(kind)])
-    return kind(**options)
+    given = cast(Mapping[str, Any], options)
+    keys(f"option of {name}", given, [field.name for field in dataclasses.fields(kind)])
+    return kind(**given)
 
 
 class Channel:
@@ -223,7 +224,7 @@ class Channel:
         sample = self._sample(self._rows, now)
         if self._period > 1:
             fresh = self._randomizer.steps % self._period == 0
-            sample = np.where(fresh[:, None], sample, self._values[0])
+            sample = cast(Array, np.where(fresh[:, None], sample, self._values[0]))
         self._values = np.concatenate([sample[None], self._values[:-1]])
         self.sensor.tell(now, self.seen)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
@@ -18,8 +18,9 @@ def register(task: type[Task]) -> type[Task]:
     Raises:
         QuadrlError: It is not a Task subclass with a name, or another task has the name.
     """
-    named = isinstance(task, type) and issubclass(task, Task) and hasattr(task, "name")
-    if not named or not isinstance(task.name, str) or not task.name.isidentifier():
+    given, name = cast(Any, task), getattr(task, "name", None)
+    named = isinstance(given, type) and issubclass(given, Task) and isinstance(name, str)
+    if not named or not task.name.isidentifier():
         allowed = "a Task subclass with a string `name` such as 'my_task'"
         raise QuadrlError(name="task", value=task, allowed=allowed)
     if TASKS.get(task.name, task) is not task:

@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import warnings
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -164,7 +164,7 @@ class CompiledStep(Step):
         if any(array.dtype != np.float64 for array in kept):
             raise NotCompilable("what it remembers is not all float64")
         self.kept = records.Columns(0, kept)
-        kinds = type(now.task), type(now.potentials)
+        kinds = now.task.__class__, now.potentials.__class__
         self._reads = Reads(self.task, METHODS, kinds)
         (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
         if (body, trace.constants) != (other, again.constants) or self._reads.changed:
@@ -193,7 +193,10 @@ class CompiledStep(Step):
     def _traced(self, like: Snapshot, episode: Episode) -> tuple[Trace, str]:
         """The operations of a step, and the body of its loop."""
         trace = Trace()
-        read = functools.partial(functools.partial, trace.read)
+
+        def read(place: str) -> Callable[[Any], Any]:
+            return functools.partial(trace.read, place)
+
         # Arrays whose numbers say where they stand, made by what makes the views of real ones.
         own = Parameters.of(
             np.arange(float(ROW_SIZE)).view(AIRCRAFT),
@@ -230,7 +233,7 @@ class CompiledStep(Step):
         seen = [*done.observation.values(), *(done.truth.values() if self._estimate else ())]
         rest = [*done.reward_terms.values(), done.reward, done.error]
         self.seen = records.Columns(self.kept.end, seen)
-        self.flags, outputs = len(rest), {}
+        self.flags, outputs = len(rest), dict[str, Any]()
         numbers = np.arange(self.seen.end)[:, None]
         for columns, arrays in ((self.kept, kept), (self.seen, seen)):
             for places, array in zip(columns.views(numbers), arrays, strict=True):

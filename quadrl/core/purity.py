@@ -5,6 +5,8 @@ modules count as what they are. A number or a text that a name stands for is wat
 may give the name another value. Everything else may change where nobody sees it.
 """
 
+# pyright: standard
+# What it looks at is anything that a function may name.
 from __future__ import annotations
 
 import dataclasses

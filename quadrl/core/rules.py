@@ -61,7 +61,7 @@ def _located(path: Path, line: int | None = None) -> Generator[None]:
     try:
         yield
     except Exception as error:
-        frames, cause = [], error
+        frames, cause = list[traceback.FrameSummary](), error
         while cause is not None:
             frames += traceback.extract_tb(cause.__traceback__)
             cause = cause.__cause__

@@ -167,9 +167,10 @@ class Scenario:
         known = [field.name for field in dataclasses.fields(made)]
         validation.keys(f"{made.name} option", options, known)
         validation.keys(f"{made.name} option", others, [*KEYWORDS, *also, *known])
-        parts = {name: value for name, value in whole.items() if value is not None}
+        parts: dict[str, Any] = {k: value for k, value in whole.items() if value is not None}
         made = made.replace(**validation.tuples(options | others))
-        return cls(**parts | {"task": made, "vehicle": vehicle})
+        parts |= {"task": made, "vehicle": vehicle}
+        return cls(**parts)
 
     def to_json(self) -> dict[str, Any]:
         """What differs from the defaults, as JSON can hold it; `of` makes the same scenario."""
@@ -208,7 +209,7 @@ KEYWORDS = ("task", *Conditions.__annotations__)
 
 def _differing(record: Any, usual: Any = None) -> dict[str, Any]:
     """The fields of a record that differ from those of another, by default from the defaults."""
-    differs = {}
+    differs: dict[str, Any] = {}
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
         other = _default(field) if usual is None else getattr(usual, field.name)

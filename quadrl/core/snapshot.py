@@ -47,7 +47,7 @@ class Snapshot:
     rotor_command: Array  # (N, R) [rad/s], mean over the control step; the rotor speed at the start
     time: Array  # (N,) [s], since the start of the episode
     potentials: Potentials = None  # type: ignore[assignment] - what `Task.measure` gives
-    sensed: Mapping[str, Array] = dataclasses.field(default_factory=dict)  # (N, size) by sensor
+    sensed: Mapping[str, Array] = dataclasses.field(default_factory=dict[str, Array])  # (N, size)
     around: Surroundings | None = None  # in a world with solids (`Task.solids`)
 
     @property

@@ -1,5 +1,7 @@
 """A recorded flight, as it is drawn."""
 
+# pyright: standard
+# SciPy has no types.
 from __future__ import annotations
 
 import dataclasses
@@ -87,7 +89,7 @@ def _between(before: Shown, after: Shown, share: float) -> Shown:
     kinds = [[getattr(one, "kind", None) for one in shown] for shown in (before, after)]
     if before is after or kinds[0] != kinds[1]:
         return before
-    between = []
+    between: list[Marker | Primitive] = []
     for one, other in zip(before, after, strict=True):
         if isinstance(one, Marker) and isinstance(other, Marker) and not one.end:
             way = np.subtract(other.position, one.position)

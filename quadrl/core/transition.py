@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -227,7 +227,8 @@ def check_task(
     rows, rotors = SAMPLE, parameters.rotor.hover_speed.shape[-1]
     keys = np.arange(rows)
     begun = task.begin(Rng(keys, 0 * keys), parameters)
-    if not isinstance(begun, tuple) or not isinstance(begun[0], Start):
+    given: Any = begun
+    if not isinstance(given, tuple) or not isinstance(given[0], Start):
         raise QuadrlError(name=f"{task.name} begin", value=begun, allowed="a Start and a TaskState")
     start, task_state = begun
     scene = Scene(task.solids())
@@ -237,8 +238,8 @@ def check_task(
     for name, columns in sizes.items():
         _check_array(task, f"{name} of begin", getattr(start, name), (rows, columns), "f")
     for field in dataclasses.fields(task_state):
-        value = getattr(task_state, field.name)
-        if not isinstance(value, np.ndarray) or value.shape[:1] != (rows,):
+        value: Any = getattr(task_state, field.name)
+        if not isinstance(value, np.ndarray) or cast(Array, value).shape[:1] != (rows,):
             name, allowed = f"{task.name} {field.name} of begin", f"an array ({rows}, ...)"
             raise QuadrlError(name=name, value=value, allowed=allowed)
     if not (abs(square_norm(start.quaternion) - 1) < 1e-6).all():
