@@ -110,19 +110,6 @@ def test_what_made_an_environment_makes_it_again():
     assert again.num_envs == 3 and again.environment.time_limit_steps == 7
 
 
-def test_a_crash_on_the_last_step_is_no_time_out():
-    environment = gym.make("quadrl/Landing-v0", start_height=0.2)
-    environment.reset(seed=0)
-    steps = 1
-    while not environment.step(np.full(4, -1.0))[2]:
-        steps += 1
-    timestep = environment.unwrapped.environment.vehicle.control_timestep
-    again = gym.make("quadrl/Landing-v0", start_height=0.2, time_limit=steps * timestep)
-    again.reset(seed=0)
-    flags = [again.step(np.full(4, -1.0))[2:4] for _ in range(steps)]
-    assert flags == [(False, False)] * (steps - 1) + [(True, False)]
-
-
 VECTOR_WRAPPERS = {
     "RecordEpisodeStatistics": {},
     "NormalizeObservation": {},

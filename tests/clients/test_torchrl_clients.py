@@ -47,15 +47,6 @@ def test_the_info_is_read_into_tensors():
     torch.testing.assert_close(terms, after["reward"][:, 0], check_dtype=False)
 
 
-@pytest.mark.parametrize("mode", ["Disabled", "SameStep"])
-def test_a_vector_is_wrapped(mode):
-    vector = gym.make_vec(HOVER, num_envs=3, autoreset_mode=mode, time_limit=0.5)
-    environment = GymWrapper(vector)
-    check_env_specs(environment)
-    flown = environment.rollout(25, break_when_any_done=False)
-    assert flown.batch_size == (3, 25)
-
-
 def test_a_vector_with_gymnasiums_default_says_which_mode_torchrl_takes():
     with pytest.raises(RuntimeError, match="SAME_STEP or DISABLED"):
         GymWrapper(gym.make_vec(HOVER, num_envs=3))

@@ -217,10 +217,6 @@ FAULTS = {
         "begin with tensors|begin fails",
         {"begin": begun(lambda a, b: (dataclasses.replace(a, position=np.array(a.position)), b))},
     ),
-    "a term that is not declared": (
-        "observe.*must be the declared terms",
-        {"observe": lambda self, now: Hover.observe(self, now) | {"wind": now.state.velocity}},
-    ),
     "a constant entry": ("entries .2. of 'goal' never change", {"observe": level_goal}),
     "a reward by the mean of the batch": (
         "one aircraft and a batch get different numbers: spin",
@@ -230,10 +226,6 @@ FAULTS = {
     "a reward with a memory": (
         "differ: reward|get different numbers",
         {"reward": rewarded("survival", remembered)},
-    ),
-    "one end for all": (
-        r"terminated.*\(\)",
-        {"terminated": lambda self, now: Hover.terminated(self, now).any()},
     ),
     "words to draw": ("markers fails.*'str'", {"markers": lambda self, now: ["a sphere"]}),
     "a negative error": (

@@ -38,14 +38,6 @@ def test_row_i_is_the_single_environment_seeded_with_seed_plus_i(name, engine):
         helpers.assert_records(helpers.fly(single, actions[:, i : i + 1]), records, [i])
 
 
-@pytest.mark.parametrize("num_threads", [1, 2])
-def test_threads_and_neighbours_do_not_matter(num_threads):
-    actions = helpers.random_actions(30, 5)
-    five = helpers.fly(begun(helpers.SHORT["hover"], 5, seed=7), actions)
-    two = begun(helpers.SHORT["hover"], 2, seed=9, num_threads=num_threads)
-    helpers.assert_records(helpers.fly(two, actions[:, 2:4]), five, slice(2, 4))
-
-
 def test_seeding_again_gives_the_same_episodes_and_another_seed_others():
     actions = helpers.random_actions(10, 2)
     environment = begun(num_envs=2, seed=5)
@@ -64,21 +56,6 @@ def test_seeding_again_gives_the_same_episodes_and_another_seed_others():
     new = begun(num_envs=2, seed=5)
     equal = (environment.engine.qpos == new.engine.qpos).all(axis=1)
     assert equal.tolist() == [False, True]
-
-
-def test_a_reset_of_some_leaves_the_others_bit_by_bit():
-    left, touched = begun(num_envs=4, seed=2), begun(num_envs=4, seed=2)
-    for k, action in enumerate(helpers.random_actions(12, 4)):
-        expected, got = (helpers.recorded(e, e.step(action)) for e in (left, touched))
-        for name, value in expected.items():
-            np.testing.assert_array_equal(got[name][[0, 3]], value[[0, 3]], err_msg=name)
-        if k == 4:
-            observation = touched.reset(np.array([False, True, True, False]))
-            assert observation["position"].shape == (2, 3)
-            np.testing.assert_array_equal(touched.snapshot.time > 0, [True, False, False, True])
-        if k == 7:
-            touched.reset(np.array([2]))
-    np.testing.assert_allclose(touched.snapshot.time, [0.6, 0.35, 0.2, 0.6])
 
 
 def test_the_episodes_of_an_aircraft_do_not_depend_on_when_it_is_reset():
@@ -166,15 +143,6 @@ def test_the_flat_observation_is_that_of_the_documentation(name, vehicle):
 
 
 # ------------------------------------------------------------------------------- how episodes end
-
-
-@pytest.mark.parametrize("name", tasks.TASKS)
-def test_an_episode_is_never_terminated_and_truncated(name):
-    environment = begun(tasks.make(name, time_limit=0.5), 8)
-    for action in helpers.random_actions(30, 8):
-        now = environment.step(action)  # flies on past the time limit
-        assert not (now.terminated & now.truncated).any()
-        assert (now.terminated | now.truncated | ~now.is_success).all()
 
 
 @pytest.mark.parametrize(

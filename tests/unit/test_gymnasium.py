@@ -224,23 +224,6 @@ def test_render_draws_the_flight(id):
 
 
 @pictures
-def test_two_environments_that_draw_take_turns():
-    one, other = (gym.make(HOVER, **PICTURE) for _ in range(2))
-    one.reset(seed=0)
-    other.reset(seed=1)
-    first, between = one.render(), other.render()
-    assert not alike(first, between)
-    assert alike(one.render(), first)
-    for _ in range(10):
-        one.step(np.ones(4, dtype=np.float32))
-    assert not alike(one.render(), first)
-    assert alike(other.render(), between)
-    one.close()
-    assert alike(other.render(), between)
-    other.close()
-
-
-@pictures
 def test_the_goal_is_drawn():
     # Seen from where it does not move with the aircraft, the goal of hover is all that is green.
     environment = gym.make(HOVER, camera="fixed", **PICTURE | {"width": 480, "height": 288})

@@ -59,6 +59,8 @@ HOSTILE = {  # methods, and what the error names
     "reward of another shape": (with_term(lambda p: np.zeros((3, 1))), "own"),
     "reward that is text": (with_term(lambda p: np.full(np.shape(p), "a")), "own"),
     "no reward": (changed("reward", lambda terms: {}), "reward"),
+    "a part more": (changed("observe", lambda p: p | {"wind": p["velocity"]}), "observe"),
+    "an end for all": (changed("terminated", lambda end: end.any()), "terminated"),
     "a part missing": (changed("observe", lambda p: dict(list(p.items())[1:])), "observe"),
     "a part too wide": (changed("observe", lambda p: p | {"goal": p["velocity"][:, :2]}), "goal"),
     "parts in disorder": (changed("observe", lambda p: dict(sorted(p.items()))), "observe"),

@@ -134,19 +134,6 @@ def test_an_exported_policy_flies_a_sequence_as_the_actor_does(tmp_path):
         np.testing.assert_allclose(action, mean[:, t].clamp(-1, 1), atol=2e-6)
 
 
-def test_a_sequence_is_its_steps_one_by_one():
-    actor, _, _ = actor_critic()
-    observation, state, begins = sequences()
-    with torch.no_grad(), set_recurrent_mode():
-        whole = actor.get_dist(sequence_batch(observation, state, begins))
-    for t in range(STEPS):
-        state = torch.where(begins[:, t], torch.zeros_like(state), state)
-        with torch.no_grad():
-            now = actor(TensorDict({"observation": observation[:, t], STATE: state}, [ROWS]))
-        torch.testing.assert_close(now["loc"], whole.base_dist.loc[:, t], rtol=0, atol=2e-6)
-        state = now["next", STATE]
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_are_those_of_a_loop_over_time(kind):
     """Of the surrogate at the policy that acted: of ratio times advantage."""
@@ -386,12 +373,3 @@ def test_a_live_flight_forgets_the_rows_that_begin_anew():
     assert (flight._act.state != 0).all()
     flight.reset()
     assert (flight._act.state == 0).all()
-
-
-def test_the_numbers_stay_finite_whatever_is_seen():
-    policy = make_remembering()
-    seen = np.array([np.zeros(22), np.full(22, 1e30), np.full(22, -1e3)])
-    state = policy.initial_state(3)
-    for _ in range(50):
-        action, state = policy.step(seen, state)
-        assert (np.abs(action) <= 1).all() and (np.abs(state) <= 1 + 1e-6).all()

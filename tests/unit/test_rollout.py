@@ -89,10 +89,12 @@ def test_an_error_before_the_last_two_seconds_does_not_count():
     assert summarize(make_rollout(error=late))["position_error_m"] == pytest.approx(0.3 + 0.1 / 3)
 
 
-def test_episode_i_is_the_single_environment_of_its_seed():
-    rollout = fly(brake, "hover", episodes=4, seed=EVALUATION_SEED + 7)
+@pytest.mark.parametrize("weather", ["calm", "light"])
+def test_episode_i_is_the_single_environment_of_its_seed(weather):
+    rollout = fly(brake, "hover", episodes=4, seed=EVALUATION_SEED + 7, weather=weather)
+    assert np.nan_to_num(rollout.wind).any() == (weather == "light")
     for i in range(4):
-        alone = Environment("hover", seed=EVALUATION_SEED + 7 + i)
+        alone = Environment("hover", seed=EVALUATION_SEED + 7 + i, weather=weather)
         observation = alone.flatten(alone.reset())
         for t in range(rollout.length[i]):
             now = alone.step(brake(observation))
@@ -100,9 +102,11 @@ def test_episode_i_is_the_single_environment_of_its_seed():
             assert now.reward[0] == rollout.reward[t, i] and now.error[0] == rollout.error[t, i]
             position = alone.snapshot.state.position[0]
             np.testing.assert_array_equal(position, rollout.position[t, i])
+            np.testing.assert_array_equal(alone.engine.wind[0], rollout.wind[t, i])
         assert now.terminated[0] == rollout.terminated[i]
         assert now.terminated[0] or now.truncated[0]
-        assert np.isnan(rollout.reward[rollout.length[i] :, i]).all()
+        for after in (rollout.reward, rollout.wind):
+            assert np.isnan(after[rollout.length[i] :, i]).all()
 
 
 def test_an_evaluation_is_the_same_every_time_and_another_with_another_seed():
@@ -136,21 +140,6 @@ def test_a_trajectory_is_in_the_world_frame():
     np.testing.assert_allclose(trajectory.goal, np.tile(up, (steps, 1)))
     np.testing.assert_array_equal(trajectory.max_rotor_speed, vehicle.max_speed)
     assert trajectory.task == "hover"
-
-
-def test_wind_blows_the_aircraft_about_and_is_kept():
-    task = tasks.make("hover", time_limit=2.0)
-    calm, windy = (fly(brake, task, episodes=3, weather=w) for w in (None, "light"))
-    assert not np.nan_to_num(calm.wind).any() and (windy.position[0] != calm.position[0]).all()
-    again = fly(brake, task, episodes=3, weather="light")
-    np.testing.assert_array_equal(windy.position, again.position)
-    # The second aircraft alone, and in the same wind.
-    alone = Environment(task, seed=EVALUATION_SEED + 1, weather="light")
-    alone.reset()
-    for k in range(windy.length[1]):
-        alone.step(windy.action[k, 1:2])
-        np.testing.assert_array_equal(windy.wind[k, 1], alone.engine.wind[0])
-    assert np.isnan(windy.wind[windy.length[1] :, 1]).all()
 
 
 @pytest.mark.parametrize(

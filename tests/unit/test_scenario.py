@@ -138,6 +138,8 @@ def test_what_cannot_be_is_refused_by_its_name(name, value):
     [
         ({"wether": "light"}, "hover option"),
         ({"vehicle": {"weight": 1.0}}, "field of vehicle"),
+        ({"randomization": {"mas": (0.9, 1.1)}}, "field of randomization"),
+        ({"observe": {"rotor_speeds": "none"}}, "option of observe"),
         ({"aerodynamics": {"lift": 1.0}}, "field of aerodynamics"),
         ({"vehicle_options": {"rotors": ()}}, "vehicle option"),
     ],
