@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import warnings
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from quadrl.base.trace import NotCompilable, Trace, symbolic
 from quadrl.core.purity import Reads
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.step import Step, WrittenStep
+from quadrl.core.step_source import FLAGS, SOURCE, Rows
 from quadrl.core.task import Task
 from quadrl.core.transition import Episode, Transition, finish
 from quadrl.engines import native
@@ -35,31 +36,6 @@ from quadrl.engines.state import State
 
 METHODS = ("measure", "terminated", "error", "succeeded", "reward", "update", "observe")
 """Functions of a task that a step calls."""
-FLAGS = ("terminated", "truncated", "is_success", "diverged")
-POINTERS = "constants parameters action command diverged state last_state estimate was out rest"
-SOURCE = """#include <math.h>
-#include <stdint.h>
-typedef struct {{
-  const double *constants, *parameters, *action, *command;
-  const uint8_t* diverged;
-  const double *state, *last_state, *estimate, *was;
-  double *out, *rest;
-  int64_t stride, columns;
-}} Rows;
-__attribute__((visibility("default"))) void step(const Rows* rows, int64_t n) {{
-  const double *restrict c = rows->constants, *restrict p = rows->parameters;
-  const double *restrict action = rows->action, *restrict command = rows->command;
-  const double *restrict state = rows->state, *restrict last_state = rows->last_state;
-  const double *restrict estimate = rows->estimate, *restrict was = rows->was;
-  const uint8_t* restrict diverged = rows->diverged;
-  double *restrict out = rows->out, *restrict rest = rows->rest;
-  const int64_t stride = rows->stride, columns = rows->columns;
-  uint8_t* restrict flags = (uint8_t*)(rest + {flags} * columns);
-  for (int64_t i = 0; i < n; ++i) {{
-    {body}
-  }}
-}}
-"""
 _REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
 """Tasks of which was said that they are not compiled."""
 
@@ -98,13 +74,6 @@ def _reported(step: WrittenStep, reason: str) -> WrittenStep:
     return step
 
 
-class _Rows(ctypes.Structure):
-    """Where the function finds its rows; as in SOURCE."""
-
-    _fields_ = [(name, ctypes.c_void_p) for name in POINTERS.split()]
-    _fields_ += [("stride", ctypes.c_int64), ("columns", ctypes.c_int64)]
-
-
 class _Page:
     """A table of all that a step gives, a row per number, and its named views."""
 
@@ -113,6 +82,9 @@ class _Page:
         whole = np.empty((step.seen.end, step.columns))
         table = whole[:, : step.count]
         self.address = native.address(whole)
+        sensed = np.empty((step.sensed.end + 1, step.columns))  # at least a row has an address
+        self.sensed_address = native.address(sensed)
+        self.sensed = step.by_sensor(step.sensed.views(sensed[:, : step.count]))
         self.kept = step.kept.views(table)
         parts = iter(self.kept)
         self.now, self.episode = (records.filled(like, parts) for like in (now, episode))
@@ -159,11 +131,10 @@ class CompiledStep(Step):
         self.count, self.columns = self._engine.num_envs, padded(self._engine.num_envs)
         like = dataclasses.replace(now, state=None, parameters=None)  # these have their own tables
         kept = [*records.leaves(like), *records.leaves(episode)]
-        if self.task.sensors:
-            raise NotCompilable("it reads sensors")
         if any(array.dtype != np.float64 for array in kept):
             raise NotCompilable("what it remembers is not all float64")
         self.kept = records.Columns(0, kept)
+        self.sensed = records.Columns(0, [now.sensed[name] for name in self.task.sensors])
         kinds = now.task.__class__, now.potentials.__class__
         self._reads = Reads(self.task, METHODS, kinds)
         (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
@@ -180,7 +151,7 @@ class CompiledStep(Step):
         self._call.argtypes, self._call.restype = [ctypes.c_void_p, ctypes.c_int64], None
         self._constants = np.array([*trace.constants, 0.0])
         inputs = (getattr(self._inputs, f.name) for f in dataclasses.fields(self._inputs))
-        self._arguments = _Rows(
+        self._arguments = Rows(
             *(array.ctypes.data for array in (self._constants, parameters, *inputs)),
             estimate=self._estimate.address if self._estimate else None,
             stride=parameters.strides[0] // 8 if len(parameters) > 1 else 0,
@@ -214,18 +185,26 @@ class CompiledStep(Step):
             for record in (like, episode)
         )
         before.state, before.parameters = last_state, own.map(read("p[i * stride + {}]"))
+        sensors = self.sensed.views(np.arange(self.sensed.end)[:, None])
         action, command = (
             read(f"{name}[i * {size} + {{}}]")(np.arange(size)[None])
             for name in ("action", "command")
             for size in [getattr(self._inputs, name).shape[1]]
         )
         diverged = trace.inputs(np.array(["diverged[i]"], object), is_flag=True)
-        inputs = state, action, command, diverged, estimate if self._estimate else None
+        before.sensed = self.by_sensor(map(read("last_sensed[{} * columns + i]"), sensors))
+        sensed = self.by_sensor(map(read("sensed[{} * columns + i]"), sensors))
+        seen_from = estimate if self._estimate else None
+        inputs = state, action, command, diverged, seen_from, None, sensed
         with symbolic():
             after, ended, done = finish(self.task, self._clock, begun, before, *inputs)
             after.state = after.parameters = None  # type: ignore[assignment]
             kept = [*records.leaves(after), *records.leaves(ended)]
             return trace, trace.body(self._outputs(kept, done))
+
+    def by_sensor(self, arrays: Iterable[Any]) -> dict[str, Any]:
+        """What the sensors of the task give, in their order, by their names."""
+        return dict(zip(self.task.sensors, arrays, strict=True))
 
     def _outputs(self, kept: list[Array], done: Transition) -> dict[str, Any]:
         """What is computed, by where it is written to."""
@@ -263,6 +242,11 @@ class CompiledStep(Step):
         self._pages = page, last
         rows, (now, before) = self._arguments, self._engine.frames
         rows.state, rows.last_state = now.address, before.address
+        # A reset since the last step has given its rows what the sensors show then.
+        for given, own in ((self.snapshot.sensed, last.sensed), (sensed, page.sensed)):
+            for name, array in own.items():
+                array[:] = given[name]
+        rows.sensed, rows.last_sensed = page.sensed_address, last.sensed_address
         rest, count = np.empty((self.flags + 1, self.columns)), self.count
         rows.was, rows.out, rows.rest = last.address, page.address, native.address(rest)
         self._call(self._address, count)
