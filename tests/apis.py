@@ -1,5 +1,7 @@
 """The APIs with one face, for tests of what they have in common."""
 
+import importlib.util
+
 import numpy as np
 import torch
 
@@ -126,4 +128,31 @@ class StableBaselines(Vector):
         return [k and not x["TimeLimit.truncated"] for k, x in zip(*given[2:], strict=True)]
 
 
+class RslRl:
+    """Two aircraft by rsl_rl, which begins anew in the step of an end."""
+
+    rows = 2
+
+    def __init__(self, task="hover", seed=None, **settings):
+        self.environment = envs.rsl_rl.QuadrotorVecEnv(task, 2, seed=seed, **settings)
+        self.core = self.environment.environment
+
+    def reset(self):
+        return self.environment.reset()
+
+    def step(self, actions):
+        return self.environment.step(torch.as_tensor(actions))
+
+    def observation(self, given):
+        return given[-1].get("final_obs", given[0])["policy"].numpy()
+
+    def terminated(self, given):
+        return ((given[2] == 1) & ~given[3]["time_outs"]).tolist()
+
+    def copied(self, given):
+        return given[0].clone().numpy() | {"rest": repr(given[1:])}
+
+
 APIS = [DmControl, Gymnasium, Vector, TorchRL, StableBaselines]
+if importlib.util.find_spec("rsl_rl"):
+    APIS.append(RslRl)

@@ -1,4 +1,4 @@
-"""The APIs, thin layers over `quadrl.core.environment`: dm_control, Gymnasium, SB3 and TorchRL."""
+"""The APIs, thin layers over the core: dm_control, Gymnasium, rsl_rl, SB3 and TorchRL."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import gymnasium as gym
 from quadrl import tasks
 
 if TYPE_CHECKING:
-    from quadrl.envs import dm_control, gymnasium, sb3, torchrl
+    from quadrl.envs import dm_control, gymnasium, rsl_rl, sb3, torchrl
 
-__all__ = ["dm_control", "gymnasium", "register_ids", "sb3", "torchrl"]
+__all__ = ["dm_control", "gymnasium", "register_ids", "rsl_rl", "sb3", "torchrl"]
 
 
 def register_ids() -> None:

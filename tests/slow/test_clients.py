@@ -158,6 +158,45 @@ def test_rllib_learns_on_one_machine(monkeypatch):
     ray.shutdown()
 
 
+def mean_return(runner, envs):
+    """What the mean action reaches in an episode of each aircraft."""
+    policy = runner.get_inference_policy()
+    total, over = torch.zeros(envs.num_envs), torch.zeros(envs.num_envs, dtype=torch.bool)
+    seen, _ = envs.reset()
+    while not over.all():
+        with torch.no_grad():
+            seen, reward, done, _ = envs.step(policy(seen))
+        total, over = total + reward * ~over, over | (done == 1)
+    return total.mean().item()
+
+
+def test_rsl_rl_learns_to_stay_in_the_air():
+    pytest.importorskip("rsl_rl")
+    from rsl_rl.runners import OnPolicyRunner
+
+    from quadrl.envs.rsl_rl import QuadrotorVecEnv as RslRlEnv
+
+    torch.manual_seed(0)
+    network = {"class_name": "MLPModel", "hidden_dims": [64, 64], "obs_normalization": True}
+    normal = {"class_name": "GaussianDistribution", "init_std": 0.5}
+    algorithm = {"class_name": "PPO", "gamma": 0.92, "learning_rate": 5e-3, "schedule": "fixed"}
+    algorithm |= {"num_learning_epochs": 4, "num_mini_batches": 4, "value_loss_coef": 1e-3}
+    settings = {
+        "num_steps_per_env": 16,
+        "save_interval": 1000,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": network | {"distribution_cfg": normal},
+        "critic": network,
+        "algorithm": algorithm | {"use_clipped_value_loss": False, "entropy_coef": 0.0},
+    }
+    envs, fresh = (RslRlEnv("hover", 128, seed=seed) for seed in (0, 1000))
+    runner = OnPolicyRunner(envs, settings)
+    before = mean_return(runner, fresh)
+    runner.learn(30, init_at_random_ep_len=True)
+    # Who falls at once gets about 50, and who stays in the air to the end about 2000.
+    assert before < 100 and mean_return(runner, fresh) > 800
+
+
 # --------------------------------------------------------------------------------------- videos
 
 

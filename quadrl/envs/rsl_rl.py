@@ -1,0 +1,130 @@
+"""rsl_rl: a native batch as its VecEnv. It needs rsl-rl-lib, thus torch."""
+
+# pyright: reportIncompatibleVariableOverride=false
+# `episode_length_buf` is a property here: what is set is checked.
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+try:
+    from rsl_rl.env import VecEnv
+except ImportError as error:
+    reason = "quadrl.envs.rsl_rl needs rsl_rl: pip install 'quadrl[rsl_rl]'"
+    raise ImportError(reason) from error
+
+from quadrl.base.errors import QuadrlError
+from quadrl.core.task import Task
+from quadrl.envs.common import make
+
+
+class QuadrotorVecEnv(VecEnv):
+    """N aircraft on all cores: `OnPolicyRunner(QuadrotorVecEnv("hover", 256), settings)`.
+
+    Observations are a TensorDict with the group `policy` (N, size) and, with
+    `observe={"privileged": True}`, the group `critic` (N, p): the privileged observation, in which
+    the true one is. A row begins anew in the step that ends its episode. The CPU simulates.
+    """
+
+    def __init__(
+        self,
+        task: str | Task = "hover",
+        num_envs: int = 1,
+        seed: int | None = None,
+        device: str | torch.device = "cpu",
+        **settings: Any,
+    ) -> None:
+        """Make N environments.
+
+        Args:
+            task: A name of the catalogue or a task.
+            num_envs: N.
+            seed: Row i is seeded with seed + i; None for one from the system.
+            device: Of the tensors.
+            **settings: Those of `quadrl.envs.common.make`.
+
+        Raises:
+            QuadrlError: Unknown name or impossible value.
+        """
+        self.environment = make(task, num_envs, ("device",), seed=seed, **settings)
+        self.num_envs, self.num_actions = num_envs, self.environment.action_size
+        self.max_episode_length = self.environment.time_limit_steps
+        self.device, self.cfg = torch.device(device), self.environment.scenario
+        self._lengths = np.zeros(num_envs, np.int64)
+        self._observation = np.zeros((num_envs, self.environment.size), np.float32)
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps of each row's episode (N,), a copy; set them to end episodes earlier.
+
+        At `max_episode_length` an episode is over by the clock. `OnPolicyRunner.learn` sets random
+        lengths at the start, so that the rows do not end together. The environment counts on its
+        own: the task's time and its weather do not jump, and a row whose length is set back still
+        ends with its time limit.
+        """
+        return torch.from_numpy(self._lengths.copy()).to(self.device)
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, lengths: torch.Tensor) -> None:
+        given = torch.as_tensor(lengths).cpu().numpy()
+        if given.shape != (self.num_envs,) or given.dtype.kind not in "iu" or (given < 0).any():
+            allowed = f"{self.num_envs} whole numbers from 0 on"
+            raise QuadrlError(name="episode_length_buf", value=lengths, allowed=allowed)
+        self._lengths = given.astype(np.int64)
+
+    def get_observations(self) -> TensorDict:
+        """The observations now; the first call begins the first episodes."""
+        if not self.environment.has_begun:
+            self.reset()
+        return self._groups()
+
+    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+        """Begin an episode in every row; returns the observations and nothing further."""
+        self._begin(np.ones(self.num_envs, dtype=bool))
+        return self._groups(), {}
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Fly one control step; actions (N, k) are clipped to [-1, 1].
+
+        Returns:
+            Observations, those of the new episode where one has ended; rewards (N,) float32; dones
+            (N,) 0 or 1; and extras: `time_outs` (N,) bool, over by the clock; where an episode has
+            ended also `final_obs`, the observations (N, ...) before any row began anew, and
+            `log`, with `success` and `error` [m] of the episodes that ended by themselves.
+        """
+        now = self.environment.step(actions.detach().cpu())
+        self._observation = self.environment.flatten(now.observation)
+        self._lengths += 1
+        itself = np.logical_or(now.terminated, now.truncated)
+        over = itself | (self._lengths >= self.max_episode_length)
+        extras: dict[str, Any] = {"time_outs": self._tensor(over & ~now.terminated)}
+        if itself.any():
+            ends = {"success": now.is_success, "error": now.error}
+            log = {name: self._tensor(x[itself].astype(np.float32)) for name, x in ends.items()}
+            extras["log"] = log
+        if over.any():
+            extras["final_obs"] = self._groups()
+            self._begin(over)
+        dones = self._tensor(over.astype(np.int64))
+        return self._groups(), self._tensor(now.reward.astype(np.float32)), dones, extras
+
+    def _begin(self, rows: np.ndarray) -> None:
+        """Begin an episode in some rows (N,) bool."""
+        self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
+        self._lengths[rows] = 0
+
+    def _groups(self) -> TensorDict:
+        """What is observed now, copied."""
+        groups = {"policy": self._tensor(self._observation.copy())}
+        if (privileged := self.environment.privileged) is not None:
+            groups["critic"] = self._tensor(privileged.astype(np.float32))
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array).to(self.device)
