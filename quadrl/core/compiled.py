@@ -68,7 +68,7 @@ def _reported(step: WrittenStep, reason: str) -> WrittenStep:
     step.not_compiled, task = reason, type(step.task)
     if task not in _REPORTED:
         _REPORTED.add(task)
-        advice = "`compiled = False` in the class says that this is meant"
+        advice = "NumPy runs it; `compiled = False` in the class says that this is meant"
         message = f"the step of the task {task.name} is not compiled: {reason}; {advice}"
         warnings.warn(message, QuadrlWarning, stacklevel=2)
     return step

@@ -2,6 +2,8 @@
 
 import json
 import os
+import platform
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -10,7 +12,12 @@ import venv
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
+
+from quadrl.aircraft.aerodynamics import STILL_AIR
+from quadrl.deploy import wheels
 
 REPOSITORY = Path(__file__).parents[2]
 FOLDERS = ("quadrl", "quadrl/assets", "quadrl/tasks")  # links are not followed
@@ -30,18 +37,67 @@ assert environment.task.transition.error < 1, environment.task.transition
 """
 
 
+FLIGHTS = """
+import dataclasses, hashlib, sys, warnings
+import numpy as np
+import quadrl
+from quadrl.core.environment import Environment
+from quadrl.engines import native
+from quadrl.tasks.hover import Hover
+
+@dataclasses.dataclass(frozen=True)
+class Mine(Hover):
+    name = "mine"
+    def reward(self, before, now, end):
+        return super().reward(before, now, end) | {"slow": -np.abs(now.state.velocity[..., 0])}
+
+def digest(task, **settings):
+    environment, seen = Environment(task, num_envs=20, seed=3, **settings), hashlib.sha256()
+    environment.reset()
+    shape = 100, environment.num_envs, environment.action_size
+    for action in np.random.default_rng(0).uniform(-1, 1, shape):
+        done = environment.step(action)
+        moved = environment.engine.qpos, environment.engine.qvel
+        for array in (done.reward, done.terminated, *done.observation.values(), *moved):
+            seen.update(array.tobytes())
+        if (over := done.terminated | done.truncated).any():
+            environment.reset(over)
+    if environment.engine.name == "free_flight":
+        leg = environment.engine.leg(4)
+        for array in leg.vector_jacobian_product(np.ones_like(leg.start)):
+            seen.update(array.tobytes())
+    print(seen.hexdigest())
+    return environment.not_compiled
+
+assert not digest("hover")
+assert not digest("hover", engine="free_flight", randomization="full", weather="severe")
+assert not digest("hover", vehicle="hexa", control_mode="velocity", altitude=1.0, time_limit=1.0)
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    assert digest(Mine()) == digest(Mine(), num_threads=2)
+for line in (native.library()._name, *(str(warning.message) for warning in caught)):
+    print(line, file=sys.stderr)
+"""
+
+
 def run(*command, cwd):
     """Run a command that no environment variable leads to this repository."""
-    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
+    return finished(*command, cwd=cwd).stdout
+
+
+def finished(*command, cwd, **variables):
+    """The same with its errors, and with further variables; one that is None is not there."""
+    variables = os.environ | {"PYTHONPATH": None, "PYTHONHOME": None} | variables
+    environment = {name: value for name, value in variables.items() if value is not None}
     done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+    return done
 
 
-def build(kind, source, folder):
+def build(kind, source, folder, **variables):
     # Without isolation: hatchling is in the dev extra, in the version that constraints.txt names.
     options = ("--no-isolation", kind, "--outdir", folder, source)
-    run(sys.executable, "-m", "build", *options, cwd=folder)
+    finished(sys.executable, "-m", "build", *options, cwd=folder, **variables)
     (package,) = folder.iterdir()
     return package
 
@@ -82,9 +138,14 @@ def test_wheel_built_from_the_sdist_is_the_same(wheel, tmp_path):
 @pytest.fixture(scope="module", params=["wheel", "sdist"])
 def installed(request, wheel, tmp_path_factory):
     """The folder of an environment that has the package and what it depends on, nothing else."""
-    package, root = wheel, tmp_path_factory.mktemp("empty") / "environment"
+    package = wheel
     if request.param == "sdist":
         package = build("--sdist", REPOSITORY, tmp_path_factory.mktemp("sdist"))
+    return installation(package, tmp_path_factory.mktemp("empty") / "environment")
+
+
+def installation(package, root):
+    """Make that environment."""
     venv.create(root, symlinks=True)
     python = root / "bin" / "python"
     where = "import sysconfig; print(sysconfig.get_path('purelib'))"
@@ -111,6 +172,49 @@ def test_installed_package_trains(installed, tmp_path):
     run(quadrl, "train", "hover", *short, "--no-video", "--out", "run", cwd=tmp_path)
     evaluated = run(quadrl, "evaluate", "run", "--episodes", "4", "--json", cwd=tmp_path)
     assert json.loads(evaluated)["episodes"] == 4
+
+
+@pytest.fixture(scope="module")
+def without_compiler(tmp_path_factory):
+    """Runs a program of an environment that has the wheel for this machine, and no compiler."""
+    root, machine = tmp_path_factory.mktemp("machine"), platform.machine()
+    libraries = root / wheels.tag(machine)
+    wheels.fill(libraries, machine, tasks=["hover"], airs=[STILL_AIR])
+    (root / "dist").mkdir()
+    wheel = build("--wheel", REPOSITORY, root / "dist", QUADRL_LIBRARIES=str(libraries))
+    assert wheel.name.endswith(f"-py3-none-{libraries.name}.whl")
+    programs, cache = installation(wheel, root / "environment") / "bin", root / "cache"
+    assert not any(shutil.which(name, path=programs) for name in ("cc", "gcc", "clang"))
+
+    def program(name, *arguments, cwd):
+        variables = {"PATH": str(programs), "CC": None, "QUADRL_CACHE": str(cache)}
+        done = finished(programs / name, *arguments, cwd=cwd, **variables)
+        assert not cache.exists() or not [*cache.iterdir()]
+        return done
+
+    return program
+
+
+def test_without_a_compiler_hover_is_trained_and_drawn(without_compiler, tmp_path):
+    short = ("--steps", "8192", "--episodes", "4", "--no-video", "--out", "run")
+    done = without_compiler("quadrl", "train", "hover", *short, cwd=tmp_path)
+    assert "compile" not in done.stderr
+    drawn = ("--out", "flight.png", "--width", "160", "--height", "120")
+    without_compiler("quadrl", "render", "run", *drawn, cwd=tmp_path)
+    assert np.std(Image.open(tmp_path / "flight.png")) > 10
+
+
+def test_a_wheel_flies_as_what_is_compiled_here_and_an_own_task_in_numpy(
+    without_compiler, tmp_path
+):
+    there = without_compiler("python", "-W", "error", "-c", FLIGHTS, cwd=tmp_path)
+    here = finished(sys.executable, "-W", "error", "-c", FLIGHTS, cwd=REPOSITORY)
+    assert there.stdout == here.stdout and len(set(here.stdout.split())) == 4
+    library, warning = there.stderr.splitlines()
+    assert Path(library).parts[-3:-1] == ("native", "prebuilt")
+    assert warning.startswith("the step of the task mine is not compiled: no C compiler found")
+    (library,) = here.stderr.splitlines()
+    assert "prebuilt" not in library
 
 
 def test_python_is_limited_as_the_dependencies_are(wheel):

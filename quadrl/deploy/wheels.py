@@ -1,0 +1,112 @@
+"""The libraries of a wheel that needs no compiler: rotor callbacks, free flight, steps of tasks.
+
+`scripts/wheels` runs it once for each version of mujoco. The libraries are those that a cache would
+hold (`quadrl.engines.native.compiling`), under the same names and with the same bits.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import platform
+import re
+import sys
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from unittest import mock
+
+from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.base.errors import NativeError, QuadrlWarning
+from quadrl.control.modes import CONTROL_MODES
+from quadrl.core.environment import Environment
+from quadrl.engines import adjoint
+from quadrl.engines.native import compiling
+from quadrl.tasks import TASKS
+
+GLIBC = 28
+"""Of the oldest glibc that mujoco's own wheels run with, 2.28: manylinux_2_28."""
+MACOS = "11_0"
+"""The oldest macOS that mujoco's own wheels run with."""
+MAX_WAYPOINTS = 4
+"""How many `static_waypoint` has at most, to fly without a compiler at full speed."""
+AIRS = STILL_AIR, ROTOR_EFFECTS, GROUND_EFFECT
+ROTORS = {vehicle.rotor_count: name for name, vehicle in VEHICLES.items()}
+"""A vehicle for each number of rotors; the other numbers of one are constants of the C."""
+
+
+def tag(machine: str) -> str:
+    """The platform of a wheel for a kind of machine, as `platform.machine` names it."""
+    if sys.platform == "darwin":
+        return f"macosx_{MACOS}_{machine}"
+    return f"manylinux_2_{GLIBC}_{machine}"
+
+
+def steps(tasks: Iterable[str]) -> list[str]:
+    """C of the steps of tasks: of all their options, for the vehicles and conditions that ship.
+
+    What changes the code, not only its constants: the number of rotors and of actions, whether
+    what is observed is an estimate, a weight of zero, and the number of waypoints.
+    """
+    found: dict[str, None] = {}
+
+    def note(source: str) -> None:
+        found[source] = None
+        raise NativeError("only the source is wanted")
+
+    many = range(1, MAX_WAYPOINTS + 1)
+    routes = [{"waypoints": [[1.0, 1.0, 0.5]] * count} for count in many]
+    with mock.patch.object(compiling, "compile_generated", note), warnings.catch_warnings():
+        warnings.simplefilter("ignore", QuadrlWarning)
+        for task, vehicle, mode, randomization, weight in itertools.product(
+            tasks, ROTORS.values(), CONTROL_MODES, ("none", "full"), (0.0, 0.1)
+        ):
+            for options in routes if task == "static_waypoint" else [{}]:
+                Environment(
+                    task,
+                    task_options={"smoothness_weight": weight} | options,
+                    vehicle=vehicle,
+                    control_mode=mode,
+                    randomization=randomization,
+                ).reset()
+    return list(found)
+
+
+def fill(
+    folder: Path,
+    machine: str,
+    compiler: str | None = None,
+    tasks: Iterable[str] = TASKS,
+    airs: Iterable[int] = AIRS,
+) -> None:
+    """Compile what a wheel brings, for the mujoco that is installed.
+
+    Args:
+        folder: Where to; what it holds already is not compiled again.
+        machine: The kind of machine that it is for, as `platform.machine` names it there.
+        compiler: The command that compiles for it; None for the one of this machine.
+        tasks: Those whose steps it brings.
+        airs: Kinds of air whose derivatives it brings, as `Aerodynamics.effects`.
+
+    Raises:
+        NativeError: A library would not run on all systems that the wheel is for.
+    """
+    sources = steps(tasks)  # first, since flights need libraries of this machine
+    folder.mkdir(parents=True, exist_ok=True)
+    variables = {"QUADRL_CACHE": str(folder)} | ({"CC": compiler} if compiler else {})
+    with mock.patch.dict(os.environ, variables), mock.patch("platform.machine", lambda: machine):
+        paths = [compiling.build(), *map(compiling.build_generated, sources)]
+        paths += itertools.starmap(adjoint.build, itertools.product(airs, ROTORS))
+    for path in paths:
+        versions = map(int, re.findall(rb"GLIBC_2\.(\d+)", path.read_bytes()))
+        if (newest := max(versions, default=0)) > GLIBC:
+            raise NativeError(f"{path} needs glibc 2.{newest}: must be at most 2.{GLIBC}")
+
+
+if __name__ == "__main__":
+    chosen, *other = sys.argv[1:]
+    machine, compiler = other or (platform.machine(), None)
+    folder = Path(chosen) / tag(machine)
+    fill(folder, machine, compiler)
+    print(folder)
