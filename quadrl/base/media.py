@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 from quadrl.base.errors import QuadrlError
@@ -18,6 +19,8 @@ class Media:
     """Content of the file."""
     kind: str
     """The file's ending: png, mp4, gif, pdf or svg."""
+    make: Callable[[str], bytes] | None = dataclasses.field(default=None, compare=False)
+    """Makes the content of a file with another ending; None for videos."""
 
     def __repr__(self) -> str:
         return f"{self.kind}, {len(self.content) // 1024} kB; save(path) writes it"
@@ -35,12 +38,15 @@ class Media:
         """Write the file, whole or not at all.
 
         Raises:
-            QuadrlError: The name has another ending.
+            QuadrlError: The name has an ending that is not the kind's, nor one of a figure.
         """
         path = Path(path)
-        if path.suffix.lower() != f".{self.kind}":
-            allowed = f"a name that ends in .{self.kind}"
-            raise QuadrlError(name="path", value=str(path), allowed=allowed)
+        content, kind = self.content, path.suffix.lower().lstrip(".")
+        if kind != self.kind:
+            if self.make is None or not kind:
+                allowed = f"a name that ends in .{self.kind}"
+                raise QuadrlError(name="path", value=str(path), allowed=allowed)
+            content = self.make(kind)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, self.content)
+        write_whole(path, content)
         return path

@@ -86,6 +86,8 @@ class Quadrl:
         arg(name="import", metavar="FILE", help_behavior_hint="(repeatable)"),
     ] = ()
     """A Python file that registers tasks and aircraft of your own."""
+    quiet: CascadeSubcommandArgs[bool] = False
+    """Print errors, warnings and what --json asks for, and nothing else."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -99,6 +101,7 @@ def main(arguments: list[str] | None = None) -> None:
         with _warned_in_a_line(stderr), handling(IN_ORDER):
             chosen = parse(words)
             console.own_files[:] = chosen.own
+            console.console.quiet = chosen.quiet
             for path in chosen.own:
                 import_own(path)
             chosen.command.run()

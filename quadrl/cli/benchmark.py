@@ -5,7 +5,7 @@ from __future__ import annotations
 from quadrl.base.machine import in_a_line
 from quadrl.base.validation import number
 from quadrl.cli import choices
-from quadrl.cli.console import console, make_table, say
+from quadrl.cli.console import console, make_table, print_json, say
 
 
 @choices.command
@@ -34,8 +34,9 @@ class Benchmark:
             self.task, num_envs=self.num_envs, seconds=self.seconds, repeats=self.repeats
         )
         if self.json:
-            console.print_json(data=measured, indent=None)
+            print_json(measured)
             return
-        head = ("what", "control steps/s", "median", "share", "of", "target")
-        console.print(make_table(head, rows(measured), numbers=3))
+        head, *layers = rows(measured)
+        console.print(make_table(head, layers, numbers=5))
+        say("\nsteps/s: control steps a second, the fastest of the repetitions")
         say(f"\n{in_a_line(measured['machine'])}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from quadrl.cli import choices
-from quadrl.cli.console import console, make_table
+from quadrl.cli.console import console, make_table, print_json
 from quadrl.cli.flown import Conditioned
 from quadrl.evaluation.check import check
 
@@ -24,7 +24,7 @@ class Check(Conditioned):
         found = check(task=self.task, **self.conditions())
         if self.json:
             rows = [dataclasses.asdict(row) for row in found.rows]
-            console.print_json(data={"vehicle": found.vehicle.name, "rows": rows}, indent=None)
+            print_json({"vehicle": found.vehicle.name, "rows": rows})
             return
         head, *rows = found.table
         console.print(make_table(head, rows))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import shlex
 import signal
 import sys
@@ -27,12 +28,19 @@ def say(text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
+def print_json(data: Any) -> None:
+    """Print one JSON object, with --quiet as well."""
+    print(json.dumps(data))
+
+
 def make_table(head: Sequence[str], rows: Iterable[Sequence[str]] = (), numbers: int = 0) -> Table:
     """A table without lines, whose texts are no markup; the last columns hold `numbers`."""
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
     for k, column in enumerate(head):
         right = k >= len(head) - numbers
-        table.add_column(column, no_wrap=k == 0, justify="right" if right else "left")
+        table.add_column(
+            column, no_wrap=right or (k == 0 and not numbers), justify="right" if right else "left"
+        )
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
     return table

@@ -8,7 +8,7 @@ from typing import Any
 
 from quadrl.base.units import quantity
 from quadrl.cli import choices
-from quadrl.cli.console import console, make_table, say
+from quadrl.cli.console import console, make_table, print_json, say
 from quadrl.cli.flown import Flown
 from quadrl.conditions.observing import Observing
 from quadrl.evaluation.evaluate import evaluate
@@ -41,7 +41,7 @@ class Evaluate(Flown):
         if self.csv is not None:
             flown.save_csv(self.csv)
         if self.json:
-            console.print_json(data=first, indent=None)
+            print_json(first)
             return
         rows = [
             (name, *(quantity(name, column[name]) for column in columns.values())) for name in first

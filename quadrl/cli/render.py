@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from quadrl.cli import choices
-from quadrl.cli.console import say
+from quadrl.cli.console import console, say
 from quadrl.cli.flown import Flown
 from quadrl.learning.show import render
 from quadrl.rendering.sheet import SHEETS
@@ -64,6 +64,7 @@ class Render(Flown):
             width=self.width,
             height=self.height,
             fps=self.fps,
+            progress=not console.quiet,
             **self.conditions(),
         )
         say(f"wrote {media.save(out)}")

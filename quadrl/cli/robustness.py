@@ -10,7 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
 from quadrl.cli import choices
-from quadrl.cli.console import console, going_on, make_table, say
+from quadrl.cli.console import console, going_on, make_table, print_json, say
 from quadrl.cli.flown import Conditioned
 from quadrl.control import CONTROLLERS
 from quadrl.evaluation.evaluate import comes_with_quadrl
@@ -43,6 +43,8 @@ class Robustness(Conditioned):
     out: Path = Path("robustness")
     """Folder for the pictures (.png, .pdf), the numbers (.json) and the table (.csv). Until they
     are written it keeps what was flown, from which the same command goes on after a stop."""
+    json: bool = False
+    """Print the numbers as one JSON object and nothing else."""
 
     def run(self) -> None:
         """Fly, print where half of the flights fail, and write the files."""
@@ -63,12 +65,17 @@ class Robustness(Conditioned):
                 seed=self.seed,
                 recovery=self.recovery,
                 keep=self.out,
+                progress=not (self.json or console.quiet),
                 disturbances=self.disturbances or None,
                 **self.conditions(),
             )
+        paths = card.save(self.out)
+        if self.json:
+            print_json(card.found)
+            return
         head, *rows = card.table
         console.print(make_table(head, rows, numbers=len(head) - 1))
         if card.reach:
             say(card.reach)
-        for path in card.save(self.out):
+        for path in paths:
             say(f"wrote {path}")

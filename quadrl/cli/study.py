@@ -11,7 +11,7 @@ from tyro.conf import Positional
 from quadrl.base.errors import QuadrlError
 from quadrl.cli import choices
 from quadrl.cli import console as shared
-from quadrl.cli.console import console, going_on, make_table, say
+from quadrl.cli.console import console, going_on, make_table, print_json, say
 
 
 @choices.command
@@ -28,20 +28,31 @@ class Study:
     """Address of a Ray cluster that carries out the trainings, such as 10.0.0.1:6379; auto for the
     one that this machine belongs to, local for Ray on this machine alone."""
 
+    json: bool = False
+    """Print what study.json holds as one JSON object and nothing else."""
+
     def run(self) -> None:
         """Train what is missing, print the table, write the files."""
-        carry_out(self.file, jobs=self.jobs, out=self.out, ray=self.ray or None)
+        given = {"jobs": self.jobs, "out": self.out, "ray": self.ray or None}
+        carry_out(self.file, json=self.json, **given)
 
 
-def carry_out(what: Path | Mapping[str, Any], **given: Any) -> None:
+def carry_out(what: Path | Mapping[str, Any], *, json: bool = False, **given: Any) -> None:
     """Carry out a study, as `quadrl.study` takes it, and print what it reached."""
     from quadrl.learning.study import complaint, study
 
+    def on_line(line: str) -> None:
+        if not json:
+            say(line)
+
     with going_on():
-        found = study(what, own=tuple(shared.own_files), on_line=say, **given)
-    head, *rows = found.table
-    console.print("", make_table(head, rows, numbers=4))
-    say("\nmeans over the seeds, with their 95 % intervals in brackets")
-    say(f"in {found.folder}: table.csv, study.json, learning_curves_TASK.png, the runs")
+        found = study(what, own=tuple(shared.own_files), on_line=on_line, **given)
+    if json:
+        print_json(found.content)
+    else:
+        head, *rows = found.table
+        console.print("", make_table(head, rows, numbers=4))
+        say("\nmeans over the seeds, with their 95 % intervals in brackets")
+        say(f"in {found.folder}: table.csv, study.json, learning_curves_TASK.png, the runs")
     if found.failed:
         raise QuadrlError(complaint(found.failed))

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from quadrl import tasks
 from quadrl.cli import choices
-from quadrl.cli.console import console, make_table, say
+from quadrl.cli.console import console, make_table, print_json, say
 from quadrl.learning.defaults import PAIRS
 from quadrl.learning.description import describe
 
@@ -30,7 +30,7 @@ class Tasks:
         described = [describe(tasks.make(name)) for name in chosen]
         if self.json:
             whole = {task["name"]: task for task in described}
-            console.print_json(data=whole[self.task] if self.task else whole, indent=None)
+            print_json(whole[self.task] if self.task else whole)
             return
         console.print(make_table(("task", "", ""), _texts(described)))
         head = ("observation", "numbers", "unit", "meaning and frame")

@@ -108,7 +108,7 @@ class Card:
     @property
     def figure(self) -> Media:
         """Success and error over every disturbance."""
-        return Media(self._drawn(FILE, "png")[0], "png")
+        return self._picture(FILE)
 
     @property
     def maps(self) -> Media:
@@ -119,7 +119,7 @@ class Card:
         """
         if not self.found["recovery"]:
             raise QuadrlError("there are no recovery maps: recovery was False")
-        return Media(self._drawn(RECOVERY, "png")[0], "png")
+        return self._picture(RECOVERY)
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write numbers (.json, .csv) and pictures (.png, .pdf) into a folder; returns the paths.
@@ -156,6 +156,9 @@ class Card:
         if written != FORMAT:
             raise QuadrlError(name=f"format of {file}", value=written, allowed=FORMAT)
         return cls(found)
+
+    def _picture(self, name: str) -> Media:
+        return Media(self._drawn(name, "png")[0], "png", lambda kind: self._drawn(name, kind)[0])
 
     def _drawn(self, name: str, *kinds: str) -> list[bytes]:
         """One of its pictures, as files of some kinds."""

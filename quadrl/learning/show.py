@@ -116,7 +116,11 @@ def plot(*what: Any, kind: str = "png") -> Media:
         raise QuadrlError(name="task", value=sorted(figures), allowed=allowed)
     (figure,) = figures.values()
     carried = comment(one.scenario.to_json() for one in flown) if flown else ""
-    return Media(plotting.content(figure, kind, comment=carried), kind)
+
+    def make(kind: str) -> bytes:
+        return plotting.content(figure, kind, comment=carried)
+
+    return Media(make(kind), kind, make)
 
 
 def curve(folder: Path) -> Figure:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import read_table, write_whole
+from quadrl.base.units import quantity
 from quadrl.base.validation import keys, names, number
 from quadrl.base.validation import seeds as seeds_of
 from quadrl.evaluation.evaluate import html_table
@@ -40,12 +41,8 @@ OWN = {
 """Settings of a training that no table of a study may hold, and what to write instead."""
 MAX_RUNS, MAX_JOBS = 10_000, 4096
 EPISODES = 100
-FIGURES = {
-    "success_rate": (1.0, 100, "%"),
-    "position_error_m": (math.inf, 100, "cm"),
-    "training_s": (math.inf, 1, "s"),
-}
-"""What is compared: its largest value (the least is zero), and factor and unit in the table."""
+FIGURES = {"success_rate": 1.0, "position_error_m": math.inf, "training_s": math.inf}
+"""What is compared, and its largest value; the least is zero."""
 TABLE, STUDY = "table.csv", "study.json"
 GROUP = ("task", "algo", "variant")
 CONFIDENCE = 0.95
@@ -91,6 +88,13 @@ class StudyResult:
     def _repr_html_(self) -> str:
         return html_table(self.table)
 
+    @property
+    def content(self) -> dict[str, Any]:
+        """The rows, the runs and the failures as study.json has them."""
+        content = {"rows": self.rows, "runs": self.runs, "failed": self.failed}
+        # JSON has no NaN.
+        return json.loads(json.dumps(content), parse_constant=lambda constant: None)
+
     def save(self) -> list[Path]:
         """Write table.csv, study.json, and the learning curves of each task; returns the paths."""
         text = io.StringIO(newline="")
@@ -98,10 +102,7 @@ class StudyResult:
         table.writeheader()
         table.writerows(self.rows)
         write_whole(self.folder / TABLE, text.getvalue().encode())
-        content = {"rows": self.rows, "runs": self.runs, "failed": self.failed}
-        # JSON has no NaN.
-        known = json.loads(json.dumps(content), parse_constant=lambda constant: None)
-        write_json(self.folder / STUDY, known)
+        write_json(self.folder / STUDY, self.content)
         return [self.folder / TABLE, self.folder / STUDY, *self._draw()]
 
     def _draw(self) -> list[Path]:
@@ -185,7 +186,7 @@ def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
     rows = []
     for key, members in groups.items():
         row = dict(zip(GROUP, key, strict=True)) | {"seeds": len(members)}
-        for name, (most, *_) in FIGURES.items():
+        for name, most in FIGURES.items():
             values = [run["metrics"][name] for run in members]
             row |= dict(zip(_columns(name), interval(values, 0.0, most), strict=True))
         rows.append(row)
@@ -215,11 +216,11 @@ def _columns(name: str) -> list[str]:
 
 def _text(row: dict[str, Any], name: str) -> str:
     """A mean and its interval."""
-    (mean, low, high), (_, factor, unit) = (row[column] for column in _columns(name)), FIGURES[name]
+    mean, low, high = (row[column] for column in _columns(name))
     if mean is None:
         return "none"
-    around = "" if low is None else f" ({factor * low:.3g} to {factor * high:.3g})"
-    return f"{factor * mean:.3g} {unit}{around}"
+    around = "" if low is None else f" ({quantity(name, low)} to {quantity(name, high)})"
+    return f"{quantity(name, mean)}{around}"
 
 
 def read_plan(what: str | Path | Mapping[str, Any], out: Path | None) -> Plan:

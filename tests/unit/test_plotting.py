@@ -104,6 +104,9 @@ def test_the_same_numbers_make_the_same_file_of_every_kind(tmp_path, kind, begin
     flown = quadrl.evaluate("geometric", "hover", episodes=1, time_limit=0.5)
     shown = quadrl.plot(flown, kind=kind)
     assert shown.content.startswith(begins) and kind in shown._repr_html_()
+    # A picture is saved as another kind, too.
+    (ending, start) = FILES[(FILES.index((kind, begins)) + 1) % len(FILES)]
+    assert shown.save(tmp_path / f"flight.{ending}").read_bytes().startswith(start)
     if kind == "png":
         assert read_scenarios(shown.save(tmp_path / "flight.png")) == [flown.scenario]
 
