@@ -162,7 +162,8 @@ def _draw(run: Run, *, video: bool) -> None:
     with ProgressBar(console) as bar:
 
         def on_frame(done: int, total: int) -> None:
-            bar.update(done, total, f"drawing {names.VIDEO} (Ctrl-C skips it)")
+            hint = " (Ctrl-C skips it)" if console.is_terminal else ""
+            bar.update(done, total, f"drawing {names.VIDEO}{hint}")
 
         try:
             for _ in run.draw(video=video, on_frame=on_frame):

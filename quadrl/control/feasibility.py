@@ -163,18 +163,33 @@ def unreached(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[float, str, f
 
 
 def warn_of_unreached(vehicle: Vehicle, randomization: Randomized) -> None:
-    """Warn the caller's caller if more than a FEW of the drawn aircraft cannot hover.
+    """Warn the caller's caller of what no policy can make up for.
+
+    More than a FEW of the drawn aircraft cannot hover, half of the actions or more are cut at the
+    largest speed, or an action lasts longer than the rotors take to follow it.
 
     Raises:
         QuadrlError: The randomization does not fit the aircraft.
     """
+    reach, scale = Reach(vehicle), vehicle.action_scale
+    if 2 * reach.room < scale:
+        said = f"action_scale = {scale:g}: actions over {reach.room / scale:.2g} change nothing"
+        _warn(f"{said}, since the rotors turn no faster; quadrl check suggests another")
+    lag = max(1 / min(rotor.lag_up, rotor.lag_down) for rotor in vehicle.rotors)
+    if vehicle.control_timestep > lag:
+        said = f"control_timestep = {vehicle.control_timestep:g}: an action lasts longer"
+        _warn(f"{said} than the rotors take to follow it, {lag:.2g} s; see quadrl check")
     share, lack, enough = unreached(vehicle, AircraftSampler(randomization, vehicle))
     if share > FEW:
         said = (
             f"{100 * share:.0f} % of the drawn aircraft cannot hover level and still, whatever the "
             f"policy: {lack}; train with --vehicle-options action_scale={enough:.3g}"
         )
-        warnings.warn(said, QuadrlWarning, stacklevel=3)
+        _warn(said)
+
+
+def _warn(said: str) -> None:
+    warnings.warn(said, QuadrlWarning, stacklevel=4)
 
 
 @functools.lru_cache

@@ -98,7 +98,7 @@ def benchmark(
 
 def rows(measured: dict[str, Any]) -> list[tuple[str, ...]]:
     """What `benchmark` returned as rows of text, the head first."""
-    written = [("what", "steps/s", "median", "share", "of", "target")]
+    written: list[tuple[str, ...]] = [("what", "steps/s", "median", "share", "of", "target")]
     for row in measured["rates"]:
         what, rate = row["what"], row["rate"]
         if what.startswith(KERNEL):

@@ -173,6 +173,18 @@ def test_the_variant_robust_and_the_preset_light_are_flown_without_a_warning():
         feasibility.warn_of_unreached(VEHICLES["crazyflie"], "full")
 
 
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ({"action_scale": 1000}, "actions over 0.093 change nothing"),
+        ({"control_timestep": 1.0}, "an action lasts longer than the rotors take"),
+    ],
+)
+def test_what_no_policy_can_make_up_for_is_said(numbers, said):
+    with pytest.warns(QuadrlWarning, match=said):
+        feasibility.warn_of_unreached(resolve("paper", numbers), "none")
+
+
 def test_train_says_it_before_it_begins(tmp_path):
     seen = []
     settings = {"randomization": WEAK, "algo": "ppo", "on_progress": seen.append, "episodes": 1}
