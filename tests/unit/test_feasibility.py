@@ -182,7 +182,7 @@ def test_the_variant_robust_and_the_preset_light_are_flown_without_a_warning():
 )
 def test_what_no_policy_can_make_up_for_is_said(numbers, said):
     with pytest.warns(QuadrlWarning, match=said):
-        feasibility.warn_of_unreached(resolve("paper", numbers), "none")
+        feasibility.warn_of_unreached(dataclasses.replace(VEHICLES["paper"], **numbers), "none")
 
 
 def test_train_says_it_before_it_begins(tmp_path):
