@@ -24,6 +24,23 @@ class Progress:
     metrics: dict[str, float]
 
 
+class TimeLeft:
+    """The time that something counted still takes, at the speed since the first look."""
+
+    def __init__(self) -> None:
+        """Begin with the first look."""
+        self._first: tuple[float, float] | None = None  # how much was done, and when [s]
+
+    def left(self, done: float, total: float) -> str:
+        """The time left as text, such as "  2:05 min left"; empty where it cannot be known."""
+        now = time.monotonic()
+        self._first = self._first or (done, now)
+        before, since = self._first
+        if done <= before or done >= total:
+            return ""
+        return f"  {duration((now - since) * (total - done) / (done - before))} left"
+
+
 class ProgressBar:
     """A progress bar for a training or any other count; use it in a `with`."""
 
@@ -44,7 +61,7 @@ class ProgressBar:
         )
         self._row: progress.TaskID | None = None
         self._begun: tuple[int, float] | None = None  # iteration and seconds of the first update
-        self._first_update: tuple[int, float] | None = None  # how much was done, and when
+        self._clock = TimeLeft()
         self._last_line = time.monotonic()
         self._metrics: dict[str, float] = {}
 
@@ -69,7 +86,7 @@ class ProgressBar:
             if last:
                 self._progress.stop()
             return
-        left = self._left(done, total)
+        left = self._clock.left(done, total)
         seconds = self.NOTEBOOK_SECONDS if self._console.is_jupyter else self.LINE_SECONDS
         now = time.monotonic()
         # A drawing that takes no time needs no line; a training always has its last one.
@@ -83,15 +100,6 @@ class ProgressBar:
         else:
             line = f"{100 * done / total:3.0f} %  {text}{left}"
             self._console.print(line, soft_wrap=True, highlight=False)
-
-    def _left(self, done: int, total: int) -> str:
-        """The time left, at the speed since the first update."""
-        now = time.monotonic()
-        self._first_update = self._first_update or (done, now)
-        before, since = self._first_update
-        if done in (before, total):
-            return ""
-        return f"  {duration((now - since) * (total - done) / (done - before))} left"
 
     def show(self, now: Progress) -> None:
         """Show steps, steps/s, return and success after an iteration of a training."""

@@ -34,14 +34,17 @@ def print_json(data: Any) -> None:
 
 
 def make_table(head: Sequence[str], rows: Iterable[Sequence[str]] = (), numbers: int = 0) -> Table:
-    """A table without lines, whose texts are no markup; the last columns hold `numbers`."""
+    """A table without lines, whose texts are no markup; the last columns hold `numbers`.
+
+    Where the terminal is narrow, cells are broken between words and never within one.
+    """
+    cells = [head, *rows]
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
     for k, column in enumerate(head):
         right = k >= len(head) - numbers
-        table.add_column(
-            column, no_wrap=right or (k == 0 and not numbers), justify="right" if right else "left"
-        )
-    for row in rows:
+        longest = max(len(word) for row in cells for word in ("", *row[k].split()))
+        table.add_column(column, min_width=longest, justify="right" if right else "left")
+    for row in cells[1:]:
         table.add_row(*(escape(cell) for cell in row))
     return table
 

@@ -21,6 +21,7 @@ from typing import Any
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.machine import cores
+from quadrl.base.progress import TimeLeft
 from quadrl.base.signals import Stopped, heeded, unheeded
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import CONFIG, EVALUATION, FREE, METRICS, lock_folder
@@ -257,7 +258,8 @@ def train_all(
     waiting = [_Job(run) for run in given if not run.done]
     going: list[_Job] = []
     failed: dict[str, str] = {}
-    news, done = time.monotonic(), len(given) - len(waiting)
+    clock, news, done = TimeLeft(), time.monotonic(), len(given) - len(waiting)
+    clock.left(done + sum(job.share for job in waiting), len(given))
     if done:
         say(f"{done} of {len(given)} trainings are done already")
     try:
@@ -286,7 +288,8 @@ def train_all(
             if time.monotonic() - news > NEWS_SECONDS:
                 news = time.monotonic()
                 at = ", ".join(f"{job.run.name} {100 * job.share:.0f} %" for job in going)
-                say(f"{done} of {len(given)} done; {at}")
+                parts = sum(job.share for job in (*going, *waiting))
+                say(f"{done} of {len(given)} done; {at}{clock.left(done + parts, len(given))}")
             time.sleep(POLL_SECONDS)
     finally:
         for job in going:  # after a Ctrl-C: each run can be continued

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from quadrl.base import units
+from quadrl.base.progress import TimeLeft
 
 
 @pytest.mark.parametrize(
@@ -56,3 +57,11 @@ def test_a_metric_has_the_unit_of_its_name():
 )
 def test_a_time_is_short(seconds, text):
     assert units.duration(seconds) == text
+
+
+def test_the_time_left_is_told_from_the_speed_since_the_first_look(monkeypatch):
+    now = iter([100.0, 110.0, 130.0, 140.0])
+    monkeypatch.setattr("quadrl.base.progress.time.monotonic", lambda: next(now))
+    clock = TimeLeft()
+    # Three of ten are done by others; two more in 10 s, so that five take 25 s.
+    assert [clock.left(done, 10) for done in (3, 5, 9, 10)] == ["", "  25 s left", "  5 s left", ""]
