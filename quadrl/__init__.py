@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from dm_control.rl.control import Environment as ControlEnvironment
 
     from quadrl import rendering, suite, testing
+    from quadrl.deploy.export import export
     from quadrl.evaluation.check import check
     from quadrl.evaluation.evaluate import evaluate
     from quadrl.evaluation.robustness import robustness
@@ -39,8 +40,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "RANDOMIZATIONS", "VEHICLES", "Observing", "Policy", "Randomization", "Task", "Vehicle",
-    "check", "envs", "evaluate", "load", "plot", "register", "render", "rendering", "robustness",
-    "study", "suite", "tasks", "testing", "train",
+    "check", "envs", "evaluate", "export", "load", "plot", "register", "render", "rendering",
+    "robustness", "study", "suite", "tasks", "testing", "train",
 ]  # fmt: skip
 LAZY = {
     "train": "quadrl.learning.run",
@@ -50,6 +51,7 @@ LAZY = {
     "robustness": "quadrl.evaluation.robustness",
     "study": "quadrl.learning.study",
     "check": "quadrl.evaluation.check",
+    "export": "quadrl.deploy.export",
 }
 """Functions that are imported on first use, and their modules."""
 

@@ -29,6 +29,7 @@ from quadrl.cli import choices, console, parsing, train
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
 from quadrl.cli.evaluate import Evaluate
+from quadrl.cli.export import Export
 from quadrl.cli.plot import Plot
 from quadrl.cli.render import Render
 from quadrl.cli.robustness import Robustness
@@ -65,6 +66,7 @@ Command = (
     | Annotated[View, subcommand("view")]
     | Annotated[Plot, subcommand("plot")]
     | Annotated[Check, subcommand("check")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Benchmark, subcommand("benchmark")]
     | Annotated[Completion, subcommand("completion")]
 )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from quadrl.base.files import free_name
 from quadrl.cli import choices
 from quadrl.cli.console import console, say
 from quadrl.cli.flown import Flown
@@ -68,9 +68,3 @@ class Render(Flown):
             **self.conditions(),
         )
         say(f"wrote {media.save(out)}")
-
-
-def free_name(path: Path) -> Path:
-    """The path, or the first of NAME-2, NAME-3 and so on that is not there yet."""
-    names = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(2))
-    return next(name for name in itertools.chain([path], names) if not name.exists())

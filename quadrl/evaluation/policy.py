@@ -23,18 +23,14 @@ from quadrl.conditions import observing
 from quadrl.core.scenario import KEYWORDS, Scenario
 from quadrl.evaluation import policy_file
 from quadrl.evaluation.memory import GRU, PolicyInFlight
-from quadrl.evaluation.policy_file import CLIP, RUN
+from quadrl.evaluation.policy_file import CLIP, RUN, SHIPPED, SHIPPED_AS, shipped
 
 if TYPE_CHECKING:
     from quadrl.core.environment import Environment
+    from quadrl.evaluation.module import PolicyModule
 
 LOG_VARIANCE = (-12.0, 2.0)
 """Bounds of the log-variance of the actions."""
-SHIPPED = Path(__file__).parents[1] / "assets" / "policies"
-"""The policies that come with the package: TASK_ALGO.safetensors, or TASK_VARIANT.safetensors for a
-variant of the training, with a .json beside each."""
-SHIPPED_AS = {"vpg": "gae"}
-"""Algorithms that the file names call otherwise: the paper's word for the policy gradient."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -110,6 +106,12 @@ class Policy:
         """Numbers that it remembers of an aircraft; 0 without a memory."""
         return self.memory.width if self.memory else 0
 
+    @property
+    def mean_layers(self) -> list[tuple[np.ndarray, ...]]:
+        """Weight and bias of each layer, the last of which gives the means alone."""
+        *hidden, last = zip(self.weights, self.biases, strict=True)
+        return [*hidden, tuple(array[: self.action_size] for array in last)]
+
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """The mean action of a policy without a memory; `flying` is for every policy.
 
@@ -168,6 +170,12 @@ class Policy:
             seed: Seed of the draws of the stochastic policy; None for the mean action.
         """
         return PolicyInFlight(self, n, seed)
+
+    def to_torch(self) -> PolicyModule:
+        """The mean action as a `torch.nn.Module`, with the observations' normalisation."""
+        from quadrl.evaluation.module import PolicyModule
+
+        return PolicyModule(self)
 
     def check_fits(self, environment: Environment) -> None:
         """Refuse an environment in which observations or actions mean something else.
@@ -290,8 +298,3 @@ class Policy:
 
 
 REPR = ("algo", "seed", "vehicle")  # what a policy says of itself
-
-
-def shipped() -> list[Path]:
-    """The files of the policies that come with the package, by name."""
-    return sorted(SHIPPED.glob("*.safetensors"))

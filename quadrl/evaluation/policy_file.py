@@ -19,6 +19,11 @@ UNSEALED, RECURRENT_UNSEALED = "quadrl-policy-2", "quadrl-policy-gru-1"
 """Formats of files without a digest."""
 FILE, RUN, RUN_FORMAT = "policy.safetensors", "config.json", "quadrl-run-2"
 """In the folder of a run: its policy, and its settings."""
+SHIPPED = Path(__file__).parents[1] / "assets" / "policies"
+"""The policies that come with the package: TASK_ALGO.safetensors, or TASK_VARIANT.safetensors for a
+variant of the training, with a .json beside each."""
+SHIPPED_AS = {"vpg": "gae"}
+"""Algorithms that the file names call otherwise: the paper's word for the policy gradient."""
 CLIP = 10.0
 """Normalised observations are clipped to +-CLIP."""
 LARGEST = 1e30
@@ -123,3 +128,8 @@ def _is_network(
             return False
         width = bias.size
     return width > 0 and width % 2 == 0
+
+
+def shipped() -> list[Path]:
+    """The files of the policies that come with the package, by name."""
+    return sorted(SHIPPED.glob("*.safetensors"))

@@ -30,17 +30,12 @@ def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]
     """
     vehicle, texts = resolve(vehicle), docstrings(type(task))
     environment = Environment(task, vehicle=vehicle, seed=0)
-    terms = zip(environment.layout.items(), task.observation.values(), strict=True)
     values = dataclasses.asdict(task)
     return {
         **{name: getattr(task, name) for name in ("name", "asks", "starts", "ends", "solved")},
         "time_limit": task.time_limit,
         "training": own_settings(task),
-        "observation": [
-            {"name": name, "first": where.start, "last": where.stop - 1, "unit": term.unit,
-             "meaning": term.meaning}
-            for (name, where), term in terms
-        ],
+        "observation": describe_observation(environment),
         "action": describe_action(vehicle),
         "reward": [
             {"name": term, "weight": values.get(f"{term}_weight"),
@@ -53,6 +48,16 @@ def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]
             if name != "time_limit" and not name.endswith("_weight")
         ],
     }  # fmt: skip
+
+
+def describe_observation(environment: Environment) -> list[dict[str, Any]]:
+    """Name, first and last place, unit and meaning of each term of the flat observation."""
+    seen = environment.observer.terms if environment.observer else environment.task.observation
+    return [
+        {"name": name, "first": where.start, "last": where.stop - 1, "unit": seen[name].unit,
+         "meaning": seen[name].meaning}
+        for name, where in environment.layout.items()
+    ]  # fmt: skip
 
 
 def describe_action(vehicle: Vehicle) -> str:

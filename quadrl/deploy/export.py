@@ -1,0 +1,114 @@
+"""Carry an aircraft or a policy out of quadrl: to MuJoCo alone, to ONNX, to torch."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+from pathlib import Path
+from typing import Any
+
+from quadrl import __version__, tasks
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError
+from quadrl.base.files import free_name, write_whole
+from quadrl.base.validation import choice
+from quadrl.core.environment import Environment
+from quadrl.evaluation.evaluate import comes_with_quadrl
+from quadrl.evaluation.policy import Policy, shipped
+from quadrl.learning.description import describe_observation
+from quadrl.rendering.video import checked
+
+TARGETS = {
+    "mjcf": ("xml", "quadrl.deploy.mjcf", ""),
+    "onnx": ("onnx", "quadrl.deploy.onnx", "export"),
+    "torch": ("pt2", "quadrl.evaluation.module", "train"),
+}
+"""By name: the ending of its file, the module that makes it, and the extra which that needs."""
+
+
+def export(what: Any, to: str, out: str | Path | None = None) -> Path:
+    """Write an aircraft or a policy for programs without quadrl; `quadrl export` in Python.
+
+    Args:
+        what: A `Policy`, what `quadrl.train` returned, a run folder, a .safetensors file, or the
+            name of a policy that comes with quadrl; for "mjcf" also a Vehicle, or its name.
+        to: "mjcf" for the aircraft as a model of MuJoCo, "onnx" or "torch" for the policy.
+        out: The file; one that exists is overwritten. By default NAME.xml, TASK.onnx or TASK.pt2
+            in this folder or, where that exists, NAME-2.xml and so on.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        QuadrlError: A name is unknown, there is no policy, or a library is missing.
+        OSError: The file cannot be written.
+    """
+    ending, name, extra = TARGETS[choice("to", to, TARGETS)]
+    found = _found(what)
+    if to == "mjcf":
+        vehicle = found if isinstance(found, Vehicle) else found.scenario.vehicle
+        stem, given = vehicle.name, (vehicle, __version__)
+    elif isinstance(found, Policy):
+        stem, given = found.task, (found, described(found))
+    else:
+        reason = f"an aircraft has no network: give a policy for {to}"
+        raise QuadrlError(reason, name="to", value=to, allowed=f"mjcf for {found.name}")
+    try:
+        module = importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        reason = f"python -m pip install 'quadrl[{extra}]' installs it"
+        raise QuadrlError(f"{error.name} is not installed: {reason}") from error
+    path, _ = checked(out or free_name(Path(f"{stem}.{ending}")), (ending,))
+    path.parent.mkdir(parents=True, exist_ok=True)  # refused before the work, not after
+    write_whole(path, module.content(*given))
+    return path
+
+
+def _found(what: Any) -> Vehicle | Policy:
+    """The aircraft or the policy that is meant.
+
+    Raises:
+        QuadrlError: It is neither.
+    """
+    if isinstance(what, Vehicle):
+        return what
+    if isinstance(what, str) and what in VEHICLES:
+        return VEHICLES[what]
+    found = getattr(what, "policy", what)  # of what `quadrl.train` returned
+    if isinstance(found, str) and comes_with_quadrl(found):
+        return Policy.pretrained(found)
+    if isinstance(found, str) and not Path(found).exists():
+        known = *VEHICLES, *tasks.TASKS, *(file.stem for file in shipped())
+        choice("what", found, ("a run folder", "a .safetensors file", *known))
+    if isinstance(found, (str, Path)):
+        return Policy.load(found)
+    if not isinstance(found, Policy):
+        raise QuadrlError(name="what", value=what, allowed="a policy or an aircraft")
+    return found
+
+
+def described(policy: Policy) -> dict[str, str]:
+    """What the numbers of a policy mean, each entry in JSON.
+
+    Returns:
+        scenario, as `Scenario.of` takes it; observation, as `describe_observation` gives it;
+        action: name, unit, meaning, value at 0 and change at 1 of each number; control_timestep
+        [s]; quadrl: its version.
+
+    Raises:
+        QuadrlError: Its task is not known here, or does not fit it.
+    """
+    environment = Environment(policy.scenario, seed=0)
+    policy.check_fits(environment)
+    mode = environment.control_mode
+    numbers = zip(mode.terms, mode.centre.tolist(), mode.scale.tolist(), strict=True)
+    whole = {
+        "scenario": policy.scenario.to_json(),
+        "observation": describe_observation(environment),
+        "action": [dataclasses.asdict(n) | {"at_0": at_0, "change": c} for n, at_0, c in numbers],
+        "control_timestep": environment.vehicle.control_timestep,
+        "quadrl": __version__,
+    }
+    return {name: json.dumps(value) for name, value in whole.items()}

@@ -1,0 +1,341 @@
+"""What leaves quadrl flies without it: MuJoCo's own actuators, ONNX and torch."""
+
+import functools
+import json
+import subprocess
+import sys
+
+import helpers
+import mujoco
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from policies import linear, make_remembering
+from runs import refused
+
+import quadrl
+from quadrl import cli
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.core.scenario import Scenario
+from quadrl.deploy.export import export
+from quadrl.engines.mjcf import compile_model
+from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.rollout import fly
+
+LAYOUTS = pytest.mark.parametrize("vehicle", helpers.LAYOUTS.values(), ids=helpers.LAYOUTS)
+# A run of its own, where neither quadrl nor its callbacks are.
+ALONE = """
+import sys, mujoco
+model = mujoco.MjModel.from_xml_path(sys.argv[1])
+data = mujoco.MjData(model)
+mujoco.mj_resetDataKeyframe(model, data, model.key("hover").id)
+for _ in range(round(1 / model.opt.timestep)):
+    mujoco.mj_step(model, data)
+print(abs(data.qpos - model.key("hover").qpos).max(), *(m for m in sys.modules if m == "quadrl"))
+"""
+
+
+@functools.cache
+def models(vehicle) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    """What an aircraft is written as, read from its file, and the lean model of quadrl's engine."""
+    written = mujoco.MjModel.from_xml_path(str(export(vehicle, "mjcf")))
+    return written, compile_model(vehicle, drawn=False)
+
+
+def hovering(vehicle) -> tuple[mujoco.MjData, mujoco.MjData]:
+    """The same hover in both."""
+    written, own = models(vehicle)
+    data, true = mujoco.MjData(written), mujoco.MjData(own)
+    mujoco.mj_resetDataKeyframe(written, data, written.key("hover").id)
+    true.qpos[:], true.act[:] = (0, 0, 1, 1, 0, 0, 0), vehicle.hover_speed
+    return data, true
+
+
+# ------------------------------------------------------------------------------------ MuJoCo alone
+
+
+@LAYOUTS
+def test_it_hovers(vehicle):
+    (model, _), (data, _) = models(vehicle), hovering(vehicle)
+    assert model.nu == model.na == vehicle.rotor_count and model.nmesh == 0
+    start = data.qpos.copy()
+    for _ in range(round(1 / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(data.qpos, start, atol=1e-3)  # 1 mm; the file has six digits
+
+
+def test_it_hovers_where_quadrl_is_not(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    path = export("crazyflie", "mjcf", tmp_path / "there" / "small.xml")
+    assert path.stat().st_size < 20_000 and [*path.parent.iterdir()] == [path]
+    command = (sys.executable, "-c", ALONE, str(path))
+    done = subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 1e-3
+
+
+@LAYOUTS
+def test_the_forces_are_those_of_quadrl(vehicle):
+    """Weight, thrust, torque, drag and moment in any motion and wind; the file has six digits."""
+    (model, reference), (data, true) = models(vehicle), hovering(vehicle)
+    motion = helpers.random_motion(vehicle, 20, speed=8.0, turn=5.0, wind=5.0, rotor=0.3)
+    for k in range(20):
+        data.qpos[3:] = true.qpos[3:] = motion.quaternion[k]
+        data.qvel[:] = true.qvel[:] = (*motion.velocity[k], *motion.body_rate[k])
+        true.act[:] = motion.rotor_speed[k]
+        data.act[:] = (motion.rotor_speed[k] / vehicle.max_speed) ** 2
+        model.opt.wind[:] = true.userdata[:3] = motion.wind[k]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_forward(reference, true)
+        largest = np.abs(true.qacc[:3]).max(), np.abs(true.qacc[3:]).max()
+        scale = np.repeat(largest, 3)
+        np.testing.assert_allclose(data.qacc / scale, true.qacc / scale, atol=2e-4)
+    model.opt.wind[:] = 0
+
+
+@LAYOUTS
+@pytest.mark.parametrize("change", [0.01, -0.01])
+def test_rotors_follow_a_command_near_hover_as_fast(vehicle, change):
+    """The square of the speed changes by 2 Omega times the change of the speed."""
+    (model, reference), (data, true) = models(vehicle), hovering(vehicle)
+    command = vehicle.hover_speed * (1 + change)
+    data.ctrl[:], true.ctrl[:] = (command / vehicle.max_speed) ** 2, command
+    mujoco.mj_forward(model, data)
+    mujoco.mj_forward(reference, true)
+    expected = 2 * vehicle.hover_speed * true.act_dot / vehicle.max_speed**2
+    np.testing.assert_allclose(data.act_dot, expected, rtol=0.006)  # half of the change
+
+
+@LAYOUTS
+def test_it_stays_near_quadrl_under_commands_that_vary(vehicle):
+    """Commands change every 0.1 s by up to 0.3 of the action scale; after 1 s they are near."""
+    apart, (model, reference) = [], models(vehicle)
+    for seed in range(3):
+        data, true = hovering(vehicle)
+        data.qpos[2] = true.qpos[2] = 30
+        every = round(0.1 / model.opt.timestep)
+        shares = np.random.default_rng(seed).uniform(-0.3, 0.3, (10, model.nu))
+        for share in shares:
+            command = vehicle.hover_speed + vehicle.action_scale * share
+            data.ctrl[:], true.ctrl[:] = (command / vehicle.max_speed) ** 2, command
+            for _ in range(every):
+                mujoco.mj_step(model, data)
+                mujoco.mj_step(reference, true)
+        away = np.linalg.norm(true.qpos[:3] - (0, 0, 30))
+        apart.append(np.linalg.norm(data.qpos[:3] - true.qpos[:3]))
+        assert away > 5 * apart[-1]
+    assert max(apart) < 0.03  # [m]; over 20 seeds at most 0.027, of the Crazyflie
+
+
+@LAYOUTS
+def test_it_stands_on_the_ground(vehicle):
+    model, height = models(vehicle)[0], vehicle.ground_clearance
+    data = mujoco.MjData(model)
+    for _ in range(round(1 / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(data.qpos[:3], (0, 0, height), atol=0.02 * height)
+    assert data.ncon >= 4
+
+
+def test_the_numbers_of_its_actions_are_in_it():
+    vehicle = VEHICLES["hexa"]
+    model, _ = models(vehicle)
+    for name in ("hover_speed", "max_speed", "action_scale", "control_timestep"):
+        np.testing.assert_allclose(model.numeric(name).data, getattr(vehicle, name), rtol=1e-5)
+
+
+def test_the_aircraft_of_a_policy_is_as_it_was_trained(tmp_path):
+    path = export("hover_robust", "mjcf", tmp_path / "robust.xml")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    assert model.numeric("action_scale").data == 90.0  # the paper's has 35
+
+
+def test_mjx_takes_it():
+    jax, mjx = pytest.importorskip("jax"), pytest.importorskip("mujoco.mjx")
+    vehicle = VEHICLES["crazyflie"]
+    model, (data, _) = models(vehicle)[0], hovering(vehicle)
+    step, put = jax.jit(mjx.step), (mjx.put_model(model), mjx.put_data(model, data))
+    for _ in range(10):
+        put = put[0], step(*put)
+    np.testing.assert_allclose(put[1].qpos, data.qpos, atol=1e-4)
+
+
+# ---------------------------------------------------------------------------------- ONNX and torch
+
+POLICIES = [
+    Policy.pretrained("hover"),
+    Policy.pretrained("hover", variant="robust"),  # sees its last actions and a disturbance
+    linear(24, 6, vehicle="hexa"),
+    make_remembering(vehicle="crazyflie"),
+]
+policies = pytest.mark.parametrize("k", range(len(POLICIES)), ids=lambda k: repr(POLICIES[k]))
+
+
+@functools.cache
+def seen(k: int) -> np.ndarray:
+    """Observations (n, size) of a policy: drawn ones and, of a trained one, clipped and flown ones.
+
+    The weights of the others are drawn, and so large that clipped observations make sums whose last
+    digit is more than 1e-6.
+    """
+    policy, kept = POLICIES[k], []
+
+    def act(observation):
+        kept.append(observation.astype(np.float32))
+        return policy(observation)
+
+    drawn = np.random.default_rng(0).normal(policy.mean, policy.deviation, (1000, policy.size))
+    if "algo" in policy.metadata:
+        drawn[:50] *= 100
+        fly(act, policy.scenario, episodes=5, seed=0)
+    return np.concatenate([*kept, drawn]).astype(np.float32)
+
+
+def states(policy: Policy, count: int) -> np.ndarray:
+    """What a policy with a memory may remember, (count, state_size)."""
+    shape = (count, policy.state_size)
+    return np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32)
+
+
+@policies
+def test_onnx_acts_as_the_policy(k):
+    policy, path = POLICIES[k], export(POLICIES[k], "onnx")
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    observation, shapes = seen(k), {"observation": ["batch", policy.size]}
+    given, memory = {"observation": observation}, states(policy, len(observation))
+    if policy.memory:
+        shapes["state"], given["state"] = ["batch", policy.state_size], memory
+    assert {entry.name: entry.shape for entry in session.get_inputs()} == shapes
+    found = dict(
+        zip([e.name for e in session.get_outputs()], session.run(None, given), strict=True)
+    )
+    action, state = policy.step(observation, memory)
+    np.testing.assert_allclose(found.pop("action"), action, rtol=0, atol=1e-6)
+    assert [*found] == ["next_state"] * bool(policy.memory)
+    for array in found.values():
+        np.testing.assert_allclose(array, state, rtol=0, atol=1e-6)
+    one = {name: array[:1] for name, array in given.items()}
+    np.testing.assert_allclose(session.run(["action"], one)[0], action[:1], rtol=0, atol=1e-6)
+
+
+@policies
+def test_torch_acts_as_the_policy(k):
+    policy, observation = POLICIES[k], seen(k)
+    before = torch.get_rng_state()
+    module = policy.to_torch()
+    assert torch.equal(torch.get_rng_state(), before)
+    memory = states(policy, len(observation))
+    with torch.no_grad():
+        found = module(*map(torch.from_numpy, (observation, memory)[: 1 + bool(policy.memory)]))
+    expected = policy.step(observation, memory)
+    for array, tensor in zip(expected, found if policy.memory else [found], strict=False):
+        np.testing.assert_allclose(tensor, array, rtol=0, atol=1e-6)
+
+
+def test_a_module_has_its_own_numbers_which_can_be_trained():
+    policy = Policy.pretrained("hover")
+    module, observation = policy.to_torch(), torch.zeros(1, policy.size)
+    before = policy(observation.numpy())
+    module(observation).sum().backward()
+    with torch.no_grad():
+        for parameter in module.parameters():
+            assert parameter.grad is not None
+            parameter.add_(1.0)
+    np.testing.assert_array_equal(policy(observation.numpy()), before)
+
+
+def test_the_file_says_what_its_numbers_are():
+    policy = Policy.pretrained("hover", variant="robust")
+    model = onnx.load(export(policy, "onnx"))
+    said = {entry.key: json.loads(entry.value) for entry in model.metadata_props}
+    assert Scenario.of(said["scenario"]) == policy.scenario
+    assert said["control_timestep"] == 0.05 and said["quadrl"] == quadrl.__version__
+    terms = {term["name"]: term for term in said["observation"]}
+    assert [*terms][-2:] == ["disturbance", "action_history"]
+    assert terms["velocity"] == {
+        "name": "velocity", "first": 9, "last": 11, "unit": "m/s", "meaning": "body frame"
+    }  # fmt: skip
+    assert terms["action_history"]["last"] == policy.size - 1
+    hover = policy.scenario.aircraft.hover_speed
+    for number, speed in zip(said["action"], hover, strict=True):
+        assert (number["unit"], number["at_0"], number["change"]) == ("rad/s", speed, 90.0)
+
+
+def test_the_same_policy_is_the_same_file():
+    contents = {export("hover", "onnx", f"{k}.onnx").read_bytes() for k in range(3)}
+    assert len(contents) == 1
+
+
+# -------------------------------------------------------------------------- names, files, refusals
+
+
+def test_files_have_names_of_their_own_unless_they_are_given():
+    assert export("hexa", "mjcf").name == "hexa.xml"
+    assert export("hexa", "mjcf").name == "hexa-2.xml"
+    assert export(Policy.pretrained("hover"), "onnx").name == "hover.onnx"
+    kept = export("hexa", "mjcf", "hexa.xml")
+    assert kept.name == "hexa.xml" and "paper" not in kept.read_text()
+    assert "The aircraft paper" in export("paper", "mjcf", "hexa.xml").read_text()
+
+
+def test_the_command_says_what_it_wrote(capsys, tmp_path):
+    cli.main(["export", "hover", "--to", "onnx", "--out", "new/flown.onnx"])
+    assert capsys.readouterr().out == "wrote new/flown.onnx\n"
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["flown.onnx"]
+
+
+def test_a_run_is_exported_by_its_folder(tmp_path):
+    (tmp_path / "run").mkdir()
+    make_remembering().save(tmp_path / "run" / "policy.safetensors")
+    assert export(tmp_path / "run", "onnx").name == "hover.onnx"
+
+
+@pytest.mark.parametrize(
+    ("what", "to", "out", "said"),
+    [
+        ("hover", "onx", None, "did you mean onnx?"),
+        ("crazyfly", "mjcf", None, "did you mean crazyflie?"),
+        ("hover_robst", "onnx", None, "did you mean hover_robust?"),
+        ("crazyflie", "onnx", None, "an aircraft has no network: give a policy for onnx"),
+        (VEHICLES["hexa"], "torch", None, "must be mjcf for hexa"),
+        ("geometric", "onnx", None, "must be one of a run folder"),
+        (len, "onnx", None, "a policy or an aircraft"),
+        (".", "onnx", None, "there is no policy at policy.safetensors"),
+        ("hover", "onnx", "hover.xml", "the name of a file ending in .onnx"),
+        ("hexa", "mjcf", ".", "the name of a file ending in .xml"),
+    ],
+)
+def test_what_cannot_be_exported_is_said_in_a_line(what, to, out, said, tmp_path):
+    with refused() as caught:
+        export(what, to, out)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_folder_that_cannot_be_written_is_said_in_a_line(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit) as end:
+        cli.main(["export", "hexa", "--to", "mjcf", "--out", "file/hexa.xml"])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.splitlines() == [
+        "quadrl: cannot read or write file: File exists"
+    ]
+
+
+def test_a_missing_library_is_named(monkeypatch):
+    monkeypatch.delitem(sys.modules, "quadrl.deploy.onnx", raising=False)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with refused() as caught:
+        export("hover", "onnx")
+    assert str(caught.value) == (
+        "onnx is not installed: python -m pip install 'quadrl[export]' installs it"
+    )
+
+
+def test_an_aircraft_needs_neither_torch_nor_onnx():
+    code = "import sys, quadrl; quadrl.export('paper', 'mjcf'); "
+    code += "print({'torch', 'onnx'} & {*sys.modules})"
+    done = subprocess.run((sys.executable, "-c", code), capture_output=True, text=True)
+    assert done.stdout == "set()\n", done.stderr
