@@ -74,7 +74,7 @@ def lift(rotor, air, speed, climb, across, noise=0.0):
     momentum = 2 * air.air_density * area * w0 * w0
     w = flow_through(w0, kappa, min(max(climb, -2 * w0), 3 * w0), across)
     total = rest + (momentum * kappa * (1 - w / w0) if w0 else 0.0)
-    total += air.translational_lift * across * across
+    total += air.translational_lift * air.air_density * area * across * across
     deep = 1 - ((climb / (w0 + 1e-6) + 1.4) / 1.2) ** 2
     slow = 1 - (across / (0.95 * (w0 + 1e-6))) ** 2
     if deep > 0 and slow > 0:

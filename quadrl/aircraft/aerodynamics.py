@@ -30,7 +30,7 @@ class Aerodynamics:
     """Effects of the air on the rotors of an aircraft. Every number is part of its row.
 
     An effect is off where its flag is False or its number 0. The other numbers say how strong an
-    effect is that is on; their defaults are those of the paper's aircraft, which is the OS4.
+    effect is that is on. None is another aircraft's unasked: what blades do has to be given.
     """
 
     inflow: bool = False
@@ -51,15 +51,17 @@ class Aerodynamics:
     rotor_inertia: float = 0.0
     """J_r [kg m^2] of a rotor and its drive about its axis: reaction to its acceleration, and
     gyroscopic moment."""
-    blade_lift: float = 0.953
-    """s: solidity of the disc times lift slope of the blades [1/rad]. Acts with `inflow`."""
-    translational_lift: float = 4.9e-3
-    """k_h [N s^2/m^2]: lift over the square of the airspeed in the plane of the rotor. Acts with
-    `inflow`."""
+    blade_lift: float = 0.0
+    """s: solidity of the disc times lift slope of the blades [1/rad]. Acts with `inflow`, which
+    needs it."""
+    translational_lift: float = 0.0
+    """Lift by the airspeed in the plane of a rotor, over its square and over the density and area
+    of the disc. Acts with `inflow`."""
     body_lift: float = 2.0
     """K_b, 0 to 2: lift of the air that rises between the rotors. Acts with `ground_effect`."""
     air_density: float = 1.225
-    """rho [kg/m^3]."""
+    """rho [kg/m^3] of the air in which the coefficients of the aircraft and its rotors hold; in
+    thinner air these are others too (`presets.at_air_density`)."""
 
     def __post_init__(self) -> None:
         """Validate the numbers."""
@@ -69,9 +71,13 @@ class Aerodynamics:
         ranges = dict.fromkeys(
             ("rotor_drag", "flapping_moment", "rotor_inertia", "translational_lift"), (0.0, MAX)
         ) | dict.fromkeys(("vortex_ring", "vortex_ring_noise"), (0.0, 1.0))
-        ranges |= {"blade_lift": (MIN, MAX), "body_lift": (0.0, MAX_BODY_LIFT)}
+        ranges |= {"blade_lift": (0.0, MAX), "body_lift": (0.0, MAX_BODY_LIFT)}
         for name, (low, high) in (ranges | {"air_density": DENSITIES}).items():
             object.__setattr__(self, name, number(name, getattr(self, name), low, high))
+        if self.inflow and self.blade_lift < MIN:
+            reason = "thrust answers the flow by the lift of the aircraft's own blades"
+            allowed = "with inflow, the solidity of the disc times the lift slope of the blades"
+            raise QuadrlError(reason, name="blade_lift", value=self.blade_lift, allowed=allowed)
         if (self.vortex_ring or self.vortex_ring_noise) and not self.inflow:
             name = "vortex_ring" if self.vortex_ring else "vortex_ring_noise"
             reason = "the vortex ring state takes away from the thrust that inflow gives"
@@ -86,9 +92,17 @@ class Aerodynamics:
             vortex_ring=0.44,
             vortex_ring_noise=0.1,
             # Blade theory of the OS4, with stiff plastic blades: the physics page says how.
+            blade_lift=0.953,
+            translational_lift=0.0566,  # k_h = 4.9e-3 N s^2/m^2
             rotor_drag=1.25e-4,
             rotor_inertia=6e-5,  # OS4, with its gear
         )
+
+    def at(self, air_density: float) -> Aerodynamics:
+        """The same in air of another density [kg/m^3], to which forces are proportional."""
+        ratio = number("air_density", air_density, *DENSITIES) / self.air_density
+        forces = {name: getattr(self, name) * ratio for name in ("rotor_drag", "flapping_moment")}
+        return dataclasses.replace(self, air_density=air_density, **forces)
 
     @property
     def uses_discs(self) -> bool:

@@ -32,7 +32,7 @@ CRAZYFLIE = Vehicle(
     ),
     drag_coefficient=5e-3,  # chosen: 7.6 m/s of terminal speed
     moment_coefficient=1e-7,  # chosen: the paper's, over the fifth power of the arm length
-    action_scale=200.0,  # chosen
+    action_scale=480.0,  # chosen: the weakest aircraft of the randomization `full` hovers
     physics_timestep=0.005,  # chosen
     control_timestep=0.02,  # chosen
 )
@@ -60,7 +60,7 @@ RACER = Vehicle(
     ),
     drag_coefficient=2e-2,  # chosen: 19 m/s of terminal speed
     moment_coefficient=1e-4,  # chosen
-    action_scale=150.0,  # chosen
+    action_scale=230.0,  # chosen: the weakest aircraft of the randomization `full` hovers
     physics_timestep=0.005,  # chosen
     control_timestep=0.02,  # chosen
 )
@@ -100,7 +100,7 @@ REAL_AIR = {
             flapping_moment=9e-8,  # identified in flights: 6.4e-4 N m per m/s sideways
             rotor_inertia=6e-8,  # identified in flights (ARPL, IMRCLab)
             blade_lift=0.384,  # gives the heave damping of drone-models, 0.0128 N s/m
-            translational_lift=0.0,  # unknown
+            translational_lift=0.0,  # unknown; k_h is that share of rho A
         ),
         0.2,  # estimated from its frontal area
     ),
@@ -195,9 +195,11 @@ def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> V
     if not isinstance(aerodynamics, str):
         allowed = f"an Aerodynamics, {NONE}, {FULL}, or names of {', '.join(EFFECTS)}"
         raise QuadrlError(name="aerodynamics", value=aerodynamics, allowed=allowed)
+    density = vehicle.aerodynamics.air_density
     if aerodynamics == NONE:
-        return dataclasses.replace(vehicle, aerodynamics=Aerodynamics())
+        return dataclasses.replace(vehicle, aerodynamics=Aerodynamics(air_density=density))
     own, share = _full_set(vehicle)
+    own = own.at(density)
     kept = set(SWITCHES)
     if aerodynamics != FULL:
         names = [name.strip() for name in aerodynamics.split(",")]
@@ -207,6 +209,27 @@ def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> V
     chosen = dataclasses.replace(own, **{n: off[n] for n in SWITCHES if n not in kept})
     drag = vehicle.drag_coefficient * (share if chosen.rotor_drag else 1.0)
     return dataclasses.replace(vehicle, aerodynamics=chosen, drag_coefficient=drag)
+
+
+def at_air_density(vehicle: Vehicle, air_density: float) -> Vehicle:
+    """A vehicle in thinner or denser air: all that the air gives and takes is in proportion to it.
+
+    Args:
+        vehicle: The aircraft, with coefficients for the density that its aerodynamics name.
+        air_density: rho [kg/m^3]: 1.225 at sea level, 1.007 at 2,000 m (standard atmosphere).
+
+    Raises:
+        QuadrlError: The density is impossible, or the rotors do not carry the aircraft in it.
+    """
+    air = vehicle.aerodynamics.at(air_density)
+    ratio = air.air_density / vehicle.aerodynamics.air_density
+
+    def scaled(part: Any, *names: str, **changes: Any) -> Any:
+        return dataclasses.replace(part, **{n: getattr(part, n) * ratio for n in names}, **changes)
+
+    rotors = [scaled(r, "thrust_coefficient", "torque_coefficient") for r in vehicle.rotors]
+    own = {"rotors": tuple(rotors), "aerodynamics": air}
+    return scaled(vehicle, "drag_coefficient", "moment_coefficient", **own)
 
 
 def _full_set(vehicle: Vehicle) -> tuple[Aerodynamics, float]:

@@ -118,7 +118,7 @@ class Randomization:
     thrust: Range = (1.0, 1.0)
     """Factor of the thrust of all rotors at a rotor speed."""
     torque: Range = (1.0, 1.0)
-    """Factor of their torque."""
+    """Factor of their torque; where the air acts on the discs, from what the thrust takes on."""
     lag: Range = (1.0, 1.0)
     """Factor of their time constants, rising and falling."""
     drag: Range = (1.0, 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,7 @@ class AircraftSampler:
         # New numbers stand at the end, so that those before them keep their random numbers.
         last = vehicle.rotor_count - 1 if randomization.one_rotor != OFF else 0
         ends |= {"one_rotor": randomization.one_rotor, DAMAGED: (0, last)}
+        ends["torque"] = (self._least_torque(), ends["torque"][1])
         self.names = tuple(ends)
         """Of the numbers; all are drawn, so that a range has no effect on the others."""
         whole = zip((*DELAYS, DAMAGED), (*self.delays, (0, last)), (*timesteps, 1.0), strict=True)
@@ -134,6 +136,26 @@ class AircraftSampler:
         return np.array_equal(own.view(np.float64).reshape(saved.shape), saved)
 
     # ------------------------------------------------------------------- what cannot fly
+
+    def _least_torque(self) -> float:
+        """The lowest torque factor with which no disc makes power from nothing.
+
+        Raises:
+            QuadrlError: It is above the largest that is asked for.
+        """
+        given, air = self.randomization, self._vehicle.aerodynamics
+        if not (air.uses_discs and given.per_row):
+            return given.torque[0]
+        merit = max(rotor.figure_of_merit(air.air_density) for rotor in self._vehicle.rotors)
+        strong = max(1.0, given.one_rotor[1])
+        # Merit goes with thrust^1.5 over torque; a damaged rotor has the same factor for both.
+        least = (given.thrust[1] * given.rotors[1]) ** 1.5 * math.sqrt(strong) / given.rotors[0]
+        least *= merit * (1 + ROUNDING)
+        if least > given.torque[1]:
+            reason = "with less the rotors would make more power than momentum theory allows"
+            allowed = f"above {least:.3g} with these thrusts"
+            raise QuadrlError(reason, name="torque", value=given.torque, allowed=allowed)
+        return max(given.torque[0], least)
 
     def _at(self, count: int, **columns: Any) -> Array:
         """Numbers (count, k): some columns, each from a name on, and the lowest of the others."""

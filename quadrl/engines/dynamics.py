@@ -97,7 +97,7 @@ def lift_change(
     ring = steep * steep * steep * clip(1 - p_square * over * over / 0.95**2, low=0.0)
     change = (
         flow * k * (w0 - w - p.vortex_ring[..., None] * w0 * ring)
-        + inflow * p.translational_lift[..., None] * p_square
+        + inflow * p.translational_lift[..., None] * flow / 2 * p_square
         + p.vortex_ring_noise[..., None] * rest * noise * ring
     )
     return clip(change, -rest, 0.6 * rest)  # above, the blades stall

@@ -18,7 +18,7 @@ import reference
 
 from quadrl.aircraft.aerodynamics import EFFECTS, Aerodynamics
 from quadrl.aircraft.parameters import WIND, Parameters, rows
-from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
+from quadrl.aircraft.presets import VEHICLES, at_air_density, in_real_air, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.core.environment import Environment
@@ -31,7 +31,7 @@ HIGH = 50.0  # [m], far from the ground
 T_H, V_H, OMEGA_H = 1.594125, 3.033975, 225.6781
 RADIUS = 0.15
 ENGINES = ("mujoco", "free_flight")
-INFLOW = Aerodynamics(inflow=True, translational_lift=0.0)
+INFLOW = Aerodynamics(inflow=True, blade_lift=0.953)
 VORTEX = dataclasses.replace(INFLOW, vortex_ring=0.44)
 
 
@@ -161,6 +161,58 @@ def test_climb_and_flight_across_change_the_thrust(name, climb, across, share):
     own = with_effects(VEHICLES[name], "inflow").aerodynamics
     vehicle = bare(dataclasses.replace(own, translational_lift=0.0), name)
     assert lift_share(vehicle, climb, across) == pytest.approx(share, abs=1e-3)
+
+
+def test_translational_lift_is_that_of_the_rotor_whatever_its_size():
+    # 4 * 0.0566 * 1.225 * pi 0.15^2 = 0.0196 N at 1 m/s for the paper's discs. At a p that is the
+    # same share of w0 the lift is the same share of the weight: 0.0566 w0^2 rho A, and the weight
+    # of a rotor is 2 rho A w0^2, so 0.0283 of it at p = w0.
+    more = dataclasses.replace(INFLOW, translational_lift=0.0566)
+    forces = [Probe(bare(air))(velocity=(1, 0, 0))[0][2] for air in (more, INFLOW)]
+    assert forces[0] - forces[1] == pytest.approx(0.0196, abs=1e-4)
+    for name in ("paper", "crazyflie", "hexa"):
+        shares = [lift_share(bare(air, name), 0.0, 1.0) for air in (more, INFLOW)]
+        assert shares[0] - shares[1] == pytest.approx(0.0283, rel=1e-3)
+
+
+def test_an_aircraft_of_ones_own_gets_no_blades_unasked():
+    off = dataclasses.asdict(Aerodynamics())
+    assert {name for name, value in off.items() if value} == {"body_lift", "air_density"}
+    with pytest.raises(QuadrlError, match="own blades") as caught:
+        Aerodynamics(inflow=True, translational_lift=0.05)
+    assert caught.value.name == "blade_lift" and caught.value.value == 0.0
+
+
+def test_thin_air_asks_for_faster_rotors_and_damps_less():
+    # At 1.007 kg/m^3 all coefficients are 0.8220 of those at sea level. The rotors hover
+    # 1 / sqrt(0.8220) = 1.1030 times as fast, and so is the flow through their discs; heave is
+    # damped by 2 rho A kappa w0 / (kappa + 2) with the same kappa: 0.8220 * 1.1030 = 0.9067.
+    low = dataclasses.replace(in_real_air(PAPER), drag_coefficient=9e-3)
+    high = at_air_density(low, 1.007)
+    assert high.hover_speed == pytest.approx(1.1030 * low.hover_speed, rel=1e-4)
+    assert high.rotors[0].figure_of_merit(1.007) == pytest.approx(
+        low.rotors[0].figure_of_merit(1.225)
+    )
+    slopes = []
+    for vehicle in (low, high):
+        probe = Probe(dataclasses.replace(vehicle, drag_coefficient=0.0))
+        up, down = (probe(velocity=(0, 0, way * 1e-4))[0][2] for way in (1, -1))
+        slopes.append((up - down) / 2e-4)
+    assert slopes[1] / slopes[0] == pytest.approx(0.9067, abs=1e-4)
+    # Sideways at 1 m/s each force is 0.8220 of what it was, but that of the faster rotors.
+    drags = [-Probe(vehicle)(velocity=(1, 0, 0))[0][0] for vehicle in (low, high)]
+    assert drags[0] == pytest.approx(9e-3 + 4 * 1.25e-4 * 225.678, abs=1e-5)
+    assert drags[1] == pytest.approx(0.8220 * (9e-3 + 4 * 1.25e-4 * 1.1030 * 225.678), abs=1e-5)
+    assert at_air_density(high, 1.225).drag_coefficient == pytest.approx(9e-3)
+    # Effects that are asked for in thin air are those of thin air.
+    thin = at_air_density(PAPER, 1.007)
+    assert in_real_air(thin).aerodynamics == high.aerodynamics
+    assert with_effects(high, "none").aerodynamics == Aerodynamics(air_density=1.007)
+    for density in (0.0, 1e-4, math.nan, "thin"):
+        with pytest.raises(QuadrlError, match="air_density"):
+            at_air_density(PAPER, density)
+    with pytest.raises(QuadrlError, match="max_speed of rotor 1"):
+        at_air_density(PAPER, 0.6)  # half the air, and twice the weight at most in all of it
 
 
 def test_inflow_damps_heave_and_roll():
@@ -591,7 +643,8 @@ def test_an_aircraft_without_a_full_set_is_refused_until_it_has_one():
     ]
     + [{"inflow": True, name: bad} for name in ("vortex_ring", "vortex_ring_noise")
        for bad in (-0.1, 1.1)]
-    + [{"blade_lift": 0.0}, {"body_lift": 2.1}, {"body_lift": -1}, {"air_density": 0.0}]
+    + [{"inflow": True, "blade_lift": 0.0}, {"blade_lift": -1.0}]
+    + [{"body_lift": 2.1}, {"body_lift": -1}, {"air_density": 0.0}]
     + [{"inflow": 1}, {"ground_effect": "yes"}, {"vortex_ring": 0.4}, {"vortex_ring_noise": 0.1}],
 )  # fmt: skip
 def test_numbers_that_no_air_has_are_refused(changed):
@@ -613,7 +666,7 @@ def test_a_disc_that_makes_power_from_nothing_is_refused():
     drawn = tuple(dataclasses.replace(rotor, disc_radius=0.0) for rotor in PAPER.rotors)
     assert drawn[0].disc == 0.06 and Vehicle(rotors=drawn).rotors[0].disc == 0.06
     assert drawn[0].figure_of_merit(1.225) == pytest.approx(1.40, abs=0.01)
-    for effect in ({"inflow": True}, {"ground_effect": True}):
+    for effect in ({"inflow": True, "blade_lift": 0.9}, {"ground_effect": True}):
         error = refused(rotors=drawn, aerodynamics=Aerodynamics(**effect))
         assert (error.name, error.value) == ("disc_radius of rotor 1", 0.06)
         assert "0.0842 m" in error.allowed

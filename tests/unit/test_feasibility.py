@@ -14,11 +14,11 @@ from scipy.optimize import linprog
 import quadrl
 from quadrl import cli
 from quadrl.aircraft.parameters import rows
-from quadrl.aircraft.presets import VEHICLES, resolve
+from quadrl.aircraft.presets import VEHICLES, in_real_air, resolve
 from quadrl.aircraft.rotors import GRAVITY, mixer
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.errors import QuadrlWarning
-from quadrl.conditions.sampler import AircraftSampler
+from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.conditions.sampler import AircraftSampler, vehicle_of
 from quadrl.control import feasibility
 from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
 from quadrl.evaluation import card_figures
@@ -166,11 +166,42 @@ def test_the_variant_robust_and_the_preset_light_are_flown_without_a_warning():
     for vehicle in VEHICLES.values():
         feasibility.warn_of_unreached(vehicle, "light")
     # A corner of one in a hundred is no reason; a quarter is.
-    racer = VEHICLES["racer"]
+    racer = resolve("racer", {"action_scale": 150})
     assert 0 < unreached(racer, AircraftSampler("full", racer))[0] < feasibility.FEW
     feasibility.warn_of_unreached(racer, "full")
     with pytest.warns(QuadrlWarning, match="28 %"):
-        feasibility.warn_of_unreached(VEHICLES["crazyflie"], "full")
+        feasibility.warn_of_unreached(resolve("crazyflie", {"action_scale": 200}), "full")
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_the_presets_draw_no_aircraft_that_is_refused_or_cannot_hover(name):
+    for vehicle in (VEHICLES[name], in_real_air(VEHICLES[name])):
+        for drawn in ("light", "full"):
+            sampler = AircraftSampler(drawn, vehicle)
+            table, corners = feasibility.samples(sampler)
+            # With every number at an end at once, which nothing draws, the paper's aircraft would
+            # need 43 of its 35 rad/s.
+            if (name, drawn) != ("paper", "full"):
+                table = np.concatenate([table, corners])
+            assert Reach(vehicle, table).carries(vehicle.action_scale).all()
+            for row in np.concatenate([table[::64], corners[::16]]):
+                vehicle_of(vehicle, row)
+
+
+def test_no_torque_is_drawn_with_which_a_rotor_would_make_power():
+    # The hexacopter's discs have a merit of 0.659; with 1.05 * 1.04 of the thrust and 0.96 of the
+    # torque it is 0.659 * 1.092^1.5 / 0.96 = 0.783, which a torque factor below that would pass 1.
+    air = in_real_air(VEHICLES["hexa"])
+    lowest = {}
+    for vehicle in (VEHICLES["hexa"], air, in_real_air(PAPER)):
+        sampler = AircraftSampler("full", vehicle)
+        torque = sampler.low[sampler.names.index("torque")]
+        lowest[vehicle.name, vehicle.aerodynamics.uses_discs] = torque
+    assert lowest["hexa", True] == pytest.approx(0.783, abs=1e-3)
+    assert lowest["hexa", False] == lowest["paper", True] == 0.7
+    with pytest.raises(QuadrlError, match="momentum theory") as caught:
+        AircraftSampler({"thrust": (1.0, 1.5), "torque": (0.8, 1.2)}, air)
+    assert caught.value.name == "torque" and "1.21" in caught.value.allowed  # 0.659 * 1.5^1.5
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ AERO double aero_lift_change(const Aircraft* a, const Rotor* rotor, const Disc* 
   const double slow = aero_positive(1 - p_square * over * over * (1 / (0.95 * 0.95)));
   const double ring = steep * steep * steep * slow;
   const double change = disc->flow[i] * k * (w0 - w - a->vortex_ring[i] * w0 * ring) +
-                        a->inflow[i] * a->translational_lift[i] * p_square +
+                        a->inflow[i] * a->translational_lift[i] * disc->flow[i] * 0.5 * p_square +
                         a->vortex_ring_noise[i] * rest * noise * ring;
   return aero_clip(change, -rest, 0.6 * rest);  // above, the blades stall
 }
