@@ -1,4 +1,4 @@
-"""The notebooks run as they stand, and their outputs are in place."""
+"""The notebooks run as they stand, without a warning, and their outputs are in place."""
 
 from pathlib import Path
 
@@ -19,6 +19,7 @@ def kinds(book):
     """The kinds of output of all cells: some have pictures, tables or videos."""
     outputs = [output for cell in code(book) for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error"]
+    assert not [output.text for output in outputs if output.get("name") == "stderr"]
     return {kind for output in outputs for kind in output.get("data", {})}
 
 
