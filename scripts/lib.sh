@@ -16,10 +16,16 @@ die() {
     exit 1
 }
 
-# install_packages NAME...: with apt-get where this user may; fails without a word where not.
+# may_install WHAT: says what is about to be installed and how to prevent it; fails where QUADRL_INSTALL=no does.
+may_install() {
+    [ "${QUADRL_INSTALL:-yes}" != no ] || return 1
+    say "installing $* (QUADRL_INSTALL=no prevents it)"
+}
+
+# install_packages NAME...: with apt-get where this user may, never with sudo; fails without a word where not.
 install_packages() {
     [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null || return 1
-    say "installing $*"
+    may_install "with apt-get, as root: $*" || return 1
     apt-get update -qq >&2 &&
         DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >&2
 }
@@ -133,9 +139,11 @@ ensure_environment() {
     done
     wanted="$(fingerprint; echo "$installed")"
     if [ "$(cat "$STAMP" 2>/dev/null)" != "$wanted" ]; then
-        say "installing quadrl[${installed// /,}]; the first time takes minutes and, with torch, some gigabytes"
+        installed="${installed:+[${installed// /,}]}"
+        may_install "quadrl$installed into $ENVIRONMENT: at first minutes and, with torch, gigabytes" ||
+            die "needs quadrl$installed in $ENVIRONMENT, and QUADRL_INSTALL=no: run again without it"
         "$ENVIRONMENT_PYTHON" -m pip install --disable-pip-version-check \
-            --constraint "$REPOSITORY/constraints.txt" --editable "${REPOSITORY}[${installed// /,}]" >&2
+            --constraint "$REPOSITORY/constraints.txt" --editable "$REPOSITORY$installed" >&2
         echo "$wanted" >"$STAMP"
     fi
     ensure_renderer
