@@ -1,14 +1,12 @@
-"""Draw the pictures of the tasks and of a training in motion.
+"""Draw the tasks and a training in motion.
 
 The PPO policy that ships for a task flies it; the geometric controller flies what has no policy.
 """
 
 from __future__ import annotations
 
-import itertools
-import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +25,34 @@ from quadrl.learning.train import Training
 from quadrl.rendering import render_trajectory
 from scripts.reports.report import IMAGES
 
-MOMENTS, SHOWN = 4, (320, 180)  # [pixels]; drawn twice as large, for smooth edges
+SHOWN = (360, 203)  # [pixels]; drawn twice as large, for smooth edges
 SETTLED = 0.05  # of the largest distance from the last position: little happens after that
-# The moving picture: four policies of one training fly the same start.
+LONGEST = 6.0  # [s] of a task's flight that are shown
+# The training: four policies fly the same start.
 SEED, SHARES = 225, (0.0, 0.12, 0.3, 1.0)  # of the training
 RELEASED = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
-PANEL: Any = {"width": 400, "height": 225, "overlay": False}  # [pixels]
+PANEL = (400, 225)  # [pixels]
 FPS, LAST = 12.5, 1.5  # [1/s], [s] that the end is shown
+QUALITY = 30  # a task is then under 250 kB
 
 
-def pictures() -> None:
-    """Draw the pictures of the tasks and of a training in motion."""
-    rows = {name: np.hstack(list(moments(name))) for name in tasks.TASKS}
+def pictures(only: tuple[str, ...] = (*tasks.TASKS, "learning")) -> None:
+    """Draw the tasks and a training in motion.
+
+    Args:
+        only: What to draw.
+    """
     (IMAGES / "tasks").mkdir(exist_ok=True)
-    stills = {f"tasks/{name}": row for name, row in rows.items()}
-    for name, picture in (*stills.items(), ("tasks", np.vstack([*rows.values()]))):
-        Image.fromarray(picture).save(IMAGES / f"{name}.jpg", quality=88, optimize=True)
-    first, *others = learning()
+    for name in only:
+        frames = learning() if name == "learning" else flight(name)
+        save(frames, IMAGES / ("learning.webp" if name == "learning" else f"tasks/{name}.webp"))
+
+
+def save(frames: Iterable[Image.Image], file: Path) -> None:
+    """Write frames as a picture that moves for ever."""
+    first, *others = frames
     moving: Any = {"save_all": True, "append_images": others, "duration": round(1000 / FPS)}
-    first.save(IMAGES / "learning.webp", loop=0, quality=50, method=6, **moving)
+    first.save(file, loop=0, quality=QUALITY, method=6, **moving)
 
 
 def flown(flyer: Any, task: Task, seed: int = EVALUATION_SEED) -> tuple[Any, Any, bool]:
@@ -84,23 +91,30 @@ def learning() -> Iterator[Image.Image]:
 def panel(policy: Policy, name: str) -> list[np.ndarray]:
     """A flight of a policy until its end, with a name in the corner."""
     flight, model, early = flown(policy, tasks.make("hover", **RELEASED), 5)
-    font, frames = ImageFont.load_default(15), []
-    for frame in render_trajectory(flight, model, fps=FPS, **PANEL):
-        image, outline = Image.fromarray(frame), {"stroke_width": 2, "stroke_fill": (20, 30, 45)}
-        ImageDraw.Draw(image).text((10, 8), name, (255, 255, 255), font, **outline)
-        frames.append(np.asarray(image))
+    width, height = PANEL
+    drawn = render_trajectory(flight, model, fps=FPS, width=width, height=height, overlay=False)
+    frames = [np.asarray(named(Image.fromarray(frame), name)) for frame in drawn]
     return [*frames, (frames[-1] * 0.45).astype(np.uint8)] if early else frames
 
 
-def moments(name: str) -> Iterator[np.ndarray]:
-    """A few pictures of a flight of a task, until little happens."""
+def named(image: Image.Image, name: str) -> Image.Image:
+    """A picture with a name in its corner."""
+    outline = {"stroke_width": 2, "stroke_fill": (20, 30, 45)}
+    font = ImageFont.load_default(15)
+    ImageDraw.Draw(image).text((10, 8), name, (255, 255, 255), font, **outline)
+    return image
+
+
+def flight(name: str) -> Iterator[Image.Image]:
+    """Frames of a flight of a task, until little happens."""
     task, file = tasks.make(name), SHIPPED / f"{name}_ppo.safetensors"
     controller = Policy.load(file) if file.exists() else make_controller("geometric", task)
     flight, model, _ = flown(controller, task)
     away = np.linalg.norm(flight.qpos[:, :3] - flight.qpos[-1, :3], axis=1)
-    last = int(np.flatnonzero(away > SETTLED * away.max())[-1])
-    fps = (MOMENTS - 0.9) / (flight.time[last] - flight.time[0])
-    every = math.ceil(1 / fps)  # one picture a second is the slowest that is drawn
-    frames = render_trajectory(flight, model, fps=fps * every, width=640, height=360)
-    for frame in itertools.islice(frames, 0, MOMENTS * every, every):
-        yield np.asarray(Image.fromarray(frame).resize(SHOWN, Image.Resampling.LANCZOS))
+    settled = flight.time[np.flatnonzero(away > SETTLED * away.max())[-1]]
+    times = np.arange(0.0, min(settled + LAST, LONGEST), 1.0 / FPS)
+    width, height = (2 * size for size in SHOWN)
+    size: Any = {"width": width, "height": height, "overlay": False}
+    for frame in render_trajectory(flight, model, fps=FPS, times=times, **size):
+        small = Image.fromarray(frame).resize(SHOWN, Image.Resampling.LANCZOS)
+        yield named(small, name.replace("_", " "))

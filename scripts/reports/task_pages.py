@@ -121,9 +121,9 @@ def page(name: str) -> str:
     ]
     own = " ".join(f"`{setting}`" for setting in settings(own_settings(task)))
     flies = (SHIPPED / f"{name}_ppo.safetensors").exists()
-    moments = f"![Four moments of a flight](images/tasks/{name}.jpg)\n\n"
-    drawn = (report.IMAGES / "tasks" / f"{name}.jpg").exists()
-    return moments * drawn + PAGE.format(
+    moving = f"![A flight of a policy that comes with quadrl](images/tasks/{name}.webp)\n\n"
+    drawn = (report.IMAGES / "tasks" / f"{name}.webp").exists()
+    return moving * drawn + PAGE.format(
         name=name,
         camel=camel,
         make=f'policy = quadrl.Policy.pretrained("{name}")\n' if flies else "",
