@@ -5,7 +5,7 @@
 import { readFileSync } from "node:fs";
 import { Episode } from "../docs/fly/episode.mjs";
 import { Flight, Kernel } from "../docs/fly/flight.mjs";
-import { fromFragment, toFragment } from "../docs/fly/link.mjs";
+import { fromFragment, toFragment, unread } from "../docs/fly/link.mjs";
 import { Policy } from "../docs/fly/policy.mjs";
 
 const book = JSON.parse(readFileSync(process.argv[2]));
@@ -78,6 +78,7 @@ const jobs = {
   // Settings through a link and back.
   link: ({ settings }) => fromFragment(toFragment(settings), book),
   open: ({ fragment }) => fromFragment(fragment, book),
+  unread: ({ fragment }) => unread(fragment, fromFragment(fragment, book)),
 };
 
 const asked = JSON.parse(readFileSync(0));

@@ -90,6 +90,13 @@ export class Episode {
     this.history.push({ time: this.time, error: flight.error, command });
     if (flight.truncated) this.solved = flight.succeeded;
     if (flight.diverged[0]) this.outcome = "faster than a physics step resolves";
-    else if (flight.terminated) this.outcome = "the task ended it";
+    else if (flight.terminated) this.outcome = this.#failure();
+  }
+
+  // Why the task has ended it. Every task here names first how far away that is (`Task.ends`).
+  #failure() {
+    const { qpos, task: { ends } } = this.flight, [away] = ends.split(", ");
+    const inverted = qpos[4] ** 2 + qpos[5] ** 2 > 0.5;
+    return inverted && /tilted/.test(ends) ? "tipped over" : away;
   }
 }

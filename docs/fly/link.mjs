@@ -31,6 +31,13 @@ export function fromFragment(fragment, book) {
   return settings;
 }
 
+// Names of the parts of a link that were not understood: settings do not say what they say.
+export function unread(fragment, settings) {
+  const understood = new URLSearchParams(toFragment(settings).slice(1));
+  const parts = [...new URLSearchParams(fragment.replace(/^#/, ""))];
+  return parts.filter(([name, value]) => understood.get(name) !== value).map(([name]) => name);
+}
+
 // As a link writes it, so that what is flown now and what the link shows are the same numbers.
 export function rounded(values) {
   return values.map((x) => Number(x.toFixed(DIGITS)));

@@ -3,7 +3,7 @@
 import { decoded, Kernel } from "./flight.mjs";
 import { Policy } from "./policy.mjs";
 import { Episode } from "./episode.mjs";
-import { fromFragment, rounded, toFragment } from "./link.mjs";
+import { fromFragment, rounded, toFragment, unread } from "./link.mjs";
 import { Stage } from "./scene.mjs";
 import { Plot } from "./plot.mjs";
 
@@ -50,6 +50,7 @@ class Page {
   // Takes up the settings of a link.
   open(hash) {
     this.settings = fromFragment(hash, this.book);
+    const strange = unread(hash, this.settings);
     const { at: step } = this.settings;
     this.begin();
     const { substeps } = this.vehicle;
@@ -58,6 +59,7 @@ class Page {
     if (step > 0) {
       this.say(`This is the moment of the link, ${this.time.toFixed(1)} s. Press Play to fly on.`);
     }
+    if (strange.length) this.say(`Not understood in the link: ${strange.join(", ").slice(0, 80)}.`);
     this.orbit.distance = this.#distance();
     this.showWind();
   }

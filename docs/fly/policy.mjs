@@ -2,18 +2,26 @@
 
 const LAYERS = ["weight", "bias"];
 const DAMAGED = "The file is damaged or not a safetensors file.";
+const CHECKPOINT = "This is a checkpoint, from which a training goes on. The policy is policy.safetensors in the same folder.";
 
-// Arrays (float32) and the text table of a safetensors file.
-export function readSafetensors(buffer) {
+// What a safetensors file says of itself: its text table, its arrays' places, and the bytes that hold them.
+function readTable(buffer) {
   const bytes = new Uint8Array(buffer);
   const size = bytes.length < 8 ? NaN : Number(new DataView(bytes.buffer).getBigUint64(0, true));
   if (!(size <= bytes.length - 8)) throw new Error(DAMAGED);
-  const arrays = {};
-  let texts;
   try {
     const table = JSON.parse(new TextDecoder().decode(bytes.subarray(8, 8 + size)));
-    const { __metadata__: own = {}, ...entries } = table, data = bytes.subarray(8 + size);
-    texts = own;
+    const { __metadata__: texts = {}, ...entries } = table;
+    return { texts, entries, data: bytes.subarray(8 + size) };
+  } catch {
+    throw new Error(DAMAGED);
+  }
+}
+
+// Arrays (float32) of a safetensors file.
+function readArrays({ entries, data }) {
+  const arrays = {};
+  try {
     for (const [name, { dtype, data_offsets: [from, to] }] of Object.entries(entries)) {
       if (dtype !== "F32" || to > data.length) throw new Error(DAMAGED);
       arrays[name] = new Float32Array(data.slice(from, to).buffer);
@@ -21,7 +29,7 @@ export function readSafetensors(buffer) {
   } catch {
     throw new Error(DAMAGED);
   }
-  return { arrays, texts };
+  return arrays;
 }
 
 // Options of the observation that this page knows, by their names in quadrl/conditions/observing.py.
@@ -30,14 +38,16 @@ const KNOWN = { disturbance: false, action_history: 0, observation_history: 0 };
 export class Policy {
   // rules: the `policy` entry of the book.
   constructor(buffer, rules) {
-    const { arrays, texts } = readSafetensors(buffer);
+    const table = readTable(buffer);
     let header = {};
     try {
-      header = JSON.parse(texts[rules.header] ?? "{}");
+      header = JSON.parse(table.texts[rules.header] ?? "{}");
     } catch {
       // The format below is missing then.
     }
+    if (`${header.format}`.startsWith("quadrl-checkpoint")) throw new Error(CHECKPOINT);
     if (!rules.formats.includes(header.format)) throw new Error("The file holds no policy of quadrl.");
+    const arrays = readArrays(table);
     const length = Math.max(1, Math.floor(Object.keys(arrays).length / 2) - 1);
     const names = Array.from({ length }, (_, k) => LAYERS.map((name) => `${name}_${k}`));
     for (const name of ["mean", "deviation", ...names.flat()]) {

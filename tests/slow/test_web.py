@@ -15,13 +15,16 @@ import time
 import chromium
 import numpy as np
 import pytest
+from safetensors.numpy import save
 
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.base.files import write_safetensors
 from quadrl.control.geometric import GeometricController
 from quadrl.core.environment import Environment
 from quadrl.deploy import web
 from quadrl.evaluation.policy import SHIPPED, Policy, shipped
+from quadrl.learning.checkpoint import FORMAT as CHECKPOINT
 
 FLOWN = [name for name, task in tasks.TASKS.items() if not task.contact]
 PAIRS = [(task, vehicle) for task in FLOWN for vehicle in VEHICLES]
@@ -210,6 +213,8 @@ def test_gusts_have_the_deviation_that_is_asked_for(node):
 def test_files_that_cannot_fly_are_refused(node, tmp_path):
     hover, other = ((SHIPPED / f"{name}.safetensors").read_bytes()
                     for name in (TRAINED, "target_following_ppo"))  # fmt: skip
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    write_safetensors(checkpoint, {"steps": np.arange(3)}, {"format": CHECKPOINT}, save)
     cases = [
         (hover, "hover", "paper", "^$"),
         (hover, "random_waypoint", "paper", "^$"),
@@ -218,6 +223,7 @@ def test_files_that_cannot_fly_are_refused(node, tmp_path):
         (other, "hover", "paper", "observes"),
         *((part, "hover", "paper", "damaged") for part in (hover[:1000], hover[:-8], b"", b"no")),
         (b"\x02" + bytes(7) + b"{}", "hover", "paper", "no policy"),
+        (checkpoint.read_bytes(), "hover", "paper", "checkpoint.*policy.safetensors"),
     ]
     jobs = [
         dict(job="read", file=base64.b64encode(file).decode(), task=task, aircraft=vehicle)
@@ -236,6 +242,22 @@ def test_a_link_keeps_the_settings(node):
     (found,) = node(dict(job="open", fragment=wrong))
     assert found == {"task": "hover", "aircraft": "paper", "left": "", "right": "geometric",
                      "seed": 0, "at": 20000, "events": []}  # fmt: skip
+    fragments = (wrong, "#nonsense", "", "#task=hover&seed=7&events=push@1:1,0,0,0,0,0")
+    unread = node(*(dict(job="unread", fragment=fragment) for fragment in fragments))
+    assert unread == [["task", "aircraft", "seed", "at", "events"], ["nonsense"], [], []]
+
+
+def test_a_flight_that_fails_says_why(node):
+    level = np.array([0, 0, 3, 1, 0, 0, 0, *np.zeros(6), *VEHICLES["paper"].hover_speed])
+    away, over, low = level.copy(), level.copy(), level.copy()
+    away[0], over[3:5], low[2] = 3.5, (0, 1), 0.15
+    settings = {"task": "hover", "aircraft": "paper", "seed": 3}
+    job = dict(job="fly", settings=settings, controller=TRAINED, steps=2, events=[])
+    outcomes = [
+        flight["outcome"]
+        for flight in node(*(job | {"start": x.tolist()} for x in (away, over, low)))
+    ]
+    assert outcomes == ["more than 3 m away", "tipped over", "near the ground"]
 
 
 TIME = "Number(document.documentElement?.dataset.time)"  # [s]; JavaScript
