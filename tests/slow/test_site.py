@@ -43,8 +43,7 @@ def site(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pages(site):
-    # The page of missing pages has addresses from the root of a server.
-    return {path: Parsed(path) for path in site.rglob("*.html") if path.name != "404.html"}
+    return {path: Parsed(path) for path in site.rglob("*.html")}
 
 
 def test_every_page_is_there(site, pages):
@@ -83,4 +82,11 @@ def test_the_search_knows_the_pages(site):
     index = (site / "search" / "search_index.json").read_text()
     for words in ("target_velocity", "geometric controller", "write_video", "gladLoadGL"):
         assert words in index
+    # What newcomers look for; "not yet" is an answer, too.
+    asked = (
+        "payload battery ONNX PX4 Betaflight gate camera lidar obstacles swarm GPU MJX Isaac ROS"
+    )
+    page = REPOSITORY / "docs" / "coming_from.md"
+    answers = page.read_text().partition("## What is there, what is not yet")[2]
+    assert not [word for word in asked.split() if word not in answers]
     assert "class Hover(Task)" not in index  # the sources are not searched
