@@ -9,7 +9,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
@@ -29,6 +29,7 @@ class Hover(Task):
         Target("success_rate", "successful", 1.0, True),
         Target("position_error_m", "error over the last 2 s", 0.05, unit="cm"),
         Target("heading_error_deg", "off east", 5.0, unit="deg"),
+        *STILL,
     )
     training = {
         "gamma": 0.92,

@@ -14,7 +14,7 @@ from quadrl.base.rotation import Array, namespace, norm, square_norm, stack
 from quadrl.core import rewards
 from quadrl.core.contact import stands, strikes_ground
 from quadrl.core.markers import Marker
-from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.core.task import TURNING, EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import REST_SPEED, Start
 
@@ -55,6 +55,7 @@ class Landing(Task):
         Target("success_rate", "successful", 0.98, True),
         Target("crash_rate", "crashes", 0.0),
         Target("touchdown_speed_median_m_s", "touchdown, median", 0.3, unit="m/s"),
+        TURNING,  # while it comes down: on its feet it rests
     )
     training = {"gamma": 0.98, "steps": 2_621_440}
     training_with = {
@@ -74,6 +75,7 @@ class Landing(Task):
         "robust": {"gamma": 0.97, "initial_deviation": 0.4, "aerodynamics": "ground_effect"}
     }
     heading_matters = True
+    keeps_place = False
     contact = True
 
     altitude: float = 0.0

@@ -8,7 +8,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState
+from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
@@ -32,6 +32,7 @@ class RandomWaypoint(Task):
     targets = (
         Target("success_rate", "successful", 0.99, True),
         Target("position_error_m", "error over the last 2 s", 0.06, unit="cm"),
+        *STILL,
     )
     training = {"steps": 3_276_800, "holds_goal": True, "training_options": {"farthest": 3.0}}
     training_with = {

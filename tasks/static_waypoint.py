@@ -15,7 +15,7 @@ from quadrl.base.validation import MAX_OPTION, numbers
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
-from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
@@ -48,6 +48,7 @@ class StaticWaypoint(Task):
         Target("success_rate", "successful", 1.0, True),
         Target("position_error_m", "error over the last 2 s", 0.05, unit="cm"),
         Target("heading_error_deg", "off east", 5.0, unit="deg"),
+        *STILL,
     )
     training = {"gamma": 0.9, "holds_goal": True, "ppo": {"learning_rate": 8e-3}}
     training_with = {"apg": {"steps": 153_600, "holds_goal": False}}

@@ -15,7 +15,7 @@ from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY
-from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
+from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
 
@@ -47,9 +47,11 @@ class StraightAndLevel(Task):
         Target("altitude_rms_m", "altitude error, RMS", 0.05, unit="cm"),
         Target("cross_track_rms_m", "off the line, RMS", 0.10, unit="cm"),
         Target("speed_error_share", "speed error", 0.05),
+        TURNING,
     )
     training = {"gamma": 0.94, "steps": 1_966_080}
     observation = OBSERVATION | TARGET_VELOCITY
+    keeps_place = False
 
     time_limit: float = 20.0
     """Time limit of an episode [s]."""

@@ -16,7 +16,7 @@ from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY
-from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
+from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import FULL_TURN, Rng
 from quadrl.engines.state import Start
 
@@ -51,6 +51,9 @@ class TargetFollowing(Task):
     targets = (
         Target("survival_rate", "flown to the end", 0.99, True),
         Target("distance_rms_m", "distance off 1 m, RMS", 0.15, unit="cm"),
+        TURNING,
+        # The target turns, and who follows lags: the geometric controller has 0.07 m/s.
+        Target("circling_m_s", "circling over the last 2 s", 0.1, unit="m/s"),
     )
     observation = OBSERVATION | TARGET_VELOCITY
 

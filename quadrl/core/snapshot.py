@@ -119,7 +119,9 @@ class Rollout:
     body_rate: np.ndarray  # (T, N, 3) [rad/s], body frame
     rotor_speed: np.ndarray  # (T, N, R) [rad/s]
     goal: np.ndarray  # (T, N, 3) [m], task frame
+    target_velocity: np.ndarray  # (T, N, 3) [m/s], world frame; zero where nothing moves
     action: np.ndarray  # (T, N, k), within [-1, 1]
+    rotor_command: np.ndarray  # (T, N, R), mean over each step, as a share of the largest speed
     error: np.ndarray  # (T, N) [m]
     reward: np.ndarray  # (T, N)
     wind: np.ndarray  # (T, N, 3) [m/s], world frame; that of the step which led to each state

@@ -48,8 +48,19 @@ class Target:
     """In the unit of the metric's name; shares as shares."""
     at_least: bool = False
     """Whether the figure must reach the limit, or stay under it."""
-    unit: Literal["%", "cm", "m/s", "deg", "s"] = "%"
+    unit: Literal["%", "cm", "m/s", "deg", "s", "rad/s"] = "%"
     """Unit in which it is shown."""
+
+    def met(self, metrics: Mapping[str, Any]) -> bool:
+        """Whether an evaluation reaches it; a figure that is missing or no number does not."""
+        value = math.nan if (found := metrics.get(self.metric)) is None else found
+        return value >= self.limit if self.at_least else value <= self.limit
+
+
+TURNING = Target("yaw_rate_rad_s", "turning over the last 2 s", 0.3, unit="rad/s")
+STILL = (TURNING, Target("circling_m_s", "circling over the last 2 s", 0.05, unit="m/s"))
+"""What is asked of who should stand, beside the place: one that turns or circles has not solved
+its task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +78,8 @@ class Task(abc.ABC):
     solved: ClassVar[str]
     """What counts as success, in a line."""
     targets: ClassVar[tuple[Target, ...]] = (Target("success_rate", "successful", 0.99, True),)
-    """What a trained policy has to reach over many episodes."""
+    """What a trained policy has to reach over many episodes that nothing disturbs; wind alone moves
+    an aircraft that holds its place at more than `STILL` allows."""
     training: ClassVar[dict[str, Any]] = {}
     """Training settings that differ from the defaults of `quadrl.learning.config.TrainConfig`."""
     training_with: ClassVar[dict[str, dict[str, Any]]] = {}
@@ -78,6 +90,8 @@ class Task(abc.ABC):
     """The entries of the observation in the order of the flat vector."""
     heading_matters: ClassVar[bool] = False
     """Whether the attitude error counts yaw against east (0), or only roll and pitch."""
+    keeps_place: ClassVar[bool] = True
+    """Whether it asks to stay at the goal, or with one that moves: speed relative to it counts."""
     contact: ClassVar[bool] = False
     """Whether the aircraft can touch anything without the episode being over."""
     compiled: ClassVar[bool] = True

@@ -26,7 +26,7 @@ from quadrl.base.files import read_sealed_json, write_sealed_json
 from quadrl.core.task import Task
 
 FILE = "flown.json"
-FORMAT = "quadrl-flown-2"
+FORMAT = "quadrl-flown-3"
 
 
 class ResultCache:

@@ -15,8 +15,10 @@ from typing import Any
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
 from quadrl.base.media import Media
+from quadrl.base.units import quantity
 from quadrl.evaluation.cache import ResultCache
 from quadrl.evaluation.evaluate import html_table
+from quadrl.evaluation.rollout import BEHAVIOUR
 
 NORMAL_95 = 1.959963984540054  # the normal distribution's quantile of 97.5 %
 QUARTILES = (0.25, 0.5, 0.75)
@@ -61,10 +63,12 @@ class Card:
     found: dict[str, Any]
     """As the JSON file has it: task, vehicle, seed, episodes, engine; `flown`, the names, and
     `scenarios` by name; in `axes` by disturbance its levels and, for each that flew, `success`,
-    its 95 % interval `low` and `high`, quartiles of the error over the last 2 s `error_m`, and
+    its 95 % interval `low` and `high`, quartiles of the error over the last 2 s `error_m`, what
+    `quadrl.evaluation.rollout.BEHAVIOUR` names (None where the task does not ask for it), and
     `half`, the levels under and over the usual one at which half of the flights fail, and `reach`,
     for each that flew those from which on no policy can hover within its actions; by recovery map
-    the shares of the flights that recover. Older files have neither `reach` nor `scenarios`."""
+    the shares of the flights that recover. Older files have no
+    `reach`, `scenarios` or behaviour."""
     kept: ResultCache | None = dataclasses.field(default=None, compare=False)
     """What was kept of the flights until the card is saved."""
 
@@ -82,12 +86,22 @@ class Card:
 
     @property
     def table(self) -> list[tuple[str, ...]]:
-        """Where half of the flights fail, a row for each disturbance; the first row is the head."""
+        """Where half of the flights fail, a row for each disturbance; the first row is the head.
+
+        The last rows say how fast the aircraft turn and circle where nothing disturbs them.
+        """
         flown = self.found["flown"]
         rows: list[tuple[str, ...]] = [("half of the flights fail at", *flown)]
         for axis in self.found["axes"].values():
             cells = (half_words(axis, axis["flown"][name]["half"]) for name in flown)
             rows.append((f"{axis['label']} [{axis['unit']}]", *cells))
+        for axis in [*self.found["axes"].values()][:1]:
+            k = axis["levels"].index(axis["usual"])
+            for metric, word in (("yaw_rate_rad_s", "turning"), ("circling_m_s", "circling")):
+                values = [axis["flown"][name].get(metric, {k: None})[k] for name in flown]
+                if values != [None] * len(flown):
+                    cells = (quantity(metric, "" if x is None else x) for x in values)
+                    rows.append((f"{word}, undisturbed", *cells))
         return rows
 
     @property
@@ -172,14 +186,16 @@ class Card:
         text = io.StringIO(newline="")
         writer = csv.writer(text)
         quartiles = [f"error_{round(100 * q)}_m" for q in QUARTILES]
-        head = ("disturbance", "unit", "flown", "level", "success", "low", "high", *quartiles)
+        shares, rest = ("success", "low", "high"), BEHAVIOUR
+        head = ("disturbance", "unit", "flown", "level", *shares, *quartiles, *rest)
         writer.writerow(head)
         for name, axis in self.found["axes"].items():
             for flown, reached in axis["flown"].items():
                 for k, level in enumerate(axis["levels"]):
                     errors = reached["error_m"][k] or ["", "", ""]
-                    shares = (reached[which][k] for which in ("success", "low", "high"))
-                    writer.writerow([name, axis["unit"], flown, level, *shares, *errors])
+                    known = (reached[which][k] for which in shares)
+                    ways = (reached[which][k] if which in reached else None for which in rest)
+                    writer.writerow([name, axis["unit"], flown, level, *known, *errors, *ways])
         return text.getvalue()
 
 

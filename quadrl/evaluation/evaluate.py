@@ -69,7 +69,8 @@ class Evaluation:
             f"{self.name} on {self.task.name}, {found['episodes']} episodes: "
             f"{percent(found['survival_rate'])} to the end, "
             f"{percent(found['success_rate'])} successful, error over the last 2 s "
-            f"{length(found['position_error_m'])}"
+            f"{length(found['position_error_m'])}, turning at "
+            f"{quantity('yaw_rate_rad_s', found['yaw_rate_rad_s'])}"
         )
 
     def _repr_html_(self) -> str:

@@ -27,12 +27,14 @@ from quadrl.evaluation.evaluate import setting
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.recovery import MAPS, recovered
 from quadrl.evaluation.rollout import (
+    BEHAVIOUR,
     EVALUATION_SEED,
     MAX_EPISODES,
     MAX_SEED,
     Controller,
     flights,
     fly,
+    summarize,
 )
 
 WORLD = ("weather", "randomization", "engine")
@@ -212,21 +214,23 @@ def disturbed(scenario: Scenario, level: Randomization | Weather) -> Scenario:
 def measured(
     controller: Controller, scenario: Scenario, *, episodes: int, seed: int
 ) -> dict[str, Any] | None:
-    """Success with its interval, and quartiles of the error [m]; None where none can hover."""
+    """Success with its interval, quartiles of the error [m], behaviour; None where none hovers."""
     try:
         AircraftSampler(scenario.randomization, scenario.aircraft)
     except QuadrlError:  # the aircraft cannot exist, or hardly fly
         return None
-    reached = flights(fly(controller, scenario, episodes=episodes, seed=seed))
+    rollout = fly(controller, scenario, episodes=episodes, seed=seed)
+    reached, metrics = flights(rollout), summarize(rollout)
     success = int(reached["success"].sum())
     low, high = wilson(success, episodes)
     errors = np.quantile(reached["position_error_m"], QUARTILES).tolist()
-    return {"success": success / episodes, "low": low, "high": high, "error_m": errors}
+    found = {"success": success / episodes, "low": low, "high": high, "error_m": errors}
+    return found | {name: metrics.get(name) for name in BEHAVIOUR}
 
 
 def _summary(one: Disturbance, at: list[dict[str, Any] | None]) -> dict[str, Any]:
     """What was reached at the levels of a disturbance, and where half fail."""
-    names = ("success", "low", "high", "error_m")
+    names = ("success", "low", "high", "error_m", *BEHAVIOUR)
     columns = {name: [level[name] if level else None for level in at] for name in names}
     start, shares = one.levels.index(one.usual), columns["success"]
     below = half_level(one.levels[start::-1], shares[start::-1])

@@ -25,8 +25,11 @@ EVALUATION_SEED = 1 << 53
 """Beyond the seeds of every training (2^32 * 2^20), so that evaluation episodes are fresh ones."""
 MAX_SEED, MAX_EPISODES = (1 << 32) - 1, 100_000
 FINAL_STRETCH = 2.0  # [s], over which position_error_m is the mean
-HISTORY = ("position", "quaternion", "velocity", "body_rate", "rotor_speed", "goal", "action",
-           "error", "reward", "wind")  # fmt: skip
+HISTORY = ("position", "quaternion", "velocity", "body_rate", "rotor_speed", "goal",
+           "target_velocity", "action", "rotor_command", "error", "reward", "wind")  # fmt: skip
+BEHAVIOUR = ("yaw_rate_rad_s", "circling_m_s", "command_change_rate", "saturated_rate",
+             "least_height_m")  # fmt: skip
+"""How an aircraft flies beside where: what `flights` says of it, in this order."""
 
 
 def fly(
@@ -56,7 +59,7 @@ def fly(
     environment = Environment(scenario, num_envs=episodes, seed=seed)
     controller = begun(controller, environment)
     flown, timestep = environment.task, environment.vehicle.control_timestep
-    steps, numbers = environment.time_limit_steps, 21 + len(environment.vehicle.rotors)
+    steps, numbers = environment.time_limit_steps, 24 + 2 * len(environment.vehicle.rotors)
     machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
     observation = environment.flatten(environment.reset())
     history: dict[str, list[np.ndarray]] = {name: [] for name in HISTORY}
@@ -73,6 +76,9 @@ def fly(
         state, goal = environment.snapshot.state, flown.goal(environment.snapshot)
         moment = {"goal": goal, "action": taken, "error": now.error, "reward": now.reward}
         moment["wind"] = environment.engine.wind
+        velocity = flown.target_velocity(environment.snapshot)
+        moment["target_velocity"] = np.zeros_like(goal) if velocity is None else velocity
+        moment["rotor_command"] = environment.snapshot.rotor_command / environment.vehicle.max_speed
         for name, values in history.items():
             value = np.array(moment[name] if name in moment else getattr(state, name), dtype=float)
             value[~alive] = np.nan
@@ -138,8 +144,8 @@ def flights(rollout: Rollout) -> dict[str, np.ndarray]:
 
     Returns:
         success, survived and diverged (bool); position_error_m: mean error over the last 2 s [m];
-        where the heading matters heading_error_deg: mean of |yaw| over the same time; return;
-        length_s.
+        where the heading matters heading_error_deg: mean of |yaw| over the same time; the
+        `behaviour`; return; length_s.
     """
     steps = max(1, round(FINAL_STRETCH / rollout.control_timestep))
     index = np.arange(len(rollout.error))[:, None]
@@ -153,8 +159,38 @@ def flights(rollout: Rollout) -> dict[str, np.ndarray]:
         "diverged": rollout.diverged,
         "position_error_m": _means(rollout.error, last),
         **(heading if rollout.task.heading_matters else {}),
+        **behaviour(rollout, last),
         "return": np.nansum(rollout.reward, 0),
         "length_s": rollout.length * rollout.control_timestep,
+    }
+
+
+def behaviour(rollout: Rollout, last: np.ndarray) -> dict[str, np.ndarray]:
+    """How each aircraft flies, beside where: arrays (N,).
+
+    Args:
+        rollout: The flights.
+        last: Whether a step is in the last 2 s of a flight, (T, N) bool.
+
+    Returns:
+        yaw_rate_rad_s: mean of the body rate about z, without its sign, over the last 2 s [rad/s];
+        where the task asks to keep a place circling_m_s: mean speed relative to the goal over the
+        same time [m/s]; and over the whole flight command_change_rate: mean change of a rotor's
+        command from one control step to the next, as a share of its largest speed;
+        saturated_rate: share of the entries of the actions that are -1 or 1; least_height_m: of
+        the aircraft's centre above the ground [m].
+    """
+    height = rollout.position[..., 2] + rollout.origin[2]
+    flown = np.arange(len(height))[:, None] < rollout.length
+    relative = np.linalg.norm(rollout.velocity - rollout.target_velocity, axis=-1)
+    change = np.abs(np.diff(rollout.rotor_command, axis=0)).mean(-1)
+    circling = {"circling_m_s": _means(relative, last)} if rollout.task.keeps_place else {}
+    return {
+        "yaw_rate_rad_s": _means(np.abs(rollout.body_rate[..., 2]), last),
+        **circling,
+        "command_change_rate": _means(change, flown[1:]),
+        "saturated_rate": _means((np.abs(rollout.action) >= 1.0).mean(-1), flown),
+        "least_height_m": np.where(flown, height, np.inf).min(0),
     }
 
 
@@ -164,10 +200,14 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
     Returns:
         episodes; success_rate and survival_rate (shares); position_error_m and
         position_error_std_m: mean and deviation over the flights [m]; where the heading matters
-        heading_error_deg; return_mean and return_std; length_mean_s; diverged (count); and the
-        task's own metrics. `flights` says what each of them is of one flight.
+        heading_error_deg; return_mean and return_std; length_mean_s; diverged (count); the means
+        of the behaviour, and the least of the heights, over the flights that did not fail (who
+        tumbles does not spin), over all if none is left; and the task's own metrics. `flights`
+        says what each of them is of one flight.
     """
     flown = flights(rollout)
+    counts = flown["survived"] | ~flown["survived"].any()
+    ways = {name: flown[name][counts] for name in BEHAVIOUR if name in flown}
     heading = {k: float(v.mean()) for k, v in flown.items() if k == "heading_error_deg"}
     return {
         "episodes": len(flown["return"]),
@@ -176,6 +216,7 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
         "position_error_m": float(flown["position_error_m"].mean()),
         "position_error_std_m": float(flown["position_error_m"].std()),
         **heading,
+        **{k: float(v.min() if k == "least_height_m" else v.mean()) for k, v in ways.items()},
         "return_mean": float(flown["return"].mean()),
         "return_std": float(flown["return"].std()),
         "length_mean_s": float(flown["length_s"].mean()),
@@ -184,5 +225,5 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
 
 
 def _means(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Mean of values (T, N) over the chosen steps, (N,)."""
-    return np.sum(np.where(chosen, values, 0.0), 0) / chosen.sum(0)
+    """Mean of values (T, N) over the chosen steps, (N,); 0 where there are none."""
+    return np.sum(np.where(chosen, values, 0.0), 0) / np.maximum(1, chosen.sum(0))

@@ -41,7 +41,13 @@ OWN = {
 """Settings of a training that no table of a study may hold, and what to write instead."""
 MAX_RUNS, MAX_JOBS = 10_000, 4096
 EPISODES = 100
-FIGURES = {"success_rate": 1.0, "position_error_m": math.inf, "training_s": math.inf}
+FIGURES = {
+    "success_rate": 1.0,
+    "position_error_m": math.inf,
+    "yaw_rate_rad_s": math.inf,
+    "circling_m_s": math.inf,
+    "training_s": math.inf,
+}
 """What is compared, and its largest value; the least is zero."""
 TABLE, STUDY = "table.csv", "study.json"
 GROUP = ("task", "algo", "variant")
@@ -67,8 +73,8 @@ class StudyResult:
     """A row a training: name, task, algo, variant, seed, scenario, metrics and settings."""
     rows: tuple[dict[str, Any], ...]
     """A row for each task, algorithm and variant: seeds, and of `success_rate`, `position_error_m`
-    over the last 2 s and `training_s` the mean over the seeds, with its 95 % interval `_low`,
-    `_high` (None with one seed)."""
+    over the last 2 s, `yaw_rate_rad_s`, `circling_m_s` and `training_s` the mean over the seeds,
+    with its 95 % interval `_low`, `_high` (None with one seed, or where there is no figure)."""
     failed: dict[str, str]
     """Why trainings failed, by name."""
 
@@ -76,7 +82,7 @@ class StudyResult:
     def table(self) -> list[tuple[str, ...]]:
         """Rows of text, the head first."""
         known = (*GROUP, "seeds")
-        head = (*known, "successful", "error over the last 2 s", "training")
+        head = (*known, "successful", "error over the last 2 s", "turning", "circling", "training")
         figures = ([_text(row, name) for name in FIGURES] for row in self.rows)
         named = ([str(row[name]) for name in known] for row in self.rows)
         return [head, *((*one, *other) for one, other in zip(named, figures, strict=True))]
@@ -187,7 +193,7 @@ def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
     for key, members in groups.items():
         row = dict(zip(GROUP, key, strict=True)) | {"seeds": len(members)}
         for name, most in FIGURES.items():
-            values = [run["metrics"][name] for run in members]
+            values = [run["metrics"].get(name) for run in members]
             row |= dict(zip(_columns(name), interval(values, 0.0, most), strict=True))
         rows.append(row)
     return StudyResult(plan.folder, tuple(runs), tuple(rows), failed)

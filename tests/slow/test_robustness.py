@@ -130,7 +130,7 @@ def test_a_card_is_read_as_it_was_written(card, tmp_path):
         with pytest.raises(QuadrlError, match=name):
             Card.load(tmp_path / name)
     head, *lines = card.table
-    assert head[1:] == ("a", "again", "geometric") and len(lines) == 2
+    assert head[1:] == ("a", "again", "geometric") and len(lines) == 2 + 2
     assert repr(card).count("\n") == 0 and len(repr(card)) < 200
     page = card._repr_html_()
     assert "<table>" in page and page.count("<img") == 2

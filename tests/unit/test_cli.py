@@ -21,6 +21,7 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.cli.flown import parse_options
 from quadrl.conditions.weather import Weather
+from quadrl.evaluation.rollout import BEHAVIOUR
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import read_config, write_config
 
@@ -429,6 +430,8 @@ def test_a_table_of_the_flights(tmp_path, capsys):
         rows = list(csv.DictReader(file))
     assert [row["seed"] for row in rows] == ["4", "5", "6"]
     alone = quadrl.evaluate("hover", episodes=1, seed=5)
+    for name in BEHAVIOUR:
+        assert float(rows[1][name]) == pytest.approx(alone.metrics[name], rel=1e-4)
     assert float(rows[1]["return"]) == pytest.approx(alone.metrics["return_mean"], rel=1e-5)
 
 

@@ -1,5 +1,7 @@
 """What actions reach: exactly, in warnings, on the robustness card, and in `quadrl check`."""
 
+import copy
+import csv
 import dataclasses
 import json
 import math
@@ -17,6 +19,7 @@ from quadrl.aircraft.parameters import rows
 from quadrl.aircraft.presets import VEHICLES, in_real_air, resolve
 from quadrl.aircraft.rotors import GRAVITY, mixer
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base import units
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.conditions.sampler import AircraftSampler, vehicle_of
 from quadrl.control import feasibility
@@ -26,6 +29,7 @@ from quadrl.evaluation.card import Card
 from quadrl.evaluation.check import OK
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.robustness import DISTURBANCES
+from quadrl.evaluation.rollout import BEHAVIOUR
 from quadrl.learning.defaults import VARIANTS
 
 PAPER = Vehicle()
@@ -260,6 +264,27 @@ def test_a_card_knows_what_the_actions_of_each_that_flew_reach(card, tmp_path):
     assert "delay" not in card.reach and card.reach in card._repr_html_()
     card.save(tmp_path / "card")
     assert Card.load(tmp_path / "card").found == card.found
+
+
+def test_a_card_says_who_turns_and_circles(card, tmp_path):
+    card.save(tmp_path / "card")
+    with open(tmp_path / "card" / "robustness.csv", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["level"] in ("1.0", "0.0")]
+    for name, words in (("yaw_rate_rad_s", "turning"), ("circling_m_s", "circling")):
+        reached = card.found["axes"]["mass"]["flown"]["usual"][name]
+        assert len(reached) == len(card.found["axes"]["mass"]["levels"])
+        undisturbed = reached[card.found["axes"]["mass"]["levels"].index(1.0)]
+        (row,) = (row for row in card.table if row[0] == f"{words}, undisturbed")
+        assert row[1] == units.quantity(name, undisturbed) and len(row) == 3
+        usual = [float(row[name]) for row in rows if row["flown"] == "usual"]
+        assert usual == [undisturbed] * 2
+    older = copy.deepcopy(card.found)
+    for axis in older["axes"].values():
+        for reached in axis["flown"].values():
+            for name in BEHAVIOUR:
+                del reached[name]
+    assert len(Card(older).table) == len(card.table) - 2
+    Card(older).save(tmp_path / "older")
 
 
 def drawn(found):

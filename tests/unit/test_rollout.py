@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import MAX_ENVS
 from quadrl.evaluation.evaluate import evaluate
-from quadrl.evaluation.rollout import EVALUATION_SEED, Rollout, fly, summarize
+from quadrl.evaluation.rollout import EVALUATION_SEED, Rollout, flights, fly, summarize
 from quadrl.learning.config import MAX_SEED
 from quadrl.learning.environments import SEED_STRIDE
 
@@ -33,7 +34,8 @@ def make_rollout(**changes) -> Rollout:
     nothing = {
         name: np.zeros((steps, episodes, k))
         for name, k in (("position", 3), ("quaternion", 4), ("velocity", 3), ("body_rate", 3),
-                        ("rotor_speed", 4), ("goal", 3), ("action", 4), ("wind", 3))
+                        ("rotor_speed", 4), ("goal", 3), ("target_velocity", 3), ("action", 4),
+                        ("rotor_command", 4), ("wind", 3))
     }  # fmt: skip
     values = dict(
         error=error,
@@ -87,6 +89,110 @@ def test_an_error_before_the_last_two_seconds_does_not_count():
     assert summarize(make_rollout(error=early))["position_error_m"] == pytest.approx(0.3)
     # One of 40 is 4 m larger: 0.1 on the first aircraft, a third of it in the mean.
     assert summarize(make_rollout(error=late))["position_error_m"] == pytest.approx(0.3 + 0.1 / 3)
+
+
+SECONDS = 0.05 * np.arange(1, 101)[:, None]  # (100, 1) [s]
+
+
+def turning(yaw_rate: float, radius: float, rate: float, **changes) -> Rollout:
+    """Three aircraft on circles, turning: to the end, crashed after 1 s, done after 3 s."""
+    angle = rate * SECONDS + [0.0, 1.0, 2.0]
+    level = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    velocity = radius * rate * np.stack([-level[..., 1], level[..., 0], level[..., 2]], -1)
+    body_rate = np.broadcast_to([9.0, -9.0, yaw_rate], velocity.shape)
+    moved = {"position": radius * level, "velocity": velocity, "body_rate": body_rate}
+    return make_rollout(**moved | changes)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_who_turns_and_circles_is_seen_although_the_place_is_held(sign):
+    """4.6 rad/s about z; 0.1 m around the goal at 1.2 rad/s are 0.12 m/s, beside a target, too."""
+    metrics = summarize(turning(4.6 * sign, 0.1, 1.2 * sign))
+    assert metrics["yaw_rate_rad_s"] == pytest.approx(4.6)
+    assert metrics["circling_m_s"] == pytest.approx(0.12)
+    beside = turning(4.6, 0.1, 1.2)
+    along = np.broadcast_to([2.0, 0.0, 0.0], beside.velocity.shape)
+    together = dataclasses.replace(
+        beside, velocity=beside.velocity + along, target_velocity=along,
+        task=tasks.make("target_following"),
+    )  # fmt: skip
+    assert summarize(together)["circling_m_s"] == pytest.approx(0.12)
+    for task in ("straight_and_level", "landing"):  # they go somewhere
+        assert "circling_m_s" not in flights(dataclasses.replace(beside, task=tasks.make(task)))
+
+
+def test_only_the_last_two_seconds_turn_and_who_has_failed_does_not_count():
+    body_rate = np.zeros((100, 3, 3))
+    body_rate[:60, 0, 2] = 50.0  # before the last 2 s of 5 s
+    body_rate[60:, 0, 2], body_rate[20:60, 2, 2] = 0.2, -0.4
+    body_rate[:, 1, 2] = 30.0  # crashed: it tumbles
+    each = flights(make_rollout(body_rate=body_rate))["yaw_rate_rad_s"]
+    np.testing.assert_allclose(each, [0.2, 30.0, 0.4])
+    assert summarize(make_rollout(body_rate=body_rate))["yaw_rate_rad_s"] == pytest.approx(0.3)
+    none = make_rollout(body_rate=body_rate, terminated=np.ones(3, bool), is_success=0 > each)
+    assert summarize(none)["yaw_rate_rad_s"] == pytest.approx((0.2 + 30.0 + 0.4) / 3)
+
+
+def test_commands_and_heights_by_hand():
+    """Rotor 1 of 4 goes 0.2 up and down, the others stand: 0.05 a step. Two of four actions are at
+    their ends in 10 of the 100 steps of the first: 5 %; the others have shorter flights."""
+    command, action, position = (np.zeros((100, 3, k)) for k in (4, 4, 3))
+    command[::2, :, 0] = 0.2
+    action[:10, 0, :2], action[:20, 1] = [1.0, -1.0], 1.0
+    position[40, 0, 2], position[5, 1, 2], position[70:, 2, 2] = -1.25, -2.9, np.nan
+    for array in (command, action, position):
+        array[np.arange(100)[:, None] >= make_rollout().length] = np.nan
+    rollout = make_rollout(rotor_command=command, action=action, position=position)
+    each = flights(rollout)
+    np.testing.assert_allclose(each["command_change_rate"], [0.05] * 3)
+    np.testing.assert_allclose(each["saturated_rate"], [0.05, 1.0, 0.0])
+    np.testing.assert_allclose(each["least_height_m"], [1.75, 0.1, 3.0])  # the origin is 3 m up
+    metrics = summarize(rollout)  # without the second, which crashed
+    assert metrics["saturated_rate"] == pytest.approx(0.025)
+    assert metrics["least_height_m"] == pytest.approx(1.75)
+    once = make_rollout(length=np.ones(3, int), rotor_command=command)
+    assert (flights(once)["command_change_rate"] == 0).all()
+    json.dumps(metrics, allow_nan=False)
+
+
+def test_a_task_is_not_solved_by_who_turns_or_circles():
+    turned = {"hover": 2, "static_waypoint": 2, "random_waypoint": 2, "straight_and_level": 1,
+              "target_following": 2, "landing": 1}  # fmt: skip
+    for name, count in turned.items():
+        targets = tasks.TASKS[name].targets
+        still = [x for x in targets if x.metric in ("yaw_rate_rad_s", "circling_m_s")]
+        assert len(still) == count and {x.metric: x.limit for x in still}["yaw_rate_rad_s"] == 0.3
+        stands = summarize(turning(0.29, 0.1, 0.49) if count == 2 else turning(0.29, 0, 0))
+        assert all(target.met(stands) for target in still)
+        spins = summarize(turning(-4.6, 0.1, 1.2))
+        assert not any(target.met(spins) for target in still)
+        assert not any(x.met({}) or x.met({x.metric: None}) for x in targets)
+
+
+def test_what_ships_is_seen_to_spin_or_to_stand():
+    calm: Any = {"weather": "calm", "randomization": "none"}
+    calm |= {"engine": "free_flight", "episodes": 10}
+    for name, spins in (("random_waypoint", False), ("random_waypoint_robust", True)):
+        found = evaluate(name, **calm)
+        assert found.metrics["success_rate"] == 1.0
+        missed = {x.metric for x in found.task.targets if not x.met(found.metrics)}
+        assert missed == ({"yaw_rate_rad_s", "circling_m_s"} if spins else set())
+        assert ("turning at 4.9 rad/s" in repr(found)) == spins
+
+
+@pytest.mark.parametrize("mode", ["rotor", "velocity"])
+def test_rotor_commands_are_those_of_the_environment(mode):
+    task = tasks.make("target_following", time_limit=1.0)
+    rollout = fly(brake, task, episodes=2, seed=3, control_mode=mode)
+    alone = Environment(task, seed=3, control_mode=mode)
+    observation = alone.flatten(alone.reset())
+    for t in range(rollout.length[0]):
+        observation = alone.flatten(alone.step(brake(observation)).observation)
+        command = alone.snapshot.rotor_command[0] / alone.vehicle.max_speed
+        np.testing.assert_array_equal(rollout.rotor_command[t, 0], command)
+        velocity = alone.task.target_velocity(alone.snapshot)[0]
+        np.testing.assert_array_equal(rollout.target_velocity[t, 0], velocity)
+    assert 0 < np.nanmin(rollout.rotor_command) and np.nanmax(rollout.rotor_command) <= 1
 
 
 @pytest.mark.parametrize("weather", ["calm", "light"])
