@@ -95,8 +95,8 @@ export class Episode {
 
   // Why the task has ended it. Every task here names first how far away that is (`Task.ends`).
   #failure() {
-    const { qpos, task: { ends } } = this.flight, [away] = ends.split(", ");
-    const inverted = qpos[4] ** 2 + qpos[5] ** 2 > 0.5;
-    return inverted && /tilted/.test(ends) ? "tipped over" : away;
+    const { qpos, vehicle, task: { ends } } = this.flight, [away] = ends.split(", ");
+    if (qpos[4] ** 2 + qpos[5] ** 2 > 0.5 && /tilted/.test(ends)) return "tipped over";
+    return qpos[2] < vehicle.size ? "on the ground" : away;
   }
 }
