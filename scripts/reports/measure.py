@@ -273,8 +273,9 @@ def goals_table() -> str:
 def speed_table() -> str:
     """Every layer."""
     result = report.load("speed")
+    _, *rows = benchmark.rows(result)
     head = ("what", "control steps/s", "median", "share", "of", "target")
-    return f"{table(head, benchmark.rows(result))}\n\n{report.source(result)}"
+    return f"{table(head, rows)}\n\n{report.source(result)}"
 
 
 PARTS: report.Parts = {"training-hover": hover_table, "training-suite": suite_table,
