@@ -126,7 +126,10 @@ def rotor_effects(x, vehicle, lag, air_velocity):
         push = more[..., None] * axis - air.rotor_drag * omega_k * across
         momentum = rotor.spin * air.rotor_inertia * omega_k * axis
         force += push
-        moment += np.cross(r, push) + air.flapping_moment * omega_k * np.cross(across, axis)
+        flapping = air.flapping_moment * omega_k * np.cross(across, axis)
+        most = 0.2 * rotor.disc * rotor.thrust_coefficient * omega_k**2
+        size = np.hypot(most, np.linalg.norm(flapping, axis=-1, keepdims=True))
+        moment += np.cross(r, push) + flapping * most / np.maximum(size, 1e-300)
         moment -= rotor.spin * air.rotor_inertia * lag[..., k, None] * axis
         moment -= np.cross(omega, momentum)
     return force, moment

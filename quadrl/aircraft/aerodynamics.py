@@ -21,6 +21,8 @@ from quadrl.base.validation import number
 
 DENSITIES = (1e-3, 100.0)  # [kg/m^3]
 MAX_BODY_LIFT = 2.0
+MOST_OFFSET = 0.2
+"""Largest distance of the centre of lift from the hub by `flapping_moment`, in radii (chosen)."""
 STILL_AIR, ROTOR_EFFECTS, GROUND_EFFECT = range(3)
 """`Aerodynamics.effects`: none, those of the air on rotors, and of the ground beside them."""
 
@@ -42,7 +44,7 @@ class Aerodynamics:
     """k_H [N s^2/(m rad)]: drag of a rotor in its plane over rotor speed and airspeed."""
     flapping_moment: float = 0.0
     """k_flap [N s^2/rad]: moment on the hub over rotor speed and airspeed; nose up in forward
-    flight."""
+    flight, and never above MOST_OFFSET radii times the thrust."""
     vortex_ring: float = 0.0
     """D, 0 to 1: loss of thrust in fast descent, as a share of the answer to inflow."""
     vortex_ring_noise: float = 0.0

@@ -14,7 +14,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR, Aerodynamics
+from quadrl.aircraft.aerodynamics import (
+    GROUND_EFFECT,
+    MOST_OFFSET,
+    ROTOR_EFFECTS,
+    STILL_AIR,
+    Aerodynamics,
+)
 from quadrl.aircraft.rotors import Rotor, hover_squares, mixer
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
 from quadrl.base.rotation import Array
@@ -157,7 +163,7 @@ def c_structs() -> str:
     sizes += f", ROW_SIZE = {ROW_SIZE}"
     return (
         "// Written by quadrl/aircraft/parameters.py from Rotor, Vehicle and Aerodynamics.\n"
-        f"#define QUADRL_MARK {MARK!r}\n"
+        f"#define QUADRL_MARK {MARK!r}\n#define MOST_OFFSET {MOST_OFFSET!r}\n"
         f"enum {{ {sizes} }};\nenum {{ {effects} }};\n"
         f"typedef struct {{\n{fields(ROTOR)}\n}} Rotor;\n"
         f"typedef struct {{\n{fields(AIRCRAFT)}\n}} Aircraft;\n"

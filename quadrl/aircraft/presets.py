@@ -36,6 +36,27 @@ CRAZYFLIE = Vehicle(
     physics_timestep=0.005,  # chosen
     control_timestep=0.02,  # chosen
 )
+CRAZYFLIE_BRUSHLESS = Vehicle(
+    name="crazyflie_brushless",  # Crazyflie 2.1 Brushless, without the guards of its propellers
+    mass=0.037,  # weighed (IMRCLab flights)
+    inertia=(25e-6, 28e-6, 49e-6),  # drone-models; about x also from IMRCLab flights
+    rotors=ring(
+        (315, 225, 135, 45),
+        (1, -1, 1, -1),
+        0.05,  # drone-models
+        thrust_coefficient=3.7e-8,  # IMRCLab flights
+        torque_coefficient=3.7e-8 * 5.939e-3,  # ratio of torque to thrust: drone-models
+        lag_up=1 / 0.042,  # from measured rotor speeds (IMRCLab flights)
+        lag_down=1 / 0.037,  # the same flights
+        max_speed=math.sqrt(0.18 / 3.7e-8),  # 0.18 N per rotor: drone-models
+        radius=0.0275,  # drone-models
+    ),
+    drag_coefficient=5e-3,  # chosen: 8.5 m/s of terminal speed
+    moment_coefficient=1e-7,  # chosen: as the brushed one's
+    action_scale=400.0,  # chosen: the weakest aircraft of the randomization `full` hovers
+    physics_timestep=0.0025,  # chosen: it turns faster than the brushed one
+    control_timestep=0.02,  # chosen
+)
 RACER = Vehicle(
     name="racer",  # Foehn et al. 2022, "Agilicious", Science Robotics 7: the Kingfisher
     mass=0.752,
@@ -88,7 +109,9 @@ HEXA = Vehicle(
 )
 OPTIONS = ("mass", "inertia", "drag_coefficient", "moment_coefficient", "action_scale")
 """Fields that may differ from an aircraft's without making another one of it."""
-VEHICLES = {vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, RACER, HEXA)}
+VEHICLES = {
+    vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, CRAZYFLIE_BRUSHLESS, RACER, HEXA)
+}
 """The aircraft that are known by name."""
 _ALL = Aerodynamics.full()
 REAL_AIR = {
@@ -96,13 +119,26 @@ REAL_AIR = {
     "crazyflie": (
         dataclasses.replace(
             _ALL,
-            rotor_drag=9.18e-7,  # Foerster 2015
-            flapping_moment=9e-8,  # identified in flights: 6.4e-4 N m per m/s sideways
-            rotor_inertia=6e-8,  # identified in flights (ARPL, IMRCLab)
+            rotor_drag=1.85e-6,  # drone-models
+            # That of the brushless one times the weight, over the rotor speed: the same offset of
+            # the centre of lift, in radii, at the same airspeed over that of the tips.
+            flapping_moment=5.6e-8,
+            rotor_inertia=6.4e-8,  # 2.2e-3 of the inertia about z (flights of a brushed one: ARPL)
             blade_lift=0.384,  # gives the heave damping of drone-models, 0.0128 N s/m
             translational_lift=0.0,  # unknown; k_h is that share of rho A
         ),
         0.2,  # estimated from its frontal area
+    ),
+    "crazyflie_brushless": (
+        dataclasses.replace(
+            _ALL,
+            rotor_drag=2.5e-6,  # fitted to IMRCLab flights
+            flapping_moment=1.02e-7,  # IMRCLab flights: 6.4e-4 N m per m/s sideways
+            rotor_inertia=6e-8,  # IMRCLab flights
+            blade_lift=0.343,  # gives the heave damping of the IMRCLab flights, 0.47 1/s
+            translational_lift=0.0,  # unknown
+        ),
+        0.2,  # estimated, as the brushed one's
     ),
     "racer": (
         dataclasses.replace(

@@ -14,7 +14,7 @@ import math
 import operator
 from typing import Any
 
-from quadrl.aircraft.aerodynamics import GROUND_EFFECT, STILL_AIR
+from quadrl.aircraft.aerodynamics import GROUND_EFFECT, MOST_OFFSET, STILL_AIR
 from quadrl.aircraft.parameters import WIND, Parameters
 from quadrl.base.rotation import Array, namespace, norm, rotation_matrix, stack, to_body, to_world
 
@@ -170,7 +170,11 @@ def rotor_wrench(
         change = change + (rest + change) * (most / (1 - most))  # lift / (1 - most)
     drag = (p.rotor_drag[..., None] * speed)[..., None] * across
     push = change[..., None] * rotor.axis - drag
-    flap = (p.flapping_moment[..., None] * speed)[..., None] * cross(across, rotor.axis)
+    # Smoothly, the moment cannot move the centre of lift farther than that.
+    most = MOST_OFFSET * rotor.disc_radius * rotor.thrust_coefficient * speed
+    slope = p.flapping_moment[..., None]
+    share = most / namespace(speed).sqrt(most * most + slope * slope * p_square + 1e-40)
+    flap = (slope * speed * share)[..., None] * cross(across, rotor.axis)
     inertia = rotor.spin * p.rotor_inertia[..., None]
     momentum = (inertia * speed)[..., None] * rotor.axis
     faster = (inertia * rotor_acceleration(p, speed, command))[..., None] * rotor.axis

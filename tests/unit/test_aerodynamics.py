@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import reference
 
+import quadrl
 from quadrl.aircraft.aerodynamics import EFFECTS, Aerodynamics
 from quadrl.aircraft.parameters import WIND, Parameters, rows
 from quadrl.aircraft.presets import VEHICLES, at_air_density, in_real_air, with_effects
@@ -298,12 +299,56 @@ def test_rotor_drag_is_linear_in_airspeed_and_rotor_speed():
 
 def test_the_flapping_moment_lifts_the_nose_in_forward_flight():
     # 4 * 2.3e-5 * 225.678 = 0.0208 N m a m/s. Nose up is -y.
-    moment = Probe(bare(Aerodynamics(flapping_moment=2.3e-5)))(velocity=(1, 0, 0))[1]
-    np.testing.assert_allclose(moment, [0, -0.0208, 0], atol=5e-5)
-    # The Crazyflie's as it was identified: 6.4e-4 N m a m/s, here with a hover speed of 1886 rad/s.
-    crazyflie = bare(Aerodynamics(flapping_moment=9e-8), "crazyflie")
-    moment = Probe(crazyflie)(velocity=(0, 1, 0))[1]
-    np.testing.assert_allclose(moment, [6.4e-4 * 1886 / 1767, 0, 0], rtol=0.02, atol=1e-12)
+    moment = Probe(bare(Aerodynamics(flapping_moment=2.3e-5)))(velocity=(0.1, 0, 0))[1]
+    np.testing.assert_allclose(moment, [0, -0.00208, 0], atol=5e-6)
+
+
+def test_the_velocity_moment_of_the_crazyflies_is_the_one_of_the_flights():
+    # Brushless: 6.4e-4 N m a m/s on 2.5e-5 kg m^2, 25 rad/s^2 in roll. Brushed: 0.0293 kg and
+    # 1886 rad/s in place of 0.037 kg and 1566 rad/s, so 6.4e-4 * 0.792 * 0.830 = 4.2e-4 N m.
+    # At 0.1 m/s a rotor's are 1.6e-5 and 1.05e-5 of at most 0.2 T R, 5.0e-4 and 3.2e-4 N m:
+    # hypot(1, 0.032) and hypot(1, 0.033) take less than a thousandth.
+    for name, moment in (("crazyflie_brushless", 6.4e-4), ("crazyflie", 4.2e-4)):
+        flap = in_real_air(VEHICLES[name]).aerodynamics.flapping_moment
+        probe = Probe(bare(Aerodynamics(flapping_moment=flap), name))
+        np.testing.assert_allclose(
+            probe(velocity=(0, 0.1, 0))[1], [0.1 * moment, 0, 0], rtol=0.01, atol=1e-12
+        )
+
+
+def test_the_velocity_moment_never_moves_the_lift_farther_than_a_fifth_of_the_radius():
+    # 4 * 0.2 * 1.594 N * 0.15 m = 0.1913 N m is the most, which 2.3e-5 alone would reach at
+    # 0.1913 / 0.02076 = 9.214 m/s: there it is 1 / sqrt(2) of that, 0.1353 N m.
+    probe = Probe(bare(Aerodynamics(flapping_moment=2.3e-5)))
+    for speed, moment in ((9.214, 0.1353), (1000.0, 0.1913), (1.0, 0.02064)):
+        assert -probe(velocity=(speed, 0, 0))[1][1] == pytest.approx(moment, rel=1e-3)
+    # The limit is of the thrust: a quarter of it at half the speed, and nothing at rest.
+    slow = probe(velocity=(1000, 0, 0), speed=PAPER.hover_speed / 2)[1][1]
+    assert slow == pytest.approx(-0.1913 / 4, rel=1e-3)
+    assert not probe(velocity=(1000, 0, 0), speed=np.zeros(4))[1].any()
+
+
+def test_the_crazyflies_are_damped_as_in_the_flights():
+    # Heave 0.0128 / 0.0293 = 0.437 1/s (drone-models), and 0.47 1/s (IMRCLab). Along x and y k_H
+    # gives 4 * 1.85e-6 * 1886 / 0.0293 = 0.476 and 4 * 2.5e-6 * 1566 / 0.037 = 0.423 1/s: between
+    # the 0.34 and 0.48 1/s of the flights.
+    for name, heave, sideways in (
+        ("crazyflie", 0.437, 0.476),
+        ("crazyflie_brushless", 0.47, 0.423),
+    ):
+        vehicle = in_real_air(VEHICLES[name])
+        probe = Probe(bare(vehicle.aerodynamics, name))
+        up = (probe(velocity=(0, 0, way * 1e-3))[0][2] for way in (-1, 1))
+        assert (next(up) - next(up)) / (2e-3 * vehicle.mass) == pytest.approx(heave, rel=0.01)
+        across = -probe(velocity=(1e-3, 0, 0))[0][0] / (1e-3 * vehicle.mass)
+        assert across == pytest.approx(sideways, rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["crazyflie", "crazyflie_brushless"])
+def test_the_controller_holds_the_crazyflies_in_wind(name):
+    settings = {"vehicle": name, "aerodynamics": "full", "weather": {"wind_speed": 3.0}}
+    figures = quadrl.evaluate("geometric", "hover", episodes=8, time_limit=4, **settings).metrics
+    assert figures["survival_rate"] == 1.0
 
 
 # --------------------------------------------------------------------------------- ground effect

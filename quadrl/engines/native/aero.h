@@ -160,6 +160,16 @@ AERO void aero_ground(const Aircraft* a, int rotors, const Rotor* rotor, const L
   }
 }
 
+// Share of the moment flap * speed * p on a hub that is left where it cannot move the centre of lift
+// farther than MOST_OFFSET radii: 1 in slow flight, and smooth.
+AERO double aero_flapping_share(const Aircraft* a, const Rotor* rotor, double speed,
+                                double p_square, int i) {
+  const double flap = a->flapping_moment[i];
+  const double most =
+      MOST_OFFSET * rotor->disc_radius[i] * rotor->thrust_coefficient[i] * speed;
+  return most / sqrt(most * most + flap * flap * p_square + 1e-40);
+}
+
 // What the air does to the rotors beside equation 7, and their inertia.
 //   effects: STILL_AIR, ROTOR_EFFECTS or GROUND_EFFECT, a constant.
 //   speed, command: of the rotors [rad/s]; noise: of their thrust. airspeed, body_rate: as in
@@ -215,7 +225,9 @@ AERO void aero_rotors(const Aircraft* a, const Disc* disc, int effects, int roto
         const double most = taken < 0.36 ? taken : 0.36;
         change += (rest + change) * (most / (1 - most));  // lift / (1 - most)
       }
-      const double drag = a->rotor_drag[i] * omega, flap = a->flapping_moment[i] * omega;
+      const double drag = a->rotor_drag[i] * omega;
+      const double flap = a->flapping_moment[i] * omega *
+                          aero_flapping_share(a, rotor, omega, p_square, i);
       const double inertia = rotor->spin[i] * a->rotor_inertia[i];
       const double faster = inertia * aero_rotor_acceleration(rotor, omega, command[k][i], i);
       for (int m = 0; m < 3; ++m) {
