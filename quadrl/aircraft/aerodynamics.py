@@ -78,7 +78,7 @@ class Aerodynamics:
             object.__setattr__(self, name, number(name, getattr(self, name), low, high))
         if self.inflow and self.blade_lift < MIN:
             reason = "thrust answers the flow by the lift of the aircraft's own blades"
-            allowed = "with inflow, the solidity of the disc times the lift slope of the blades"
+            allowed = "above 0 with inflow: solidity of the disc times lift slope of the blades"
             raise QuadrlError(reason, name="blade_lift", value=self.blade_lift, allowed=allowed)
         if (self.vortex_ring or self.vortex_ring_noise) and not self.inflow:
             name = "vortex_ring" if self.vortex_ring else "vortex_ring_noise"

@@ -18,6 +18,7 @@ from quadrl.aircraft import presets
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
+from quadrl.base.errors import QuadrlError
 from quadrl.conditions import observing, randomization
 from quadrl.conditions.observing import Observed, Observing
 from quadrl.conditions.randomization import Randomization, Randomized
@@ -109,7 +110,11 @@ class Scenario:
         for field in dataclasses.fields(self):
             value = field.metadata["parse"](getattr(self, field.name))
             object.__setattr__(self, field.name, value)
-        _ = self.aircraft
+        wind = self.weather.wind_speed + self.weather.gust_speed
+        if wind > (resolved := self.aircraft.resolved_speed):
+            reason = "faster air carries the aircraft off at a speed that its step does not resolve"
+            allowed = f"mean wind and gust together up to {resolved:.3g} m/s, for this aircraft"
+            raise QuadrlError(reason, name="weather", value=f"{wind:g} m/s", allowed=allowed)
 
     @classmethod
     def of(

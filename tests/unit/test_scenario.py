@@ -11,7 +11,7 @@ from runs import refused
 import quadrl
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import VEHICLES, in_real_air
-from quadrl.base.errors import UnknownKeyword
+from quadrl.base.errors import QuadrlError, UnknownKeyword
 from quadrl.conditions.weather import WEATHERS, Weather
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario
@@ -55,7 +55,7 @@ def test_every_field_has_its_keyword_and_a_value_here():
         whole(),
         Scenario.of("landing", vehicle=MINE, control_timestep=0.02, max_episode_steps=50),
         Scenario.of("hover", vehicle="hexa", control_timestep=0.01),
-        Scenario.of("hover", aerodynamics=Aerodynamics(inflow=True)),
+        Scenario.of("hover", aerodynamics=Aerodynamics(inflow=True, blade_lift=0.9)),
     ],
     ids=["plain", "everything", "an aircraft of one's own", "another step", "air of one's own"],
 )
@@ -178,3 +178,13 @@ def test_a_policy_and_a_training_carry_it():
     assert policy.scenario.weather == Weather(wind_speed=7.72)
     assert policy.scenario.aircraft.action_scale == 90.0
     assert policy.scenario.task.smoothness_weight == 10.0
+
+
+def test_wind_that_no_step_of_the_aircraft_resolves_is_refused():
+    # 2 k_D v dt / m = 1 at 0.001 / (2 * 5e-3 * 0.005) = 20 m/s for a Crazyflie of 1 g.
+    given = {"vehicle": "crazyflie", "vehicle_options": {"mass": 1e-3}}
+    for weather in ("severe", {"wind_speed": 15.0, "gust_speed": 5.1}):
+        with pytest.raises(QuadrlError, match="20 m/s") as caught:
+            Scenario.of("hover", weather=weather, **given)
+        assert caught.value.name == "weather"
+    assert Scenario.of("hover", weather={"wind_speed": 19.9}, **given).aircraft.mass == 1e-3
