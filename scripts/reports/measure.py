@@ -19,6 +19,8 @@ import numpy as np
 import tyro
 
 from quadrl import VEHICLES, tasks
+from quadrl.base.units import quantity
+from quadrl.core.task import STILL, Target
 from quadrl.engines.mujoco import ENGINES
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.plotting import learning_curves, save
@@ -44,6 +46,8 @@ GOALS |= {  # their settings were changed after the policies of those seeds had 
 }
 FLIGHTS, MANY = 1000, {("random_waypoint", "ppo"): 10_000}  # FLIGHTS of them in a batch
 SHIPPED_EPISODES, WORTH_HAVING = 500, 0.9  # least share of successes
+RESTLESS = [target.metric for target in STILL]
+CALM: Any = {"weather": "calm", "randomization": "none"}
 
 
 def trained(run: PlannedRun) -> Result:
@@ -149,7 +153,8 @@ def ship(runs: Annotated[tuple[Path, ...], tyro.conf.Positional], out: Path = SH
     """Copy trained policies into assets/policies, where they come with the package.
 
     For each task, algorithm and variant it takes the run with the lowest seed, never the best one,
-    and leaves it out if it is not worth having: `scripts/report ship runs/paper/*`.
+    and leaves it out if it is not worth having, since it fails too often or, in still air, turns or
+    circles faster than its task allows: `scripts/report ship runs/paper/*`.
 
     Args:
         runs: Run folders.
@@ -167,6 +172,11 @@ def ship(runs: Annotated[tuple[Path, ...], tyro.conf.Positional], out: Path = SH
         say(f"{name}: {copied(run, config, out / f'{name}.safetensors')}")
 
 
+def unmet(task: str, metrics: Result) -> list[Target]:
+    """The targets of a task that an evaluation misses."""
+    return [target for target in tasks.TASKS[task].targets if not target.met(metrics)]
+
+
 def copied(run: Path, config: TrainConfig, file: Path) -> str:
     """Copy a policy with its configuration, its metrics and the command that makes it again."""
     usual = TrainConfig(
@@ -178,10 +188,13 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     policy, given = Policy.load(run), {"vehicle": config.scenario.aircraft}
     metrics = summarize(fly(policy, config.scenario.task, episodes=SHIPPED_EPISODES, **given))
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {SHIPPED_EPISODES}"
-    if metrics["success_rate"] < WORTH_HAVING:
+    still = summarize(fly(policy, config.scenario.task, episodes=SHIPPED_EPISODES, **given, **CALM))
+    restless = [x for x in unmet(config.task, still) if x.metric in RESTLESS]
+    ways = "".join(f", {x.words} {quantity(x.metric, still[x.metric])}" for x in restless)
+    if metrics["success_rate"] < WORTH_HAVING or restless:
         for old in (file, file.with_suffix(".json")):
             old.unlink(missing_ok=True)
-        return f"left out, not worth having: {said} successful"
+        return f"left out, not worth having: {said} successful{ways}"
     command = f"quadrl train {config.task} --algo {config.algo} --seed {config.seed}"
     command += "" if config.engine == usual.engine else f" --engine {config.engine}"
     command += "" if config.variant == "ideal" else f" --variant {config.variant}"
@@ -239,8 +252,11 @@ def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
     runs = [run for run in runs if run["engine"] == "free_flight"][: len(SEEDS)]
     rows = []
     for target in tasks.TASKS[name].targets:
-        metrics = (each["metrics"][target.metric] for each in (*runs, *known))
-        cells = (number(value and factor(target) * value) for value in metrics)
+        cells = []
+        for metrics in (each["metrics"] for each in (*runs, *known)):
+            value = metrics.get(target.metric)  # older trainings were not asked for all
+            lacks = target.metric not in metrics
+            cells.append("not measured" if lacks else number(value and factor(target) * value))
         rows.append((target.words, asked(target), *cells))
     seeds = [run["seed"] for run in runs]
     if runs:

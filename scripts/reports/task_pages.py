@@ -8,14 +8,16 @@ from typing import Any
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.units import quantity
 from quadrl.cli.tasks import settings
-from quadrl.core.task import Task
+from quadrl.core.task import Target, Task
+from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED
 from quadrl.learning.defaults import own_settings
 from quadrl.learning.description import describe, describe_action
 from scripts.reports import measure, report
 from scripts.reports.code import shown
-from scripts.reports.report import Parts, factor, number, table
+from scripts.reports.report import Parts, asked, factor, number, table
 
 PAGE = """{asks}
 
@@ -76,13 +78,23 @@ counts as successful when the mean action reaches this in {episodes} fresh episo
 ## Policies
 
 {policies}"""
-POLICIES = """`quadrl.Policy.pretrained("{name}", algo="ppo")` and `quadrl render {name}` fly them.
-The mean action reaches, in {flown} fresh episodes:
+SHIPS = """`quadrl.Policy.pretrained("{name}", algo="ppo")` and `quadrl render {name}` fly them. A
+policy is a safetensors file, with a .json of all its settings beside it, in
+`quadrl/assets/policies`.
 
-{table}
-
-A policy is a safetensors file, with a .json of all its settings beside it, in
-`quadrl/assets/policies`."""
+"""
+POLICIES = """The mean action in {flown} fresh episodes, in the conditions of the training. The last
+column is what the task asks and the policy misses in as many episodes where nothing disturbs it.
+{source}"""
+FIGURES = {
+    "success_rate": "successful",
+    "position_error_m": "error over the last 2 s",
+    "yaw_rate_rad_s": "turning over the last 2 s",
+    "circling_m_s": "circling over the last 2 s",
+    "command_change_rate": "change of the commands",
+    "saturated_rate": "commands at their ends",
+    "least_height_m": "least height",
+}
 SEEDS = "Median and range over the seeds of `scripts/report training`."
 PAPER = "The three algorithms in [the paper's experiments](paper.md)."
 PICTURES = {
@@ -144,7 +156,7 @@ def page(name: str) -> str:
             for pattern, (about, words) in PICTURES.items()
             for picture in report.IMAGES.glob(pattern.format(name=name))
         ),
-        policies=policies(name, task),
+        policies=policies(name),
     )
 
 
@@ -164,20 +176,47 @@ def observations(task: Task, known: dict[str, Any]) -> str:
     return table(("number", "term", "entry", "unit", "meaning and frame"), rows)
 
 
-def policies(name: str, task: Task) -> str:
-    """The policies that ship."""
-    rows, episodes = [], set()
-    for file in sorted(SHIPPED.glob(f"{name}_*.json")):
-        beside, algo = json.loads(file.read_text()), file.stem.removeprefix(f"{name}_")
-        measured = beside["evaluation"]
-        episodes.add(measured["episodes"])
-        reached = (f"{number(factor(x) * measured[x.metric])} {x.unit}" for x in task.targets)
-        rows.append((f"`{algo}`", f"`{beside['command']}`", *reached))
+def shipped(episodes: int = 300) -> None:
+    """Fly every policy that comes with quadrl, as it was trained and where nothing disturbs it.
+
+    Args:
+        episodes: Flights of each in each of the two conditions.
+    """
+    rows = []
+    for name in sorted(file.stem for file in SHIPPED.glob("*.safetensors")):
+        found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, measure.CALM))
+        rows.append({"policy": name} | found | {"undisturbed": still})
+        report.say(f"{name}: {[x.words for x in measure.unmet(found['task'], still)]}")
+    report.save("shipped", {"rows": rows})
+
+
+def policies(name: str = "") -> str:
+    """The policies that ship for a task, or for every one: how they fly and what they miss."""
+    result = report.load("shipped")
+    targets = tasks.TASKS[name].targets if name else ()
+    own, rows = [x for x in targets if x.metric not in FIGURES], []
+    for row in result["rows"]:
+        if name in ("", row["task"]):
+            made = json.loads((SHIPPED / f"{row['policy']}.json").read_text())["command"]
+            cells = [quantity(x, row[x]) if x in row else "" for x in FIGURES]
+            cells += [given(x, row) for x in own]
+            still = row["undisturbed"]
+            missed = (
+                f"{x.words}: {given(x, still)}, asked {asked(x)}"
+                for x in measure.unmet(row["task"], still)
+            )
+            rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "nothing"))
     if not rows:
         return "None comes with quadrl."
-    head = ("algo", "made by", *(target.words for target in task.targets))
-    flown = " and ".join(map(str, sorted(episodes)))
-    return POLICIES.format(name=name, flown=flown, table=table(head, rows))
+    head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "asked and missed")
+    note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result))
+    how = SHIPS.format(name=name) if name else ""
+    return f"{how}{table(head, rows)}\n\n{note}"
+
+
+def given(target: Target, metrics: dict[str, Any]) -> str:
+    """A figure in the unit of its target."""
+    return f"{number(factor(target) * metrics[target.metric])} {target.unit}"
 
 
 def line(text: str) -> str:
@@ -185,4 +224,6 @@ def line(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-PARTS: Parts = {f"task-{name}": functools.partial(page, name) for name in tasks.TASKS}
+PARTS: Parts = {"shipped": policies} | {
+    f"task-{name}": functools.partial(page, name) for name in tasks.TASKS
+}

@@ -4,17 +4,19 @@ import dataclasses
 import functools
 import json
 import math
+import shutil
 
 import mujoco
 import numpy as np
 import pytest
 
-from quadrl.evaluation.policy import Policy
+import quadrl
+from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
-from scripts.reports import measure, pages, report, robustness
+from scripts.reports import measure, pages, report, robustness, task_pages
 
 
 @pytest.fixture(autouse=True)
@@ -167,10 +169,28 @@ def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass():
     assert found[1.0]["success"] == 1.0
 
 
-def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch):
+def test_policies_that_ship_are_judged_where_nothing_disturbs_them(tmp_path, monkeypatch):
+    for name in ("hover_ppo", "random_waypoint_robust"):
+        for end in (".json", ".safetensors"):
+            shutil.copy(SHIPPED / f"{name}{end}", tmp_path)
+    monkeypatch.setattr(task_pages, "SHIPPED", tmp_path)
+    task_pages.shipped(episodes=4)
+    hover, spins = report.load("shipped")["rows"]
+    assert hover["undisturbed"]["episodes"] == 4 and spins["undisturbed"]["yaw_rate_rad_s"] > 4
+    flown = quadrl.evaluate("random_waypoint_robust", episodes=4).metrics  # as it was trained
+    assert spins["yaw_rate_rad_s"] == pytest.approx(flown["yaw_rate_rad_s"], 1e-4)
+    head, _, first, second = task_pages.policies().splitlines()[:4]
+    assert "| circling over the last 2 s |" in head and first.endswith("| nothing |")
+    assert "rad/s, asked at most 0.3 rad/s; circling over the last 2 s: 0.1" in second
+    assert "hover" not in task_pages.policies("random_waypoint")
+    assert "None comes" in task_pages.policies("landing")
+
+
+def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch, capsys):
     def run(name, policy, seed, **settings):
         (tmp_path / name).mkdir(exist_ok=True)
-        write_config(tmp_path / name, TrainConfig("hover", seed=seed, **settings).resolved())
+        config = TrainConfig(**{"task": "hover", "seed": seed, **settings})
+        write_config(tmp_path / name, config.resolved())
         own = dataclasses.replace(policy, metadata=policy.metadata | {"seed": seed})
         own.save(tmp_path / name / "policy.safetensors")
 
@@ -184,6 +204,14 @@ def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch):
     assert beside["command"] == f"quadrl train hover --algo ppo --seed {seed}"
     assert beside["evaluation"] == summarize(fly(source, "hover", episodes=20))
     monkeypatch.setattr(measure, "WORTH_HAVING", 0.0)
+    for file in (tmp_path / "out").iterdir():
+        file.rename(file.with_stem("random_waypoint_robust"))  # as if it had come earlier
+    spins = Policy.pretrained("random_waypoint", variant="robust")
+    run("c", spins, seed, variant="robust", task="random_waypoint")
+    measure.ship((tmp_path / "c",), tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
+    told = capsys.readouterr().err
+    assert "successful, turning over the last 2 s 5.0 rad/s, circling over the last 2 s 0.1" in told
     run("b", Policy.pretrained("hover", variant="robust"), seed, variant="robust")
     measure.ship((tmp_path / "b",), tmp_path / "out")
     beside = json.loads((tmp_path / "out" / "hover_robust.json").read_text())
