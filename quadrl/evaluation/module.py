@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
-from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import CLIP
 
 
@@ -19,7 +19,7 @@ class PolicyModule(nn.Module):
     mean: torch.Tensor  # (size,)
     deviation: torch.Tensor  # (size,)
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Any) -> None:
         """Copy the numbers of a policy."""
         super().__init__()
         self.register_buffer("mean", torch.tensor(policy.mean))
@@ -58,7 +58,7 @@ def _fill(module: nn.Module, arrays: Iterable[np.ndarray]) -> None:
             parameter.copy_(torch.tensor(array))
 
 
-def content(policy: Policy, metadata: Mapping[str, str]) -> bytes:
+def content(policy: Any, metadata: Mapping[str, str]) -> bytes:
     """The file of a program for batches of any size: `torch.export.load(path).module()`.
 
     Args:

@@ -1,11 +1,15 @@
 """quadrl.train, evaluate, render and plot, and what they return shows of itself."""
 
+import json
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from policies import make_remembering
 from rich.console import Console
 from runs import TINY, refused
 
@@ -149,3 +153,31 @@ def test_a_notebook_updates_one_line(monkeypatch):
             bar.update(done, 4, "drawing")
     assert lines and "━" * ProgressBar.WIDTH in lines[-1] and "drawing" in lines[-1]
     assert len({len(line) for line in lines}) == 1
+
+
+LOADED = """
+import json, sys, torch
+said = {"scenario": ""}
+module = torch.export.load(sys.argv[1], extra_files=said).module()
+rows = torch.tensor(json.loads(sys.argv[2]))
+given = [rows] + [torch.full((len(rows), int(n)), 0.5) for n in sys.argv[3:]]
+found = module(*given)
+print(json.dumps([part.tolist() for part in (found if sys.argv[3:] else [found])]))
+assert "quadrl" not in sys.modules and json.loads(said["scenario"])["task"] == "hover"
+"""
+
+
+@pytest.mark.parametrize(
+    "policy", [quadrl.Policy.pretrained("hover"), make_remembering()], ids=repr
+)
+def test_a_program_of_torch_loads_where_quadrl_is_not(policy, tmp_path):
+    path = quadrl.export(policy, "torch", tmp_path / "policy.pt2")
+    rows = np.random.default_rng(0).normal(policy.mean, policy.deviation, (5, policy.size))
+    rows = rows.astype(np.float32)
+    sizes = [str(policy.state_size)] * bool(policy.memory)
+    command = [sys.executable, "-W", "error", "-c", LOADED, str(path), json.dumps(rows.tolist())]
+    done = subprocess.run([*command, *sizes], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    expected = policy.step(rows, np.full((5, policy.state_size), 0.5))
+    for found, array in zip(json.loads(done.stdout), expected, strict=False):
+        np.testing.assert_allclose(found, array, rtol=0, atol=1e-6)
