@@ -172,6 +172,8 @@ class Environment(saving.Copied):
         begun, task_state = self.task.begin(Rng(*place), seen)
         # Up to here nothing is written, and `place` refuses before it writes.
         begun = begun.replaced(start or {}, rows, self.num_envs)
+        if start:
+            self._refuse_underground(start, begun)
         state = self.engine.place(rows, begun, table, self._placed(place, begun, task_state))
         self.seeds = seeds
         self.randomizer.begin(rows, *place, drawn)
@@ -190,6 +192,13 @@ class Environment(saving.Copied):
             records.put(self.episode, rows, episode)
             self.snapshot.sensed = self.sensed
         return observation
+
+    def _refuse_underground(self, given: Mapping[str, Any], start: Start) -> None:
+        """Refuse a position that was given if it is below the ground."""
+        lowest = -float(self.origin[2])  # [m], from the origin of the task's frame
+        if "position" in given and (start.position[:, 2] < lowest).any():
+            allowed = f"above the ground, at z of at least {lowest:g}"
+            raise QuadrlError(name="position", value=given["position"], allowed=allowed)
 
     def _placed(
         self, place: tuple[Array, Array], start: Start, task_state: Any

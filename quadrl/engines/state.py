@@ -133,8 +133,7 @@ class Start:
         """A start with some arrays given, (count, k) or (k,), of which some rows (n,) count.
 
         Raises:
-            QuadrlError: Unknown name, wrong shape, a quaternion of length 0, or a position below
-                the ground.
+            QuadrlError: Unknown name, wrong shape, or a quaternion of length 0.
         """
         if not given:
             return self
@@ -153,9 +152,6 @@ class Start:
                 allowed = "of a length above 0"
                 raise QuadrlError(name="quaternion", value=given["quaternion"], allowed=allowed)
             arrays["quaternion"] = arrays["quaternion"] / length
-        if "position" in arrays and (arrays["position"][:, 2] < 0).any():
-            allowed = "at a height of at least 0"
-            raise QuadrlError(name="position", value=given["position"], allowed=allowed)
         return dataclasses.replace(self, **arrays)
 
 

@@ -23,7 +23,7 @@ MISTAKES = {
     ),
     "a start below the ground": (
         lambda: hover().reset(options={"position": (0, 0, -50)}),
-        r"position = .*must be at a height of at least 0",
+        r"position = .*must be above the ground, at z of at least -3",
     ),
     "a start too fast": (
         lambda: hover().reset(options={"velocity": (1e9, 0, 0)}),
