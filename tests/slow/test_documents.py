@@ -115,6 +115,10 @@ def test_quadrl_command_runs(command, folder):
     if RUN in arguments and arguments[arguments.index(RUN) - 1] == "--out":
         shutil.rmtree(folder / RUN)  # this command makes it
     shorter = SHORTER.get(arguments[0], ())
+    for option in shorter:  # each is given once
+        if option.startswith("--") and option in arguments:
+            at = arguments.index(option)
+            del arguments[at : at + (1 if option.startswith("--no-") else 2)]
     run((sys.executable, "-m", "quadrl", *arguments, *shorter), folder)
 
 

@@ -430,8 +430,9 @@ def test_a_table_of_the_flights(tmp_path, capsys):
         rows = list(csv.DictReader(file))
     assert [row["seed"] for row in rows] == ["4", "5", "6"]
     alone = quadrl.evaluate("hover", episodes=1, seed=5)
+    # A network rounds otherwise in a batch, which shows in what is nearly zero.
     for name in BEHAVIOUR:
-        assert float(rows[1][name]) == pytest.approx(alone.metrics[name], rel=1e-4)
+        assert float(rows[1][name]) == pytest.approx(alone.metrics[name], rel=1e-4, abs=1e-6)
     assert float(rows[1]["return"]) == pytest.approx(alone.metrics["return_mean"], rel=1e-5)
 
 
