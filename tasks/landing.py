@@ -54,7 +54,7 @@ class Landing(Task):
     targets = (
         Target("success_rate", "successful", 0.98, True),
         Target("crash_rate", "crashes", 0.0),
-        Target("touchdown_speed_median_m_s", "touchdown, median", 0.3, unit="m/s"),
+        Target("touchdown_speed_median_m_s", "touchdown, median", 0.3),
         TURNING,  # while it comes down: on its feet it rests
     )
     training = {"gamma": 0.98, "steps": 2_621_440}

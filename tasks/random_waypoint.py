@@ -31,7 +31,7 @@ class RandomWaypoint(Task):
     solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
     targets = (
         Target("success_rate", "successful", 0.99, True),
-        Target("position_error_m", "error over the last 2 s", 0.06, unit="cm"),
+        Target("position_error_m", "error over the last 2 s", 0.06),
         *STILL,
     )
     training = {"steps": 3_276_800, "holds_goal": True, "training_options": {"farthest": 3.0}}

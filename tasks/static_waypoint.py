@@ -46,8 +46,8 @@ class StaticWaypoint(Task):
     )
     targets = (
         Target("success_rate", "successful", 1.0, True),
-        Target("position_error_m", "error over the last 2 s", 0.05, unit="cm"),
-        Target("heading_error_deg", "off east", 5.0, unit="deg"),
+        Target("position_error_m", "error over the last 2 s", 0.05),
+        Target("heading_error_deg", "off east", 5.0),
         *STILL,
     )
     training = {"gamma": 0.9, "holds_goal": True, "ppo": {"learning_rate": 8e-3}}

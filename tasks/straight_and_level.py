@@ -44,8 +44,8 @@ class StraightAndLevel(Task):
     solved = "in the air, on altitude and near the line to the end"
     targets = (
         Target("survival_rate", "flown to the end", 0.99, True),
-        Target("altitude_rms_m", "altitude error, RMS", 0.05, unit="cm"),
-        Target("cross_track_rms_m", "off the line, RMS", 0.10, unit="cm"),
+        Target("altitude_rms_m", "altitude error, RMS", 0.05),
+        Target("cross_track_rms_m", "off the line, RMS", 0.10),
         Target("speed_error_share", "speed error", 0.05),
         TURNING,
     )

@@ -50,10 +50,10 @@ class TargetFollowing(Task):
     solved = "in the air to the end, distance within 0.3 m of 1 m on average"
     targets = (
         Target("survival_rate", "flown to the end", 0.99, True),
-        Target("distance_rms_m", "distance off 1 m, RMS", 0.15, unit="cm"),
+        Target("distance_rms_m", "distance off 1 m, RMS", 0.15),
         TURNING,
         # The target turns, and who follows lags: the geometric controller has 0.07 m/s.
-        Target("circling_m_s", "circling over the last 2 s", 0.1, unit="m/s"),
+        Target("circling_m_s", "circling over the last 2 s", 0.1),
     )
     observation = OBSERVATION | TARGET_VELOCITY
 

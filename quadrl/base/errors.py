@@ -23,9 +23,8 @@ class QuadrlError(ValueError):
         self.name, self.value, self.allowed, self.reason = name, value, allowed, reason
         if name is not None:
             must = f": must be {allowed}" if allowed else ""
-            value = (
-                value.tolist() if hasattr(value, "tolist") else value
-            )  # lists are easier to read
+            # Lists are easier to read than arrays.
+            value = value.tolist() if hasattr(value, "tolist") else value
             reason = f"{name} = {reprlib.repr(value)}{must}" + (f"; {reason}" if reason else "")
         super().__init__(reason)
 

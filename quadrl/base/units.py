@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 
 UNITS = {"_rad_s": "rad/s", "_m_s": "m/s", "_deg": "°", "_s": "s"}
-"""Units by the end of a metric's name; lengths (`_m`) and shares (`_rate`) choose their own."""
+"""Units by the end of a metric's name; lengths (`_m`) and shares choose their own."""
+
+SHARES = ("_rate", "_share")
+"""Ends of the names of shares, which are shown in percent."""
 
 LENGTHS = (("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("µm", 1e-6))
 """Units of length and their sizes [m], the largest first."""
@@ -16,8 +19,11 @@ def quantity(name: str, value: object) -> str:
 
     Args:
         name: The metric's name, such as `position_error_m`, `success_rate` or `yaw_rate_rad_s`.
-        value: A number in the unit of the name; anything else is shown as it is.
+        value: A number in the unit of the name; None stands for no number, and
+            anything else is shown as it is.
     """
+    if value is None:
+        return "none"
     if not isinstance(value, float):
         return str(value)
     if name.endswith("_m"):
@@ -25,7 +31,7 @@ def quantity(name: str, value: object) -> str:
     for end, unit in UNITS.items():
         if name.endswith(end):
             return f"{digits(value)} {unit}"
-    return percent(value) if name.endswith("_rate") else digits(value)
+    return percent(value) if name.endswith(SHARES) else digits(value)
 
 
 def length(metres: float) -> str:
@@ -55,7 +61,7 @@ def digits(value: float) -> str:
     if abs(value) < 0.0005:
         return "under 0.001"
     places = 1 - math.floor(math.log10(abs(value)))
-    return f"{value:,.{max(0, places)}f}"
+    return f"{value:,.{min(3, max(0, places))}f}"
 
 
 def duration(seconds: float) -> str:

@@ -58,8 +58,8 @@ def again(command: str, *folder: Path) -> str:
 
 
 @contextlib.contextmanager
-def going_on(words: Sequence[str] = ()) -> Generator[None]:
-    """Say, after a Ctrl-C or a SIGTERM, which command goes on: by default the same one."""
+def going_on() -> Generator[None]:
+    """Say, after a Ctrl-C or a SIGTERM, that the same command goes on."""
 
     def stop(number: int, _: Any) -> None:
         raise Stopped(number)
@@ -68,7 +68,7 @@ def going_on(words: Sequence[str] = ()) -> Generator[None]:
         with handling({signal.SIGTERM: stop}):
             yield
     except KeyboardInterrupt as stopped:
-        words = ["quadrl", *(words or sys.argv[1:])]
+        words = ["quadrl", *sys.argv[1:]]
         stopped.args = (f"stopped; the same command goes on: {shlex.join(words)}",)
         raise
 

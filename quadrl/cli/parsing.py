@@ -23,10 +23,12 @@ KINDS = {
     "{[INT [INT ...]]}": "whole numbers with spaces between them",
 }
 """What an option takes, by the parser's name for it."""
+REPEATED = ("robustness", "--controller")
+"""The command and its option that may be given several times."""
 
 
 def parse(kind: type[Parsed], words: Sequence[str], commands: Iterable[str]) -> Parsed:
-    """What the words of a command line ask for.
+    """Parse the words of a command line.
 
     Args:
         kind: The class of all commands and their options.
@@ -83,12 +85,12 @@ def _whole(text: str) -> int:
 
 
 def _command(words: Sequence[str]) -> str | None:
-    """The first word that is neither `--import` nor its file."""
+    """The first word that is neither `--quiet`, `--import` nor its file."""
     rest = iter(words)
     for word in rest:
         if word == "--import":
             next(rest, None)
-        elif not word.startswith("--import="):
+        elif word != "--quiet" and not word.startswith("--import="):
             return word
     return None
 
@@ -100,7 +102,7 @@ def _refuse_repetition(words: Sequence[str]) -> None:
         if not re.match(r"--[a-z]", word):
             continue
         name = word.partition("=")[0].replace("_", "-").replace("--no-", "--", 1)
-        if name in seen and name not in ("--import", "--controller"):
+        if name in seen and name != "--import" and (_command(words), name) != REPEATED:
             raise QuadrlError(name="option", value=name, allowed="given once")
         seen.add(name)
 

@@ -172,7 +172,8 @@ class AircraftSampler:
             weak = 1 - heavy
             ends = {"mass": heavy, "inertia": inertia, "drag": drag, "inflow": 1, "lag": 0}
             ends |= {"thrust": weak, "torque": weak, "max_speed": weak}
-            columns: Any = {name: getattr(given, name)[end] for name, end in ends.items()}
+            both = self.low, self._high
+            columns: Any = {k: both[end][self.names.index(k)] for k, end in ends.items()}
             columns |= {f"{name}_1": [given.rotors[ends[name]]] * count for name in EACH_ROTOR}
             columns |= {"one_rotor": 1.0, "centre_of_mass_x": (0.0, 0.0, 0.0)}
             try:

@@ -58,12 +58,14 @@ class RotorSpeed(Sensor):
 
     def begin(self, now: Moment) -> Memory:
         """The model starts from the true ones."""
-        return {"speed": now.true.rotor_speed}
+        return {} if self.source == "true" else {"speed": now.true.rotor_speed}
 
     def follow(
         self, memory: Memory, specified: Parameters, command: Array, seconds: float
     ) -> Memory:
         """Each approaches its command, no faster than the rotor turns at most."""
+        if not memory:
+            return memory
         speed, rotor = memory["speed"], specified.rotor
         goal = np.minimum(command, rotor.max_speed)
         up, down = (1 - np.exp(-seconds * lag) for lag in (rotor.lag_up, rotor.lag_down))

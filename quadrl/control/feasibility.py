@@ -26,11 +26,12 @@ from quadrl.conditions.randomization import AFFECTS, Randomization, Randomized
 from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control.allocation import Allocation
+from quadrl.control.modes import CONTROL_MODES
 from quadrl.engines.rng import uniform
 
 MARGIN = 1.2
 """Thrust over weight that an aircraft needs to be flown. With it thrust carries the weight at a
-tilt of 33 degrees, or climbs with g / 5; the aircraft that come with quadrl have at least 1.22."""
+tilt of 33 degrees, or climbs with g / 5; the aircraft that come with quadrl have at least 1.33."""
 FEW = 0.02
 """Share of drawn aircraft that may be unable to hover without a warning: tasks ask for 98 to 100 %
 of success, which more of them rule out."""
@@ -162,7 +163,18 @@ def unreached(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[float, str, f
     return share, lack, enough
 
 
-def warn_of_unreached(vehicle: Vehicle, randomization: Randomized) -> None:
+def held_command(vehicle: Vehicle, control_mode: str) -> float:
+    """Time for which rotors are given one command [s].
+
+    The loops of every mode but "rotor" answer at each physics step.
+    """
+    looped = CONTROL_MODES[control_mode].has_loops
+    return vehicle.physics_timestep if looped else vehicle.control_timestep
+
+
+def warn_of_unreached(
+    vehicle: Vehicle, randomization: Randomized, control_mode: str = "rotor"
+) -> None:
     """Warn the caller's caller of what no policy can make up for.
 
     More than a FEW of the drawn aircraft cannot hover, half of the actions or more are cut at the
@@ -176,7 +188,7 @@ def warn_of_unreached(vehicle: Vehicle, randomization: Randomized) -> None:
         said = f"action_scale = {scale:g}: actions over {reach.room / scale:.2g} change nothing"
         _warn(f"{said}, since the rotors turn no faster; quadrl check suggests another")
     lag = max(1 / min(rotor.lag_up, rotor.lag_down) for rotor in vehicle.rotors)
-    if vehicle.control_timestep > lag:
+    if held_command(vehicle, control_mode) > lag:
         said = f"control_timestep = {vehicle.control_timestep:g}: an action lasts longer"
         _warn(f"{said} than the rotors take to follow it, {lag:.2g} s; see quadrl check")
     share, lack, enough = unreached(vehicle, AircraftSampler(randomization, vehicle))

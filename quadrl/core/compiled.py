@@ -134,7 +134,9 @@ class CompiledStep(Step):
         if any(array.dtype != np.float64 for array in kept):
             raise NotCompilable("what it remembers is not all float64")
         self.kept = records.Columns(0, kept)
-        self.sensed = records.Columns(0, [now.sensed[name] for name in self.task.sensors])
+        # Others do not show themselves to the task.
+        self._shown = [name for name in self.task.sensors if name in now.sensed]
+        self.sensed = records.Columns(0, [now.sensed[name] for name in self._shown])
         kinds = now.task.__class__, now.potentials.__class__
         self._reads = Reads(self.task, METHODS, kinds)
         (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
@@ -203,8 +205,8 @@ class CompiledStep(Step):
             return trace, trace.body(self._outputs(kept, done))
 
     def by_sensor(self, arrays: Iterable[Any]) -> dict[str, Any]:
-        """What the sensors of the task give, in their order, by their names."""
-        return dict(zip(self.task.sensors, arrays, strict=True))
+        """Name what the sensors give that the task asks for and sees, in their order."""
+        return dict(zip(self._shown, arrays, strict=True))
 
     def _outputs(self, kept: list[Array], done: Transition) -> dict[str, Any]:
         """What is computed, by where it is written to."""

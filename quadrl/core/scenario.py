@@ -110,7 +110,7 @@ class Scenario:
         for field in dataclasses.fields(self):
             value = field.metadata["parse"](getattr(self, field.name))
             object.__setattr__(self, field.name, value)
-        wind = self.weather.wind_speed + self.weather.gust_speed
+        wind = self.weather.wind_speed * self.randomization.wind[1] + self.weather.gust_speed
         if wind > (resolved := self.aircraft.resolved_speed):
             reason = "faster air carries the aircraft off at a speed that its step does not resolve"
             allowed = f"mean wind and gust together up to {resolved:.3g} m/s, for this aircraft"

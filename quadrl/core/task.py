@@ -13,7 +13,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
@@ -45,11 +45,9 @@ class Target:
     words: str
     """What it is."""
     limit: float
-    """In the unit of the metric's name; shares as shares."""
+    """In the unit of the metric's name, in which it is shown too; shares as shares."""
     at_least: bool = False
     """Whether the figure must reach the limit, or stay under it."""
-    unit: Literal["%", "cm", "m/s", "deg", "s", "rad/s"] = "%"
-    """Unit in which it is shown."""
 
     def met(self, metrics: Mapping[str, Any]) -> bool:
         """Whether an evaluation reaches it; a figure that is missing or no number does not."""
@@ -57,8 +55,8 @@ class Target:
         return value >= self.limit if self.at_least else value <= self.limit
 
 
-TURNING = Target("yaw_rate_rad_s", "turning over the last 2 s", 0.3, unit="rad/s")
-STILL = (TURNING, Target("circling_m_s", "circling over the last 2 s", 0.05, unit="m/s"))
+TURNING = Target("yaw_rate_rad_s", "turning over the last 2 s", 0.3)
+STILL = (TURNING, Target("circling_m_s", "circling over the last 2 s", 0.05))
 """What is asked of who should stand, beside the place: one that turns or circles has not solved
 its task."""
 

@@ -249,8 +249,9 @@ def check_task(
     state = State.of_coordinates(**start_state, origin_height=origin_height)
     now, _ = begin(task, state, task_state, parameters, actions, around)
     for name, options in task.sensors.items():
-        sensed = np.zeros((rows, sensor.make(name, options).width(Sizes(rotors, actions))))
-        now.sensed = {**now.sensed, name: sensed}
+        made = sensor.make(name, options)
+        if made.shown and not made.last:
+            now.sensed = {**now.sensed, name: np.zeros((rows, made.width(Sizes(rotors, actions))))}
     terminated = task.terminated(now)
     _check_array(task, "terminated", terminated, (rows,), "b")
     if terminated.any():

@@ -17,6 +17,7 @@ from quadrl.control.feasibility import (
     Reach,
     angular_acceleration,
     attitude_bandwidth,
+    held_command,
     held_wind,
     samples,
     unreached,
@@ -146,7 +147,7 @@ def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Ite
     looped = CONTROL_MODES[control_mode].has_loops
     given = sampler.randomization
     late = given.command_delay[1] + (0.0 if looped else given.observation_delay[1])
-    held = step if looped else control
+    held = held_command(vehicle, control_mode)
     lag = float(1 / rates.min())
     slow = f"over the lag of the rotors: control_timestep={lag:.2g} or less"
     yield Row("slowest rotor lag", 1000 * lag, "ms")

@@ -34,7 +34,7 @@ from quadrl.evaluation.rollout import (
     Controller,
     flights,
     fly,
-    summarize,
+    means_of_behaviour,
 )
 
 WORLD = ("weather", "randomization", "engine")
@@ -220,12 +220,13 @@ def measured(
     except QuadrlError:  # the aircraft cannot exist, or hardly fly
         return None
     rollout = fly(controller, scenario, episodes=episodes, seed=seed)
-    reached, metrics = flights(rollout), summarize(rollout)
+    reached = flights(rollout)
+    ways = means_of_behaviour(reached)
     success = int(reached["success"].sum())
     low, high = wilson(success, episodes)
     errors = np.quantile(reached["position_error_m"], QUARTILES).tolist()
     found = {"success": success / episodes, "low": low, "high": high, "error_m": errors}
-    return found | {name: metrics.get(name) for name in BEHAVIOUR}
+    return found | {name: ways.get(name) for name in BEHAVIOUR}
 
 
 def _summary(one: Disturbance, at: list[dict[str, Any] | None]) -> dict[str, Any]:

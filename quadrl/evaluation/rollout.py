@@ -194,20 +194,26 @@ def behaviour(rollout: Rollout, last: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+def means_of_behaviour(flown: dict[str, np.ndarray]) -> dict[str, float]:
+    """Means of the `behaviour` in what `flights` gives, and the least of the heights.
+
+    Over the flights that did not fail (who tumbles does not spin), over all if none is left.
+    """
+    counts = flown["survived"] | ~flown["survived"].any()
+    ways = {name: flown[name][counts] for name in BEHAVIOUR if name in flown}
+    return {k: float(v.min() if k == "least_height_m" else v.mean()) for k, v in ways.items()}
+
+
 def summarize(rollout: Rollout) -> dict[str, Any]:
     """The metrics of an evaluation.
 
     Returns:
         episodes; success_rate and survival_rate (shares); position_error_m and
         position_error_std_m: mean and deviation over the flights [m]; where the heading matters
-        heading_error_deg; return_mean and return_std; length_mean_s; diverged (count); the means
-        of the behaviour, and the least of the heights, over the flights that did not fail (who
-        tumbles does not spin), over all if none is left; and the task's own metrics. `flights`
-        says what each of them is of one flight.
+        heading_error_deg; `means_of_behaviour`; return_mean and return_std; length_mean_s; diverged
+        (count); and the task's own metrics. `flights` says what each of them is of one flight.
     """
     flown = flights(rollout)
-    counts = flown["survived"] | ~flown["survived"].any()
-    ways = {name: flown[name][counts] for name in BEHAVIOUR if name in flown}
     heading = {k: float(v.mean()) for k, v in flown.items() if k == "heading_error_deg"}
     return {
         "episodes": len(flown["return"]),
@@ -216,7 +222,7 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
         "position_error_m": float(flown["position_error_m"].mean()),
         "position_error_std_m": float(flown["position_error_m"].std()),
         **heading,
-        **{k: float(v.min() if k == "least_height_m" else v.mean()) for k, v in ways.items()},
+        **means_of_behaviour(flown),
         "return_mean": float(flown["return"].mean()),
         "return_std": float(flown["return"].std()),
         "length_mean_s": float(flown["length_s"].mean()),

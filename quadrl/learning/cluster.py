@@ -52,9 +52,11 @@ class Task(NamedTuple):
             reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
             return End(f"its node or its process there was lost ({reason})", lost=True)
 
-    def stop(self) -> None:
+    def ask(self) -> None:
         """Kill the task: its process ends with it."""
         self.ray.cancel(self.task, force=True)
+
+    stop = ask
 
 
 @dataclasses.dataclass(frozen=True)

@@ -156,7 +156,7 @@ class Process:
 
     def __init__(self, what: dict[str, Any], log: Path) -> None:
         """Start it; what it prints goes to a file."""
-        self._log = log
+        self._log, self._asked = log, False
         log.parent.mkdir(parents=True, exist_ok=True)
         search = os.pathsep.join(path or os.getcwd() for path in sys.path)
         with open(log, "wb") as file:
@@ -186,9 +186,15 @@ class Process:
         lines = self._log.read_text(errors="replace").strip().splitlines() or ["no output"]
         return End(lines[-1].strip().removeprefix("quadrl: ") if code else "")
 
+    def ask(self) -> None:
+        """Ask it, once, to write a checkpoint at the end of its iteration and to end."""
+        if not self._asked:
+            self._asked = True
+            self._process.terminate()
+
     def stop(self) -> None:
-        """Let it write a checkpoint at the end of its iteration and end; kill it if it does not."""
-        self._process.terminate()
+        """Let it end as `ask` says; kill it if it does not."""
+        self.ask()
         try:
             self._process.wait(STOP_SECONDS)
         except subprocess.TimeoutExpired:
@@ -293,6 +299,8 @@ def train_all(
             time.sleep(POLL_SECONDS)
     finally:
         for job in going:  # after a Ctrl-C: each run can be continued
+            job.worker.ask()
+        for job in going:
             job.worker.stop()
     return failed
 

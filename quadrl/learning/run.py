@@ -118,7 +118,7 @@ def train_in(
     """Train as `train` does, with settings and folder prepared, in the context `heed`."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = config.scenario
-    warn_of_unreached(scenario.aircraft, scenario.randomization)
+    warn_of_unreached(scenario.aircraft, scenario.randomization, scenario.control_mode)
     training = Training(config, folder, resume=resume)
     with heed(training):
         policy = training.run(show)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.rotation import Array
+from quadrl.base.units import length
 from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER
 from quadrl.rendering.horizon import horizon
 
@@ -157,7 +158,7 @@ def flight_lines(
     """
     return {
         "time": f"{time:.2f} s",
-        "error": f"{error:.2f} m",
+        "error": length(error),
         "speed": f"{speed:.2f} m/s",
         "reward": f"{reward:+.2f}",
         **({} if wind is None else {"wind": f"{wind:.1f} m/s"}),

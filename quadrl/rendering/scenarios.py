@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from quadrl.base.errors import QuadrlError
+from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.core.scenario import Scenario
 from quadrl.rendering.overlay import require
 
@@ -46,6 +46,8 @@ def read_scenarios(path: str | os.PathLike[str]) -> list[Scenario]:
         listed = json.loads(text)
         if not listed or not all(isinstance(one, dict) and "task" in one for one in listed):
             raise ValueError("its comment holds none")
+    except RenderingUnavailable:
+        raise
     except (OSError, ValueError, TypeError) as error:
         reason = "give a file that quadrl render, plot or train has drawn"
         raise QuadrlError(f"{path} carries no scenario ({error}): {reason}") from error

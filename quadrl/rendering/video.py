@@ -37,7 +37,7 @@ OneOrMore = T | Sequence[T]
 OnFrame = Callable[[int, int], object]
 """Is told how many pictures are drawn, and how many there will be."""
 MAX_FPS = 240
-LARGEST = 1920  # pixels, the width of the pictures that assets/scene.xml makes room for
+LARGEST = {"width": 1920, "height": 1080}  # pixels, as assets/scene.xml makes room for
 FFMPEG = ("-preset", "veryfast", "-movflags", "+faststart")
 LEAST_RATE = 20.0  # [1/s], at which a flight is followed
 HOLD = 1.0  # [s], for which a video stays at its end, for the outcome to be read
@@ -173,7 +173,7 @@ def write_video(
     """
     path, kind = checked(path, VIDEOS)
     for name in ("width", "height"):
-        if kind == "mp4" and number(name, options.get(name, 2), 1, LARGEST, whole=True) % 2:
+        if kind == "mp4" and number(name, options.get(name, 2), 1, LARGEST[name], whole=True) % 2:
             raise QuadrlError(name=name, value=options[name], allowed="even for a video")
     flights = listed(trajectory)
     start, end = min(one.time[0] for one in flights), max(one.time[-1] for one in flights)

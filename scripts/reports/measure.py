@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from quadrl import VEHICLES, tasks
-from quadrl.base.units import quantity
+from quadrl.base.units import digits, length, quantity
 from quadrl.core.task import STILL, Target
 from quadrl.engines.mujoco import ENGINES
 from quadrl.evaluation.controllers import make_controller
@@ -32,7 +32,7 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
 from quadrl.learning.folder import EVALUATION, FREE, METRICS, read_metrics, write_json
 from scripts.reports import report
-from scripts.reports.report import Result, asked, factor, number, say, table
+from scripts.reports.report import Result, asked, say, table
 
 # Seeds are not those that settings were chosen with.
 HOVER_SEEDS, SEEDS = (225, 226, 227, 228, 229), (385, 386, 387)
@@ -215,14 +215,14 @@ def hover_table() -> str:
         row = [run["vehicle"], run["engine"], run["seed"], f"{run['steps']:,}"]
         row += [f"{run['training_s']:.1f} s"]
         row += [f"{100 * got[name]:.0f} %" for name in ("survival_rate", "success_rate")]
-        row += [f"{1000 * got['position_error_m']:.2f} mm", f"{got['heading_error_deg']:.1f} deg"]
+        row += [length(got["position_error_m"]), f"{got['heading_error_deg']:.1f} deg"]
         rows.append(row)
     head = ("aircraft", "engine", "seed", "control steps", "training", "flown to the end",
             "successful", "error", "heading off east")  # fmt: skip
-    error = max(1000 * row["metrics"]["position_error_m"] for row in own)
+    error = max(row["metrics"]["position_error_m"] for row in own)
     success = min(100 * row["metrics"]["success_rate"] for row in own)
     note = f"The geometric controller, in the same episodes and with every aircraft: {success:.0f} "
-    note += f"% successful, largest error {number(error)} mm."
+    note += f"% successful, largest error {length(error)}."
     return f"{table(head, rows)}\n\n{note}  \n{report.source(result, runs)}"
 
 
@@ -254,9 +254,9 @@ def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
     for target in tasks.TASKS[name].targets:
         cells = []
         for metrics in (each["metrics"] for each in (*runs, *known)):
-            value = metrics.get(target.metric)  # older trainings were not asked for all
-            lacks = target.metric not in metrics
-            cells.append("not measured" if lacks else number(value and factor(target) * value))
+            # Older trainings were not asked for all.
+            value = metrics.get(target.metric, "not measured")
+            cells.append(quantity(target.metric, value))
         rows.append((target.words, asked(target), *cells))
     seeds = [run["seed"] for run in runs]
     if runs:
@@ -271,8 +271,8 @@ def goals_table() -> str:
     result, rows = report.load("goals"), []
     for task, algo in GOALS:
         runs = [run for run in result["runs"] if (run["task"], run["algo"]) == (task, algo)]
-        error = (number(1000 * run["position_error_m"], 2) for run in runs)
-        off = (number(run["heading_error_deg"], 2) for run in runs if "heading_error_deg" in run)
+        error = (length(run["position_error_m"]) for run in runs)
+        off = (digits(run["heading_error_deg"]) for run in runs if "heading_error_deg" in run)
         took = [run["training_s"] for run in runs]
         failed = ", ".join(str(run["failed"]) for run in runs)
         time = f"{statistics.median(took):.1f} s ({min(took):.1f} to {max(took):.1f})"
@@ -281,7 +281,7 @@ def goals_table() -> str:
                  f"{failed} of {first['flights']:,}", ", ".join(error), ", ".join(off))  # fmt: skip
         rows.append((f"`{task}`", algo, *cells))
     head = ("task", "algorithm", "seeds", "control steps", "training, median and range",
-            "failed flights, seed by seed", "error [mm]", "heading error [deg]")  # fmt: skip
+            "failed flights, seed by seed", "error", "heading error [deg]")  # fmt: skip
     note = "Errors are means over all flights, also failed ones."
     return f"{table(head, rows)}\n\n{note} {report.source(result, result['runs'])}"
 
@@ -289,8 +289,7 @@ def goals_table() -> str:
 def speed_table() -> str:
     """Every layer."""
     result = report.load("speed")
-    _, *rows = benchmark.rows(result)
-    head = ("what", "control steps/s", "median", "share", "of", "target")
+    head, *rows = benchmark.rows(result)
     return f"{table(head, rows)}\n\n{report.source(result)}"
 
 

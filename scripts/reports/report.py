@@ -13,6 +13,7 @@ from typing import Any
 
 from quadrl import tasks
 from quadrl.base.machine import in_a_line, machine
+from quadrl.base.units import quantity
 from quadrl.core.task import Target
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -103,21 +104,7 @@ def table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |".replace("|  |", "| |") for cells in lines)
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """A number in few digits and without an exponent."""
-    if value is None or not math.isfinite(value):
-        return "none"
-    if 0 < abs(value) < 1e-3:
-        return "under 0.001" if value > 0 else "over -0.001"
-    return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
-
-
-def factor(target: Target) -> float:
-    """From the unit of a target's metric to the one that it is shown in."""
-    return {"%": 100.0, "cm": 100.0}.get(target.unit, 1.0)
-
-
 def asked(target: Target) -> str:
     """What a target asks, in its unit."""
     word = "at least" if target.at_least else "at most"
-    return f"{word} {factor(target) * target.limit:g} {target.unit}"
+    return f"{word} {quantity(target.metric, float(target.limit))}"

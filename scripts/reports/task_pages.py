@@ -10,14 +10,14 @@ from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.units import quantity
 from quadrl.cli.tasks import settings
-from quadrl.core.task import Target, Task
+from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED
 from quadrl.learning.defaults import own_settings
 from quadrl.learning.description import describe, describe_action
 from scripts.reports import measure, report
 from scripts.reports.code import shown
-from scripts.reports.report import Parts, asked, factor, number, table
+from scripts.reports.report import Parts, asked, table
 
 PAGE = """{asks}
 
@@ -199,10 +199,10 @@ def policies(name: str = "") -> str:
         if name in ("", row["task"]):
             made = json.loads((SHIPPED / f"{row['policy']}.json").read_text())["command"]
             cells = [quantity(x, row[x]) if x in row else "" for x in FIGURES]
-            cells += [given(x, row) for x in own]
+            cells += [quantity(x.metric, row[x.metric]) for x in own]
             still = row["undisturbed"]
             missed = (
-                f"{x.words}: {given(x, still)}, asked {asked(x)}"
+                f"{x.words}: {quantity(x.metric, still[x.metric])}, asked {asked(x)}"
                 for x in measure.unmet(row["task"], still)
             )
             rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "nothing"))
@@ -212,11 +212,6 @@ def policies(name: str = "") -> str:
     note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result))
     how = SHIPS.format(name=name) if name else ""
     return f"{how}{table(head, rows)}\n\n{note}"
-
-
-def given(target: Target, metrics: dict[str, Any]) -> str:
-    """A figure in the unit of its target."""
-    return f"{number(factor(target) * metrics[target.metric])} {target.unit}"
 
 
 def line(text: str) -> str:

@@ -536,6 +536,8 @@ MISTYPED = {
     "train --hidden a b": "hidden = 'a', 'b': must be whole numbers",
     "evaluate hover --episodes": "--episodes needs a value; see quadrl evaluate --help",
     "evaluate hover --seed 1 --seed 2": "option = '--seed': must be given once",
+    "evaluate hover --controller zero --controller random": "must be given once",
+    "--quiet evaluate hover --seed 1 --seed 2": "option = '--seed': must be given once",
     "evaluate hover --task-options radius=1 radius=2": "radius = 'radius=2': must be given once",
     "study": "missing: PATH The study: a .toml or .json file",
     "--import": "--import needs a value; see quadrl --help",

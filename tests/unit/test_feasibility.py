@@ -206,6 +206,9 @@ def test_no_torque_is_drawn_with_which_a_rotor_would_make_power():
     with pytest.raises(QuadrlError, match="momentum theory") as caught:
         AircraftSampler({"thrust": (1.0, 1.5), "torque": (0.8, 1.2)}, air)
     assert caught.value.name == "torque" and "1.21" in caught.value.allowed  # 0.659 * 1.5^1.5
+    # Less thrust needs less power, and the torque is raised where even then it would not do.
+    raised = AircraftSampler({"thrust": (0.9, 1.0), "torque": (0.6, 1.2)}, air)
+    assert raised.low[raised.names.index("torque")] == pytest.approx(0.659, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -218,6 +221,11 @@ def test_no_torque_is_drawn_with_which_a_rotor_would_make_power():
 def test_what_no_policy_can_make_up_for_is_said(numbers, said):
     with pytest.warns(QuadrlWarning, match=said):
         feasibility.warn_of_unreached(dataclasses.replace(VEHICLES["paper"], **numbers), "none")
+
+
+def test_a_mode_whose_loops_answer_at_each_physics_step_holds_no_command_for_long():
+    slow = dataclasses.replace(VEHICLES["paper"], control_timestep=1.0)
+    feasibility.warn_of_unreached(slow, "none", "velocity")  # a warning is an error here
 
 
 def test_train_says_it_before_it_begins(tmp_path):

@@ -187,4 +187,6 @@ def test_wind_that_no_step_of_the_aircraft_resolves_is_refused():
         with pytest.raises(QuadrlError, match="20 m/s") as caught:
             Scenario.of("hover", weather=weather, **given)
         assert caught.value.name == "weather"
+    with pytest.raises(QuadrlError, match="20 m/s"):  # twice the mean wind may be drawn
+        Scenario.of("hover", weather={"wind_speed": 11.0}, randomization={"wind": (0, 2)}, **given)
     assert Scenario.of("hover", weather={"wind_speed": 19.9}, **given).aircraft.mass == 1e-3

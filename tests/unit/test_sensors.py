@@ -123,6 +123,24 @@ def test_samples_are_held_and_as_late_as_the_sensor_says(name, entry):
             np.testing.assert_array_equal(found[start + t][row], true[sample][row])
 
 
+@dataclasses.dataclass(frozen=True)
+class Aware(Hover):
+    """Asks for sensors that show nothing of their own to a task, and for one that does."""
+
+    sensors = {"state": {"rate": 10.0}, "rotor_speed": {}, "airspeed": {}}
+
+    def reward(self, before, now, end):
+        """As hover, and the airspeed."""
+        return super().reward(before, now, end) | {"air": now.sensed["airspeed"][..., 0]}
+
+
+def test_a_task_may_ask_for_any_sensor():
+    environment = Environment(Aware(), num_envs=2, seed=1)
+    environment.reset()
+    shown = environment.step(np.zeros((2, 4))).observation
+    assert {"rotor_speed", "airspeed"} <= shown.keys()
+
+
 def test_noise_is_new_in_each_sample_and_a_bias_lasts():
     options = {"compass": {"noise": 0.1, "bias": 0.5}}
     environment = helpers.begun("hover", 400, observe={"sensors": options})

@@ -47,6 +47,9 @@ def test_a_metric_has_the_unit_of_its_name():
         "return_mean": (187.4, "187"),
         "episodes": (100, "100"),
         "task": ("hover", "hover"),
+        "speed_error_share": (0.12, "12 %"),
+        "command_change_rate": (None, "none"),
+        "circling_m_s": (0.00712, "0.007 m/s"),
     }
     shown = {name: units.quantity(name, value) for name, (value, _) in metrics.items()}
     assert shown == {name: text for name, (_, text) in metrics.items()}
