@@ -99,7 +99,7 @@ def test_trainings_are_evaluated_beside_the_controller_and_drawn(short, monkeypa
     (own,) = result["yardstick"]
     assert own["metrics"]["success_rate"] == 1
     rows, seeds = measure.reached("hover")
-    assert seeds == [1, 2] and rows[0] == ("successful", "at least 100 %", "0", "0", "100")
+    assert seeds == [1, 2] and rows[0] == ("successful", "at least 100 %", "0 %", "0 %", "100 %")
     assert measure.hover_table().count("\n| paper |") == 4
     assert (report.IMAGES / "curves" / "hover.png").stat().st_size > 0
 
