@@ -181,7 +181,7 @@ def test_policies_that_ship_are_judged_where_nothing_disturbs_them(tmp_path, mon
     assert spins["yaw_rate_rad_s"] == pytest.approx(flown["yaw_rate_rad_s"], 1e-4)
     head, _, first, second = task_pages.policies().splitlines()[:4]
     assert "| circling over the last 2 s |" in head and first.endswith("| nothing |")
-    assert "rad/s, asked at most 0.3 rad/s; circling over the last 2 s: 0.1" in second
+    assert "rad/s, asked at most 0.30 rad/s; circling over the last 2 s: 0.1" in second
     assert "hover" not in task_pages.policies("random_waypoint")
     assert "None comes" in task_pages.policies("landing")
 
