@@ -36,7 +36,7 @@ export class Episode {
     if (this.outcome) return false;
     const { vehicle } = this.flight;
     if (this.ticks % vehicle.substeps === 0) this.#control();
-    if (!this.flight.advance()) {
+    if (!this.flight.tick()) {
       this.outcome = "near the ground";
       return false;
     }

@@ -97,6 +97,7 @@ export class Flight {
   // What is seen first, from where the aircraft is.
   first() {
     this.#read();
+    this.late = Array.from({ length: this.vehicle.deadSteps }, () => this.act.slice());
     this.call("first");
     this.call("rest");
   }
@@ -112,6 +113,16 @@ export class Flight {
   advance(steps = 1) {
     const rows = this.kernel.address(this.slot, "flight_rows");
     return this.kernel.functions.quadrl_free_flight(rows, 0n, ONE, BigInt(steps)) === 0n;
+  }
+
+  // Flies a physics step with the commands of the aircraft's dead time ago; whether as `advance`.
+  tick() {
+    const command = this.ctrl.slice();
+    this.late.push(command);
+    this.ctrl.set(this.late.shift());
+    const clear = this.advance();
+    this.ctrl.set(command);
+    return clear;
   }
 
   // The transition of a control step, after its physics steps.

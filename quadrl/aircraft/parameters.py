@@ -36,6 +36,7 @@ MARK = 1903518052.0
 """Tells the actuators and bodies of quadrl from everybody else's: "quad" in ASCII."""
 SETTINGS = (
     *("name", "rotors", "action_scale", "physics_timestep", "control_timestep", "aerodynamics"),
+    "dead_time",
 )
 """Fields of `Vehicle` that are not a parameter of an aircraft's row."""
 DERIVED = ("foot", "hull", "ground_clearance", "rotor_height", "resolved_speed", "resolved_turn")

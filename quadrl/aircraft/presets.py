@@ -35,6 +35,7 @@ CRAZYFLIE = Vehicle(
     action_scale=480.0,  # chosen: the weakest aircraft of the randomization `full` hovers
     physics_timestep=0.005,  # chosen
     control_timestep=0.02,  # chosen
+    dead_time=0.01,  # 7 to 10 ms, beside the lag (IMRCLab flights), in whole physics steps
 )
 CRAZYFLIE_BRUSHLESS = Vehicle(
     name="crazyflie_brushless",  # Crazyflie 2.1 Brushless, without the guards of its propellers
@@ -56,6 +57,7 @@ CRAZYFLIE_BRUSHLESS = Vehicle(
     action_scale=400.0,  # chosen: the weakest aircraft of the randomization `full` hovers
     physics_timestep=0.0025,  # chosen: it turns faster than the brushed one
     control_timestep=0.02,  # chosen
+    dead_time=0.005,  # beside the lag (IMRCLab flights)
 )
 RACER = Vehicle(
     name="racer",  # Foehn et al. 2022, "Agilicious", Science Robotics 7: the Kingfisher
@@ -107,7 +109,9 @@ HEXA = Vehicle(
     physics_timestep=0.005,  # chosen
     control_timestep=0.02,  # chosen
 )
-OPTIONS = ("mass", "inertia", "drag_coefficient", "moment_coefficient", "action_scale")
+OPTIONS = (
+    *("mass", "inertia", "drag_coefficient", "moment_coefficient", "action_scale", "dead_time"),
+)
 """Fields that may differ from an aircraft's without making another one of it."""
 VEHICLES = {
     vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, CRAZYFLIE_BRUSHLESS, RACER, HEXA)

@@ -31,7 +31,7 @@ from quadrl.aircraft.rotors import (
 )
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
-from quadrl.base.validation import number, numbers
+from quadrl.base.validation import number, numbers, whole_steps
 
 MIN_ROTORS, MAX_ROTORS = 4, 8
 DRAWN_SIZE = 0.23  # [m], distance of a rotor from the centre in the drawings of assets/
@@ -74,6 +74,8 @@ class Vehicle:
     """Time between two actions [s] (gym-aero); a whole number of physics steps."""
     aerodynamics: Aerodynamics = Aerodynamics()
     """What the air does to the rotors beside equation 7; nothing by default."""
+    dead_time: float = 0.0
+    """Time from a command to the first motion of a rotor [s], in whole physics steps."""
 
     def __repr__(self) -> str:
         return f"Vehicle({self.name!r}, {self.mass:g} kg, {len(self.rotors)} rotors)"
@@ -85,9 +87,11 @@ class Vehicle:
         object.__setattr__(self, "inertia", numbers("inertia", self.inertia, 3, MIN, MAX))
         for field in ("mass", "action_scale", "physics_timestep", "control_timestep"):
             object.__setattr__(self, field, number(field, getattr(self, field), MIN, MAX))
-        for field in ("drag_coefficient", "moment_coefficient"):
+        for field in ("drag_coefficient", "moment_coefficient", "dead_time"):
             object.__setattr__(self, field, number(field, getattr(self, field), 0, MAX))
-        check_inertia("inertia", self.inertia, self.inertia)
+        if max(self.inertia) > (sum(self.inertia) - max(self.inertia)) * (1 + 1e-9):
+            allowed = "three moments, each at most the sum of the other two"
+            raise QuadrlError(name="inertia", value=self.inertia, allowed=allowed)
         self._check_rotors()
         self._check_timesteps()
         mass, inertia, fastest = self.mass, self.inertia, self.max_speed
@@ -139,6 +143,7 @@ class Vehicle:
         ):
             allowed = f"1 to {MAX_SUBSTEPS} times the physics step, {step:g} s"
             raise QuadrlError(name="control_timestep", value=self.control_timestep, allowed=allowed)
+        whole_steps("dead_time", (self.dead_time,), step, "physics")
         # The Runge-Kutta method is unstable from 2.785 on, and inexact before.
         fastest = max(max(rotor.lag_up, rotor.lag_down) for rotor in self.rotors)
         if fastest * step > 1 + 1e-9:
@@ -285,16 +290,3 @@ def resolved_turn(inertia: Array, moment_coefficient: Array, timestep: float) ->
     """`Vehicle.resolved_turn` of rows with a least moment of inertia [rad/s]."""
     damping = 2 * np.asarray(moment_coefficient) * timestep / inertia
     return np.minimum(DAMPING / np.maximum(damping, 1 / MAX), min(TURN / timestep, MAX))
-
-
-def check_inertia(name: str, low: Vector, high: Vector) -> None:
-    """Refuse moments of inertia between `low` and `high` that no body has.
-
-    Raises:
-        QuadrlError: One of them can be larger than the sum of the other two.
-    """
-    for k in range(3):
-        if high[k] > (sum(low) - low[k]) * (1 + 1e-9):
-            value = high if low == high else (low, high)
-            allowed = "three moments, each at most the sum of the other two"
-            raise QuadrlError(name=name, value=value, allowed=allowed)

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import math
 import numbers as abstract
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from quadrl.base.errors import QuadrlError, UnknownKeyword
 
 MAX_SEEDS = 1000
+WHOLE = 1e-6  # of a step, within which a delay is a whole number of them
 MAX_OPTION = 1e9
 """Larger options of a task would take the digits from what is added to them."""
 
@@ -42,6 +43,20 @@ def number(
         ):
             return converted
     raise QuadrlError(name=name, value=value, allowed=_range(low, high, whole, positive))
+
+
+def whole_steps(name: str, times: Sequence[float], timestep: float, kind: str) -> tuple[int, ...]:
+    """Times [s] in steps.
+
+    Raises:
+        QuadrlError: One is not a multiple of the time step.
+    """
+    steps = tuple(round(time / timestep) for time in times)
+    if any(abs(time / timestep - k) > WHOLE for time, k in zip(times, steps, strict=True)):
+        allowed = f"a whole number of {kind} steps of {timestep:g} s"
+        value = times if len(times) > 1 else times[0]
+        raise QuadrlError(name=name, value=value, allowed=allowed)
+    return steps
 
 
 def numbers(

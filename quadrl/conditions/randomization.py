@@ -136,7 +136,8 @@ class Randomization:
     centre_of_mass: float = 0.0
     """Largest distance of the centre of mass from where it should be, along each axis [m]."""
     command_delay: Range = (0.0, 0.0)
-    """Time from a command to the rotors that get it [s], in whole physics steps."""
+    """Time from a command to the rotors that get it [s], in whole physics steps, beside the
+    aircraft's own `dead_time`."""
     observation_delay: Range = (0.0, 0.0)
     """Age of the observation [s], in whole control steps."""
     noise: Errors = Errors()
@@ -194,7 +195,7 @@ RANDOMIZATIONS = {
         inflow=(0.85, 1.15),  # chosen
         rotors=(0.975, 1.025),  # chosen
         centre_of_mass=0.001,  # chosen
-        command_delay=(0.0, 0.01),  # 5 to 10 ms on Crazyflies (fitted to flights by IMRCLab)
+        command_delay=(0.0, 0.01),  # chosen: radio, beside the dead time of the aircraft
         noise=Errors(position=1e-3, attitude=1e-3, velocity=2e-3, body_rate=2e-3),
     ),
     # An aircraft that is known from its data sheet.

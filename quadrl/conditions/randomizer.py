@@ -34,9 +34,10 @@ class Randomizer:
         Args:
             sampler: Samples what is drawn.
             engine: Flies the aircraft.
-            active: Whether anything follows from what is drawn; nothing is drawn otherwise.
+            active: Whether anything follows from what is drawn; nothing is drawn otherwise, unless
+                commands are late.
         """
-        self.sampler, self._engine, self.active = sampler, engine, active
+        self.sampler, self._engine = sampler, engine
         count, rotors = engine.ctrl.shape
         given, vehicle = sampler.randomization, engine.vehicle
         self._rows: np.ndarray = np.arange(count)
@@ -48,9 +49,15 @@ class Randomizer:
         """Control steps since their start."""
         self._pushes = given.pushes
         self._chance = -math.expm1(-given.pushes.rate * vehicle.control_timestep)
-        longest = sampler.delays[0][1]
+        self._dead = round(vehicle.dead_time / vehicle.physics_timestep)  # physics steps
+        longest = self._dead + sampler.delays[0][1]
         self.late = longest > 0
-        """Whether commands pass a queue; the rotors then get one at each physics step."""
+        """Whether commands pass a queue."""
+        late = {k % vehicle.substeps for k in range(self._dead + sampler.delays[0][0], longest + 1)}
+        ends = [k for k in range(1, vehicle.substeps) if k in late] + [vehicle.substeps]
+        self.held = [next(end for end in ends if end > k) - k for k in range(vehicle.substeps)]
+        """For how many physics steps, from each of a control step on, no command changes."""
+        self.active = active or self.late
         self.queue = np.zeros((longest + 1, count, rotors))  # [rad/s]
         self.newest = np.zeros(1, np.int64)  # where in the queue
         self._delay = np.zeros(count, np.int64)  # [physics steps]
@@ -116,6 +123,7 @@ class Randomizer:
                 ("observation_delay", vehicle.control_timestep),
             )
         )
+        self._delay += self._dead
 
     def wind_speed(self, rows: np.ndarray, weather: Weather) -> Array | None:
         """Wind speed of some aircraft (n,) [m/s]; None where it is the weather's."""
@@ -123,14 +131,18 @@ class Randomizer:
             return None
         return weather.wind_speed * self.column("wind")[rows]
 
-    def delayed(self, command: Array) -> Array:
-        """The delayed command for a physics step, given the present one, both (N, R) [rad/s]."""
+    def delayed(self, command: Array, steps: int) -> Array:
+        """The delayed command for some physics steps, given the present one, (N, R) [rad/s]."""
         if not self.late:
             return command
         length = len(self.queue)
-        self.newest[0] = newest = (self.newest[0] + 1) % length
-        self.queue[newest] = command
-        return self.queue[(newest - self._delay) % length, self._rows]
+        first = int(self.newest[0]) + 1
+        self.queue[first % length] = command
+        arrived = self.queue[(first - self._delay) % length, self._rows]
+        for k in range(1, min(steps, length)):  # which may overwrite what arrives
+            self.queue[(first + k) % length] = command
+        self.newest[0] = (first + steps - 1) % length
+        return arrived
 
     def estimated(self, rows: np.ndarray | None, rotor_speed: Array) -> Array:
         """Coordinates with the noise and the bias of the randomization, (n, 13 + R).

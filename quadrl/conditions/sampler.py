@@ -13,7 +13,7 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
-from quadrl.base.validation import number
+from quadrl.base.validation import number, whole_steps
 from quadrl.conditions.randomization import (
     AFFECTS,
     DELAYS,
@@ -31,7 +31,6 @@ DAMAGED = "damaged_rotor"
 ROUNDING = 1e-9
 EXCHANGES = 3
 """Rounds that suffice: in layouts of four to eight rotors, more find no worse aircraft."""
-WHOLE = 1e-6  # of a step, within which a delay is a whole number of them
 
 
 class AircraftSampler:
@@ -237,16 +236,3 @@ def vehicle_of(vehicle: Vehicle, row: np.void) -> Vehicle:
 
     rotors = tuple(made(*pair) for pair in zip(vehicle.rotors, row["rotor"], strict=False))
     return made(vehicle, row, rotors=rotors, aerodynamics=made(vehicle.aerodynamics, row))
-
-
-def whole_steps(name: str, times: tuple[float, ...], timestep: float, kind: str) -> tuple[int, ...]:
-    """Times [s] in steps.
-
-    Raises:
-        QuadrlError: One is not a multiple of the time step.
-    """
-    steps = tuple(round(time / timestep) for time in times)
-    if any(abs(time / timestep - k) > WHOLE for time, k in zip(times, steps, strict=True)):
-        allowed = f"a whole number of {kind} steps of {timestep:g} s"
-        raise QuadrlError(name=name, value=times, allowed=allowed)
-    return steps

@@ -16,10 +16,9 @@ from quadrl.aircraft.rotors import MAX
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SENSORS as STREAMS
 from quadrl.base.rotation import Array
-from quadrl.base.validation import choice, keys, number
+from quadrl.base.validation import choice, keys, number, whole_steps
 from quadrl.conditions.randomization import LONGEST_DELAY
 from quadrl.conditions.randomizer import Randomizer
-from quadrl.conditions.sampler import whole_steps
 from quadrl.engines import native
 from quadrl.engines.engine import Engine, Frame
 from quadrl.engines.rng import normal, uniform

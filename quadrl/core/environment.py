@@ -107,7 +107,7 @@ class Environment(saving.Copied):
         """Where each named term of the observation stands in the flat vector."""
         self.size = max(part.stop for part in self.layout.values())
         self.stepwise = self.control_mode.has_loops or self.randomizer.late
-        """Whether the rotors get a command at each physics step, from `control`."""
+        """Whether the rotors get more than one command in a control step, from `control`."""
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
         self._all = np.arange(self.num_envs)
         self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
@@ -117,7 +117,7 @@ class Environment(saving.Copied):
         self._inputs = Inputs.zeros(self.num_envs, self.action_size, rotors)
         self.transition: Transition | None = None  # what the last step gave
         self._setpoint: Any = None
-        self._flown = 0  # physics steps of this control step that the mode's loops have flown
+        self._flown = 0  # physics steps of this control step that `control` has commanded
         self.seed(seed)
 
     def seed(self, seed: Seed = None, rows: np.ndarray | None = None) -> Seed:
@@ -262,12 +262,11 @@ class Environment(saving.Copied):
             RuntimeError: There was no reset before.
         """
         self.begin(action)
-        if self.stepwise:
-            for _ in range(self.vehicle.substeps):
-                self.control()
-                self.engine.advance(1)
-        else:
-            self.engine.advance(self.vehicle.substeps)
+        left = self.vehicle.substeps
+        while left:
+            steps = self.control(left) if self.stepwise else left
+            self.engine.advance(steps)
+            left -= steps
         return self.finish()
 
     def begin(self, action: Array) -> None:
@@ -294,18 +293,23 @@ class Environment(saving.Copied):
             if self.observer:
                 self.observer.follow(command, self.vehicle.control_timestep)
 
-    def control(self) -> None:
-        """Command the rotors before a physics step, where they get more than one in a step."""
-        command = self._setpoint
+    def control(self, most: int) -> int:
+        """Command the rotors, where they get more than one command in a control step.
+
+        Returns:
+            For how many physics steps, of `most` that are left.
+        """
+        command, steps = self._setpoint, min(most, self.randomizer.held[self._flown])
         if self.control_mode.has_loops:
             if self._flown and (diverged := self.engine.read()) is not None:
                 self._inputs.diverged[diverged] = True
-            command = self.control_mode.rotor_command(self.engine.state, self._setpoint)
+            command, steps = self.control_mode.rotor_command(self.engine.state, command), 1
             self._inputs.command[:] += command / self.vehicle.substeps  # their mean counts
-            self._flown += 1
             if self.observer:
                 self.observer.follow(command, self.vehicle.physics_timestep)
-        self.engine.ctrl[:] = self.randomizer.delayed(command)
+        self._flown += steps
+        self.engine.ctrl[:] = self.randomizer.delayed(command, steps)
+        return steps
 
     def finish(self) -> Transition:
         """Second half of a step, after the engine has advanced."""
@@ -380,7 +384,8 @@ class Environment(saving.Copied):
 def row_memory(task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Observing) -> float:
     """Memory that one more aircraft takes at least [bytes]; measured, and the histories counted."""
     rotors, (commands, observations) = vehicle.rotor_count, sampler.delays
+    late = commands[1] + round(vehicle.dead_time / vehicle.physics_timestep)
     single = sum(term.width(rotors) for term in task.observation.values())
-    kept = single * (1 + observations[1] + seen.observation_history) + rotors * commands[1]
+    kept = single * (1 + observations[1] + seen.observation_history) + rotors * late
     flat = single * (1 + seen.observation_history) + rotors * seen.action_history
     return 3_000 + 5_000 * sampler.randomization.per_row + 8 * (kept + 2 * flat)

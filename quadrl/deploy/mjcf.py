@@ -29,8 +29,9 @@ HEAD = """<!--
   ctrl = (clip(hover_speed + action_scale * a, 0, max_speed) / max_speed)^2.
   Left out: the lag is of the square of the speed, not of the speed; what the air does to rotors
   (inflow, rotor drag, flapping, ground effect, vortex ring), their gyroscopic moments, turbulence,
-  delays, noise, randomization. Drag and moment that go with the square of airspeed and body rate
-  act on the sphere "drag", in the wind of option/wind. mujoco.mjx with JAX knows no such sphere:
+  the dead time (custom/numeric dead_time [s], to delay ctrl by), delays, noise, randomization.
+  Drag and moment that go with the square of airspeed and body rate act on the sphere "drag", in the
+  wind of option/wind. mujoco.mjx with JAX knows no such sphere:
   there the drag is a box's, right in the mean over its axes, and the moment is smaller.
 -->
 """
@@ -64,7 +65,7 @@ def spec(vehicle: Vehicle) -> mujoco.MjSpec:
         actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
         actuator.gainprm[0] = rotor.thrust_coefficient * rotor.max_speed**2  # [N]
         actuator.ctrlrange = (0, 1)
-    for name in ("hover_speed", "max_speed", "action_scale", "control_timestep"):
+    for name in ("hover_speed", "max_speed", "action_scale", "control_timestep", "dead_time"):
         whole.add_numeric(name=name, data=np.atleast_1d(getattr(vehicle, name)))
     whole.add_key(name="hover", qpos=(0, 0, HEIGHT, 1, 0, 0, 0), act=share, ctrl=share)
     return whole

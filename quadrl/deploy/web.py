@@ -137,6 +137,7 @@ def describe(vehicle: Vehicle) -> dict[str, Any]:
         "substeps": vehicle.substeps,
         "physicsTimestep": vehicle.physics_timestep,
         "controlTimestep": vehicle.control_timestep,
+        "deadSteps": round(vehicle.dead_time / vehicle.physics_timestep),
         "layout": vehicle.layout.tolist(),
         "size": vehicle.size,
         "wide": max(vehicle.scale, SMALLEST),

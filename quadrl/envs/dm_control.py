@@ -40,9 +40,8 @@ class Physics(mujoco.Physics):
 
     engine: DataEngine | None = None
     """Flies it where free flight is the engine; a copy has none."""
-    inner_loop: Callable[[], None] | None = None
-    """Commands the rotors before each physics step, during control steps in which they get more
-    than one command."""
+    inner_loop: Callable[[int], int] | None = None
+    """`Environment.control` during control steps in which the rotors get more than one command."""
     in_view: Callable[[], tuple[np.ndarray, Sequence[Any]]] | None = None
     """The goal (3,) [m] and the markers that "follow" keeps in view; None before an episode."""
 
@@ -73,12 +72,10 @@ class Physics(mujoco.Physics):
 
     def step(self, nstep: int = 1) -> None:
         """Advance by physics steps; a NativeError if the rotor callbacks were removed."""
-        if self.inner_loop is None:
-            self._advance(nstep)
-            return
-        for _ in range(nstep):
-            self.inner_loop()
-            self._advance(1)
+        while nstep:
+            steps = self.inner_loop(nstep) if self.inner_loop else nstep
+            self._advance(steps)
+            nstep -= steps
 
     def _advance(self, steps: int) -> None:
         if self.engine is not None and self.engine.fly(steps):

@@ -146,7 +146,9 @@ def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Ite
     # The loops of the other modes see the true state at every physics step.
     looped = CONTROL_MODES[control_mode].has_loops
     given = sampler.randomization
-    late = given.command_delay[1] + (0.0 if looped else given.observation_delay[1])
+    late = (
+        vehicle.dead_time + given.command_delay[1] + (0.0 if looped else given.observation_delay[1])
+    )
     held = held_command(vehicle, control_mode)
     lag = float(1 / rates.min())
     slow = f"over the lag of the rotors: control_timestep={lag:.2g} or less"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from typing import Any
 
@@ -12,7 +13,7 @@ from torchrl.data import Unbounded
 from torchrl.modules import ProbabilisticActor
 
 from quadrl.aircraft.aerodynamics import ROTOR_EFFECTS
-from quadrl.base.errors import QuadrlError
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.core.transition import Transition
 from quadrl.engines.adjoint import kernel
 from quadrl.envs.torchrl import QuadrotorEnv
@@ -129,6 +130,14 @@ def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
         num_threads=config.num_threads,
     )
     if config.algo == "apg":
+        scenario = config.training_scenario
+        if late := scenario.vehicle.dead_time:
+            said = f"apg trains without the dead time of the aircraft, {late:g} s, for want of its"
+            warnings.warn(
+                f"{said} derivatives; evaluations fly with it", QuadrlWarning, stacklevel=2
+            )
+            prompt = dataclasses.replace(scenario.vehicle, dead_time=0.0)
+            settings["task"] = dataclasses.replace(scenario, vehicle=prompt)
         return RecordingEnv(**settings)
     if config.memory == "none":
         return QuadrotorEnv(**settings)

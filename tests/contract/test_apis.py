@@ -13,6 +13,7 @@ from apis import APIS, StableBaselines, Vector
 
 import quadrl
 from quadrl.base.errors import QuadrlError
+from quadrl.core.environment import Environment
 from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
 
@@ -36,6 +37,17 @@ def test_a_seed_gives_the_episodes_one_after_the_other(api):
     np.testing.assert_array_equal(second, episode(same))
     starts = [first[0], second[0], episode(other)[0], episode(api())[0], episode(api())[0]]
     assert len(np.unique(np.concatenate(starts), axis=0)) == 5 * api.rows
+
+
+@every_api
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_a_dead_time_is_the_same_through_every_api(api, engine):
+    settings = {"seed": 3, "vehicle": "crazyflie", "engine": engine}
+    found = episode(api(**settings))
+    core = Environment("hover", num_envs=found.shape[1], **settings)
+    seen = [core.flatten(core.reset())]
+    seen += [core.flatten(core.step(a[: core.num_envs]).observation) for a in ACTIONS]
+    np.testing.assert_allclose(found, seen, rtol=1e-6, atol=1e-7)  # some give float32
 
 
 @every_api

@@ -4,11 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 from runs import assert_same_run, metrics, refused, stopped, train
 
 from quadrl import tasks
+from quadrl.base.errors import QuadrlWarning
 from quadrl.base.rotation import norm
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.environments import make_env
 from quadrl.tasks.hover import Hover
 
 TINY = TrainConfig(
@@ -54,6 +57,17 @@ def test_what_has_no_derivatives_is_refused(name, value):
     with refused(name):
         TrainConfig("hover", algo="apg", **{name: value})
     TrainConfig("hover", **{name: value})
+
+
+def test_it_trains_without_the_dead_time_and_says_so():
+    config = TrainConfig("hover", algo="apg", vehicle="crazyflie", num_envs=8)
+    with pytest.warns(QuadrlWarning, match=r"without the dead time of the aircraft, 0\.01 s"):
+        trained = make_env(config, torch.device("cpu"))
+    assert trained.environment.vehicle.dead_time == 0 and not trained.environment.stepwise
+    assert config.scenario.vehicle.dead_time == 0.01
+    assert make_env(
+        dataclasses.replace(config, algo="ppo"), torch.device("cpu")
+    ).environment.stepwise
 
 
 def test_a_task_with_contact_is_refused():

@@ -324,8 +324,21 @@ def found(**given):
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_the_aircraft_that_come_with_quadrl_are_ok(name):
-    assert {row.verdict for row in quadrl.check(name).rows} == {OK}
-    assert "every row is ok" in repr(quadrl.check(name))
+    rows = found(vehicle=name)
+    late = rows.pop("longest delay")
+    assert late.value == pytest.approx({"crazyflie": 10, "crazyflie_brushless": 5}.get(name, 0))
+    assert late.verdict == OK or (late.value and "action_history=1" in late.verdict)
+    assert {row.verdict for row in rows.values()} == {OK}
+
+
+def test_the_dead_time_counts_in_the_loop():
+    plain, late = found(), found(vehicle={"dead_time": 0.03}, randomization={"command_delay": 0.06})
+    assert late["longest delay"].value == pytest.approx(90) and plain["longest delay"].value == 0
+    assert "action_history=2" in late["longest delay"].verdict
+    expected = math.pi / 4 / (0.18 + 0.09 + 0.05 / 2)
+    assert late["attitude bandwidth"].value == pytest.approx(expected)
+    looped = found(vehicle={"dead_time": 0.03}, control_mode="velocity")
+    assert looped["longest delay"].value == pytest.approx(30)
 
 
 def test_the_rows_of_the_paper_by_worked_numbers():

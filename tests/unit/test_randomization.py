@@ -73,11 +73,14 @@ def test_none_is_the_usual_flight_and_remembers_nothing():
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("late", [1, 3, 5, 12])  # physics steps of 0.01 s, 5 in a control step
-def test_commands_arrive_so_many_physics_steps_late(engine, late):
-    environment = helpers.begun(
-        "hover", 3, engine=engine, randomization={"command_delay": late / 100}
-    )
+@pytest.mark.parametrize(
+    ("drawn", "dead"),  # physics steps of 0.01 s, 5 in a control step
+    [(1, 0), (3, 0), (5, 0), (12, 0), (0, 1), (0, 3), (0, 5), (0, 7), (2, 5), (3, 1)],
+)
+def test_commands_arrive_so_many_physics_steps_late(engine, drawn, dead):
+    late, vehicle = drawn + dead, dataclasses.replace(PAPER, dead_time=dead / 100)
+    given = {"command_delay": drawn / 100} if drawn else None
+    environment = helpers.begun("hover", 3, engine=engine, vehicle=vehicle, randomization=given)
     other = BatchEngine(PAPER, 3, altitude=3.0, engine=engine)
     for field in ("qpos", "qvel", "act"):
         getattr(other, field)[:] = getattr(environment.engine, field)
@@ -94,11 +97,12 @@ def test_commands_arrive_so_many_physics_steps_late(engine, late):
         )
 
 
-def test_the_commands_of_loops_are_late_too():
-    late = 7
-    environment = helpers.begun(
-        "hover", 2, control_mode="velocity", randomization={"command_delay": late / 100}
-    )
+@pytest.mark.parametrize(("drawn", "dead"), [(7, 0), (0, 3), (4, 3)])
+@pytest.mark.parametrize("kind", ["thrust_body_rate", "velocity", "position"])
+def test_the_commands_of_loops_are_late_too(kind, drawn, dead):
+    late, vehicle = drawn + dead, dataclasses.replace(PAPER, dead_time=dead / 100)
+    given = {"control_mode": kind, "randomization": {"command_delay": drawn / 100}}
+    environment = helpers.begun("hover", 2, vehicle=vehicle, **given)
     mode, asked, given = environment.control_mode, [], []
     asked += [np.array(environment.engine.act)] * late
     command = mode.rotor_command
@@ -107,10 +111,29 @@ def test_the_commands_of_loops_are_late_too():
     environment.engine.advance = lambda n: (
         given.append(environment.engine.ctrl.copy()) or advance(n)
     )
-    for action in helpers.random_actions(4, 2):
+    for action in helpers.random_actions(4, 2, environment.action_size):
         environment.step(action)
     assert len(given) == 20
     np.testing.assert_array_equal(given, asked[:20])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_dead_time_is_saved_and_held_as_if_each_step_had_its_command(engine):
+    vehicle = dataclasses.replace(PAPER, dead_time=0.07)
+    one, two = (
+        helpers.begun("hover", 2, engine=engine, vehicle=vehicle, randomization=given)
+        for given in (None, {"command_delay": (0.0, 0.04)})
+    )
+    # A delay that is drawn gives each physics step its own command; here it draws nothing.
+    two.randomizer._delay[:] = 7
+    for k, action in enumerate(helpers.random_actions(12, 2)):
+        if k == 6:
+            saved = one.save()
+            one = Environment("hover", num_envs=2, engine=engine, vehicle=vehicle)
+            one.restore(saved)
+        one.step(action), two.step(action)
+        np.testing.assert_array_equal(*(helpers.coordinates(e.engine) for e in (one, two)))
+    assert one.randomizer.held == [2, 1, 3, 2, 1] and two.randomizer.held == [1] * 5
 
 
 def test_each_row_has_a_delay_of_its_own_and_every_one_is_drawn_as_often():

@@ -194,6 +194,9 @@ BAD = [  # parameters, name, value (... for any)
     (dict(inertia=(0.0, J, J)), "inertia[0]", 0.0),
     (dict(inertia=(J, -J, J)), "inertia[1]", -J),
     (dict(inertia=(J, J, math.nan)), "inertia[2]", ...),
+    (dict(dead_time=0.015), "dead_time", 0.015),
+    (dict(dead_time=-0.01), "dead_time", -0.01),
+    (dict(dead_time="late"), "dead_time", "late"),
     (dict(name=5), "name", 5),
     (dict(name=""), "name", ""),
     # 2 k_M |omega| dt / J = 1 at 7.5e-3 / (2 * 0.1 * 0.01) = 3.75 rad/s: not a turn a second.
@@ -261,6 +264,7 @@ def test_a_rotor_that_cannot_be_is_refused(changed, name):
 
 
 def test_what_is_just_allowed():
+    assert Vehicle(dead_time=0.03).dead_time == 0.03 and Vehicle().dead_time == 0
     assert Vehicle(inertia=(0.1, 0.2, 0.1 + 0.2)).inertia[2] == pytest.approx(0.3)
     assert Vehicle(rotors=rotors(lag_up=100.0)).rotors[0].lag_up == 100.0
     assert Vehicle(rotors=ringed(range(0, 360, 45), [1, -1] * 4)).rotor_count == 8
