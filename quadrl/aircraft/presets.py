@@ -272,6 +272,23 @@ def at_air_density(vehicle: Vehicle, air_density: float) -> Vehicle:
     return scaled(vehicle, "drag_coefficient", "moment_coefficient", **own)
 
 
+def check_known(vehicle: Vehicle) -> None:
+    """Refuse rotors whose numbers in the full set would be those of other rotors.
+
+    Raises:
+        QuadrlError: The vehicle has the name of a known one, and other discs or another thrust.
+    """
+
+    def rotors(one: Vehicle) -> list[tuple[float, str]]:
+        density = one.aerodynamics.air_density
+        return [(r.disc, f"{r.thrust_coefficient / density:.9g}") for r in one.rotors]
+
+    known = VEHICLES.get(vehicle.name)
+    if known and rotors(known) != rotors(vehicle):
+        reason = "its rotors are not those of the aircraft that quadrl knows by this name"
+        raise QuadrlError(reason, name="vehicle", value=vehicle.name, allowed="another name")
+
+
 def _full_set(vehicle: Vehicle) -> tuple[Aerodynamics, float]:
     """Every effect of a vehicle, and the share of its quadratic drag beside its rotor drag."""
     own = vehicle.aerodynamics

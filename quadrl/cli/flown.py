@@ -25,7 +25,7 @@ from quadrl.learning.defaults import PAIRS
 HELP = {
     "vehicle": "The aircraft",
     "aerodynamics": "Effects of the air on the rotors: none, full, or names of single ones with "
-    "commas between them; by default those of the aircraft",
+    "commas between them; by default those of the aircraft, and full in wind",
     "weather": "The weather: calm, light, moderate or severe, or JSON such as "
     "'{\"wind_speed\": 5}'",
     "randomization": "What is drawn for each aircraft at each reset and disturbs it: none, light "

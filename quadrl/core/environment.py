@@ -70,7 +70,8 @@ class Environment(saving.Copied):
         self.scenario = Scenario.of(task, **conditions)
         """What is flown and how."""
         if isinstance(engine, Engine) and engine.vehicle != self.scenario.aircraft:
-            own: Any = {"vehicle": engine.vehicle, "aerodynamics": None}
+            flown = engine.vehicle
+            own: Any = {"vehicle": flown, "aerodynamics": flown.aerodynamics}
             self.scenario = dataclasses.replace(self.scenario, **own)
         self.task, self.vehicle = self.scenario.task, self.scenario.aircraft
         self.observing, self.weather = self.scenario.observe, self.scenario.weather

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 from typing_extensions import TypedDict
 
 from quadrl.aircraft import presets
-from quadrl.aircraft.aerodynamics import Aerodynamics
+from quadrl.aircraft.aerodynamics import FULL, Aerodynamics
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
@@ -47,7 +47,8 @@ class Conditions(TypedDict, total=False, extra_items=Any):
     """Numbers of the aircraft that differ from it, such as mass=0.7 action_scale=90."""
     aerodynamics: str | Aerodynamics | Mapping[str, Any] | None
     """Effects of the air on the rotors: none, full, names of single ones with commas between them,
-    or an Aerodynamics; by default those of the aircraft."""
+    or an Aerodynamics; by default those of the aircraft, and in wind the full set where it has
+    none."""
     weather: Weathered
     """The weather: calm, light, moderate or severe, a Weather, or some of its fields, such as
     {"wind_speed": 5}."""
@@ -93,7 +94,7 @@ class Scenario:
     vehicle: Vehicle = _condition(presets.VEHICLES["paper"], presets.resolve)
     """The aircraft as it is specified; `aircraft` is what flies."""
     aerodynamics: str | Aerodynamics | None = _condition(None, _effects)
-    """Effects of the air that were asked for; None for the aircraft's own."""
+    """Effects of the air that were asked for, or that wind brings; None for the aircraft's own."""
     weather: Weather = _condition(Weather(), Weather.of)
     """What the wind is like."""
     randomization: Randomization = _condition(Randomization(), randomization.resolve)
@@ -110,6 +111,8 @@ class Scenario:
         for field in dataclasses.fields(self):
             value = field.metadata["parse"](getattr(self, field.name))
             object.__setattr__(self, field.name, value)
+        if self.aerodynamics is None and not self.weather.calm:
+            object.__setattr__(self, "aerodynamics", _in_wind(self.vehicle))
         wind = self.weather.wind_speed * self.randomization.wind[1] + self.weather.gust_speed
         if wind > (resolved := self.aircraft.resolved_speed):
             reason = "faster air carries the aircraft off at a speed that its step does not resolve"
@@ -210,6 +213,38 @@ class Scenario:
 FIELDS = dataclasses.fields(Scenario)
 KEYWORDS = ("task", *Conditions.__annotations__)
 """The keywords of `Scenario.of`."""
+
+
+def as_saved(conditions: Mapping[str, Any]) -> dict[str, Any]:
+    """Conditions from a file, as `Scenario.of` takes them.
+
+    Where the air acts on the rotors in wind, `Scenario.to_json` says so. Files that do not are of
+    versions in which wind acted by drag alone, and go on flying like that.
+    """
+    found = dict(conditions)
+    vehicle: Any = found.get("vehicle")
+    own: Any = isinstance(vehicle, dict) and vehicle.get("aerodynamics")  # pyright: ignore
+    if "aerodynamics" in found or (own and _effects(own).effects):
+        return found
+    return found if Weather.of(found.get("weather")).calm else found | {"aerodynamics": "none"}
+
+
+def _in_wind(vehicle: Vehicle) -> str | None:
+    """Effects of the air on an aircraft in wind, where none were asked for; None for its own.
+
+    Raises:
+        QuadrlError: It has none of its own, and the full set is not known or not possible.
+    """
+    if vehicle.aerodynamics.effects:
+        return None
+    try:
+        presets.check_known(vehicle)
+        presets.in_real_air(vehicle)
+    except QuadrlError as error:
+        reason = f"wind acts on the rotors too: {error}"
+        allowed = "the aircraft's own Aerodynamics, or 'none' for wind that acts by drag alone"
+        raise QuadrlError(reason, name="aerodynamics", value=FULL, allowed=allowed) from error
+    return FULL
 
 
 def _differing(record: Any, usual: Any = None) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
 from quadrl.base.media import Media
 from quadrl.base.units import quantity
+from quadrl.core.scenario import as_saved
 from quadrl.evaluation.cache import ResultCache
 from quadrl.evaluation.evaluate import html_table
 from quadrl.evaluation.rollout import BEHAVIOUR
@@ -169,6 +170,8 @@ class Card:
             raise QuadrlError(f"{file} holds no robustness card: {error}") from error
         if written != FORMAT:
             raise QuadrlError(name=f"format of {file}", value=written, allowed=FORMAT)
+        scenarios = found.get("scenarios", {})
+        found |= {"scenarios": {name: as_saved(one) for name, one in scenarios.items()}}
         return cls(found)
 
     def _picture(self, name: str) -> Media:

@@ -187,7 +187,8 @@ def beside(
     """Resolve several controllers for a view side by side: one episode of one task in one world.
 
     Each has the aircraft and the observation of its training. The task is that of the first; the
-    weather and the randomization are the first that differ from calm air and from none.
+    weather and the randomization are the first that differ from calm air and from none. Wind acts
+    on all as on the first that brings it.
 
     Args:
         controllers: Policies or controllers, each as `setting` takes it.
@@ -208,7 +209,11 @@ def beside(
         usual = Scenario.__dataclass_fields__[name].default
         own = (getattr(scenario, name) for scenario in scenarios)
         same[name] = next((world for world in own if world != usual), usual)
-    return [(flies, dataclasses.replace(scenario, **same)) for flies, scenario in flown]
+    air = next((one.aerodynamics for one in scenarios if not one.weather.calm), None)
+    return [
+        (flies, dataclasses.replace(one, **same, aerodynamics=one.aerodynamics or air))
+        for flies, one in flown
+    ]
 
 
 def comes_with_quadrl(name: str) -> bool:

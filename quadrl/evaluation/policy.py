@@ -20,7 +20,7 @@ from quadrl.aircraft.presets import resolve as resolve_vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
-from quadrl.core.scenario import KEYWORDS, Scenario
+from quadrl.core.scenario import KEYWORDS, Scenario, as_saved
 from quadrl.evaluation import policy_file
 from quadrl.evaluation.memory import GRU, PolicyInFlight
 from quadrl.evaluation.policy_file import CLIP, RUN, SHIPPED, SHIPPED_AS, shipped
@@ -68,7 +68,7 @@ class Policy:
     def conditions(self) -> dict[str, Any]:
         """What it was trained for and in, as `Scenario.of` takes it; it may have unknown names."""
         known = {name: self.metadata[name] for name in KEYWORDS if name in self.metadata}
-        return known | {"task": self.task}
+        return as_saved(known | {"task": self.task})
 
     @property
     def scenario(self) -> Scenario:

@@ -10,6 +10,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from quadrl.aircraft.aerodynamics import NONE
 from quadrl.aircraft.presets import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
@@ -37,8 +38,8 @@ from quadrl.evaluation.rollout import (
     means_of_behaviour,
 )
 
-WORLD = ("weather", "randomization", "engine")
-"""Fields of the first one's scenario in which the others fly too, beside task and aircraft."""
+WORLD = ("vehicle", "aerodynamics", "weather", "randomization", "engine")
+"""Fields of the first one's scenario in which the others fly too, beside the task."""
 CELL_SHARE = 10  # a cell of a recovery map has this part of the flights of a level
 PUSHES_PER_SECOND = 0.5  # chosen: about five in a flight of 10 s
 
@@ -133,7 +134,7 @@ def robustness(
 
     All fly the same task with the same aircraft, through the same episodes. The weather and the
     randomization that a policy was trained in do not count: beside those that are given, a level
-    is all that disturbs its flights.
+    is all that disturbs its flights. Wind blows in real air, unless `aerodynamics` says otherwise.
 
     Args:
         controller: A policy or a controller, as `quadrl.evaluate` takes it; a list of them; or a
@@ -165,6 +166,11 @@ def robustness(
     found |= {"episodes": episodes, "engine": first.engine, "flown": [*flown]}
     found["scenarios"] = {name: scenario.to_json() for name, (_, scenario) in flown.items()}
     found |= {"axes": {one.name: _described(one) for one in chosen}, "recovery": {}}
+    worlds = {
+        (name, one.name): [disturbed(scenario, one.at(level)) for level in one.levels]
+        for one in chosen
+        for name, (_, scenario) in flown.items()
+    }
     for one in chosen:
         reach = {name: _reach(one, scenario.aircraft) for name, (_, scenario) in flown.items()}
         found["axes"][one.name]["reach"] = reach
@@ -187,7 +193,7 @@ def robustness(
                 for k, level in enumerate(one.levels):
                     if level != one.usual:
                         count(f"{name}, {one.label}")
-                        there = disturbed(scenario, one.at(level))
+                        there = worlds[name, one.name][k]
                         at[k] = kept(measured, flies, there, episodes=episodes, **fresh)
                 found["axes"][one.name]["flown"][name] = _summary(one, at)
         for chart in MAPS.values() if recovery else ():
@@ -269,13 +275,15 @@ def _flown(
     for name, one in pairs:
         own, flies, scenario = setting(one, task, **given)
         if not flown:
+            if scenario.aerodynamics == NONE and "aerodynamics" not in given:  # of its training
+                scenario = dataclasses.replace(scenario, aerodynamics=None)
             if "engine" not in given and not isinstance(task, Scenario):
                 engine = "mujoco" if scenario.task.contact else "free_flight"
                 scenario = dataclasses.replace(scenario, engine=engine)
             # The others get the task, the aircraft and the world as they are.
             observed = {name: given.get(name) for name in ("observe", "control_mode")}
             given = {name: getattr(scenario, name) for name in WORLD} | observed
-            task, given["vehicle"] = scenario.task, scenario.aircraft
+            task = scenario.task
         if isinstance(flies, Policy):
             trained = Scenario.of(flies.conditions, task=scenario.task).vehicle
             if trained.name == scenario.vehicle.name:

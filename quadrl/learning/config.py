@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl import __version__
+from quadrl.aircraft.aerodynamics import FULL
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.validation import choice, keys, number, tuples
 from quadrl.conditions.observing import Observing
@@ -83,6 +84,7 @@ class TrainConfig(TrainSettings):
                 settings[name] = values[name] | settings[name]
         for name, value in (values | settings | {"algo": algo}).items():
             object.__setattr__(self, name, tuples(value))
+        object.__setattr__(self, "aerodynamics", self.aerodynamics or self._wind_brings())
         self._check()
 
     def __repr__(self) -> str:
@@ -93,7 +95,14 @@ class TrainConfig(TrainSettings):
 
     def _defaults(self) -> tuple[dict[str, Any], dict[str, str]]:
         chosen = self.task, self.algo, self.vehicle, self.variant, self.memory
-        return training_defaults(_fields(), *chosen)
+        values, sources = training_defaults(_fields(), *chosen)
+        if not values["aerodynamics"] and (brought := self._wind_brings()):
+            values["aerodynamics"], sources["aerodynamics"] = brought, "in wind"
+        return values, sources
+
+    def _wind_brings(self) -> str:
+        """Effects of the air where none are asked for; the aircraft of a training have none."""
+        return "" if Weather.of(self.weather).calm else FULL
 
     def sources(self) -> Iterator[tuple[str, Any, str]]:
         """Name, value and origin of every setting that this training uses.
@@ -191,7 +200,7 @@ class TrainConfig(TrainSettings):
         Raises:
             QuadrlError: The folder holds no run, or what its names stand for has changed since.
         """
-        saved = renamed(read_config(folder))
+        saved = as_saved(read_config(folder))
         names = [field.name for field in dataclasses.fields(cls)]
         if missing := set(names) - set(saved):
             raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks {sorted(missing)[0]}")
@@ -238,6 +247,16 @@ def prepare(
 def renamed(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings with those that a run was saved with under an old name under the present one."""
     return {OLD_NAMES.get(name, name): value for name, value in settings.items()}
+
+
+def as_saved(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings from the file of a run, some of which may be of an earlier version.
+
+    Those of wind without effects of the air are of a version in which it acted by drag alone.
+    """
+    settings = renamed(settings)
+    old = settings.get("aerodynamics") == "" and not Weather.of(settings.get("weather")).calm
+    return settings | ({"aerodynamics": "none"} if old else {})
 
 
 def _fields() -> dict[str, Any]:

@@ -197,7 +197,7 @@ class TrainSettings:
     edge of what it was trained on."""
     aerodynamics: str = ""
     """Effects of the air on the rotors: none, full, or names of single ones with commas between
-    them; by default those of the aircraft."""
+    them; by default those of the aircraft, and full in wind."""
     weather: Any = "calm"
     """Weather of the training: calm, light, moderate or severe; or JSON such as
     {"wind_speed": 5}, in Python a Weather."""

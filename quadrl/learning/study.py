@@ -22,6 +22,7 @@ from quadrl.base.files import read_table, write_whole
 from quadrl.base.units import quantity
 from quadrl.base.validation import keys, names, number
 from quadrl.base.validation import seeds as seeds_of
+from quadrl.core.scenario import as_saved
 from quadrl.evaluation.evaluate import html_table
 from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning.cluster import on_ray
@@ -184,7 +185,7 @@ def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
             config, metrics = run.config, json.loads((run.folder / EVALUATION).read_text())
             known = {"name": run.name, "task": config.task, "algo": config.algo}
             known |= {"variant": run.variant, "seed": config.seed}
-            known |= {"scenario": metrics.pop("scenario"), "metrics": metrics}
+            known |= {"scenario": as_saved(metrics.pop("scenario")), "metrics": metrics}
             runs.append(known | {"settings": dataclasses.asdict(config)})
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for run in runs:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
-from quadrl.core.scenario import Scenario
+from quadrl.core.scenario import Scenario, as_saved
 from quadrl.rendering.overlay import require
 
 COMMENT = "comment"
@@ -51,7 +51,7 @@ def read_scenarios(path: str | os.PathLike[str]) -> list[Scenario]:
     except (OSError, ValueError, TypeError) as error:
         reason = "give a file that quadrl render, plot or train has drawn"
         raise QuadrlError(f"{path} carries no scenario ({error}): {reason}") from error
-    return [Scenario.of(one) for one in listed]
+    return [Scenario.of(as_saved(one)) for one in listed]
 
 
 def ffmpeg() -> str:

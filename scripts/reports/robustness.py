@@ -167,7 +167,8 @@ def half_table() -> str:
     """Where half of the flights fail, for each task."""
     result = report.load("robustness")
     rows = [{k: x for k, x in row.items() if k != "commit"} for row in result["half"]]
-    note = f"{result['episodes']} flights a level. {report.source(result, result['half'])}"
+    note = f"{result['episodes']} flights a level; wind by drag only. "
+    note += report.source(result, result["half"])
     return f"{table(rows[0], (row.values() for row in rows))}\n\n{note}"
 
 
@@ -180,7 +181,10 @@ def alone_table() -> str:
     known = [*next(iter(cells.values()))]
     note = "Successful flights [%], policy / robust policy / controller / tuned controller; "
     note += f"{result['episodes']} flights each. {report.source(result, result['alone'])}"
-    rows = ((name, *(of[task] for task in known)) for name, of in cells.items())
+    rows = (
+        (f"{name}, drag only" if name.startswith("weather") else name, *(of[k] for k in known))
+        for name, of in cells.items()
+    )
     return f"{table(('disturbed by', *known), rows)}\n\n{note}"
 
 

@@ -147,6 +147,20 @@ def test_the_settings_of_a_run_are_found_again(tmp_path):
     assert set(saved["versions"]) == {"quadrl", "mujoco", "torch", "torchrl", "numpy"}
 
 
+def test_a_run_in_wind_says_what_the_air_does_and_an_older_one_flew_by_drag_alone(tmp_path):
+    windy = TrainConfig("hover", weather="light")
+    assert windy.aerodynamics == "full" and TINY.aerodynamics == ""
+    assert ("aerodynamics", "full", "in wind") in windy.sources()
+    for name in ("new", "old"):
+        (tmp_path / name).mkdir()
+    write_config(tmp_path / "new", windy.resolved())
+    assert TrainConfig.of_folder(tmp_path / "new") == windy
+    old = TrainConfig("hover", weather="light", aerodynamics="none").resolved()
+    write_config(tmp_path / "old", old | {"aerodynamics": ""})
+    again = TrainConfig.of_folder(tmp_path / "old")
+    assert again.aerodynamics == "none" and again.scenario.aircraft.aerodynamics.effects == 0
+
+
 @pytest.mark.filterwarnings("ignore:.*no digest")
 @pytest.mark.parametrize("text", [None, "", "{", "[]", "{}", '{"task": "hover"}'])
 def test_damaged_settings_are_refused(tmp_path, text):

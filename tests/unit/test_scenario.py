@@ -10,11 +10,13 @@ from runs import refused
 
 import quadrl
 from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.presets import VEHICLES, in_real_air
+from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
 from quadrl.base.errors import QuadrlError, UnknownKeyword
 from quadrl.conditions.weather import WEATHERS, Weather
 from quadrl.core.environment import Environment
-from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario
+from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario, as_saved
+from quadrl.evaluation import robustness
+from quadrl.evaluation.evaluate import beside
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig
 from quadrl.tasks import RandomWaypoint
@@ -33,6 +35,7 @@ EVERYTHING = {
 }
 """A value that differs from the default for every field."""
 MINE = quadrl.Vehicle(name="mine", mass=0.7, aerodynamics=Aerodynamics.full())
+WIDE = tuple(dataclasses.replace(rotor, disc_radius=0.2) for rotor in MINE.rotors)
 
 
 def whole() -> Scenario:
@@ -105,6 +108,66 @@ def test_what_another_aircraft_or_task_leaves_of_a_scenario():
     # Without the air the quadratic drag is whole again.
     calm = Scenario.of(base, aerodynamics="none").aircraft
     assert calm.drag_coefficient == VEHICLES["crazyflie"].drag_coefficient
+
+
+def test_wind_blows_in_real_air_unless_something_else_is_asked_for():
+    for weather in ("light", {"gust_speed": 1.0}):
+        windy = Scenario.of("hover", vehicle="racer", weather=weather)
+        assert windy.aircraft == in_real_air(VEHICLES["racer"])
+    assert Scenario.of("hover", vehicle=MINE, weather="light").aircraft == MINE
+    for asked in ("none", "rotor_drag"):
+        given = Scenario.of("hover", weather="light", aerodynamics=asked)
+        assert given.aircraft == with_effects(VEHICLES["paper"], asked)
+        assert Scenario.of(given.to_json()) == given
+    calm = dataclasses.replace(Scenario.of("hover"), weather=Weather(roughness=0.1))
+    assert calm.aircraft == VEHICLES["paper"] and "aerodynamics" not in calm.to_json()
+    assert Environment("hover", weather="light").vehicle == in_real_air(VEHICLES["paper"])
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "why"),
+    [
+        (quadrl.Vehicle(name="mine"), "quadrl knows the full set of paper"),
+        (quadrl.Vehicle(rotors=WIDE), "not those of the aircraft"),
+        ({"name": "crazyflie", "mass": 1e-3}, "physics_timestep"),
+    ],
+    ids=["unknown", "other rotors", "too light for the step"],
+)
+def test_an_aircraft_without_numbers_for_real_air_is_told_so_in_wind(vehicle, why):
+    with pytest.raises(QuadrlError, match=why) as caught:
+        Scenario.of("hover", vehicle=vehicle, weather="light")
+    assert caught.value.name == "aerodynamics" and "'none'" in caught.value.allowed
+    assert "\n" not in str(caught.value)
+    Scenario.of("hover", vehicle=vehicle, weather="light", aerodynamics="none")
+    Scenario.of("hover", vehicle=vehicle)
+
+
+def test_what_was_saved_before_wind_acted_on_rotors_flies_as_it_did():
+    windy = {"task": "hover", "weather": {"wind_speed": 5.0}}
+    assert Scenario.of(as_saved(windy)).aircraft == VEHICLES["paper"]
+    for as_it_is in (
+        {"task": "hover"},
+        windy | {"aerodynamics": "full"},
+        Scenario.of("hover", weather="light", vehicle=MINE).to_json(),
+    ):
+        assert as_saved(as_it_is) == as_it_is
+    thin = {"name": "thin", "aerodynamics": {"air_density": 1.0}}
+    assert Scenario.of(as_saved(windy | {"vehicle": thin})).aircraft.aerodynamics.effects == 0
+    assert Policy.pretrained("hover", variant="robust").scenario.aircraft.aerodynamics.effects == 0
+
+
+def test_all_that_fly_beside_each_other_or_for_a_card_fly_in_the_same_air():
+    robust = "hover_robust"  # was trained in wind that acted by drag alone
+    for flown in (robust, "hover"), ("hover", robust):
+        together = [scenario for _, scenario in beside(flown, weather=None)]
+        assert [one.aircraft.aerodynamics.effects for one in together] == [0, 0]
+        card = robustness._flown(flown, None).values()
+        gusty = [robustness.disturbed(one, Weather(gust_speed=4.0)) for _, one in card]
+        assert {one.aerodynamics for one in gusty} == {"full"}
+        assert [one.aircraft.aerodynamics.effects for _, one in card] == [0, 0]
+        drag = robustness._flown(flown, None, aerodynamics="none").values()
+        gusty = [robustness.disturbed(one, Weather(gust_speed=4.0)) for _, one in drag]
+        assert {one.aerodynamics for one in gusty} == {"none"}
 
 
 def test_timing_is_the_aircrafts_and_the_tasks():
@@ -182,7 +245,7 @@ def test_a_policy_and_a_training_carry_it():
 
 def test_wind_that_no_step_of_the_aircraft_resolves_is_refused():
     # 2 k_D v dt / m = 1 at 0.001 / (2 * 5e-3 * 0.005) = 20 m/s for a Crazyflie of 1 g.
-    given = {"vehicle": "crazyflie", "vehicle_options": {"mass": 1e-3}}
+    given = {"vehicle": "crazyflie", "vehicle_options": {"mass": 1e-3}, "aerodynamics": "none"}
     for weather in ("severe", {"wind_speed": 15.0, "gust_speed": 5.1}):
         with pytest.raises(QuadrlError, match="20 m/s") as caught:
             Scenario.of("hover", weather=weather, **given)

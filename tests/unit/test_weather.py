@@ -328,7 +328,7 @@ def test_before_its_gust_air_without_wind_is_calm_to_the_last_bit():
     actions = helpers.random_actions(20, 20)
     records = []
     for weather in (None, Weather(gust_speed=9.0)):
-        environment = helpers.begun(task, 20, weather=weather)
+        environment = helpers.begun(task, 20, weather=weather, aerodynamics="none")
         records.append([helpers.recorded(environment, environment.step(a)) for a in actions])
     starts = column(environment.blowing, "gust_start")
     assert starts.min() < 0.8 and starts.max() > 1.0  # within the first second, and after it
@@ -397,7 +397,9 @@ def test_rows_may_have_a_wind_speed_of_their_own():
 
 
 def test_what_was_saved_in_another_weather_is_not_taken_up():
-    light, severe, calm = (helpers.begun("hover", 2, weather=w) for w in ("light", "severe", None))
+    light, severe, calm = (
+        helpers.begun("hover", 2, weather=w, aerodynamics="none") for w in ("light", "severe", None)
+    )
     before = severe.engine.air.copy()
     for environment, saved, name in (
         (severe, light.save(), "weather.table"),
