@@ -39,7 +39,8 @@ AFFECTS: dict[str, tuple[str, ...]] = {
 """What a field of `Randomization` changes in a row of parameters (`aircraft/parameters.py`)."""
 FACTORS = ("mass", "inertia", "thrust", "torque", "lag", "drag", "inflow", "max_speed")
 """Those of them that are one factor for the whole aircraft."""
-DELAYS = ("command_delay", "observation_delay")
+DELAYS = ("command_delay", "observation_delay", "rate_delay")
+AGES = DELAYS[1:]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +140,10 @@ class Randomization:
     """Time from a command to the rotors that get it [s], in whole physics steps, beside the
     aircraft's own `dead_time`."""
     observation_delay: Range = (0.0, 0.0)
-    """Age of the observation [s], in whole control steps."""
+    """Age of position, attitude and velocity in the state estimate, and so in all that is seen of
+    it [s], in whole physics steps."""
+    rate_delay: Range = (0.0, 0.0)
+    """Age of the body rate in the state estimate [s], in whole physics steps."""
     noise: Errors = Errors()
     """Standard deviations of the errors of the state estimate, drawn anew at each control step."""
     bias: Errors = Errors()
@@ -177,8 +181,9 @@ class Randomization:
 
     @property
     def uncertain(self) -> bool:
-        """Whether the state estimate has errors."""
-        return (self.noise, self.bias) != (Errors(), Errors())
+        """Whether the state estimate has errors, or is of an earlier moment."""
+        late = self.observation_delay[1] > 0 or self.rate_delay[1] > 0
+        return late or (self.noise, self.bias) != (Errors(), Errors())
 
 
 NONE = Randomization()
@@ -196,6 +201,8 @@ RANDOMIZATIONS = {
         rotors=(0.975, 1.025),  # chosen
         centre_of_mass=0.001,  # chosen
         command_delay=(0.0, 0.01),  # chosen: radio, beside the dead time of the aircraft
+        observation_delay=(0.0, 0.02),  # chosen
+        rate_delay=(0.0, 0.01),  # chosen: one physics step of the paper's aircraft
         noise=Errors(position=1e-3, attitude=1e-3, velocity=2e-3, body_rate=2e-3),
     ),
     # An aircraft that is known from its data sheet.
@@ -212,6 +219,8 @@ RANDOMIZATIONS = {
         rotors=(0.96, 1.04),  # chosen; others take 0.9 to 1.1 (Molchanov et al. 2019)
         centre_of_mass=0.002,  # chosen
         command_delay=(0.0, 0.05),  # chosen: about 10 ms from sensor to policy (RAPTOR), and radio
+        observation_delay=(0.0, 0.04),  # chosen: up to two control steps of a small aircraft
+        rate_delay=(0.0, 0.01),  # chosen: a gyroscope and its filter
         noise=Errors(position=5e-3, attitude=5e-3, velocity=2e-2, body_rate=2e-2),
         # position: Molchanov et al. 2019; the others chosen
         bias=Errors(position=1e-2, attitude=1e-2, velocity=2e-2, body_rate=5e-3),  # chosen

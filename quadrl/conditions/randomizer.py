@@ -15,14 +15,14 @@ import numpy as np
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import NOISE, PARAMETERS, PUSHES
 from quadrl.base.rotation import Array
-from quadrl.conditions.randomization import NONE
+from quadrl.conditions.randomization import AGES, NONE
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.engines import native
 from quadrl.engines.engine import Engine
 from quadrl.engines.rng import uniform
 
-SAVED = ("drawn", "place", "steps", "queue", "newest")
+SAVED = ("drawn", "place", "steps", "queue", "past", "newest")
 
 
 class Randomizer:
@@ -50,19 +50,23 @@ class Randomizer:
         self._pushes = given.pushes
         self._chance = -math.expm1(-given.pushes.rate * vehicle.control_timestep)
         self._dead = round(vehicle.dead_time / vehicle.physics_timestep)  # physics steps
-        longest = self._dead + sampler.delays[0][1]
-        self.late = longest > 0
-        """Whether commands pass a queue."""
-        late = {k % vehicle.substeps for k in range(self._dead + sampler.delays[0][0], longest + 1)}
-        ends = [k for k in range(1, vehicle.substeps) if k in late] + [vehicle.substeps]
-        self.held = [next(end for end in ends if end > k) - k for k in range(vehicle.substeps)]
-        """For how many physics steps, from each of a control step on, no command changes."""
+        fewest, most = (self._dead + steps for steps in sampler.delays["command_delay"])
+        self._aged = max(sampler.delays[name][1] for name in AGES)
+        self.late = most + self._aged > 0
+        """Whether commands pass a queue, or what was is remembered."""
+        each = range(vehicle.substeps)
+        late = each if self._aged else {k % vehicle.substeps for k in range(fewest, most + 1)}
+        ends = [k for k in each if k in late and k] + [vehicle.substeps]
+        self.held = [next(end for end in ends if end > k) - k for k in each]
+        """For how many physics steps, from each of a control step on, no command changes and
+        nothing has to be remembered."""
         self.active = active or self.late
-        self.queue = np.zeros((longest + 1, count, rotors))  # [rad/s]
-        self.newest = np.zeros(1, np.int64)  # where in the queue
+        length = 1 + max(most, self._aged)
+        self.queue = np.zeros((length, count, rotors))  # [rad/s]
+        self.past = np.zeros((length if self._aged else 0, count, 13))  # qpos, qvel before it
+        self.newest = np.zeros(1, np.int64)  # where in both
         self._delay = np.zeros(count, np.int64)  # [physics steps]
-        self.age = np.zeros(count, np.int64)
-        """Of what is measured where it is seen [control steps], drawn for each episode."""
+        self._ages = np.zeros((len(AGES), count), np.int64)  # [physics steps]
 
     def sample(
         self, keys: np.ndarray, episodes: np.ndarray
@@ -101,6 +105,15 @@ class Randomizer:
         self._set_delay()
         if self.late:
             self.queue[:, rows] = self._engine.act[rows]
+            self.forget(rows)
+
+    def forget(self, rows: np.ndarray) -> None:
+        """Take the present coordinates of aircraft for those that they had before."""
+        self.past[:, rows] = self._coordinates[rows]
+
+    @property
+    def _coordinates(self) -> Array:
+        return np.concatenate([self._engine.qpos, self._engine.qvel], axis=1)
 
     def column(self, name: str) -> Array:
         """A number of the present episodes by its name, (N,)."""
@@ -115,15 +128,10 @@ class Randomizer:
         return self.sampler.scaled(self.drawn if rows is None else self.drawn[rows])
 
     def _set_delay(self) -> None:
-        vehicle = self._engine.vehicle
-        self._delay, self.age = (
-            np.rint(self.column(name) / timestep).astype(np.int64)
-            for name, timestep in (
-                ("command_delay", vehicle.physics_timestep),
-                ("observation_delay", vehicle.control_timestep),
-            )
-        )
-        self._delay += self._dead
+        step = self._engine.vehicle.physics_timestep
+        names = "command_delay", *AGES
+        steps = [np.rint(self.column(name) / step).astype(np.int64) for name in names]
+        self._delay, self._ages = self._dead + steps[0], np.array(steps[1:])
 
     def wind_speed(self, rows: np.ndarray, weather: Weather) -> Array | None:
         """Wind speed of some aircraft (n,) [m/s]; None where it is the weather's."""
@@ -141,11 +149,13 @@ class Randomizer:
         arrived = self.queue[(first - self._delay) % length, self._rows]
         for k in range(1, min(steps, length)):  # which may overwrite what arrives
             self.queue[(first + k) % length] = command
+        if self._aged:
+            self.past[first % length] = self._coordinates
         self.newest[0] = (first + steps - 1) % length
         return arrived
 
     def estimated(self, rows: np.ndarray | None, rotor_speed: Array) -> Array:
-        """Coordinates with the noise and the bias of the randomization, (n, 13 + R).
+        """Coordinates with the ages, the noise and the bias of the randomization, (n, 13 + R).
 
         Args:
             rows: Of some aircraft (n,), or of all for None.
@@ -156,8 +166,13 @@ class Randomizer:
             body frame, rotor speeds.
         """
         chosen: Any = slice(None) if rows is None else rows
-        given, engine = self.sampler.randomization, self._engine
-        true = np.concatenate([engine.qpos[chosen], engine.qvel[chosen]], axis=1)
+        given, true = self.sampler.randomization, self._coordinates
+        if self._aged:
+            # Each physics step remembers what was before it.
+            places = (self.newest - self._ages + 1) % len(self.past)
+            old = np.where(self._ages[..., None], self.past[places, self._rows], true)
+            true = np.concatenate([old[0][:, :10], old[1][:, 10:]], axis=1)
+        true = np.ascontiguousarray(true[chosen])
         count, rotors = rotor_speed.shape
         found = np.empty((count, 13 + rotors))
         bias = self.sampler.columns(self.drawn[chosen], "position_bias_x", 12)

@@ -45,13 +45,14 @@ class AircraftSampler:
         """
         self.randomization = randomization = resolve(randomization)
         self._vehicle, self._specified = vehicle, parameters.rows(vehicle)
-        timesteps = (vehicle.physics_timestep, vehicle.control_timestep)
-        self.delays = [
-            whole_steps(name, getattr(randomization, name), timestep, kind)
-            for name, timestep, kind in zip(DELAYS, timesteps, ("physics", "control"), strict=True)
-        ]
-        """Fewest and most steps: physics steps of commands, control steps of observations."""
-        ends = {name: getattr(randomization, name) for name in (*FACTORS, *DELAYS, "wind")}
+        step = vehicle.physics_timestep
+        self.delays = {
+            name: whole_steps(name, getattr(randomization, name), step, "physics")
+            for name in DELAYS
+        }
+        """Fewest and most physics steps by the names of DELAYS."""
+        early = *FACTORS, "command_delay", "observation_delay", "wind"
+        ends = {name: getattr(randomization, name) for name in early}
         shift = randomization.centre_of_mass
         ends |= {f"centre_of_mass_{axis}": (-shift, shift) for axis in "xyz"}
         for name, size in vars(randomization.bias).items():
@@ -61,10 +62,14 @@ class AircraftSampler:
         # New numbers stand at the end, so that those before them keep their random numbers.
         last = vehicle.rotor_count - 1 if randomization.one_rotor != OFF else 0
         ends |= {"one_rotor": randomization.one_rotor, DAMAGED: (0, last)}
+        ends["rate_delay"] = randomization.rate_delay
         ends["torque"] = (self._least_torque(), ends["torque"][1])
         self.names = tuple(ends)
         """Of the numbers; all are drawn, so that a range has no effect on the others."""
-        whole = zip((*DELAYS, DAMAGED), (*self.delays, (0, last)), (*timesteps, 1.0), strict=True)
+        whole = [
+            *((name, ends, step) for name, ends in self.delays.items()),
+            (DAMAGED, (0, last), 1.0),
+        ]
         self._whole = [(self.names.index(name), ends, unit) for name, ends, unit in whole]
         self.low, self._high = np.array([*ends.values()]).T
         self._width = self._high - self.low

@@ -70,7 +70,7 @@ class Sensor(abc.ABC):
     """Numbers that it gives."""
     unit: ClassVar[str] = "1"
     measured: ClassVar[bool] = True
-    """Whether the delay of the observation and its history hold for it."""
+    """Whether the history of the observation holds for it."""
     shown: ClassVar[bool] = True
     """Whether it is an entry of the observation."""
     last: ClassVar[bool] = False
@@ -178,8 +178,7 @@ class Channel:
         self._delay, self._period = whole_steps(names, times, timestep, "control")
         self._stream = STREAMS + 2 * (zlib.crc32(sensor.name.encode()) >> 3)
         self._rows = np.arange(len(randomizer.steps))
-        further = randomizer.sampler.delays[1][1] if sensor.measured else 0
-        shape = 1 + self._delay + further, len(self._rows), self.width
+        shape = 1 + self._delay, len(self._rows), self.width
         self._values = np.zeros(shape)  # the newest first
         self._bias = np.zeros(shape[1:])
         self._memory: Memory = {}
@@ -188,13 +187,6 @@ class Channel:
     def seen(self) -> Array:
         """What is seen of it now, (N, width)."""
         return self._values[self._delay]
-
-    @property
-    def observed(self) -> Array:
-        """The same later by the delay of the observation, where that holds for it."""
-        if len(self._values) == 1 + self._delay:
-            return self.seen
-        return self._values[self._delay + self._randomizer.age, self._rows]
 
     def begin(self, now: Moment) -> None:
         """Begin episodes; the first sample is seen until the next one arrives."""

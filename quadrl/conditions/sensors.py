@@ -84,7 +84,8 @@ class RotorSpeed(Sensor):
 class StateEstimate(Sensor):
     """Coordinates of the state as they are estimated on board, which all that is seen follows from.
 
-    Its errors are the randomization's `noise` and `bias`.
+    Its errors are the randomization's `noise` and `bias`, its ages `observation_delay` and
+    `rate_delay`.
     """
 
     name, unit, measured, shown = "estimate", "", False, False

@@ -302,8 +302,8 @@ class Environment(saving.Copied):
         """
         command, steps = self._setpoint, min(most, self.randomizer.held[self._flown])
         if self.control_mode.has_loops:
-            if self._flown and (diverged := self.engine.read()) is not None:
-                self._inputs.diverged[diverged] = True
+            if self._flown:
+                self._read()
             command, steps = self.control_mode.rotor_command(self.engine.state, command), 1
             self._inputs.command[:] += command / self.vehicle.substeps  # their mean counts
             if self.observer:
@@ -314,8 +314,7 @@ class Environment(saving.Copied):
 
     def finish(self) -> Transition:
         """Second half of a step, after the engine has advanced."""
-        if (diverged := self.engine.read()) is not None:
-            self._inputs.diverged[diverged] = True
+        self._read()
         if self.observer:
             self.observer.sense(self._inputs.action)
         done = self._begun.finish(self.sensed)
@@ -324,6 +323,12 @@ class Environment(saving.Copied):
             done.observation = self.observer.observe(done)
         self.transition = done
         return done
+
+    def _read(self) -> None:
+        """Compute the state, and note which aircraft have diverged."""
+        if (diverged := self.engine.read()) is not None:
+            self._inputs.diverged[diverged] = True
+            self.randomizer.forget(diverged)
 
     def flatten(self, observation: Observation) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""
@@ -384,9 +389,9 @@ class Environment(saving.Copied):
 
 def row_memory(task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Observing) -> float:
     """Memory that one more aircraft takes at least [bytes]; measured, and the histories counted."""
-    rotors, (commands, observations) = vehicle.rotor_count, sampler.delays
-    late = commands[1] + round(vehicle.dead_time / vehicle.physics_timestep)
+    rotors, (command, *ages) = vehicle.rotor_count, (most for _, most in sampler.delays.values())
+    aged, late = max(ages), command + round(vehicle.dead_time / vehicle.physics_timestep)
     single = sum(term.width(rotors) for term in task.observation.values())
-    kept = single * (1 + observations[1] + seen.observation_history) + rotors * late
+    kept = single * (1 + seen.observation_history) + 13 * aged + rotors * max(late, aged)
     flat = single * (1 + seen.observation_history) + rotors * seen.action_history
     return 3_000 + 5_000 * sampler.randomization.per_row + 8 * (kept + 2 * flat)

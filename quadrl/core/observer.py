@@ -38,7 +38,7 @@ def make(
     """
     given, observes = sampler.randomization, options != Observing() or bool(task.sensors)
     randomizer = Randomizer(sampler, engine, active=observes or given != NONE)
-    observes |= given.uncertain or sampler.delays[1][1] > 0
+    observes |= given.uncertain
     observer = Observer(options, task, engine, actions, randomizer) if observes else None
     return randomizer, observer, observer.terms if observer else task.observation
 
@@ -174,8 +174,8 @@ class Observer:
         self.sensed = {sensor.name: seen for sensor, seen in early if sensor.shown}
 
     def _observed(self) -> Array:
-        """What is measured, as late as it is seen, (N, m)."""
-        return np.concatenate([channel.observed for channel in self._measured], axis=-1)
+        """What is measured, as it is seen, (N, m)."""
+        return np.concatenate([channel.seen for channel in self._measured], axis=-1)
 
     def _present(self) -> Array:
         """The flat observation (N, size)."""

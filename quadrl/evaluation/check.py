@@ -146,17 +146,16 @@ def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Ite
     # The loops of the other modes see the true state at every physics step.
     looped = CONTROL_MODES[control_mode].has_loops
     given = sampler.randomization
-    late = (
-        vehicle.dead_time + given.command_delay[1] + (0.0 if looped else given.observation_delay[1])
-    )
+    seen = 0.0 if looped else max(given.observation_delay[1], given.rate_delay[1])
+    late = vehicle.dead_time + given.command_delay[1] + seen
     held = held_command(vehicle, control_mode)
     lag = float(1 / rates.min())
     slow = f"over the lag of the rotors: control_timestep={lag:.2g} or less"
     yield Row("slowest rotor lag", 1000 * lag, "ms")
     yield Row("time between two commands", 1000 * held, "ms", OK if held <= lag else slow)
-    seen = math.ceil(round(late / control, 6))  # actions
-    verdict = f"a policy must know what is under way: --observe action_history={seen}"
-    yield Row("longest delay", 1000 * late, "ms", verdict if seen and not looped else OK)
+    under_way = math.ceil(round(late / control, 6))  # actions
+    verdict = f"a policy must know what is under way: --observe action_history={under_way}"
+    yield Row("longest delay", 1000 * late, "ms", verdict if under_way and not looped else OK)
     bandwidth = attitude_bandwidth(lag, late + held / 2)
     drift = GRAVITY * TILT / bandwidth**2
     slow = f"under {SLOWEST:.2g}: tilted by {TILT:g} rad it goes {drift:.2g} m until it is level"

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import number
 from quadrl.conditions.observing import Observing
-from quadrl.conditions.randomization import NONE
+from quadrl.conditions.randomization import DELAYS, NONE
 
-LATE_OR_UNSURE = ("command_delay", "observation_delay", "noise", "bias")
+LATE_OR_UNSURE = (*DELAYS, "noise", "bias")
 """What a randomization may not have where a training goes through the physics: the observation must
 follow from the state, and the rotors' commands from the action alone."""
 

@@ -68,15 +68,50 @@ def test_histories_are_those_of_the_flight_the_newest_first():
     np.testing.assert_array_equal(fresh["observation_history"], twice)
 
 
-def test_observations_are_as_late_as_is_drawn_for_each_row():
-    usual, _ = seen(None)
-    found, environment = seen(None, randomization={"observation_delay": (0.0, 0.15)})
-    late = np.rint(environment.randomizer.shown()["observation_delay"] / 0.05).astype(int)
-    assert len(set(late)) > 1
-    for t, one in enumerate(found):
-        for row, steps in enumerate(late):
-            for name, part in one.items():
-                np.testing.assert_array_equal(part[row], usual[max(0, t - steps)][name][row])
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("mode", ["rotor", "velocity"])
+def test_each_part_of_the_estimate_is_as_old_as_is_drawn_for_each_row(engine, mode):
+    given = {"observation_delay": (0.0, 0.07), "rate_delay": (0.01, 0.03)}
+    settings = {"engine": engine, "control_mode": mode, "randomization": given}
+    environment = helpers.begun("hover", 30, **settings)
+    flown, log, rows = environment.engine, [], np.arange(30)
+    advance = flown.advance
+    flown.advance = lambda steps: (advance(steps), log.append(helpers.coordinates(flown)))[0]
+    log.append(helpers.coordinates(flown))
+    begun = np.zeros(30, int)
+    for action in helpers.random_actions(9, 30, environment.action_size):
+        environment.step(action)
+        drawn = environment.randomizer.shown()
+        for name, parts in {
+            "observation_delay": {"position": (0, 3), "quaternion": (3, 7), "velocity": (7, 10)},
+            "rate_delay": {"body_rate": (10, 13)},
+        }.items():
+            ages = np.rint(drawn[name] / PAPER.physics_timestep).astype(int)
+            expected = np.array(log)[np.maximum(len(log) - 1 - ages, begun), rows]
+            for part, (first, last) in parts.items():
+                found = getattr(environment.observer.frame.state, part)
+                found = found + environment.origin if part == "position" else found
+                np.testing.assert_array_equal(found, expected[:, first:last], err_msg=part)
+        np.testing.assert_array_equal(environment.observer.frame.state.rotor_speed, flown.act)
+        if len(log) == 21:
+            environment.reset(rows % 3 == 0)
+            log[-1], begun[::3] = helpers.coordinates(flown), 20
+    assert len(log) == 46  # every physics step was seen
+
+
+def test_ages_are_drawn_evenly_and_change_nothing_else_that_is_drawn():
+    ages = {"observation_delay": (0.0, 0.03), "rate_delay": (0.0, 0.03)}
+    environment = helpers.begun("hover", 400, randomization={"mass": (0.9, 1.1), **ages})
+    for name in ages:
+        values, counts = np.unique(
+            environment.randomizer.shown()[name].round(9), return_counts=True
+        )
+        np.testing.assert_allclose(values, [0.0, 0.01, 0.02, 0.03])
+        # 100 of each; a binomial of 400 and 1/4 has a deviation of 8.7.
+        assert (np.abs(counts - 100) < 5 * 8.7).all()
+    plain = helpers.begun("hover", 400, randomization={"mass": (0.9, 1.1)})
+    shown = [each.randomizer.shown()["mass"] for each in (environment, plain)]
+    np.testing.assert_array_equal(*shown)
 
 
 def test_rotor_speeds_are_left_out_on_demand():
@@ -153,7 +188,8 @@ def test_the_privileged_observation_is_the_truth_what_was_drawn_and_the_wind():
     environment.reset(np.array([2]))
     np.testing.assert_array_equal(privileged, before)  # what was handed out stays
     np.testing.assert_array_equal(environment.privileged[:2], before[:2])
-    assert (environment.privileged[2, 22:-3] != before[2, 22:-3]).all()
+    continuous = [not name.endswith("_delay") for name in shown]  # others may be drawn again
+    assert (environment.privileged[2, 22:-3] != before[2, 22:-3])[continuous].all()
 
 
 # ------------------------------------------------------------------------------------ the APIs

@@ -264,7 +264,9 @@ REFUSED = [  # randomization, name, value, a part of what is allowed
     ({"bias": {"attitude": np.inf}}, "attitude", np.inf, "between"),
     ({"pushes": {"rate": -1.0}}, "pushes rate", -1.0, "between"),
     ({"command_delay": (0.0, 0.015)}, "command_delay", (0.0, 0.015), "0.01 s"),
-    ({"observation_delay": 0.07}, "observation_delay", (0.07, 0.07), "0.05 s"),
+    ({"observation_delay": 0.075}, "observation_delay", (0.075, 0.075), "0.01 s"),
+    ({"rate_delay": (0.0, 0.005)}, "rate_delay", (0.0, 0.005), "a whole number of physics steps"),
+    ({"rate_delay": -0.01}, "rate_delay[0]", -0.01, "between"),
     ({"command_delay": (-0.01, 0.0)}, "command_delay[0]", -0.01, "between"),
     # Hover with twice the mass takes the largest speed; 2.01 times is more.
     ({"mass": (0.8, 2.01)}, "max_speed of rotor 1", ..., "hover speed"),

@@ -30,6 +30,7 @@ SEEN = {
 WILD = dataclasses.replace(
     RANDOMIZATIONS["full"],
     observation_delay=(0.0, 0.1),
+    rate_delay=(0.0, 0.02),
     pushes=Pushes(rate=5.0, velocity=0.3, body_rate=0.5),
 )
 
@@ -250,6 +251,18 @@ def test_the_pushes_are_the_definition(engine):
         np.testing.assert_allclose(qvel, expected, rtol=0, atol=1e-14)
         hits += hit.sum()
     assert 20 < hits < 80  # of 100, with a chance of 0.63
+
+
+def test_what_diverges_is_seen_finite_however_late():
+    given = {"pushes": Pushes(rate=1e9, velocity=5.0, body_rate=20.0)}
+    given |= {"observation_delay": 0.03, "rate_delay": 0.01}
+    environment = helpers.begun("hover", 50, vehicle="racer", randomization=given)
+    diverged = 0
+    for _ in range(20):
+        now = helpers.idle(environment)
+        assert all(np.isfinite(part).all() for part in now.observation.values())
+        diverged += now.diverged.sum()
+    assert diverged
 
 
 def test_what_diverges_is_counted_and_finite():
