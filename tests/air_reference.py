@@ -9,7 +9,8 @@ import math
 
 from quadrl.base.philox import MASK, TURBULENCE, philox
 from quadrl.base.rotation import Array, namespace, stack
-from quadrl.engines.air import BLOCKS, LOG_TERMS, NOISE, SINE_TERMS, UNIT, WALK
+from quadrl.engines.air import BLOCKS, LOG_TERMS, LOWEST, NOISE, SINE_TERMS, UNIT, WALK
+from quadrl.engines.dynamics import clip
 
 Columns = dict[str, Array]
 """The rows of a table by name, (n,) each."""
@@ -99,7 +100,7 @@ def blowing(
     return stack(
         t["east"] * along - t["north"] * left + t["gust_east"] * pulse + 0.0,
         t["north"] * along + t["east"] * left + t["gust_north"] * pulse + 0.0,
-        t["upward_deviation"] * up + 0.0,
+        t["upward_deviation"] * clip(height * (1 / LOWEST), 0.0, 1.0) * up + 0.0,
     )
 
 

@@ -16,13 +16,16 @@ from quadrl.base.philox import TURBULENCE
 
 REFERENCE = 6.096  # [m], 20 ft: the height of W20
 FOOT = 0.3048  # [m]
+LOWEST = 10 * FOOT
+"""Height down to which the standard gives the turbulence [m]. Below it upward gusts fade in
+proportion to the height, since no air blows through the ground (the law of the wall)."""
 LEAST_SPEED = 1.0  # [m/s], with which turbulence is carried past at least
 """Chosen: in weaker wind turbulence would stand still."""
 WALK = ("keep", "rate", "first", "across", "second")  # of a filter of second order
 FIXED = (
     "shear",  # [m/s], mean wind over ln(h/z0)
     "level_deviation",  # [m/s], of turbulence along the mean wind and to its left
-    "upward_deviation",  # [m/s]
+    "upward_deviation",  # [m/s], at LOWEST and above
     *("along_keep", "along_fresh"),
     *(f"left_{name}" for name in WALK),
     *(f"up_{name}" for name in WALK),
@@ -97,4 +100,5 @@ def c_weather() -> str:
         f"enum {{ TURBULENCE = {TURBULENCE}, BLOCKS = {BLOCKS}, LOG_TERMS = {LOG_TERMS}, "
         f"SINE_TERMS = {SINE_TERMS} }};\n"
         f"#define NORMAL_UNIT {UNIT.hex()}\n"
+        f"#define PER_LOWEST {(1 / LOWEST).hex()}\n"
     )

@@ -120,9 +120,23 @@ def test_the_wind_is_that_at_the_height_of_the_moment():
     engine.qpos[:, 2] = 2.0, 0.5
     made.advance()
     # (0.772 - 0.489) W20 apart; both in the same turbulence.
-    apart = engine.wind[0] - engine.wind[1]
+    apart = (engine.wind[0] - engine.wind[1])[:2]
     assert np.linalg.norm(apart) == pytest.approx((0.7722 - 0.4889) * 7.72, rel=1e-3)
-    assert apart[2] == 0
+
+
+def test_upward_gusts_fade_towards_the_ground_and_level_ones_do_not():
+    heights = np.array([0.0, 0.1, 1.524, 3.048, 6.0, -1.0])
+    made, engine = process(dataclasses.replace(LIGHT, direction=0.0), 6)
+    made.begin(np.arange(6), np.zeros(6, np.int64), np.zeros(6, np.int64))  # the same numbers
+    engine.qpos[:, 2] = heights
+    for _ in range(20):
+        made.advance()
+        full = engine.wind[4, 2]  # sigma_w is 0.1 W20 times h over 10 ft, and 0.1 W20 above
+        assert full != 0
+        np.testing.assert_allclose(
+            engine.wind[:, 2] / full, [0, 0.1 / 3.048, 0.5, 1, 1, 0], rtol=1e-12, atol=0
+        )
+        np.testing.assert_array_equal(engine.wind[:, 1], engine.wind[4, 1])
 
 
 def test_directions_are_drawn_or_given():
@@ -231,7 +245,7 @@ def test_the_wind_has_the_deviations_and_correlations_of_the_spectra(step_share)
     for wind, sigma, length, first in (
         (along, 1.516, 23.05, True),
         (left, 1.516, 23.05, False),
-        (up, 0.772, 3.048, False),
+        (up, 0.772 * 0.01 / 3.048, 3.048, False),  # 1 cm over the ground
     ):
         unit = wind / sigma
         # Times far apart count alone; the bounds are those of Gauss's distribution.
@@ -257,7 +271,10 @@ def test_turbulence_does_not_depend_on_what_the_aircraft_does():
         two.step(np.array([[0.0] * 4, [0.3] * 4]))
     assert two.engine.qpos[1, 2] > two.engine.qpos[0, 2] + 0.1
     # Only the mean wind is another one higher up.
-    np.testing.assert_array_equal(two.engine.wind[0, 1:], two.engine.wind[1, 1:])
+    assert two.engine.wind[0, 1] == two.engine.wind[1, 1]
+    # And up to 10 ft the upward gusts are stronger.
+    gusts = two.engine.wind[:, 2] / np.minimum(two.engine.qpos[:, 2] / 3.048, 1)
+    assert abs(gusts[1] / gusts[0] - 1) < 0.05  # the wind was written a step ago
     assert two.engine.wind[1, 0] > two.engine.wind[0, 0]
 
 

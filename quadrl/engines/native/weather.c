@@ -142,7 +142,10 @@ AERO void blowing(const Lanes* t, const Rows* r, const double* height, Lanes* wi
     const double east = t[WEATHER_EAST][i], north = t[WEATHER_NORTH][i];
     wind[0][i] = east * along - north * left + t[WEATHER_GUST_EAST][i] * pulse[i] + 0.0;
     wind[1][i] = north * along + east * left + t[WEATHER_GUST_NORTH][i] * pulse[i] + 0.0;
-    wind[2][i] = t[WEATHER_UPWARD_DEVIATION][i] * up + 0.0;
+    double share = height[i] * PER_LOWEST;  // of the upward gusts: none blows through the ground
+    share = share < 1.0 ? share : 1.0;
+    share = share > 0.0 ? share : 0.0;
+    wind[2][i] = t[WEATHER_UPWARD_DEVIATION][i] * share * up + 0.0;
   }
 }
 
