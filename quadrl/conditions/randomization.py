@@ -28,13 +28,15 @@ AFFECTS: dict[str, tuple[str, ...]] = {
     "torque": ("rotor.torque_coefficient",),
     "lag": ("rotor.lag_up", "rotor.lag_down"),
     "drag": ("drag_coefficient", "moment_coefficient", "rotor_drag", "flapping_moment"),
-    "inflow": ("blade_lift",),
+    "inflow": ("blade_lift", "translational_lift"),
     "max_speed": ("rotor.max_speed",),
     "rotors": (
         *("rotor.thrust_coefficient", "rotor.torque_coefficient", "rotor.lag_up", "rotor.lag_down"),
     ),
     "one_rotor": ("rotor.thrust_coefficient", "rotor.torque_coefficient"),
     "centre_of_mass": ("rotor.position",),
+    "rotor_inertia": ("rotor_inertia",),
+    "inertia_axes": ("inertia",),
 }
 """What a field of `Randomization` changes in a row of parameters (`aircraft/parameters.py`)."""
 FACTORS = ("mass", "inertia", "thrust", "torque", "lag", "drag", "inflow", "max_speed")
@@ -125,7 +127,7 @@ class Randomization:
     drag: Range = (1.0, 1.0)
     """Factor of the aircraft's drag and aerodynamic moment, and of the drag of its rotors."""
     inflow: Range = (1.0, 1.0)
-    """Factor of the lift of the blades, with which thrust answers climb and descent."""
+    """Factor of the lift of the blades, with which thrust answers climb, descent and flight."""
     max_speed: Range = (1.0, 1.0)
     """Factor of the largest rotor speed, at most 1: a battery that runs low."""
     rotors: Range = (1.0, 1.0)
@@ -150,6 +152,14 @@ class Randomization:
     """Largest errors of it that last for the episode."""
     pushes: Pushes = Pushes()
     """Impulses."""
+    rotor_inertia: Range = (1.0, 1.0)
+    """Factor of the moment of inertia of the rotors about their axes."""
+    inertia_axes: Range = (1.0, 1.0)
+    """Further factor of the moment of inertia about each axis on its own, up to where that is the
+    sum of the other two."""
+    corners: float = 0.0
+    """Share of the episodes in which lag and command_delay are both drawn from the upper quarter
+    of their ranges, since slow rotors are hardest to fly where commands are late."""
 
     def __post_init__(self) -> None:
         """Validate what can be judged without an aircraft."""
@@ -157,6 +167,8 @@ class Randomization:
             name, given = field.name, getattr(self, field.name)
             if name == "centre_of_mass":
                 value: Any = number(name, given, 0, LONGEST_SHIFT)
+            elif name == "corners":
+                value = number(name, given, 0, 1)
             elif name in ("noise", "bias", "pushes"):
                 value = _record(name, given, Pushes if name == "pushes" else Errors)
             elif name in DELAYS:
@@ -203,6 +215,8 @@ RANDOMIZATIONS = {
         command_delay=(0.0, 0.01),  # chosen: radio, beside the dead time of the aircraft
         observation_delay=(0.0, 0.02),  # chosen
         rate_delay=(0.0, 0.01),  # chosen: one physics step of the paper's aircraft
+        rotor_inertia=(0.85, 1.15),  # chosen
+        inertia_axes=(0.975, 1.025),  # chosen
         noise=Errors(position=1e-3, attitude=1e-3, velocity=2e-3, body_rate=2e-3),
     ),
     # An aircraft that is known from its data sheet.
@@ -221,6 +235,8 @@ RANDOMIZATIONS = {
         command_delay=(0.0, 0.05),  # chosen: about 10 ms from sensor to policy (RAPTOR), and radio
         observation_delay=(0.0, 0.04),  # chosen: up to two control steps of a small aircraft
         rate_delay=(0.0, 0.01),  # chosen: a gyroscope and its filter
+        rotor_inertia=(0.7, 1.3),  # chosen
+        inertia_axes=(0.95, 1.05),  # chosen
         noise=Errors(position=5e-3, attitude=5e-3, velocity=2e-2, body_rate=2e-2),
         # position: Molchanov et al. 2019; the others chosen
         bias=Errors(position=1e-2, attitude=1e-2, velocity=2e-2, body_rate=5e-3),  # chosen

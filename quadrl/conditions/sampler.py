@@ -28,6 +28,9 @@ EACH_ROTOR = ("thrust", "torque", "lag")
 """Factors that each rotor has once more on its own, within `Randomization.rotors`."""
 DAMAGED = "damaged_rotor"
 """Number of the rotor, from 0 on, that `Randomization.one_rotor` is about."""
+CORNER = "corner"
+"""Whether an episode is one of the share `Randomization.corners`: 1 or 0."""
+UPPER = 0.75  # of a range, above which its corner lies
 ROUNDING = 1e-9
 EXCHANGES = 3
 """Rounds that suffice: in layouts of four to eight rotors, more find no worse aircraft."""
@@ -62,7 +65,9 @@ class AircraftSampler:
         # New numbers stand at the end, so that those before them keep their random numbers.
         last = vehicle.rotor_count - 1 if randomization.one_rotor != OFF else 0
         ends |= {"one_rotor": randomization.one_rotor, DAMAGED: (0, last)}
-        ends["rate_delay"] = randomization.rate_delay
+        ends |= {name: getattr(randomization, name) for name in ("rate_delay", "rotor_inertia")}
+        ends |= {f"inertia_axes_{axis}": randomization.inertia_axes for axis in "xyz"}
+        ends[CORNER] = (0, randomization.corners > 0)
         ends["torque"] = (self._least_torque(), ends["torque"][1])
         self.names = tuple(ends)
         """Of the numbers; all are drawn, so that a range has no effect on the others."""
@@ -82,7 +87,14 @@ class AircraftSampler:
 
     def sample(self, shares: Array) -> Array:
         """Numbers (n, k), a column for each of `names`, from shares in [0, 1) of the ranges."""
+        corner = self.columns(shares, CORNER) < self.randomization.corners
+        if corner.any():
+            shares = shares.copy()
+            for name in ("lag", "command_delay"):
+                share = self.columns(shares, name)
+                share[:] = np.where(corner, UPPER + (1 - UPPER) * share, share)
         drawn = self.low + self._width * shares
+        self.columns(drawn, CORNER)[:] = corner
         for k, (fewest, most), unit in self._whole:
             drawn[:, k] = (fewest + np.floor((most - fewest + 1) * shares[:, k])) * unit
         return drawn
@@ -106,8 +118,9 @@ class AircraftSampler:
         """Rows of parameters (n,) of aircraft with some numbers (n, k)."""
         count = self._vehicle.rotor_count
         table = np.repeat(self._specified, len(drawn))
-        for name in (*FACTORS, "one_rotor"):
-            factor = self.columns(drawn, name)
+        for name in (*FACTORS, "rotor_inertia", "inertia_axes", "one_rotor"):
+            first, width = ("inertia_axes_x", 3) if name == "inertia_axes" else (name, 1)
+            factor = self.columns(drawn, first, width)
             if name in EACH_ROTOR:
                 factor = factor * self.columns(drawn, f"{name}_1", count)
             elif name == "one_rotor":
@@ -117,6 +130,9 @@ class AircraftSampler:
             for field in AFFECTS[name]:
                 numbers = self._field(table, field)
                 apply(numbers, factor, out=numbers)
+        if self.randomization.inertia_axes != OFF:
+            inertia = table["inertia"]
+            np.minimum(inertia, inertia.sum(-1, keepdims=True) - inertia, out=inertia)
         # The origin of the body is the centre of mass: what moves are the rotors.
         shift = self.columns(drawn, "centre_of_mass_x", 3)
         self._field(table, *AFFECTS["centre_of_mass"])[:] -= shift[:, None]
@@ -174,11 +190,19 @@ class AircraftSampler:
         for heavy, inertia, drag in itertools.product((0, 1), repeat=3):
             # Its mass at one end, what its rotors give at the other.
             weak = 1 - heavy
-            ends = {"mass": heavy, "inertia": inertia, "drag": drag, "inflow": 1, "lag": 0}
+            ends = {
+                "mass": heavy,
+                "inertia": inertia,
+                "drag": drag,
+                "inflow": 1,
+                "lag": 0,
+                "rotor_inertia": 1,
+            }
             ends |= {"thrust": weak, "torque": weak, "max_speed": weak}
             both = self.low, self._high
             columns: Any = {k: both[end][self.names.index(k)] for k, end in ends.items()}
             columns |= {f"{name}_1": [given.rotors[ends[name]]] * count for name in EACH_ROTOR}
+            columns["inertia_axes_x"] = [given.inertia_axes[inertia]] * 3
             columns |= {"one_rotor": 1.0, "centre_of_mass_x": (0.0, 0.0, 0.0)}
             try:
                 made = vehicle_of(self._vehicle, self.table(self._at(1, **columns))[0])

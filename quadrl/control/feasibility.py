@@ -40,7 +40,7 @@ SURE = 1e-9
 """Share of a bound by which rounding may exceed it."""
 BISECTIONS = 24
 PHASE_MARGIN = math.pi / 4  # [rad]
-BY_HOVER = AFFECTS.keys() - {"inertia", "drag", "inflow", "lag"}
+BY_HOVER = AFFECTS.keys() - {"inertia", "inertia_axes", "drag", "inflow", "lag", "rotor_inertia"}
 """Fields of a randomization that change how fast rotors turn in hover, or may turn."""
 
 

@@ -244,6 +244,59 @@ def test_a_batch_of_equal_aircraft_draws_no_parameters():
     Environment("hover", engine=alike, randomization={"command_delay": 0.02}).reset()
 
 
+def test_each_axis_has_a_factor_of_its_own_of_which_there_is_a_body():
+    given = {"inertia": (0.8, 1.0), "inertia_axes": (0.9, 1.1), "rotor_inertia": (0.5, 1.5)}
+    environment = flying(randomization=given, count=500, aerodynamics="full")
+    table, shown = environment.engine.parameters, environment.randomizer.shown()
+    axes = np.stack([shown[f"inertia_axes_{axis}"] for axis in "xyz"], axis=1)
+    wanted = np.array(PAPER.inertia) * shown["inertia"][:, None] * axes
+    rest = wanted.sum(axis=1, keepdims=True) - wanted
+    np.testing.assert_allclose(table["inertia"], np.minimum(wanted, rest), rtol=1e-14)
+    assert (wanted > rest).any()  # z of the paper's is 1.3 of a possible 1.5
+    np.testing.assert_allclose(table["rotor_inertia"], 6e-5 * shown["rotor_inertia"])
+    for name, low, high in ((axes, 0.9, 1.1), (shown["rotor_inertia"], 0.5, 1.5)):
+        share = (name - low) / (high - low)
+        # The mean of 500 even numbers has a deviation of 0.0129.
+        np.testing.assert_allclose(share.mean(axis=0), 0.5, atol=5 * 0.0129)
+        assert np.ptp(share, axis=0).min() > 0.97
+    for vehicle in VEHICLES.values():
+        heavy = AircraftSampler({"inertia_axes": (0.5, 2.0)}, vehicle)
+        inertia = heavy.table(heavy.sample(np.random.default_rng(0).random((99, len(heavy.names)))))
+        assert (2 * inertia["inertia"] <= inertia["inertia"].sum(1)[:, None] * (1 + 1e-12)).all()
+
+
+def test_translational_lift_is_drawn_with_the_inflow():
+    environment = flying(randomization={"inflow": (0.5, 1.5)}, aerodynamics="full")
+    table, shown = environment.engine.parameters, environment.randomizer.shown()["inflow"]
+    np.testing.assert_allclose(table["translational_lift"], 0.0566 * shown, rtol=1e-14)
+    np.testing.assert_allclose(table["blade_lift"], 0.953 * shown, rtol=1e-14)
+
+
+def test_corners_are_drawn_as_often_as_is_asked_for():
+    given = {"lag": (0.5, 2.5), "command_delay": (0.0, 0.07)}
+    plain = AircraftSampler(given, PAPER)
+    shares = np.random.default_rng(0).random((4000, len(plain.names)))
+
+    def drawn(corners):
+        sampler = AircraftSampler({**given, "corners": corners}, PAPER)
+        numbers = sampler.sample(shares)
+        lag, late = (sampler.columns(numbers, k)[:, 0] for k in given)
+        return numbers, (lag >= 2.0) & (late >= 0.06 - 1e-9), sampler.columns(numbers, "corner")
+
+    for corners in (0.0, 0.3, 1.0):
+        numbers, slow, corner = drawn(corners)
+        # An even draw gives a sixteenth, 8 delays of which 2 are in the upper quarter.
+        expected = corners + (1 - corners) / 16
+        assert abs(slow.mean() - expected) < 5 * np.sqrt(0.25 / 4000), corners
+        assert slow[corner[:, 0] == 1].all() and abs(corner.mean() - corners) < 0.04
+    numbers, _, corner = drawn(0.3)
+    usual = plain.sample(shares)
+    others = [k for k, n in enumerate(plain.names) if n not in (*given, "corner")]
+    np.testing.assert_array_equal(numbers[:, others], usual[:, others])
+    same = corner[:, 0] == 0
+    np.testing.assert_array_equal(numbers[same], usual[same])
+
+
 REFUSED = [  # randomization, name, value, a part of what is allowed
     ("heavy", "randomization", "heavy", "light, full"),
     (5, "randomization", 5, "mapping"),
@@ -259,6 +312,10 @@ REFUSED = [  # randomization, name, value, a part of what is allowed
     ({"mass": (0.0, 1.0)}, "mass[0]", 0.0, "between"),
     ({"mass": {0.9, 1.1}}, "mass[0]", {0.9, 1.1}, "between"),
     ({"max_speed": (0.9, 1.1)}, "max_speed[1]", 1.1, "between"),
+    ({"corners": 1.5}, "corners", 1.5, "between 0 and 1"),
+    ({"corners": (0.1, 0.2)}, "corners", (0.1, 0.2), "between 0 and 1"),
+    ({"rotor_inertia": 0.0}, "rotor_inertia[0]", 0.0, "between"),
+    ({"inertia_axes": (0.0, 1.0)}, "inertia_axes[0]", 0.0, "between"),
     ({"centre_of_mass": -0.01}, "centre_of_mass", -0.01, "between"),
     ({"noise": {"position": -0.1}}, "position", -0.1, "between"),
     ({"bias": {"attitude": np.inf}}, "attitude", np.inf, "between"),
