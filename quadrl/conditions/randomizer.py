@@ -133,11 +133,11 @@ class Randomizer:
         steps = [np.rint(self.column(name) / step).astype(np.int64) for name in names]
         self._delay, self._ages = self._dead + steps[0], np.array(steps[1:])
 
-    def wind_speed(self, rows: np.ndarray, weather: Weather) -> Array | None:
-        """Wind speed of some aircraft (n,) [m/s]; None where it is the weather's."""
-        if self.sampler.randomization.wind == (1.0, 1.0):
+    def wind_speed(self, drawn: Array | None, weather: Weather) -> Array | None:
+        """Wind speed (n,) [m/s] with the numbers that `sample` gave; None for the weather's."""
+        if drawn is None or self.sampler.randomization.wind == (1.0, 1.0):
             return None
-        return weather.wind_speed * self.column("wind")[rows]
+        return weather.wind_speed * self.sampler.columns(drawn, "wind")[:, 0]
 
     def delayed(self, command: Array, steps: int) -> Array:
         """The delayed command for some physics steps, given the present one, (N, R) [rad/s]."""

@@ -26,10 +26,10 @@ import numpy as np
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import WEATHER
-from quadrl.base.rotation import Array
+from quadrl.base.rotation import Array, stack
 from quadrl.base.validation import choice, keys, number
 from quadrl.engines import native
-from quadrl.engines.air import FIXED, ROWS, fixed_of
+from quadrl.engines.air import FIXED, ROWS, fixed_of, mean_wind
 from quadrl.engines.rng import FULL_TURN, Rng
 
 if TYPE_CHECKING:
@@ -187,21 +187,38 @@ class WeatherProcess:
         if wind_speed is not None:
             self._write(rows, wind_speed)
             self._varied = True
-        rng, gust = Rng(keys, episodes, WEATHER), self.weather.gust_speed
-        drawn = [rng.uniform(0.0, 1.0) for _ in range(3)]
-        bearing, gust_bearing = FULL_TURN * drawn[0], FULL_TURN * drawn[1]
-        if self.weather.direction is not None:
-            bearing = gust_bearing = 0.0 * bearing + self.weather.direction
+        gust = self.weather.gust_speed
+        bearing, gust_bearing, begins = self._drawn(keys, episodes)
         values = {
             "east": np.cos(bearing),
             "north": np.sin(bearing),
-            "gust_start": self._latest * drawn[2],
+            "gust_start": self._latest * begins,
             "gust_east": gust * np.cos(gust_bearing),
             "gust_north": gust * np.sin(gust_bearing),
         }
         for name, value in values.items():
             self._table[ROWS.index(name), rows] = value
         self._kernel(self._address, len(rows), rows.ctypes.data, True)
+
+    def mean_wind(
+        self, keys: Array, episodes: Array, height: Array, wind_speed: Array | None = None
+    ) -> Array:
+        """Mean wind (n, 2) [m/s] towards east and north, at heights (n,) [m] in episodes.
+
+        The other arguments are as in `begin`.
+        """
+        speed = self.weather.wind_speed if wind_speed is None else wind_speed
+        mean = mean_wind(speed, self.weather.roughness, height)
+        bearing, *_ = self._drawn(keys, episodes)
+        return stack(mean * np.cos(bearing), mean * np.sin(bearing))
+
+    def _drawn(self, keys: Array, episodes: Array) -> tuple[Array, Array, Array]:
+        """Directions of the mean wind and of the gust [rad], and when it begins, 0 to 1, (n,)."""
+        rng = Rng(keys, episodes, WEATHER)
+        wind, gust, begins = (rng.uniform(0.0, 1.0) for _ in range(3))
+        if self.weather.direction is not None:
+            return (0.0 * wind + self.weather.direction,) * 2 + (begins,)
+        return FULL_TURN * wind, FULL_TURN * gust, begins
 
     def advance(self) -> None:
         """Advance the weather of all aircraft by a control step, and write their air."""

@@ -25,6 +25,7 @@ from quadrl.base.rotation import Array
 from quadrl.conditions.randomization import AFFECTS, Randomization, Randomized
 from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
+from quadrl.control import trim
 from quadrl.control.allocation import Allocation
 from quadrl.control.modes import CONTROL_MODES
 from quadrl.engines.rng import uniform
@@ -173,12 +174,13 @@ def held_command(vehicle: Vehicle, control_mode: str) -> float:
 
 
 def warn_of_unreached(
-    vehicle: Vehicle, randomization: Randomized, control_mode: str = "rotor"
+    vehicle: Vehicle, randomization: Randomized, control_mode: str = "rotor", wind: float = 0.0
 ) -> None:
     """Warn the caller's caller of what no policy can make up for.
 
     More than a FEW of the drawn aircraft cannot hover, half of the actions or more are cut at the
-    largest speed, or an action lasts longer than the rotors take to follow it.
+    largest speed, an action lasts longer than the rotors take to follow it, or the mean wind [m/s]
+    is more than they hold.
 
     Raises:
         QuadrlError: The randomization does not fit the aircraft.
@@ -187,6 +189,10 @@ def warn_of_unreached(
     if 2 * reach.room < scale:
         said = f"action_scale = {scale:g}: actions over {reach.room / scale:.2g} change nothing"
         _warn(f"{said}, since the rotors turn no faster; quadrl check suggests another")
+    carries = float(reach.loads(scale)[1][0])
+    if wind and wind > (held := min(held_wind(vehicle, carries), trim.fastest_held(vehicle))):
+        said = f"the mean wind of {wind:.3g} m/s carries every aircraft off, whatever the policy"
+        _warn(f"{said}: the rotors hold it in {held:.3g} m/s at most; ask for weaker weather")
     lag = max(1 / min(rotor.lag_up, rotor.lag_down) for rotor in vehicle.rotors)
     if held_command(vehicle, control_mode) > lag:
         said = f"control_timestep = {vehicle.control_timestep:g}: an action lasts longer"

@@ -26,6 +26,7 @@ from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.scene import Scene
 from quadrl.conditions.weather import WeatherProcess
 from quadrl.control import modes
+from quadrl.control.trim import trimmed
 from quadrl.core import compiled, observer, saving, transition
 from quadrl.core.markers import Marker
 from quadrl.core.observation import layout
@@ -145,6 +146,8 @@ class Environment(saving.Copied):
     ) -> Observation:
         """Begin an episode.
 
+        Where the mean wind blows, a start at rest and level is one in trim, with the same heading.
+
         Args:
             rows: Numbers (n,) or mask (N,) of the aircraft that begin one; None for all.
             start: Arrays (N, k) or (k,) by names of `engines.state.Start`, in place of the task's.
@@ -175,11 +178,16 @@ class Environment(saving.Copied):
         begun = begun.replaced(start or {}, rows, self.num_envs)
         if start:
             self._refuse_underground(start, begun)
+        wind_speed = self.randomizer.wind_speed(drawn, self.weather)
+        if self.blowing and self.weather.wind_speed and not {*(start or ())} - {"position"}:
+            height = begun.position[:, 2] + self.origin[2]
+            mean = self.blowing.mean_wind(*place, height, wind_speed)
+            begun = trimmed(self.vehicle, begun, mean)
         state = self.engine.place(rows, begun, table, self._placed(place, begun, task_state))
         self.seeds = seeds
         self.randomizer.begin(rows, *place, drawn)
         if self.blowing:
-            self.blowing.begin(rows, *place, self.randomizer.wind_speed(rows, self.weather))
+            self.blowing.begin(rows, *place, wind_speed)
         around = self.scene.surroundings(self.engine, rows) if self.scene.solids else None
         given = task_state, seen, self.action_size, around
         now, episode = transition.begin(self.task, state, *given)

@@ -27,6 +27,7 @@ from quadrl.control.modes import CONTROL_MODES
 from quadrl.core import catalogue
 from quadrl.core.task import Task
 from quadrl.engines import mjcf
+from quadrl.engines.air import LOWEST, mean_wind
 from quadrl.engines.engine import ENGINES, Engine, EngineName
 
 if TYPE_CHECKING:
@@ -201,6 +202,12 @@ class Scenario:
     def altitude(self) -> float:
         """Height of the origin of the task's frame above the ground [m]."""
         return max(self.task.altitude, self.aircraft.ground_clearance)
+
+    @property
+    def mean_wind(self) -> float:
+        """The mean wind where the task flies, taken 3 m above the ground at least [m/s]."""
+        blows, height = self.weather, max(self.altitude, LOWEST)
+        return float(mean_wind(blows.wind_speed, blows.roughness, height))
 
     def compile_model(self, *, drawn: bool = True) -> mujoco.MjModel:
         """The model of the aircraft in the world of the task, to draw, or lean, to simulate."""

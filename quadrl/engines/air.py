@@ -77,6 +77,12 @@ def fixed_of(
     }
 
 
+def mean_wind(wind_speed: Any, roughness: float, height: Any) -> Any:
+    """The mean wind [m/s] at a height [m], numbers or (n,); W20 and z0 as in `fixed_of`."""
+    shear = wind_speed / math.log(REFERENCE / roughness)
+    return shear * np.log(np.maximum(height / roughness, 1.0))
+
+
 def _second_order(name: str, rate: Any) -> dict[str, Any]:
     """One step of x1' = -x1 + noise, x2' = -x2 + x1 over `rate` time constants.
 

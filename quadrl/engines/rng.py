@@ -124,6 +124,8 @@ class Rng:
     ) -> Start:
         """A start at a position: level, any heading, the rotors at hover speed.
 
+        In wind an environment begins one at rest in trim instead (`quadrl.control.trim`).
+
         Args:
             position: (n, 3) [m], task frame.
             parameters: Parameters of the aircraft.

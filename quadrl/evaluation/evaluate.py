@@ -133,7 +133,8 @@ def evaluate(
         if not isinstance(flown, Policy):
             raise QuadrlError(name="sampled", value=True, allowed="False for a controller")
         flown = flown.flying(episodes, SAMPLING_SEED)
-    warn_of_unreached(scenario.aircraft, scenario.randomization, scenario.control_mode)
+    asked = scenario.randomization, scenario.control_mode, scenario.mean_wind
+    warn_of_unreached(scenario.aircraft, *asked)
     rollout = fly(flown, scenario, episodes=episodes, seed=EVALUATION_SEED + seed)
     names = {"task": scenario.task.name, "vehicle": scenario.vehicle.name, "seed": seed}
     return Evaluation(name, scenario, seed, names | summarize(rollout), rollout)

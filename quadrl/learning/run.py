@@ -118,7 +118,8 @@ def train_in(
     """Train as `train` does, with settings and folder prepared, in the context `heed`."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = config.scenario
-    warn_of_unreached(scenario.aircraft, scenario.randomization, scenario.control_mode)
+    asked = scenario.randomization, scenario.control_mode, scenario.mean_wind
+    warn_of_unreached(scenario.aircraft, *asked)
     training = Training(config, folder, resume=resume)
     with heed(training):
         policy = training.run(show)
