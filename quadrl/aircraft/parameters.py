@@ -21,7 +21,7 @@ from quadrl.aircraft.aerodynamics import (
     STILL_AIR,
     Aerodynamics,
 )
-from quadrl.aircraft.rotors import Rotor, hover_squares, mixer
+from quadrl.aircraft.rotors import GRAVITY, Rotor, hover_squares, mixer
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
 from quadrl.base.rotation import Array
 
@@ -41,6 +41,9 @@ SETTINGS = (
 """Fields of `Vehicle` that are not a parameter of an aircraft's row."""
 DERIVED = ("foot", "hull", "ground_clearance", "rotor_height", "resolved_speed", "resolved_turn")
 """Properties of `Vehicle` that stand in a row."""
+STEADY = ("steady_force", "steady_moment")
+"""What acts on an aircraft for an episode, zero unless it is drawn: a force [N], world frame, and a
+moment [N m], body frame, (3,) each."""
 
 
 def _fields(kind: type, settings: tuple[str, ...] = ()) -> list[Any]:
@@ -57,6 +60,7 @@ AIRCRAFT = np.dtype(
         ("rotor_count", np.float64),
         *_fields(Vehicle, SETTINGS),
         *((name, np.float64, (3,) if name in ("foot", "hull") else ()) for name in DERIVED),
+        *((name, np.float64, (3,)) for name in STEADY),
         *_fields(Aerodynamics),
         ("effects", np.float64),  # Aerodynamics.effects
         ("rotor", ROTOR, (MAX_ROTORS,)),
@@ -71,7 +75,7 @@ def rows(vehicle: Vehicle, count: int = 1) -> np.ndarray:
     table = np.zeros(count, dtype=AIRCRAFT)
     table["mark"], table["size"] = MARK, ROW_SIZE
     for name in AIRCRAFT.names or ():
-        if name not in ("mark", "size", "rotor"):
+        if name not in ("mark", "size", "rotor", *STEADY):
             owner = vehicle if hasattr(vehicle, name) else vehicle.aerodynamics
             table[name] = getattr(owner, name)
     for name, *_ in _fields(Rotor):
@@ -92,12 +96,19 @@ def limits(table: np.ndarray) -> np.ndarray:
     return np.stack([table["resolved_speed"], table["resolved_turn"]], axis=1)
 
 
+def hover_thrust(table: np.ndarray) -> np.ndarray:
+    """Thrust (n,) [N] that holds rows in place, against their weight and the steady force."""
+    x, y, z = table["steady_force"].T
+    return np.sqrt(x**2 + y**2 + (table["mass"] * GRAVITY - z) ** 2)
+
+
 def refresh(table: np.ndarray, timestep: float) -> None:
     """Recompute, in place, the parameters of rows that follow from the others."""
     count = int(table["rotor_count"][0])
     rotor = table["rotor"][:, :count]
     names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")
-    squares = hover_squares(mixer(*(rotor[name] for name in names)), table["mass"])
+    rows = mixer(*(rotor[name] for name in names))
+    squares = hover_squares(rows, hover_thrust(table), table["steady_moment"])
     table["rotor"]["hover_speed"][:, :count] = np.sqrt(np.maximum(squares, 0.0))
     table["resolved_speed"] = resolved_speed(table["mass"], table["drag_coefficient"], timestep)
     least = table["inertia"].min(axis=-1)

@@ -122,15 +122,19 @@ def mixer(
     return np.swapaxes(np.concatenate([lift, moment], axis=-1), -1, -2) + 0.0
 
 
-def hover_squares(mixer: np.ndarray, mass: Array) -> np.ndarray:
-    """Smallest squares of the rotor speeds (..., R) that carry a mass (...) without a moment."""
+def hover_squares(mixer: np.ndarray, thrust: Array, moment: Array = 0.0) -> np.ndarray:
+    """Smallest squares of the rotor speeds (..., R) that give a thrust (...) [N].
+
+    The moment (..., 3) [N m] is what acts on the aircraft beside them, which they hold.
+    """
     # Each row over its largest entry, since they differ by orders of magnitude.
     scale: np.ndarray = np.abs(mixer).max(axis=-1, keepdims=True)
     rows = mixer / scale
-    weight = np.zeros((*rows.shape[:-1], 1))
-    weight[..., 0, 0] = np.asarray(mass) * GRAVITY / scale[..., 0, 0]
+    wrench = np.zeros((*rows.shape[:-1], 1))
+    wrench[..., 0, 0] = thrust / scale[..., 0, 0]
+    wrench[..., 1:, 0] = (0.0 - np.asarray(moment)) / scale[..., 1:, 0]
     across = np.swapaxes(rows, -1, -2)
-    return (across @ np.linalg.solve(rows @ across, weight))[..., 0]
+    return (across @ np.linalg.solve(rows @ across, wrench))[..., 0]
 
 
 PAPER_ROTORS = plus(

@@ -119,7 +119,7 @@ class Vehicle:
         if values[-1] < SINGULAR * values[0]:
             reason = "they cannot set thrust, roll, pitch and yaw independently (singular mixer)"
             self._refuse("position", "a layout with an allocation that can be inverted", reason)
-        squares = hover_squares(self.mixer, self.mass)
+        squares = hover_squares(self.mixer, self.mass * GRAVITY)
         if not (squares > 0).all():
             reason = "hovering without turning would need a negative thrust of one of them"
             self._refuse("position", "around the centre of mass", reason)
@@ -187,7 +187,7 @@ class Vehicle:
     @functools.cached_property
     def hover_speed(self) -> np.ndarray:
         """(R,) Omega_hover [rad/s]: together they carry the weight and give no moment."""
-        return np.sqrt(hover_squares(self.mixer, self.mass))
+        return np.sqrt(hover_squares(self.mixer, self.mass * GRAVITY))
 
     @property
     def layout(self) -> np.ndarray:

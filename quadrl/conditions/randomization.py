@@ -19,7 +19,6 @@ from quadrl.base.validation import choice, keys, number, numbers
 Range = tuple[float, float]
 LEAST, MOST = 0.01, 100.0  # of a factor
 LONGEST_DELAY = 10.0  # [s]
-LONGEST_SHIFT = 1.0  # [m]
 OFF = (1.0, 1.0)  # a factor that changes nothing
 AFFECTS: dict[str, tuple[str, ...]] = {
     "mass": ("mass",),
@@ -37,6 +36,8 @@ AFFECTS: dict[str, tuple[str, ...]] = {
     "centre_of_mass": ("rotor.position",),
     "rotor_inertia": ("rotor_inertia",),
     "inertia_axes": ("inertia",),
+    "force": ("steady_force",),
+    "moment": ("steady_moment",),
 }
 """What a field of `Randomization` changes in a row of parameters (`aircraft/parameters.py`)."""
 FACTORS = ("mass", "inertia", "thrust", "torque", "lag", "drag", "inflow", "max_speed")
@@ -157,6 +158,12 @@ class Randomization:
     inertia_axes: Range = (1.0, 1.0)
     """Further factor of the moment of inertia about each axis on its own, up to where that is the
     sum of the other two."""
+    force: float = 0.0
+    """Largest force that acts on the aircraft for an episode, along each axis of the world, as a
+    share of its specified weight."""
+    moment: float = 0.0
+    """Largest moment that acts on it for an episode, about each axis of its body, as a share of
+    that weight times the distance of its farthest rotor."""
     corners: float = 0.0
     """Share of the episodes in which lag and command_delay are both drawn from the upper quarter
     of their ranges, since slow rotors are hardest to fly where commands are late."""
@@ -165,10 +172,8 @@ class Randomization:
         """Validate what can be judged without an aircraft."""
         for field in dataclasses.fields(self):
             name, given = field.name, getattr(self, field.name)
-            if name == "centre_of_mass":
-                value: Any = number(name, given, 0, LONGEST_SHIFT)
-            elif name == "corners":
-                value = number(name, given, 0, 1)
+            if name in ("centre_of_mass", "corners", "force", "moment"):
+                value: Any = number(name, given, 0, 1)  # [m], shares
             elif name in ("noise", "bias", "pushes"):
                 value = _record(name, given, Pushes if name == "pushes" else Errors)
             elif name in DELAYS:
@@ -217,9 +222,12 @@ RANDOMIZATIONS = {
         rate_delay=(0.0, 0.01),  # chosen: one physics step of the paper's aircraft
         rotor_inertia=(0.85, 1.15),  # chosen
         inertia_axes=(0.975, 1.025),  # chosen
+        force=0.025,  # half of the standard deviation of learning-to-fly
+        moment=0.001,  # half of that too: m g / 10^4 N m on an arm of 46 mm
         noise=Errors(position=1e-3, attitude=1e-3, velocity=2e-3, body_rate=2e-3),
     ),
-    # An aircraft that is known from its data sheet.
+    # An aircraft that is known from its data sheet. A steady force would be more than actions of
+    # the paper's aircraft and the rotors of the Crazyflie can hold beside all this.
     "full": Randomization(
         mass=(0.8, 1.2),  # chosen: a battery or a camera more or less
         inertia=(0.85, 1.15),  # chosen

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.aircraft import parameters
+from quadrl.aircraft.rotors import GRAVITY, hover_squares
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
@@ -28,6 +29,7 @@ EACH_ROTOR = ("thrust", "torque", "lag")
 """Factors that each rotor has once more on its own, within `Randomization.rotors`."""
 DAMAGED = "damaged_rotor"
 """Number of the rotor, from 0 on, that `Randomization.one_rotor` is about."""
+STEADY = ("force", "moment")
 CORNER = "corner"
 """Whether an episode is one of the share `Randomization.corners`: 1 or 0."""
 UPPER = 0.75  # of a range, above which its corner lies
@@ -48,6 +50,8 @@ class AircraftSampler:
         """
         self.randomization = randomization = resolve(randomization)
         self._vehicle, self._specified = vehicle, parameters.rows(vehicle)
+        weight = vehicle.mass * GRAVITY
+        self._units = weight, weight * vehicle.size  # of force [N] and moment [N m]
         step = vehicle.physics_timestep
         self.delays = {
             name: whole_steps(name, getattr(randomization, name), step, "physics")
@@ -67,6 +71,9 @@ class AircraftSampler:
         ends |= {"one_rotor": randomization.one_rotor, DAMAGED: (0, last)}
         ends |= {name: getattr(randomization, name) for name in ("rate_delay", "rotor_inertia")}
         ends |= {f"inertia_axes_{axis}": randomization.inertia_axes for axis in "xyz"}
+        for name in STEADY:
+            size = getattr(randomization, name)
+            ends |= {f"{name}_{axis}": (-size, size) for axis in "xyz"}
         ends[CORNER] = (0, randomization.corners > 0)
         ends["torque"] = (self._least_torque(), ends["torque"][1])
         self.names = tuple(ends)
@@ -82,6 +89,8 @@ class AircraftSampler:
         """Which of them differ from aircraft to aircraft."""
         if randomization != NONE:
             self._check_ends()
+        if randomization.moment:
+            self._check_moment()
         if randomization.per_row:
             self.check_hover(self.table(self._corners()))
 
@@ -136,6 +145,8 @@ class AircraftSampler:
         # The origin of the body is the centre of mass: what moves are the rotors.
         shift = self.columns(drawn, "centre_of_mass_x", 3)
         self._field(table, *AFFECTS["centre_of_mass"])[:] -= shift[:, None]
+        for name, unit in zip(STEADY, self._units, strict=True):
+            self._field(table, *AFFECTS[name])[:] = unit * self.columns(drawn, f"{name}_x", 3)
         parameters.refresh(table, self._vehicle.physics_timestep)
         return table
 
@@ -203,6 +214,7 @@ class AircraftSampler:
             columns: Any = {k: both[end][self.names.index(k)] for k, end in ends.items()}
             columns |= {f"{name}_1": [given.rotors[ends[name]]] * count for name in EACH_ROTOR}
             columns["inertia_axes_x"] = [given.inertia_axes[inertia]] * 3
+            columns |= {"force_x": (0.0, 0.0, 0.0), "moment_x": (0.0, 0.0, 0.0)}
             columns |= {"one_rotor": 1.0, "centre_of_mass_x": (0.0, 0.0, 0.0)}
             try:
                 made = vehicle_of(self._vehicle, self.table(self._at(1, **columns))[0])
@@ -213,6 +225,24 @@ class AircraftSampler:
                 reason = f"{error.reason}; {where}".removeprefix("; ")
                 raise QuadrlError(**vars(error) | {"reason": reason}) from error
 
+    def _check_moment(self) -> None:
+        """Refuse moments that the rotors of the specified aircraft cannot hold.
+
+        Raises:
+            QuadrlError: The message has the largest that they can.
+        """
+        given, vehicle = self.randomization.moment, self._vehicle
+        signs = np.array([*itertools.product((-1, 1), repeat=3)])
+        rows = np.repeat(vehicle.mixer[None], len(signs), axis=0)
+        squares = hover_squares(rows, self._units[0], given * self._units[1] * signs)
+        usual = vehicle.hover_speed**2
+        room = np.where(squares > usual, vehicle.max_speed**2 - usual, usual)
+        most = given * float((room / np.maximum(np.abs(squares - usual), ROUNDING * usual)).min())
+        if given >= most:
+            reason = "no rotor speeds hold such a moment in hover"
+            allowed = f"under {most:.3g} of weight times arm"
+            raise QuadrlError(reason, name="moment", value=given, allowed=allowed)
+
     def _corners(self) -> Array:
         """Numbers (n, k) of the aircraft in which a rotor turns fastest, or slowest, in hover.
 
@@ -220,12 +250,14 @@ class AircraftSampler:
         are exchanged as long as that makes it faster, or slower.
         """
         given, count = self.randomization, self._vehicle.rotor_count
-        first, second = (self.names.index(name) for name in ("thrust_1", "centre_of_mass_x"))
-        places = np.r_[first : first + 2 * count, second : second + 2]
+        each = "thrust_1", "centre_of_mass_x", "moment_x"
+        first, second, third = (self.names.index(name) for name in each)
+        places = np.r_[first : first + 2 * count, second : second + 2, third : third + 3]
         both = (self.low + self._high)[places]
         damaged = range(count if given.one_rotor != OFF else 1)
         cases = np.array([*itertools.product(range(count), (-1, 1), damaged)])
         columns: Any = {"mass": given.mass[1], DAMAGED: cases[:, 2:], "centre_of_mass_z": 0.0}
+        columns["force_x"] = (given.force, given.force, -given.force)  # down, and aside
         drawn = self._at(len(cases), **columns)
         for _ in range(EXCHANGES):
             # Each aircraft as it is, and with one end exchanged after the other.

@@ -74,7 +74,9 @@ class Reach:
         normal = np.where(length > SURE, normal / np.maximum(length, SURE), 0.0)
         normal = normal * np.where(normal[..., :1] < 0, -1.0, 1.0)
         self._across = normal @ rows  # (n, F, R)
-        self._weight = normal[..., 0] * (table["mass"] * GRAVITY / size[:, 0, 0])[:, None]
+        self._weight = normal[..., 0] * (parameters.hover_thrust(table) / size[:, 0, 0])[:, None]
+        moment = table["steady_moment"] / size[:, 1:, 0]  # which the rotors hold
+        self._held = (normal[..., 1:] * moment[:, None]).sum(axis=-1)  # (n, F)
         self._max_speed = np.minimum(rotor["max_speed"], vehicle.max_speed)  # (n, R) [rad/s]
         self.hover_speed = rotor["hover_speed"]
         """(n, R) [rad/s], of the drawn aircraft."""
@@ -96,7 +98,7 @@ class Reach:
         The largest is below the smallest where there is none.
         """
         low, high = (speed[:, None] ** 2 for speed in self.speeds(scale))
-        middle = (self._across * (high + low) / 2).sum(axis=-1)  # (n, F)
+        middle = (self._across * (high + low) / 2).sum(axis=-1) + self._held  # (n, F)
         room = (np.abs(self._across) * (high - low) / 2).sum(axis=-1)
         level = self._weight <= SURE * self._weight.max(axis=-1, keepdims=True)
         weight = np.where(level, 1.0, self._weight)

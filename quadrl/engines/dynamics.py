@@ -52,7 +52,7 @@ def thrust_wrench(p: Parameters, speed: Array) -> tuple[Array, Array]:
 
 
 def aero_wrench(p: Parameters, airspeed: Array, body_rate: Array) -> tuple[Array, Array]:
-    """Drag and aerodynamic moment: equations 8 and 9.
+    """Drag and aerodynamic moment, equations 8 and 9, and the steady moment of an episode.
 
     Args:
         p: Parameters.
@@ -63,7 +63,8 @@ def aero_wrench(p: Parameters, airspeed: Array, body_rate: Array) -> tuple[Array
         Force (N, 3) [N] and moment (N, 3) [N m], body frame.
     """
     force = -(p.drag_coefficient * norm(airspeed))[..., None] * airspeed
-    moment = -(p.moment_coefficient * norm(body_rate))[..., None] * body_rate
+    damping = (p.moment_coefficient * norm(body_rate))[..., None] * body_rate
+    moment = p.steady_moment - damping
     return force, moment
 
 
@@ -217,7 +218,7 @@ def derivative(
         around = airspeed, rate, rotation[..., 2, :], motion.position[..., 2]
         more, twist = rotor_wrench(p, speed, command, *around, noise, effects)
         force, moment = force + more, moment + twist
-    push = to_world(rotation, force) / p.mass[..., None]
+    push = (to_world(rotation, force) + p.steady_force) / p.mass[..., None]
     spin = p.inertia * rate
     w, x, y, z = (q[..., k] for k in range(4))
     a, b, c = (rate[..., k] for k in range(3))

@@ -17,6 +17,7 @@ from quadrl.base.philox import PARAMETERS
 from quadrl.conditions import sampler
 from quadrl.conditions.randomization import FACTORS
 from quadrl.conditions.sampler import EACH_ROTOR, AircraftSampler, vehicle_of
+from quadrl.control.feasibility import Reach
 from quadrl.core.environment import Environment
 from quadrl.engines import mjcf
 from quadrl.engines import mujoco as engines
@@ -272,6 +273,50 @@ def test_translational_lift_is_drawn_with_the_inflow():
     np.testing.assert_allclose(table["blade_lift"], 0.953 * shown, rtol=1e-14)
 
 
+WEIGHT = 0.65 * 9.81  # [N], and the arm of 0.23 m
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_a_steady_force_and_moment_accelerate_by_what_they_are(engine):
+    given = {"force": 0.05, "moment": 0.002}
+    environment = flying(randomization=given, count=200, engine=engine)
+    shown, table = environment.randomizer.shown(), environment.engine.parameters
+    force, moment = (np.stack([shown[f"{k}_{n}"] for n in "xyz"], axis=1) for k in given)
+    np.testing.assert_allclose(table["steady_force"], WEIGHT * force, rtol=1e-14)
+    np.testing.assert_allclose(table["steady_moment"], WEIGHT * 0.23 * moment, rtol=1e-14)
+    for shares, size in ((force, 0.05), (moment, 0.002)):
+        # The mean of 200 even numbers between -1 and 1 has a deviation of 0.041.
+        np.testing.assert_allclose(shares.mean(axis=0) / size, 0.0, atol=5 * 0.041)
+        assert np.abs(shares).max() <= size and (np.ptp(shares, axis=0) > 1.9 * size).all()
+    # Level and at rest with rotors at hover speed, a physics step of 0.01 s.
+    flown = environment.engine
+    flown.qpos[:, 3:], flown.qvel[:] = (1.0, 0.0, 0.0, 0.0), 0.0
+    flown.act[:] = flown.ctrl[:] = PAPER.hover_speed
+    flown.advance(1)
+    np.testing.assert_allclose(flown.qvel[:, :3], 9.81 * force * 0.01, rtol=1e-3, atol=1e-6)
+    expected = WEIGHT * 0.23 * moment / PAPER.inertia * 0.01
+    np.testing.assert_allclose(flown.qvel[:, 3:], expected, rtol=1e-3, atol=1e-5)
+
+
+def test_hover_holds_the_steady_force_and_moment():
+    randomization = {"force": 0.05, "moment": 0.002, "mass": (0.9, 1.1)}
+    environment = flying(randomization=randomization, count=20)
+    table = environment.engine.parameters
+    wrench = (PAPER.mixer @ table["rotor"]["hover_speed"][:, :4, None] ** 2)[..., 0]
+    up = np.array([0, 0, 9.81]) * table["mass"][:, None] - table["steady_force"]
+    np.testing.assert_allclose(wrench[:, 0], np.linalg.norm(up, axis=1), rtol=1e-12)
+    np.testing.assert_allclose(wrench[:, 1:], -table["steady_moment"], atol=1e-12)
+    # What rotors can give counts it: the load that is held is over weight and force together.
+    plain = np.repeat(parameters.rows(PAPER), 1)
+    pulled = plain.copy()
+    pulled["steady_force"][:, 2] = -0.2 * WEIGHT
+    least, most = Reach(PAPER, plain).loads(35.0)
+    low, high = Reach(PAPER, pulled).loads(35.0)
+    np.testing.assert_allclose([low, high], [least / 1.2, most / 1.2], rtol=1e-12)
+    pulled["steady_moment"][:, 2] = 0.9 * 4 * 7.5e-7 * 225.678 * 35.0  # most of what turns it
+    assert Reach(PAPER, pulled).loads(35.0)[1] < high
+
+
 def test_corners_are_drawn_as_often_as_is_asked_for():
     given = {"lag": (0.5, 2.5), "command_delay": (0.0, 0.07)}
     plain = AircraftSampler(given, PAPER)
@@ -312,6 +357,12 @@ REFUSED = [  # randomization, name, value, a part of what is allowed
     ({"mass": (0.0, 1.0)}, "mass[0]", 0.0, "between"),
     ({"mass": {0.9, 1.1}}, "mass[0]", {0.9, 1.1}, "between"),
     ({"max_speed": (0.9, 1.1)}, "max_speed[1]", 1.1, "between"),
+    ({"force": -0.1}, "force", -0.1, "between"),
+    ({"moment": (0.0, 0.1)}, "moment", (0.0, 0.1), "between"),
+    # About z the rotors of the paper's give far less than about x and y.
+    ({"moment": 0.5}, "moment", 0.5, "of weight times arm"),
+    # With 0.97 of the weight on top, 1.97 times it, sideways too: more than twice.
+    ({"force": 0.97}, "rotors", ..., "narrower"),
     ({"corners": 1.5}, "corners", 1.5, "between 0 and 1"),
     ({"corners": (0.1, 0.2)}, "corners", (0.1, 0.2), "between 0 and 1"),
     ({"rotor_inertia": 0.0}, "rotor_inertia[0]", 0.0, "between"),

@@ -62,7 +62,8 @@ AERO double aero_length(const double v[3]) {
   return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
 }
 
-// What acts beside thrust and reaction: equations 8 and 9, quadratic drag and moment.
+// What acts beside thrust and reaction: equations 8 and 9, quadratic drag and moment, and the steady
+// moment of an episode.
 //   airspeed: velocity less wind [m/s]; body_rate [rad/s]; both in the body frame.
 //   force [N] and moment [N m] are added to, body frame.
 AERO void aero_wrench(const Aircraft* a, const double airspeed[3], const double body_rate[3],
@@ -70,7 +71,7 @@ AERO void aero_wrench(const Aircraft* a, const double airspeed[3], const double 
   const double drag = a->drag_coefficient[i] * aero_length(airspeed);
   const double damping = a->moment_coefficient[i] * aero_length(body_rate);
   for (int k = 0; k < 3; ++k) force[k] -= drag * airspeed[k];
-  for (int k = 0; k < 3; ++k) moment[k] -= damping * body_rate[k];
+  for (int k = 0; k < 3; ++k) moment[k] += a->steady_moment[k][i] - damping * body_rate[k];
 }
 
 // Bound of the acceleration that the forces of aero_wrench give at an airspeed [m/s^2].

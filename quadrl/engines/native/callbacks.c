@@ -187,8 +187,8 @@ QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
     if (a->effects[0] != STILL_AIR) add_rotor_effects(m, d, a, body, airspeed, force, moment);
     if (m->nuser_geom >= 2 && m->nuserdata >= AIR + HIT) note_hits(m, d, body);
     for (int k = 0; k < 3; ++k) {
-      d->qfrc_passive[dof + k] +=
-          turn[3 * k] * force[0] + turn[3 * k + 1] * force[1] + turn[3 * k + 2] * force[2];
+      d->qfrc_passive[dof + k] += turn[3 * k] * force[0] + turn[3 * k + 1] * force[1] +
+                                  turn[3 * k + 2] * force[2] + a->steady_force[k][0];
     }
     for (int k = 0; k < 3; ++k) d->qfrc_passive[dof + 3 + k] += moment[k];
   }

@@ -49,7 +49,8 @@ static double strongest_pull(const Aircraft* a, int rotors, const World* world, 
     const double air = m[VELOCITY + k][i] - s->air[k][i];
     squares += air * air;
   }
-  double pull = fabs(world->gravity) + lift / a->mass[i] + aero_largest_drag(a, squares, i);
+  const double f[3] = {a->steady_force[0][i], a->steady_force[1][i], a->steady_force[2][i]};
+  double pull = fabs(world->gravity) + (lift + aero_length(f)) / a->mass[i] + aero_largest_drag(a, squares, i);
   if (a->effects[i] != STILL_AIR) {
     const double r[3] = {m[BODY_RATE][i], m[BODY_RATE + 1][i], m[BODY_RATE + 2][i]};
     double reach, radius;

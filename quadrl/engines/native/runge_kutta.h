@@ -115,7 +115,7 @@ INLINE void derivative(const Aircraft* a, const Setting* s, int effects, int rot
     for (int k = 0; k < 3; ++k) {
       const double pull = turn[k][0] * force[0] + turn[k][1] * force[1] + turn[k][2] * force[2];
       d[POSITION + k][i] = m[VELOCITY + k][i];
-      d[VELOCITY + k][i] = pull / a->mass[i] + (k == 2 ? gravity : 0);
+      d[VELOCITY + k][i] = (pull + a->steady_force[k][i]) / a->mass[i] + (k == 2 ? gravity : 0);
     }
     const double j[3] = {a->inertia[0][i], a->inertia[1][i], a->inertia[2][i]};
     d[BODY_RATE][i] = (moment[0] - (j[2] - j[1]) * r[1] * r[2]) / j[0];
