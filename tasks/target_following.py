@@ -60,7 +60,7 @@ class TargetFollowing(Task):
         "ppo": {"training_options": {"spin_weight": 10.0}},
         # With the task's own weight it speeds up after the target with its rotors at their ends,
         # where the physics have no derivative, and tips over in up to 9 of 100 flights.
-        "apg": {"training_options": {"speed_weight": 10.0}},
+        "apg": {"training_options": {"speed_weight": 10.0, "spin_weight": 10.0}},
     }
     observation = OBSERVATION | TARGET_VELOCITY
 
