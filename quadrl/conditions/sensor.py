@@ -42,8 +42,10 @@ class Moment:
     rows: np.ndarray | None  # (n,) which aircraft; None for all
     frame: EstimatedState | None  # where the estimate is kept; None where it is the truth
     entries: Array = None  # (n, e), the task's entries of the estimated state, that are seen
+    estimated: Mapping[str, Array] = dataclasses.field(default_factory=dict[str, Array])
+    """All its entries of the estimated state, (n, k) by name."""
     truth: Mapping[str, Array] = dataclasses.field(default_factory=dict[str, Array])
-    """Its entries of the true state, (n, k) by name."""
+    """The same of the true state."""
     observed: Array = None  # (n, m), what is measured, as late as it is seen
     memory: Memory = dataclasses.field(default_factory=Memory)  # what the sensor itself remembers
 

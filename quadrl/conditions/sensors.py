@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.rotors import GRAVITY
+from quadrl.aircraft.rotors import GRAVITY, MAX
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import Array, to_body, to_world
+from quadrl.base.rotation import Array, norm, to_body, to_world
 from quadrl.base.validation import choice, number
 from quadrl.conditions.sensor import SENSORS as SENSORS
 from quadrl.conditions.sensor import Channel as Channel
@@ -158,6 +158,51 @@ class Disturbance(Sensor):
     def sense(self, now: Moment) -> Array:
         """In the body frame."""
         return to_body(now.state.rotation, now.memory["felt"])
+
+
+@register_sensor
+class Aim(Sensor):
+    """From the aircraft to a place beyond the goal by the sum of past offsets, body frame.
+
+    It stands in the place of the goal and of the position: what flies to it as to a goal comes to
+    rest at the goal itself, whatever lasting force there is, since until then the place moves on.
+    """
+
+    name, size, unit, last = "aim", 3, "m", True
+
+    gain: float = 0.5
+    """What the place moves on in a second, of the offset [1/s]."""
+    near: float = 0.5
+    """Longer offsets [m] are ways and are not summed up."""
+    most: float = 1.0
+    """Largest distance of the place from the goal along each axis of the world [m]."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        super().__post_init__()
+        for name in ("gain", "near", "most"):
+            number(f"aim {name}", getattr(self, name), 0, MAX)
+
+    @property
+    def hides(self) -> tuple[str, ...]:
+        """What says where the goal is."""
+        return "position", "goal"
+
+    def begin(self, now: Moment) -> Memory:
+        """Nothing is summed up."""
+        return {"sum": np.zeros((len(now.wind), self.size))}
+
+    def update(self, now: Moment) -> Memory:
+        """Add a short offset."""
+        offset = to_world(now.state.rotation, now.estimated["goal"])
+        added = np.where(norm(offset)[:, None] < self.near, offset, 0.0)
+        seconds = float(now.parameters.control_timestep)
+        summed = now.memory["sum"] + self.gain * seconds * added
+        return {"sum": np.clip(summed, -self.most, self.most)}
+
+    def sense(self, now: Moment) -> Array:
+        """From the estimated state."""
+        return now.estimated["goal"] + to_body(now.state.rotation, now.memory["sum"])
 
 
 @dataclasses.dataclass(frozen=True)

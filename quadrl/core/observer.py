@@ -87,7 +87,9 @@ class Observer:
         others = [channel for name, channel in self._channels.items() if name != "state"]
         shown = [channel for channel in others if channel.sensor.shown]
         self._early = [channel for channel in others if not channel.sensor.last]
-        self._last = [channel for channel in others if channel.sensor.last]
+        late = [channel for channel in others if channel.sensor.last]
+        # What is measured is told to the others.
+        self._last = sorted(late, key=lambda channel: not channel.sensor.measured)
         self._measured = [self._entries, *(c for c in shown if c.sensor.measured)]
         self._known = [channel for channel in shown if not channel.sensor.measured]
         for channel in (*self._measured[1:], *self._known):
@@ -162,11 +164,12 @@ class Observer:
     ) -> None:
         """Let those sensors begin or step that look at the task's entries."""
         now.entries = np.concatenate([entries[name] for name in self._own], axis=-1)
-        now.truth = truth
+        now.estimated, now.truth = entries, truth
         act(self._entries, now)
-        observed = self._observed()
-        now.observed = observed if now.rows is None else observed[now.rows]
         for channel in self._last:
+            if not channel.sensor.measured and now.observed is None:
+                observed = self._observed()
+                now.observed = observed if now.rows is None else observed[now.rows]
             act(channel, now)
 
     def _show_sensed(self) -> None:

@@ -12,7 +12,7 @@ from policies import linear
 from test_observing import ACTIONS, seen
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import to_body
+from quadrl.base.rotation import to_body, to_world
 from quadrl.conditions import sensors
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.sensors import Sensor, register_sensor
@@ -139,6 +139,27 @@ def test_a_task_may_ask_for_any_sensor():
     environment.reset()
     shown = environment.step(np.zeros((2, 4))).observation
     assert {"rotor_speed", "airspeed"} <= shown.keys()
+
+
+def test_the_aim_moves_on_by_short_offsets_and_no_further_than_it_may():
+    options = {"gain": 2.0, "near": 0.5, "most": 0.15}
+    environment = helpers.begun("hover", 2, observe={"sensors": {"aim": options}})
+    assert not {"goal", "position"} & environment.observer.terms.keys()
+    east = np.array([1, 0, 0, 1]) / np.sqrt(2)  # x of the body is north
+    environment.reset(
+        start={"position": np.array([[-0.1, 0, 0], [-0.6, 0, 0]]), "quaternion": east}
+    )
+    summed = np.zeros((2, 3))
+    for _ in range(30):
+        seen = helpers.idle(environment).observation["aim"]
+        state = environment.engine.state
+        offset = to_world(state.rotation, environment.task.observe(environment.snapshot)["goal"])
+        summed += np.where(np.linalg.norm(offset, axis=1, keepdims=True) < 0.5, 0.1 * offset, 0)
+        summed = np.clip(summed, -0.15, 0.15)
+        np.testing.assert_allclose(seen, to_body(state.rotation, offset + summed), atol=1e-12)
+    assert summed[0, 0] == 0.15 and not summed[1].any()  # near, and a long way off
+    start = environment.reset(np.array([0]))["aim"]  # a new episode sums up anew
+    np.testing.assert_array_equal(start, environment.task.observe(environment.snapshot)["goal"][:1])
 
 
 def test_noise_is_new_in_each_sample_and_a_bias_lasts():
