@@ -21,7 +21,7 @@ from quadrl.aircraft.parameters import rows
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.cli import main
-from quadrl.conditions.sampler import AircraftSampler
+from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.core.environment import Environment
 from quadrl.core.rules import import_own
@@ -84,7 +84,8 @@ def test_one_rotor_is_weaker_and_it_may_be_any():
     assert set(np.round(np.sort(factor, axis=1), 9).ravel()) == {0.8, 1.0}
     assert (np.isclose(factor, 0.8).sum(axis=1) == 1).all()
     assert set(np.argmin(factor, axis=1)) == {0, 1, 2, 3}
-    np.testing.assert_array_equal(np.argmin(factor, axis=1), drawn[:, -1])
+    damaged = sampler.columns(drawn, DAMAGED, 1)[:, 0]
+    np.testing.assert_array_equal(np.argmin(factor, axis=1), damaged)
     with refused("rotors"):
         AircraftSampler(Randomization(one_rotor=(0.01, 0.01)), Vehicle())
 
