@@ -73,7 +73,7 @@ class Landing(Task):
     }
     # With the wide action scale of that variant, actions as random as usual end in a crash before
     # anything is learned.
-    variants = {"robust": {"gamma": 0.97, "initial_deviation": 0.4, "aerodynamics": "full"}}
+    variants = {"robust": {"gamma": 0.97, "initial_deviation": 0.4}}
     heading_matters = True
     keeps_place = False
     contact = True
