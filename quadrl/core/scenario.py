@@ -133,7 +133,8 @@ class Scenario:
         """Make a scenario of what a caller gives, or change one.
 
         The name of the task or of the aircraft that is there already keeps its options. Another
-        aircraft by its name flies in the air that was asked for; a Vehicle brings its own.
+        aircraft by its name flies in the air that was asked for; a Vehicle brings its own, and one
+        without any keeps wind that acts by drag alone.
 
         Args:
             given: The name of a task, a task, a scenario, or a mapping as `to_json` has it.
@@ -160,8 +161,9 @@ class Scenario:
                 del new[name]
             elif name in new:
                 whole.pop(f"{name}_options", None)
-        if isinstance(new.get("vehicle"), Vehicle):
-            whole.pop("aerodynamics", None)
+        if isinstance(flies := new.get("vehicle"), Vehicle):
+            if whole.get("aerodynamics") != "none" or flies.aerodynamics.effects:
+                whole.pop("aerodynamics", None)
         options = {**whole.pop("task_options", {}), **new.pop("task_options", {})}
         vehicle_options = {**whole.pop("vehicle_options", {}), **new.pop("vehicle_options", {})}
         whole |= new

@@ -272,11 +272,12 @@ def _flown(
     if not isinstance(task, Scenario):
         given = {"weather": Weather(), "randomization": Randomization()} | given
     flown: dict[str, tuple[Controller, Scenario]] = {}
+    asked = "aerodynamics" in given
     for name, one in pairs:
         own, flies, scenario = setting(one, task, **given)
+        if scenario.aerodynamics == NONE and not asked:  # of its training
+            scenario = dataclasses.replace(scenario, aerodynamics=None)
         if not flown:
-            if scenario.aerodynamics == NONE and "aerodynamics" not in given:  # of its training
-                scenario = dataclasses.replace(scenario, aerodynamics=None)
             if "engine" not in given and not isinstance(task, Scenario):
                 engine = "mujoco" if scenario.task.contact else "free_flight"
                 scenario = dataclasses.replace(scenario, engine=engine)

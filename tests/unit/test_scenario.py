@@ -153,6 +153,11 @@ def test_what_was_saved_before_wind_acted_on_rotors_flies_as_it_did():
         assert as_saved(as_it_is) == as_it_is
     thin = {"name": "thin", "aerodynamics": {"air_density": 1.0}}
     assert Scenario.of(as_saved(windy | {"vehicle": thin})).aircraft.aerodynamics.effects == 0
+    # Also with a Vehicle that has no effects; one that has brings them.
+    before = Scenario.of(as_saved(windy))
+    assert Scenario.of(before, vehicle=VEHICLES["paper"]) == before
+    in_air = in_real_air(VEHICLES["paper"])
+    assert Scenario.of(before, vehicle=in_air).aircraft == in_air
     assert Policy.pretrained("hover", variant="robust").scenario.aircraft.aerodynamics.effects == 0
 
 
