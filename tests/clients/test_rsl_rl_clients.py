@@ -45,7 +45,15 @@ def settings(**changed):
     [
         ("hover", {"vehicle": "crazyflie", "control_timestep": 0.04}),
         ("landing", {"start_height": 0.2}),
-        ("hover", {"randomization": "full", "weather": "light", "observe": {"privileged": True}}),
+        (
+            "hover",
+            {
+                "randomization": "full",
+                "weather": "light",
+                "observe": {"privileged": True},
+                "max_distance": 0.7,
+            },
+        ),
     ],
     ids=["hover", "landing", "uncertain"],
 )
