@@ -537,7 +537,7 @@ MISTYPED = {
     "evaluate hover --episodes": "--episodes needs a value; see quadrl evaluate --help",
     "evaluate hover --seed 1 --seed 2": "option = '--seed': must be given once",
     "evaluate hover --controller zero --controller random": "must be given once",
-    "--quiet evaluate hover --seed 1 --seed 2": "option = '--seed': must be given once",
+    "--quiet robustness hover --controller lqr --controller zero --seed 1 --seed 2": "'--seed'",
     "evaluate hover --task-options radius=1 radius=2": "radius = 'radius=2': must be given once",
     "study": "missing: PATH The study: a .toml or .json file",
     "--import": "--import needs a value; see quadrl --help",

@@ -134,6 +134,20 @@ class Aware(Hover):
         return super().reward(before, now, end) | {"air": now.sensed["airspeed"][..., 0]}
 
 
+@dataclasses.dataclass(frozen=True)
+class Peeping(Aware):
+    """Looks at a sensor that shows nothing of its own."""
+
+    def reward(self, before, now, end):
+        """As hover, and what is hidden."""
+        return super().reward(before, now, end) | {"hidden": now.sensed["rotor_speed"][..., 0]}
+
+
+def test_a_task_that_looks_at_a_hidden_sensor_fails_when_it_is_made():
+    with pytest.raises(KeyError, match="rotor_speed"):
+        Environment(Peeping(), num_envs=2, seed=1)
+
+
 def test_a_task_may_ask_for_any_sensor():
     environment = Environment(Aware(), num_envs=2, seed=1)
     environment.reset()
