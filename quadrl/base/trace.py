@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.base.rotation import Array
+from quadrl.base.rotation import Array, namespace
 
 OPERATORS = {
     "add": "+", "subtract": "-", "multiply": "*", "divide": "/", "less": "<", "less_equal": "<=",
@@ -25,7 +25,7 @@ OPERATORS = {
     "bitwise_or": "|", "bitwise_xor": "^", "logical_and": "&", "logical_or": "|",
 }  # fmt: skip
 CALLS = {"absolute": "fabs", "arcsin": "asin", "arccos": "acos", "arctan": "atan"}
-CALLS |= {name: name for name in ("sqrt", "sin", "cos", "exp", "log", "tan", "tanh")}
+CALLS |= {name: name for name in ("sqrt", "sin", "cos", "exp", "log", "tan", "tanh", "floor")}
 C: dict[str, str] = {
     "negative": "-{}",
     "arctan2": "atan2({}, {})",
@@ -68,9 +68,13 @@ REVERSE: dict[str, Callable[..., tuple[Any, ...]]] = {
     "log": lambda by, result, x: (by / x,),
     "tanh": lambda by, result, x: (by * (1 - result * result),),
     "arctan": lambda by, result, x: (by / (1 + x * x),),
+    "floor": lambda by, result, x: (None,),  # it has steps, and between them no slope
+    "look_up": lambda by, result, index: (None,),
 }
 """From the derivative of a number by a result, and the result and its operands, those by them."""
 MAX_OPERATIONS = 2000  # more would take the C compiler longer than they save
+MAX_TABLES = 1_000_000
+"""Numbers of the tables that a function looks up in."""
 
 
 class NotCompilable(TypeError):
@@ -115,6 +119,7 @@ class Trace:
         self.known: dict[tuple[str, ...], Symbol] = {}
         self.max_operations = max_operations
         self.constants: list[float] = []
+        self._tables: dict[bytes, int] = {}
 
     def inputs(self, expressions: Array, is_flag: bool = False) -> Symbols:
         """Symbols of C expressions that read memory, an array of any shape."""
@@ -147,6 +152,26 @@ class Trace:
         symbol = Symbol(self, C[name].format(*names), name, values, is_flag)
         return self.known.setdefault((name, *names), symbol)
 
+    def look_up(self, table: np.ndarray, index: Symbol) -> list[Symbol]:
+        """Symbols (k,) of the entry of a table (n, k) that an index names, from 0 to n - 1.
+
+        Raises:
+            NotCompilable: The tables are too large.
+        """
+        first = self._tables.setdefault(table.tobytes(), len(self.constants))
+        if first == len(self.constants):
+            self.constants += table.ravel().tolist()
+        if len(self.constants) > MAX_TABLES:
+            reason = f"its look-ups need {len(self.constants)} numbers, more than {MAX_TABLES}"
+            raise NotCompilable(f"{reason}, which cannot be compiled")
+        count = table.shape[1]
+        found: list[Symbol] = []
+        for place in range(first, first + count):
+            text = f"c[{place} + {count} * (int64_t){index.name}]"
+            symbol = Symbol(self, text, "look_up", (index,), is_flag=False)
+            found.append(self.known.setdefault((text,), symbol))
+        return found
+
     def name_of(self, value: Any) -> str:
         """How C names an operand; each number is a constant, so that options change no code."""
         if isinstance(value, Symbol):
@@ -175,7 +200,7 @@ class Trace:
 
         def add(values: Iterable[Any], derivatives: Iterable[Any]) -> None:
             for value, more in zip(values, derivatives, strict=True):
-                if isinstance(value, Symbol) and not value.is_flag:
+                if isinstance(value, Symbol) and not value.is_flag and more is not None:
                     by[value] = by[value] + more if value in by else symbols(more)
 
         add(results, given)
@@ -208,6 +233,8 @@ class Symbols(np.ndarray):
         """Write an operation down for each element."""
         if method == "__call__" and not any(x is not None for x in options.values()):
             return elementwise(ufunc.__name__, *inputs)
+        if ufunc.__name__ in LOGICAL and options.get("dtype") in (bool,):
+            options["dtype"] = None  # `any` and `all`
         rest = (options[name] for name in options.keys() - {"axis", "keepdims"})
         usual, axes = all(x is None or x is True for x in rest), options.get("axis", 0)
         if axes is None:
@@ -248,6 +275,30 @@ def elementwise(name: str, *arrays: Any) -> Symbols:
 
     plain = (np.asarray(array, dtype=object) for array in arrays)
     return symbols(np.frompyfunc(operate, len(arrays), 1)(*plain))
+
+
+def look_up(table: np.ndarray, index: Array) -> Array:
+    """Entries of a constant table, in any array namespace, and where a step is compiled.
+
+    Args:
+        table: Numbers (n, ...), at least one entry.
+        index: Whole numbers (...) from 0 on, held as floats. The last entry stands for all that
+            would come after it, the first for what would come before, and for what is no number.
+
+    Returns:
+        Numbers (..., *table.shape[1:]) of the index's kind.
+    """
+    table, xp = np.asarray(table, dtype=np.float64), namespace(index)
+    last = float(len(table) - 1)
+    place = xp.where(index > 0, xp.where(index < last, index, last), 0.0)
+    if not isinstance(place, Symbols):
+        entries = xp.asarray(table, dtype=place.dtype, device=place.device)
+        return entries[xp.asarray(place, dtype=xp.int64)]
+    flat = table.reshape(len(table), -1)
+    found = [
+        x.trace.look_up(flat, x) if isinstance(x, Symbol) else flat[int(x)] for x in place.flat
+    ]
+    return symbols(found).reshape(*place.shape, *table.shape[1:])
 
 
 def _is_two(value: Any) -> bool:

@@ -23,6 +23,7 @@ from quadrl.base import records
 from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.rotation import Array
 from quadrl.base.trace import NotCompilable, Trace, symbolic
+from quadrl.conditions.scene import Surroundings
 from quadrl.core.purity import Reads
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.step import Step, WrittenStep
@@ -54,9 +55,6 @@ def make(now: Snapshot, episode: Episode, loops: bool, parameters: np.ndarray, *
     if not step.task.compiled:
         step.not_compiled = "the task has `compiled = False`"
         return step
-    if step.scene.solids:
-        step.not_compiled = "there are solids in the world"
-        return step
     try:
         return CompiledStep(step, now, episode, loops, parameters, *parts)
     except NotCompilable as error:
@@ -84,7 +82,7 @@ class _Page:
         self.address = native.address(whole)
         sensed = np.empty((step.sensed.end + 1, step.columns))  # at least a row has an address
         self.sensed_address = native.address(sensed)
-        self.sensed = step.by_sensor(step.sensed.views(sensed[:, : step.count]))
+        self.sensed, self.around = step.given(step.sensed.views(sensed[:, : step.count]))
         self.kept = step.kept.views(table)
         parts = iter(self.kept)
         self.now, self.episode = (records.filled(like, parts) for like in (now, episode))
@@ -129,14 +127,17 @@ class CompiledStep(Step):
         super().__init__(*parts)
         self._written, self._parameters = written, now.parameters
         self.count, self.columns = self._engine.num_envs, padded(self._engine.num_envs)
-        like = dataclasses.replace(now, state=None, parameters=None)  # these have their own tables
+        # These have tables of their own.
+        like = dataclasses.replace(now, state=None, parameters=None, around=None)
         kept = [*records.leaves(like), *records.leaves(episode)]
         if any(array.dtype != np.float64 for array in kept):
             raise NotCompilable("what it remembers is not all float64")
         self.kept = records.Columns(0, kept)
         # Others do not show themselves to the task.
         self._shown = [name for name in self.task.sensors if name in now.sensed]
-        self.sensed = records.Columns(0, [now.sensed[name] for name in self._shown])
+        self._around = now.around
+        around = records.leaves(now.around) if now.around else []
+        self.sensed = records.Columns(0, [*(now.sensed[name] for name in self._shown), *around])
         kinds = now.task.__class__, now.potentials.__class__
         self._reads = Reads(self.task, METHODS, kinds)
         (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
@@ -194,19 +195,26 @@ class CompiledStep(Step):
             for size in [getattr(self._inputs, name).shape[1]]
         )
         diverged = trace.inputs(np.array(["diverged[i]"], object), is_flag=True)
-        before.sensed = self.by_sensor(map(read("last_sensed[{} * columns + i]"), sensors))
-        sensed = self.by_sensor(map(read("sensed[{} * columns + i]"), sensors))
+        given = (
+            self.given(map(read(f"{name}[{{}} * columns + i]"), sensors))
+            for name in ("last_sensed", "sensed")
+        )
+        (before.sensed, before.around), (sensed, around) = given
+        for solids in filter(None, (before.around, around)):
+            solids.touched = solids.touched != 0.0
         seen_from = estimate if self._estimate else None
-        inputs = state, action, command, diverged, seen_from, None, sensed
+        inputs = state, action, command, diverged, seen_from, around, sensed
         with symbolic():
             after, ended, done = finish(self.task, self._clock, begun, before, *inputs)
-            after.state = after.parameters = None  # type: ignore[assignment]
+            after.state = after.parameters = after.around = None  # type: ignore[assignment]
             kept = [*records.leaves(after), *records.leaves(ended)]
             return trace, trace.body(self._outputs(kept, done))
 
-    def by_sensor(self, arrays: Iterable[Any]) -> dict[str, Any]:
-        """Name what the sensors give that the task asks for and sees, in their order."""
-        return dict(zip(self._shown, arrays, strict=True))
+    def given(self, arrays: Iterable[Any]) -> tuple[dict[str, Any], Surroundings | None]:
+        """What the sensors give that the task asks for and sees, and the solids about aircraft."""
+        rest = iter(arrays)
+        sensed = {name: next(rest) for name in self._shown}
+        return sensed, records.filled(self._around, rest) if self._around else None
 
     def _outputs(self, kept: list[Array], done: Transition) -> dict[str, Any]:
         """What is computed, by where it is written to."""
@@ -229,11 +237,11 @@ class CompiledStep(Step):
 
     def begin(self, now: Snapshot, episode: Episode) -> None:
         """Take a snapshot of all rows as the present one."""
-        moment = dataclasses.replace(now, state=None, parameters=None)
+        moment = dataclasses.replace(now, state=None, parameters=None, around=None)
         arrays = [*records.leaves(moment), *records.leaves(episode)]
         for into, array in zip(self._pages[0].kept, arrays, strict=True):
             into[:] = array
-        self._show(self._pages[0], now.sensed)
+        self._show(self._pages[0], now.sensed, now.around)
 
     def hold(self) -> None:
         """Keep nothing: where the engine is read in between, no step looks back at the state."""
@@ -244,15 +252,22 @@ class CompiledStep(Step):
         self._pages = page, last
         rows, (now, before) = self._arguments, self._engine.frames
         rows.state, rows.last_state = now.address, before.address
+        around = self.scene.surroundings(self._engine) if self.scene.solids else None
         # A reset since the last step has given its rows what the sensors show then.
-        for given, own in ((self.snapshot.sensed, last.sensed), (sensed, page.sensed)):
-            for name, array in own.items():
+        for given, solids, own in (
+            (self.snapshot.sensed, self.snapshot.around, last),
+            (sensed, around, page),
+        ):
+            for name, array in own.sensed.items():
                 array[:] = given[name]
+            if own.around:
+                for into, array in zip(*map(records.leaves, (own.around, solids)), strict=True):
+                    into[:] = array
         rows.sensed, rows.last_sensed = page.sensed_address, last.sensed_address
         rest, count = np.empty((self.flags + 1, self.columns)), self.count
         rows.was, rows.out, rows.rest = last.address, page.address, native.address(rest)
         self._call(self._address, count)
-        self._show(page, sensed)
+        self._show(page, sensed, around)
         self._observation = page.observation.copy()
         *terms, reward, error = rest[:-1, :count]
         flags = rest[-1].view(np.bool_).reshape(-1, self.columns)[: len(FLAGS), :count]
@@ -269,9 +284,11 @@ class CompiledStep(Step):
             truth=page.truth or self._observation,
         )
 
-    def _show(self, page: _Page, sensed: Mapping[str, np.ndarray]) -> None:
+    def _show(
+        self, page: _Page, sensed: Mapping[str, np.ndarray], around: Surroundings | None
+    ) -> None:
         """Make a table the present one."""
-        page.now.sensed = sensed
+        page.now.sensed, page.now.around = sensed, around
         page.now.state, page.now.parameters = self._engine.state, self._parameters
         self.snapshot, self.episode = page.now, page.episode
 

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.base import trace
 from quadrl.base.errors import NativeError, QuadrlWarning
-from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace
+from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace, look_up
+from quadrl.conditions.scene import Cylinder, Gate, Pose
 from quadrl.core.environment import Environment
 from quadrl.engines.native import compiling
 from quadrl.tasks.hover import Hover
@@ -105,6 +107,62 @@ def test_the_state_and_the_action_before_are_seen():
     with pytest.warns(QuadrlWarning, match="the control mode reads the state in between"):
         one, other = pair(members={"reward": reward}, num_envs=3, control_mode="velocity")
     same_flights(one, other)
+
+
+GATES = {"first": (1.2, 0.0, 0.0), "second": (0.0, 1.2, 0.0), "third": (-1.2, 0.0, 0.3)}
+PLACES = np.array(list(GATES.values()))
+PLACES.flags.writeable = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Lap:
+    """What is remembered of a flight through gates."""
+
+    goal: np.ndarray  # (N, 3) [m]
+    gate: np.ndarray  # (N,) the next one's number
+
+
+def gate_after(self, before, now):
+    near = now.potentials.distance < 1.3
+    gate = now.task.gate + np.where(near, 1.0, 0.0)
+    gate = gate - 3.0 * np.floor(gate / 3.0)
+    return Lap(look_up(PLACES, gate), gate)
+
+
+def begin_lap(self, rng, parameters):
+    start, state = Hover.begin(self, rng, parameters)
+    gate = np.arange(len(state.goal)) % 3.0
+    return start, Lap(look_up(PLACES, gate), gate)
+
+
+RACE = {
+    "begin": begin_lap,
+    "update": gate_after,
+    "solids": lambda self: [*map(Gate, GATES), Cylinder("post", radius=0.05)],
+    "place": lambda self, rng, start, state: {"post": Pose(rng.level_direction())},
+    "error": lambda self, now: now.clearance + look_up(PLACES[:, 2], now.task.gate),
+    "succeeded": lambda self, now, end: now.touched[..., 1] | (now.touch_speed > 0.5),
+    "reward": lambda self, before, now, end: {
+        "closer": before.clearance - now.clearance,
+        "hit": np.where(before.touched[..., 0] | now.touched.any(-1), -1.0, 0.0),
+        "post": now.solid("post")[..., 0] - before.solid("second")[..., 0],
+        "gate": now.task.gate - before.task.gate,
+    },
+}
+
+
+@pytest.mark.parametrize(("count", "engine"), [(1, "mujoco"), (21, "free_flight")])
+def test_gates_are_looked_up_and_solids_are_seen(count, engine):
+    options = {"time_limit": 1.5, "settle_time": 0.2}
+    one, other = pair(options=options, members=RACE, num_envs=count, engine=engine)
+    assert not one.not_compiled
+    gates, hits = set(one.snapshot.task.gate), 0
+    for seed in range(4):
+        same_flights(one, other, seed=seed)
+        gates |= set(one.snapshot.task.gate)
+        hits += one.snapshot.touched.sum()
+    assert gates == {0.0, 1.0, 2.0} or count == 1
+    assert hits or count == 1  # else nothing of a touch was compared
 
 
 def noisy(self, now):
@@ -330,7 +388,7 @@ def test_what_a_transition_holds_is_its_own_but_the_observation(task, compiled):
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 0.3, 2.0, 1e300, -1e-300, np.inf, -np.inf, np.nan])
 UNARY = {"negative", "absolute", "sqrt", "sin", "cos", "exp", "log", "tan", "tanh", "arcsin",
-         "arccos", "arctan", "invert", "logical_not"}  # fmt: skip
+         "arccos", "arctan", "invert", "logical_not", "floor"}  # fmt: skip
 LIBRARY = {"sin", "cos", "exp", "log", "tan", "tanh", "arcsin", "arccos", "arctan", "arctan2"}
 
 
@@ -379,7 +437,44 @@ def test_every_operation_is_that_of_numpy(name):
         np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("name", sorted(REVERSE))
+@pytest.mark.parametrize("size", [1, 4])
+def test_a_look_up_gives_the_entries_that_numpy_gives(size):
+    table = np.random.default_rng(0).normal(size=(size, 2, 3))
+
+    def compute(index):
+        entries = look_up(table, np.stack([index, index + 1.0], axis=-1))  # (n, 2, 2, 3)
+        return np.sum(entries[:, 0, 1] * entries[:, 1, 0], axis=-1) + look_up(
+            table[:, 0, 0], np.array(2.0)
+        )
+
+    expected, found = compute(NUMBERS), run(compute, NUMBERS)
+    np.testing.assert_array_equal(found, expected)
+    # -0.0 and below are the first; the largest and infinity the last; NaN again the first.
+    places = [0, 0, 1, 0, 0, 2, size, 0, size, 0, 0]
+    entries = table[np.minimum(places, size - 1)]
+    np.testing.assert_array_equal(look_up(table, NUMBERS), entries)
+
+
+def test_a_look_up_does_not_reach_into_derivatives():
+    def derivative(x):
+        result, symbol = (x * look_up(np.array([2.0, 3.0]), np.floor(x))).item(), x.item()
+        by = symbol.trace.vector_jacobian_product([result], [1.0], [symbol])
+        return np.array(by, object) + 0 * x
+
+    np.testing.assert_array_equal(run(derivative, np.array([0.5, 1.5])), [2.0, 3.0])
+
+
+def test_tables_that_are_too_large_are_refused_with_their_size(monkeypatch):
+    monkeypatch.setattr(trace, "MAX_TABLES", 5)
+
+    def error(self, now):
+        return now.potentials.distance * look_up(np.arange(6.0), now.time)
+
+    with pytest.warns(QuadrlWarning, match="its look-ups need [0-9]+ numbers, more than 5"):
+        assert helpers.begun(variant(error=error), 2).not_compiled
+
+
+@pytest.mark.parametrize("name", sorted(REVERSE.keys() - {"floor", "look_up"}))
 def test_every_derivative_is_that_of_differences(name):
     columns = np.random.default_rng(0).uniform(0.2, 1.4, (1 if name in UNARY else 2, 40))
 
