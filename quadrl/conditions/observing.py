@@ -12,6 +12,8 @@ from quadrl.conditions import sensors
 from quadrl.conditions.sensors import LONGEST_HISTORY, Sensor
 
 ROTOR_SPEEDS = ("true", "estimated", "none")
+SWITCHES = ("relative_rotor_speed", "rotation", "airspeed", "disturbance", "privileged")
+"""Sensors that are seen where the option of their name is true."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +28,10 @@ class Observing:
     rotor_speed: Literal["true", "estimated", "none"] = "true"
     """Which rotor speeds are seen: the true ones, those that follow from the commands with the lag
     that is specified, or none."""
+    relative_rotor_speed: bool = False
+    """Whether those are seen less the speed of hover, over that, as `relative_rotor_speed`."""
+    rotation: bool = False
+    """Whether the rotation matrix from body to world is seen, row by row."""
     airspeed: bool = False
     """Whether the velocity through the air is seen, in the body frame."""
     disturbance: bool = False
@@ -45,9 +51,12 @@ class Observing:
             value = number(name, getattr(self, name), 0, LONGEST_HISTORY, whole=True)
             object.__setattr__(self, name, value)
         choice("rotor_speed", self.rotor_speed, ROTOR_SPEEDS)
-        for name in ("airspeed", "disturbance", "privileged"):
+        for name in SWITCHES:
             if not isinstance(value := getattr(self, name), bool):
                 raise QuadrlError(name=name, value=value, allowed="True or False")
+        if self.relative_rotor_speed and self.rotor_speed == "none":
+            allowed = "True beside rotor_speed true or estimated"
+            raise QuadrlError(name="relative_rotor_speed", value=True, allowed=allowed)
         given: Any = self.sensors
         if not isinstance(given, Mapping):
             allowed = "a mapping of their names to their options"
@@ -68,7 +77,7 @@ class Observing:
         """
         lengths = "action_history", "observation_history"
         given: dict[str, Any] = {"rotor_speed": {}, "estimate": {}, "state": {}}
-        given |= {k: {} for k in ("airspeed", "disturbance", "privileged") if getattr(self, k)}
+        given |= {name: {} for name in SWITCHES if getattr(self, name)}
         given |= {k: {"length": length} for k in lengths if (length := getattr(self, k))}
         for own in (further or {}, self.sensors):
             given |= {name: given.get(name, {}) | dict(options) for name, options in own.items()}

@@ -128,6 +128,37 @@ class Entries(Sensor):
 
 
 @register_sensor
+class RelativeRotorSpeed(Sensor):
+    """Rotor speeds less that of hover, over that of hover; in the place of the task's own entry."""
+
+    name = "relative_rotor_speed"
+
+    @property
+    def hides(self) -> tuple[str, ...]:
+        """The same over the largest speed."""
+        return ("rotor_speed",)
+
+    def width(self, sizes: Sizes) -> int:
+        """One for each rotor."""
+        return sizes.rotors
+
+    def sense(self, now: Moment) -> Array:
+        """True or modelled, as `rotor_speed` says."""
+        return now.state.rotor_speed / now.parameters.rotor.hover_speed - 1.0
+
+
+@register_sensor
+class Rotation(Sensor):
+    """Rotation matrix from body to world, row by row."""
+
+    name, size = "rotation", 9
+
+    def sense(self, now: Moment) -> Array:
+        """From the estimated attitude."""
+        return now.state.rotation_entries
+
+
+@register_sensor
 class Airspeed(Sensor):
     """Velocity through the air, body frame."""
 

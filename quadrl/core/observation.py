@@ -46,3 +46,7 @@ TARGET_VELOCITY = {
     )
 }
 """What tasks with a moving target add at the end."""
+
+ROTATION = {"rotation": ObservationTerm(9, "1", "rotation matrix from body to world, row by row")}
+"""What tasks add that fly in any attitude, `State.rotation_entries`: the sines and cosines of roll
+and yaw jump where the pitch passes 90 degrees."""

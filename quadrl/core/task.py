@@ -24,7 +24,8 @@ from quadrl.conditions.scene import Pose, Scene, Solid
 from quadrl.core import rewards
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, ObservationTerm
-from quadrl.core.observation import TARGET_VELOCITY as TARGET_VELOCITY  # for users' tasks
+from quadrl.core.observation import ROTATION as ROTATION  # for users' tasks
+from quadrl.core.observation import TARGET_VELOCITY as TARGET_VELOCITY
 from quadrl.core.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start

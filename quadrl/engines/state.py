@@ -62,6 +62,11 @@ class State:
         return self.rotation[..., 2, 2]
 
     @property
+    def rotation_entries(self) -> Array:
+        """The rotation matrix row by row, (N, 9)."""
+        return self.rotation.reshape(*self.speed.shape, 9)
+
+    @property
     def at_rest(self) -> Array:
         """Whether it neither moves nor turns, (N,) bool."""
         return (self.speed < REST_SPEED) & (self.angular_speed < REST_TURN)

@@ -8,7 +8,6 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.core.environment import Environment
-from quadrl.core.observation import layout
 from quadrl.learning.config import TrainConfig
 
 DRAWN = 16  # goal states that are compared
@@ -41,8 +40,8 @@ def goal_state(config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
     environment.seed(0)  # the same episodes, which have the same goals
     seen = environment.flatten(environment.reset(start=start))
     looks = np.ones(environment.size, dtype=bool)
-    places = layout(task.observation, vehicle.rotor_count)
-    looks[places["position"]] = False
+    places = environment.layout
+    looks[places.get("position", slice(0))] = False
     if not task.heading_matters:
         for name in ("sin_attitude", "cos_attitude"):
             looks[places[name].start + YAW] = False

@@ -1,5 +1,6 @@
 """Options of the observation: histories, rotor speeds, airspeed, delay, and the critic's own."""
 
+import dataclasses
 import math
 
 import helpers
@@ -11,12 +12,14 @@ from policies import linear
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import to_body
+from quadrl.base.rotation import to_body, to_world
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.sensors import SMOOTHING
 from quadrl.core.environment import Environment
+from quadrl.core.observation import OBSERVATION, ROTATION
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
 from quadrl.evaluation.evaluate import evaluate
+from quadrl.tasks.hover import Hover
 
 PAPER = Vehicle()
 ACTIONS = helpers.random_actions(12, 3)
@@ -131,6 +134,49 @@ def test_rotor_speeds_are_estimated_with_the_lag_that_is_specified(mode):
     assert np.abs(slower[-1]["rotor_speed"] - other.engine.act / PAPER.max_speed).max() > 1e-3
     if mode == "rotor":  # the estimate follows from the commands alone
         np.testing.assert_array_equal(slower[-1]["rotor_speed"], found[-1]["rotor_speed"])
+
+
+def test_the_rotation_is_the_matrix_of_the_attitude_row_by_row():
+    found, environment = seen({"rotation": True})
+    state = environment.engine.state
+    vertical = to_body(state.rotation, np.array([[0.0, 0.0, 1.0]]))  # its last row
+    np.testing.assert_allclose(found[-1]["rotation"][:, 6:], vertical, atol=1e-15)
+    ahead = to_world(state.rotation, np.array([[1.0, 0.0, 0.0]]))  # its first column
+    np.testing.assert_allclose(found[-1]["rotation"][:, ::3], ahead, atol=1e-15)
+
+
+def test_relative_rotor_speeds_are_zero_in_hover_and_hide_the_others():
+    found, environment = seen({"relative_rotor_speed": True, "rotor_speed": "estimated"})
+    modelled, _ = seen({"rotor_speed": "estimated"})
+    assert "rotor_speed" not in found[0] and environment.size == 22
+    np.testing.assert_allclose(found[0]["relative_rotor_speed"], 0.0, atol=1e-12)
+    vehicle = environment.vehicle
+    speed = modelled[-1]["rotor_speed"] * vehicle.max_speed  # [rad/s]
+    share = speed / vehicle.hover_speed - 1
+    assert np.abs(share).max() > 0.01
+    np.testing.assert_allclose(found[-1]["relative_rotor_speed"], share, atol=1e-12)
+
+
+@dataclasses.dataclass(frozen=True)
+class AnyAttitude(Hover):
+    """Sees the rotation matrix as an entry of its own."""
+
+    observation = OBSERVATION | ROTATION
+
+    def observe(self, now):
+        """As hover, and the matrix."""
+        return super().observe(now) | {"rotation": now.state.rotation_entries}
+
+
+@pytest.mark.parametrize("drawn", ["none", "light"])
+def test_the_rotation_as_an_entry_of_a_task_is_that_of_the_option(drawn):
+    options = {"num_envs": 3, "seed": 1, "randomization": drawn}
+    own = Environment(AnyAttitude(), **options)
+    other = Environment("hover", observe={"rotation": True}, **options)
+    assert [*own.reset()] == [*other.reset()]
+    for action in ACTIONS:
+        a, b = (one.step(action).observation["rotation"] for one in (own, other))
+        np.testing.assert_array_equal(a, b)
 
 
 def test_the_airspeed_is_the_velocity_through_the_air():
@@ -275,6 +321,7 @@ def test_a_policy_flies_with_the_options_of_its_training_and_no_others():
         ({"observation_history": 10**6}, "observation_history", 10**6),
         ({"rotor_speed": "guessed"}, "rotor_speed", "guessed"),
         ({"airspeed": 1}, "airspeed", 1),
+        ({"relative_rotor_speed": True, "rotor_speed": "none"}, "relative_rotor_speed", True),
         ({"privileged": "yes"}, "privileged", "yes"),
     ],
 )
