@@ -76,31 +76,56 @@ class RecordingEnv(QuadrotorEnv):
         return done
 
 
-class EpisodeStatistics:
-    """Return and length of the episodes under way, and figures of those that end."""
+ENDED = ("return", "length")
+OUTCOMES = ("over", "success", "survival")
 
-    def __init__(self, num_envs: int) -> None:
-        """Begin with every aircraft at the start of an episode."""
-        self.running = {name: np.zeros(num_envs) for name in ("return", "length")}
+
+class EpisodeStatistics:
+    """Figures of the episodes that end, and of those that were to be over by now.
+
+    Success and survival are those of episodes begun between one and two time limits ago: all of
+    them are over. Of those that end in a batch most have failed, or, where all were begun together
+    and are cut off together, none.
+    """
+
+    def __init__(self, num_envs: int, time_limit_steps: int, rollout: int) -> None:
+        """Begin with every aircraft at the start of an episode.
+
+        Args:
+            num_envs: Aircraft, N.
+            time_limit_steps: Control steps after which an episode is over at the latest.
+            rollout: Control steps of a batch.
+        """
+        self._limit = time_limit_steps
+        self.running: dict[str, np.ndarray] = {name: np.zeros(num_envs) for name in ENDED}
+        ages = 2 * time_limit_steps + rollout
+        self.running["outcomes"] = np.zeros((ages, len(OUTCOMES)))
+        """Of episodes that are over: how many, by the steps since they began."""
 
     def count(self, batch: Any) -> dict[str, float]:
-        """Return, length, success and survival of the episodes that end in a batch."""
+        """Return and length of the episodes that end in a batch; success and survival."""
         names = ("reward", "done", "terminated", "is_success", "error")
         columns = (batch["next", name][..., 0].cpu().numpy().T for name in names)
         reward, done, terminated, success, error = columns  # (time, aircraft)
-        ended: dict[str, list[np.ndarray]] = {name: [] for name in self.running}
-        for gained, over in zip(reward, done, strict=True):
+        ended: dict[str, list[np.ndarray]] = {name: [] for name in ENDED}
+        outcomes, steps = self.running["outcomes"], len(reward)
+        outcomes[steps:], outcomes[:steps] = outcomes[:-steps].copy(), 0.0
+        judged = np.stack([done, success, ~terminated | success], axis=-1)
+        for step, (gained, over) in enumerate(zip(reward, done, strict=True)):
             self.running["return"] += gained
             self.running["length"] += 1
-            for name, running in self.running.items():
-                ended[name].append(running[over])
-                running[over] = 0.0
+            ages = self.running["length"][over].astype(int) + steps - 1 - step
+            np.add.at(outcomes, ages, judged[step, over])
+            for name, found in ended.items():
+                found.append(self.running[name][over])
+                self.running[name][over] = 0.0
         metrics = {"episodes": float(done.sum()), "reward": float(reward.mean())}
         metrics["error"] = float(error.mean())
         if done.any():
             metrics |= {name: float(np.concatenate(ended[name]).mean()) for name in ended}
-            metrics["success"] = float(success[done].mean())
-            metrics["survival"] = float(1 - (terminated & ~success)[done].mean())
+        over, succeeded, survived = outcomes[self._limit :].sum(axis=0)
+        if over:
+            metrics |= {"success": succeeded / over, "survival": survived / over}
         return metrics
 
 

@@ -110,7 +110,9 @@ class Training:
         )
         self.iteration = 0
         self.seconds = 0.0  # of training, in all processes that worked on it
-        self._episodes = EpisodeStatistics(config.num_envs)
+        self._episodes = EpisodeStatistics(
+            config.num_envs, self.env.environment.time_limit_steps, config.rollout
+        )
         self._generators: dict[str, torch.Tensor] = {}
         self._remembered: dict[str, np.ndarray] = {}  # the states of a recurrent policy
         self._asked = self._stopping = False
@@ -282,7 +284,7 @@ class Training:
             self.critic.load_state_dict(tensors["critic"])
             self.algorithm.restore(tensors.get("optimisers", {}))
             self.env.restore({k: v.numpy() for k, v in tensors["environment"].items()})
-            self._episodes.running = {k: v.numpy().copy() for k, v in tensors["running"].items()}
+            self._episodes.running |= {k: v.numpy().copy() for k, v in tensors["running"].items()}
             self._generators = tensors["generators"]
             self.iteration, self.seconds = int(numbers["iteration"]), float(numbers["seconds"])
         except QuadrlError:

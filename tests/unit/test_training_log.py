@@ -1,0 +1,59 @@
+"""What the log of a training says of its episodes."""
+
+import numpy as np
+import pytest
+import torch
+
+from quadrl.learning.environments import EpisodeStatistics
+
+LIMIT, BATCH = 4, 2
+
+
+def batches(steps, lives):
+    """Batches of aircraft that crash after so many steps each, over and over, or live (0)."""
+    length = np.zeros(len(lives), dtype=int)
+    columns = {name: [] for name in ("reward", "done", "terminated", "is_success", "error")}
+    for _ in range(steps):
+        length += 1
+        crashed = length == np.array(lives)
+        over = crashed | (length == LIMIT)
+        row = {"done": over, "terminated": crashed, "is_success": over & ~crashed}
+        row |= {"reward": np.ones(len(lives)), "error": np.zeros(len(lives))}
+        length[over] = 0
+        for name, column in columns.items():
+            column.append(row[name])
+    for first in range(0, steps, BATCH):
+        part = {k: np.array(v[first : first + BATCH]).T[..., None] for k, v in columns.items()}
+        yield {("next", name): torch.from_numpy(array) for name, array in part.items()}
+
+
+def test_success_is_that_of_episodes_which_are_all_over_by_now():
+    statistics = EpisodeStatistics(3, LIMIT, BATCH)
+    found = [statistics.count(batch) for batch in batches(12, (0, 0, 1))]
+    # The third aircraft crashes in every step, the two others live until they are cut off.
+    assert [one["episodes"] for one in found] == [2.0, 4.0, 2.0, 4.0, 2.0, 4.0]
+    assert all("success" not in one for one in found[:1])
+    # After 4 steps: three were begun 4 steps ago, of which two live.
+    assert found[1]["success"] == found[1]["survival"] == pytest.approx(2 / 3)
+    # After 6: also one crashed that was begun 5, and one that was begun 4 steps ago.
+    assert found[2]["success"] == pytest.approx(2 / 5)
+    # After 8: those begun 4 to 8 steps ago, five of one aircraft and twice two.
+    assert found[3]["success"] == pytest.approx(4 / 9)
+
+
+def test_a_crash_of_all_in_the_first_step_is_no_success_while_others_are_cut_off():
+    statistics = EpisodeStatistics(50, LIMIT, BATCH)
+    found = [statistics.count(batch) for batch in batches(8, (*[1] * 48, 0, 0))]
+    # Begun 4 to 8 steps ago: all 50 twice, of which 2 live each time, and three times 48 others.
+    assert found[-1]["success"] == pytest.approx(4 / 244)
+
+
+def test_batches_longer_than_an_episode_count_every_one():
+    statistics = EpisodeStatistics(1, 1, BATCH)
+    done = torch.ones(1, BATCH, 1, dtype=torch.bool)
+    batch = {("next", name): done for name in ("done", "terminated")}
+    batch |= {("next", "is_success"): ~done}
+    batch |= {("next", name): done.double() for name in ("reward", "error")}
+    for _ in range(3):
+        found = statistics.count(batch)
+    assert found["success"] == found["survival"] == 0.0 and found["length"] == 1.0
