@@ -15,7 +15,7 @@ from quadrl.base.validation import number
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
-from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY
+from quadrl.core.observation import OBSERVATION, TARGET_MOTION, TARGET_VELOCITY
 from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import FULL_TURN, Rng
 from quadrl.engines.state import Start
@@ -82,6 +82,8 @@ class TargetFollowing(Task):
     """Distance from the target that ends the episode [m]."""
     tolerance: float = 0.3
     """Largest mean error of the distance that counts as success [m]."""
+    sees_motion: bool = False
+    """Whether the target's acceleration and jerk are observed, behind the other entries."""
 
     def __post_init__(self) -> None:
         """Validate the path."""
@@ -91,6 +93,8 @@ class TargetFollowing(Task):
         if self.fastest < self.slowest:
             allowed = f"at least slowest, {self.slowest:g}"
             raise QuadrlError(name=f"{self.name} fastest", value=self.fastest, allowed=allowed)
+        if self.sees_motion:
+            object.__setattr__(self, "observation", self.observation | TARGET_MOTION)
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Path]:
         """At rest, beside the target, level, any heading."""
@@ -119,6 +123,16 @@ class TargetFollowing(Task):
         path = now.task
         angle = path.frequency * now.time[..., None] + path.phase
         return _by_axis(path.amplitude * path.frequency * namespace(angle).cos(angle))
+
+    def target_motion(self, now: Snapshot) -> tuple[Array, Array] | None:
+        """The acceleration and the jerk of the target, where they are observed."""
+        if not self.sees_motion:
+            return None
+        path, xp = now.task, namespace(now.time)
+        angle = path.frequency * now.time[..., None] + path.phase
+        acceleration = -path.amplitude * path.frequency**2
+        waves = acceleration * xp.sin(angle), acceleration * path.frequency * xp.cos(angle)
+        return _by_axis(waves[0]), _by_axis(waves[1])
 
     def measure(self, now: Snapshot) -> Potentials:
         """The distance left is that to the sphere around the target."""

@@ -60,7 +60,8 @@ class GeometricController(Controller):
         approach = self._loops.approach_velocity(offset, self._loops.gains.max_speed)
         heading = towards_east(reading.heading) if self.task.heading_matters else reading.heading
         error = reading.velocity - velocity - approach
-        command = self._loops.rotor_command(reading, error, heading)
+        motion = self.task.feed_forward(reading)
+        command = self._loops.rotor_command(reading, error, heading, target_motion=motion)
         return np.clip((command - self.vehicle.hover_speed) / self.vehicle.action_scale, -1.0, 1.0)
 
 

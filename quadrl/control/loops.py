@@ -26,7 +26,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm, to_body
 from quadrl.base.validation import number
 from quadrl.control.allocation import Allocation, columns, product, within
-from quadrl.control.reading import Reading
+from quadrl.control.reading import Motion, Reading
 from quadrl.engines.state import State
 
 MAX_HEADING_ERROR = 0.5  # [rad], of the desired heading from the present one
@@ -147,7 +147,12 @@ class Loops:
         return offset * (speed / np.maximum(distance, 1e-9)).T.take((0, 0, 1), axis=0).T
 
     def rotor_command(
-        self, motion: State | Reading, error: Array, heading: Array, turn: Array | float = 0.0
+        self,
+        motion: State | Reading,
+        error: Array,
+        heading: Array,
+        turn: Array | float = 0.0,
+        target_motion: Motion | None = None,
     ) -> Array:
         """Rotor commands (N, R) [rad/s] that take away an error of the velocity.
 
@@ -156,16 +161,24 @@ class Loops:
             error: (N, 3) [m/s], how much the velocity is too large, world frame.
             heading: Unit vectors (N, 2), east and north, where to point.
             turn: (N, 1) [rad/s], rate of that heading.
+            target_motion: Acceleration [m/s^2] and jerk [m/s^3] of what is followed, (N, 3) each,
+                world frame, which the loops would otherwise learn of from errors alone.
         """
         wanted = -self._velocity_gain * error
         level = limited(wanted[:, :2], self.max_acceleration[0])
         climb = within(wanted[:, 2:], -self._descent, self._climb)
         force = columns(level, climb + GRAVITY)  # [m/s^2], specific
+        if target_motion is not None:
+            force = force + target_motion[0]
         drag = self.vehicle.drag_coefficient / self.vehicle.mass * motion.speed
         force = to_body(motion.rotation, force + drag[:, None] * motion.velocity)
         ahead = (motion.rotation[:, :2] * heading[:, :, None]).sum(axis=-2)  # to the body frame
         body_rate = -self._attitude_gain * attitude_error(force, ahead)
         body_rate = within(body_rate, -self.max_body_rate, self.max_body_rate)
+        if target_motion is not None:
+            # Body z turns with the force: omega x e3 = jerk / |f| across it.
+            jerk = to_body(motion.rotation, target_motion[1]) / norm(force)[:, None]
+            body_rate = body_rate + columns(-jerk[:, 1:2], jerk[:, :1], 0 * jerk[:, 2:])
         body_rate = body_rate + turn * motion.rotation[:, 2]  # about the vertical
         return self.body_rate_command(motion, self.vehicle.mass * force[:, 2:], body_rate)
 

@@ -13,6 +13,9 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, heading_of, norm, rotation_of_angles, to_world
 
+Motion = tuple[Array, Array]
+"""Acceleration [m/s^2] and jerk [m/s^3] of what is followed, (N, 3) each, world frame."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
@@ -24,6 +27,7 @@ class Reading:
     rotor_speed: Array  # (N, R) [rad/s]
     to_goal: Array  # (N, 3) [m], from the aircraft to the goal, world frame
     target_velocity: Array  # (N, 3) [m/s], world frame; zero where nothing moves
+    target_motion: Motion | None = None  # of the target; None where it is not observed
 
     @classmethod
     def of(cls, observation: Array, terms: Mapping[str, Any], vehicle: Vehicle) -> Reading:
@@ -41,6 +45,9 @@ class Reading:
         rotation = rotation_of_angles(term["sin_attitude"], term["cos_attitude"])
         velocity = to_world(rotation, term["velocity"])
         relative = to_world(rotation, term.get("target_velocity", -term["velocity"]))
+        ahead = [
+            to_world(rotation, term[k]) for k in ("target_acceleration", "target_jerk") if k in term
+        ]
         return cls(
             rotation=rotation,
             velocity=velocity,
@@ -48,6 +55,7 @@ class Reading:
             rotor_speed=term["rotor_speed"] * vehicle.max_speed,
             to_goal=to_world(rotation, term["goal"]),
             target_velocity=velocity + relative,
+            target_motion=(ahead[0], ahead[1]) if ahead else None,
         )
 
     @functools.cached_property
@@ -78,4 +86,8 @@ class Guide(Protocol):
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """Where to be, as an offset (N, 3) [m], and the velocity (N, 3) [m/s] of that place."""
+        ...
+
+    def feed_forward(self, reading: Reading) -> Motion | None:
+        """Acceleration and jerk of that place; None where they are not known."""
         ...

@@ -47,6 +47,12 @@ TARGET_VELOCITY = {
 }
 """What tasks with a moving target add at the end."""
 
+TARGET_MOTION = {
+    "target_acceleration": ObservationTerm(3, "m/s^2", "of the target, body frame"),
+    "target_jerk": ObservationTerm(3, "m/s^3", "of the target, body frame"),
+}
+"""What tasks add behind it with which controllers fly ahead of their errors."""
+
 ROTATION = {"rotation": ObservationTerm(9, "1", "rotation matrix from body to world, row by row")}
 """What tasks add that fly in any attitude, `State.rotation_entries`: the sines and cosines of roll
 and yaw jump where the pitch passes 90 degrees."""

@@ -25,6 +25,7 @@ from quadrl.core import rewards
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, ObservationTerm
 from quadrl.core.observation import ROTATION as ROTATION  # for users' tasks
+from quadrl.core.observation import TARGET_MOTION as TARGET_MOTION
 from quadrl.core.observation import TARGET_VELOCITY as TARGET_VELOCITY
 from quadrl.core.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
 from quadrl.engines.rng import Rng
@@ -33,7 +34,7 @@ from quadrl.engines.state import Start
 if TYPE_CHECKING:
     import mujoco
 
-    from quadrl.control.reading import Reading
+    from quadrl.control.reading import Motion, Reading
     from quadrl.core.snapshot import Rollout
 
 
@@ -164,6 +165,13 @@ class Task(abc.ABC):
         """Velocity of the target, (N, 3) [m/s], world frame; None where nothing moves."""
         return None
 
+    def target_motion(self, now: Snapshot) -> Motion | None:
+        """Acceleration [m/s^2] and jerk [m/s^3] of the target, (N, 3) each, world frame.
+
+        None where policies do not see them; else the observation has `TARGET_MOTION`, too.
+        """
+        return None
+
     def error(self, now: Snapshot) -> Array:
         """How far the task is from being done, (N,) [m]."""
         return now.potentials.distance
@@ -196,6 +204,10 @@ class Task(abc.ABC):
         target_velocity = self.target_velocity(now)
         if target_velocity is not None:
             terms["target_velocity"] = to_body(state.rotation, target_velocity - state.velocity)
+        ahead = self.target_motion(now)
+        if ahead is not None:
+            terms["target_acceleration"] = to_body(state.rotation, ahead[0])
+            terms["target_jerk"] = to_body(state.rotation, ahead[1])
         return terms
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
@@ -229,6 +241,14 @@ class Task(abc.ABC):
             [m/s] of that place; both in the world frame.
         """
         return reading.to_goal, reading.target_velocity
+
+    def feed_forward(self, reading: Reading) -> Motion | None:
+        """Acceleration and jerk of the place that `guide` names; None where they are not known.
+
+        Those of the target, where the observation has them. The geometric controller then need not
+        wait for an error of position and velocity to turn into a tilt.
+        """
+        return reading.target_motion
 
     def solids(self) -> Sequence[Solid]:
         """The solids of the world, with which aircraft collide in both engines."""
