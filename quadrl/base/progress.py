@@ -112,7 +112,7 @@ class ProgressBar:
         report = (
             f"{now.steps:>9,} steps  {rate:>7,.0f}/s  "
             f"return {self._metrics.get('return', float('nan')):>7.0f}  "
-            f"success {100 * self._metrics.get('success', 0.0):>3.0f} %"
+            f"success {100 * self._metrics.get('success', float('nan')):>3.0f} %"
         )
         self.update(now.iteration, now.iterations, report)
 

@@ -68,6 +68,8 @@ SETTINGS = {
     "aerodynamics": str,
 }
 """Of settings and conditions, by name."""
+FLAGS = {"from_run": "from"}
+"""Of settings that cannot have the name of their flag in Python."""
 
 
 @contextlib.contextmanager
@@ -99,7 +101,7 @@ def optional(
     fields: list[tuple[str, Any, Any]] = []
     for name, hint in hints.items():
         show = functools.partial(lambda whole, _: default(whole), within + name)
-        told = arg(help=texts[name], help_behavior_hint=show)
+        told = arg(name=FLAGS.get(name), help=texts[name], help_behavior_hint=show)
         if name in PAIRS:
             fields.append((name, Annotated[tuple[str, ...], told], ()))
         elif name in SETTINGS:

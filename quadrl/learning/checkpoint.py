@@ -12,14 +12,16 @@ from typing import Any
 from safetensors.torch import load as of_bytes
 from safetensors.torch import save as to_bytes
 from tensordict import TensorDict
+from torch import nn
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import read_safetensors, write_safetensors
 from quadrl.learning.folder import CHANGEABLE
+from quadrl.learning.folder import CHECKPOINT as CHECKPOINT
 from quadrl.learning.settings import ALGORITHM_CONFIGS
 
+AT_GOAL = ("at_goal", "looks")
 FORMAT, UNSEALED = "quadrl-checkpoint-6", "quadrl-checkpoint-5"
-CHECKPOINT = "checkpoint.safetensors"
 
 
 def save(path: Path, tensors: dict[str, Any], numbers: dict[str, Any]) -> None:
@@ -51,6 +53,29 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     if not isinstance(numbers := header.get("numbers"), dict):
         raise QuadrlError(f"{path} is damaged: its header lacks the numbers")
     return tensors, numbers
+
+
+def begin_with(path: Path, actor: nn.Module, critic: nn.Module) -> None:
+    """Give networks the weights of a checkpoint, and what it knows of the observations.
+
+    What a policy that holds the goal sees there stays its own: the goal may be another one.
+
+    Raises:
+        QuadrlError: The file cannot be read, or the networks are of other sizes.
+    """
+    tensors, _ = load(path)
+    for name, network in (("actor", actor), ("critic", critic)):
+        given = {k: v for k, v in tensors[name].items() if k.rpartition(".")[2] not in AT_GOAL}
+        own = {k: v for k, v in network.state_dict().items() if k.rpartition(".")[2] in AT_GOAL}
+        try:
+            network.load_state_dict(given | own)
+        except RuntimeError as error:
+            reason = (
+                f"its {name} sees other numbers than that of this training, or has other layers"
+            )
+            allowed = f"a run whose {name} is alike"
+            folder = str(path.parent)
+            raise QuadrlError(reason, name="from", value=folder, allowed=allowed) from error
 
 
 def check_same(

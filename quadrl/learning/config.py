@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -26,6 +27,7 @@ from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning.defaults import CHOSEN, PAIRS, flat, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, free_folder, read_config
+from quadrl.learning.origin import Origin, with_networks
 from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
 
 ALGORITHMS = ("ppo", "trpo", "vpg", "apg")
@@ -56,6 +58,7 @@ class TrainConfig(TrainSettings):
         """
         settings = _given(renamed(settings))
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
+        settings, _ = with_networks(settings)
         algo = settings.get("algo", TrainConfig.algo)
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
         vehicle = settings.get("vehicle", TrainConfig.vehicle)
@@ -98,6 +101,11 @@ class TrainConfig(TrainSettings):
         values, sources = training_defaults(_fields(), *chosen)
         if not values["aerodynamics"] and (brought := self._wind_brings()):
             values["aerodynamics"], sources["aerodynamics"] = brought, "in wind"
+        if self.from_run:
+            with contextlib.suppress(QuadrlError):  # it may be gone by now
+                origin = Origin.of(self.from_run)
+                values |= (networks := origin.networks())
+                sources |= dict.fromkeys(networks, f"run {origin.folder}")
         return values, sources
 
     def _wind_brings(self) -> str:
@@ -191,6 +199,8 @@ class TrainConfig(TrainSettings):
             "resolved_randomization": dataclasses.asdict(flown.randomization),
             "versions": _versions(),
         }
+        if not self.from_run:  # as in runs of before there was the setting
+            del whole["from_run"]
         return json.loads(json.dumps(whole))
 
     @classmethod
@@ -200,7 +210,7 @@ class TrainConfig(TrainSettings):
         Raises:
             QuadrlError: The folder holds no run, or what its names stand for has changed since.
         """
-        saved = as_saved(read_config(folder))
+        saved = {"from_run": ""} | as_saved(read_config(folder))
         names = [field.name for field in dataclasses.fields(cls)]
         if missing := set(names) - set(saved):
             raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks {sorted(missing)[0]}")

@@ -23,6 +23,7 @@ from quadrl.base.machine import processor_kind
 from quadrl.evaluation.policy_file import RUN as CONFIG
 from quadrl.evaluation.policy_file import RUN_FORMAT
 
+CHECKPOINT = "checkpoint.safetensors"
 METRICS = "metrics.csv"
 EVENTS = "events"
 EVALUATION = "evaluation.json"

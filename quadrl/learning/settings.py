@@ -232,6 +232,11 @@ class TrainSettings:
     less its output there. It sees neither position nor, where the heading is free, yaw."""
     initial_deviation: float = 1.0
     """Standard deviation of the actions at the start."""
+    from_run: str = ""
+    """Folder of a run with whose networks the training begins, those of policy and critic with the
+    mean and deviation of what they see. Their widths, memory, holds_goal and deviation are those of
+    that run; task, algorithm and all else may be others. Saved as FOLDER@DIGEST, of its checkpoint.
+    """
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     """Settings of PPO."""
     trpo: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)

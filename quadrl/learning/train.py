@@ -57,6 +57,7 @@ from quadrl.learning.networks import (
     make_actor_critic,
     update_normalisers,
 )
+from quadrl.learning.origin import Origin
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
@@ -104,6 +105,11 @@ class Training:
         )
         for network in (self.actor, self.critic):
             network.to(device)
+        begun = resume and any((folder / x).exists() for x in (checkpoint.CHECKPOINT, POLICY_FILE))
+        if config.from_run and not begun:
+            checkpoint.begin_with(
+                Origin.of(config.from_run).checkpoint(size, actions), self.actor, self.critic
+            )
         self.algorithm = make_algorithm(config, self.env, self.actor, self.critic)
         self.advantages = GAE(
             gamma=config.gamma, lmbda=config.gae_lambda, value_network=None, average_gae=True
@@ -125,7 +131,7 @@ class Training:
         self._known_as = run_of(resolved)
         if not resume:
             write_config(folder, resolved)
-        elif any((folder / name).exists() for name in (checkpoint.CHECKPOINT, POLICY_FILE)):
+        elif begun:
             # Without either, it was stopped before the first checkpoint.
             try:
                 self._restore()
@@ -228,7 +234,8 @@ class Training:
                 batch[BEGINS] = torch.roll(done, 1, dims=1)
                 batch[BEGINS][:, 0] = False  # the state before it says so
                 self._remembered = {STATE: state[:, -1].masked_fill(done[:, -1], 0.0).cpu().numpy()}
-            first = self.iteration == 0 and not self.algorithm.whole
+            fresh = self.iteration == 0 and not self.config.from_run
+            first = fresh and not self.algorithm.whole
             if first:  # the first batch was collected without a normaliser
                 update_normalisers(self.normalisers, batch)
                 with set_recurrent_mode():
