@@ -25,9 +25,8 @@ from quadrl.base.rotation import Array
 from quadrl.conditions.randomization import AFFECTS, Randomization, Randomized
 from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
-from quadrl.control import trim
+from quadrl.control import modes, trim
 from quadrl.control.allocation import Allocation
-from quadrl.control.modes import CONTROL_MODES
 from quadrl.engines.rng import uniform
 
 MARGIN = 1.2
@@ -171,7 +170,7 @@ def held_command(vehicle: Vehicle, control_mode: str) -> float:
 
     The loops of every mode but "rotor" answer at each physics step.
     """
-    looped = CONTROL_MODES[control_mode].has_loops
+    looped = modes.kind(control_mode).has_loops
     return vehicle.physics_timestep if looped else vehicle.control_timestep
 
 

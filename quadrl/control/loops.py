@@ -99,7 +99,9 @@ class Loops:
         self.vehicle, self.gains = vehicle, (gains := gains or Gains())
         low, high = vehicle.rotor_command(np.array([[-1.0], [1.0]])) ** 2
         self._allocation = Allocation(np.linalg.pinv(vehicle.mixer), low, high)
-        least, largest = (thrust / (vehicle.mass * GRAVITY) for thrust in self._allocation.thrust)
+        self.thrust = self._allocation.thrust
+        """Smallest and largest thrust without a moment [N]."""
+        least, largest = (thrust / (vehicle.mass * GRAVITY) for thrust in self.thrust)
         self._descent = gains.authority * GRAVITY * (1 - least)  # [m/s^2], largest asked for
         self._climb = gains.authority * GRAVITY * (largest - 1)  # [m/s^2]
         tilt = min(gains.max_tilt, gains.authority * math.acos(1 / largest))  # [rad]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -57,7 +57,9 @@ class ControlMode(abc.ABC):
     centre: Array
     """(k,) in the terms' units, at an action of 0."""
     scale: Array
-    """(k,) what an action of 1 adds to it, and -1 takes away."""
+    """(k,) what an action of 1 adds to it."""
+    scale_down: Array
+    """(k,) what an action of -1 takes away from it."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         """Take the scales from the vehicle."""
@@ -70,7 +72,8 @@ class ControlMode(abc.ABC):
 
     def values(self, action: Array) -> Array:
         """The values that actions (N, k), clipped to [-1, 1], stand for, in the terms' units."""
-        return self.centre + self.scale * within(np.asfortranarray(action), -1.0, 1.0)
+        share = within(np.asfortranarray(action), -1.0, 1.0)
+        return self.centre + np.where(share > 0.0, self.scale, self.scale_down) * share
 
     def setpoint(self, state: State, action: Array) -> Array:
         """The setpoint (N, n) held for a control step, from the state in which the step begins."""
@@ -91,7 +94,7 @@ class Rotor(ControlMode):
         """Hover, plus and minus the vehicle's action scale."""
         super().__init__(vehicle)
         self.centre = vehicle.hover_speed
-        self.scale = np.full(vehicle.rotor_count, vehicle.action_scale)
+        self.scale = self.scale_down = np.full(vehicle.rotor_count, vehicle.action_scale)
         self.terms = tuple(
             ActionTerm(
                 f"rotor_{k + 1}",
@@ -144,17 +147,29 @@ class ThrustBodyRate(_Looped):
     )
 
     def __init__(self, vehicle: Vehicle) -> None:
-        """Thrust as far as all rotors together reach down; rates that a largest tilt stops."""
+        """The least and the largest thrust of all rotors; rates that a largest tilt stops."""
         super().__init__(vehicle)
         self.centre = np.array([1.0, 0.0, 0.0, 0.0])
-        self.scale = np.array(
-            [self._loops.max_acceleration[2] / GRAVITY, *self._loops.max_body_rate]
-        )
+        (least, largest), rates = self._loops.thrust, self._loops.max_body_rate
+        weight = vehicle.mass * GRAVITY  # [N]
+        self.scale = np.array([largest / weight - 1.0, *rates])
+        self.scale_down = np.array([1.0 - least / weight, *rates])
 
     def rotor_command(self, state: State, setpoint: Array) -> Array:
         """The body rate loop alone."""
         thrust = self.vehicle.mass * GRAVITY * setpoint[:, :1]
         return self._loops.body_rate_command(state, thrust, setpoint[:, 1:])
+
+
+class EvenThrustBodyRate(ThrustBodyRate):
+    """The same with as much thrust to add as to take away, as it was: for what was saved then."""
+
+    name = "thrust_body_rate-v0"
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Thrust as far as all rotors together reach down, less a reserve."""
+        super().__init__(vehicle)
+        self.scale[0] = self.scale_down[0] = self._loops.max_acceleration[2] / GRAVITY
 
 
 class Velocity(_Looped):
@@ -173,7 +188,8 @@ class Velocity(_Looped):
         """Velocities that are reached within RESPONSE_TIME."""
         super().__init__(vehicle)
         yaw_rate = self._loops.max_body_rate[2]
-        self.scale = np.append(self._loops.max_acceleration * RESPONSE_TIME, yaw_rate)
+        largest = np.append(self._loops.max_acceleration * RESPONSE_TIME, yaw_rate)
+        self.scale = self.scale_down = largest
 
     def rotor_command(self, state: State, setpoint: Array) -> Array:
         """The velocity loop and those within it."""
@@ -201,7 +217,8 @@ class Position(_Looped):
     def __init__(self, vehicle: Vehicle) -> None:
         """Offsets at which the approach is as fast as RESPONSE_TIME allows."""
         super().__init__(vehicle)
-        self.scale = np.append(self._loops.max_acceleration * RESPONSE_TIME**2, MAX_HEADING_ERROR)
+        offsets = self._loops.max_acceleration * RESPONSE_TIME**2
+        self.scale = self.scale_down = np.append(offsets, MAX_HEADING_ERROR)
         self._max_speed = float(self._loops.max_acceleration[0] * RESPONSE_TIME)  # [m/s]
 
     def setpoint(self, state: State, action: Array) -> Array:
@@ -223,6 +240,41 @@ CONTROL_MODES: dict[str, type[ControlMode]] = {
     mode.name: mode for mode in (Rotor, ThrustBodyRate, Velocity, Position)
 }
 """Every control mode by name."""
+RENAMED = {ThrustBodyRate.name: (EvenThrustBodyRate.name, "thrust_body_rate-v1")}
+"""Modes whose actions meant something else before: what files call them that were saved then, and
+what files call them now."""
+
+
+def named(given: Any) -> str:
+    """The name of the control mode that a caller or a file names.
+
+    Raises:
+        QuadrlError: Unknown name; the message lists the choices.
+    """
+    for name, (before, saved) in RENAMED.items():
+        if given in (before, saved):
+            return before if given == before else name
+    return choice("control_mode", given, CONTROL_MODES)
+
+
+def to_save(name: str) -> str:
+    """What a file calls a control mode; `named` knows it."""
+    return RENAMED[name][1] if name in RENAMED else name
+
+
+def as_saved(given: Any) -> Any:
+    """The control mode that a file names: under a bare name, what it meant before."""
+    return RENAMED[given][0] if given in RENAMED else given
+
+
+def kind(name: str) -> type[ControlMode]:
+    """The class of a control mode.
+
+    Raises:
+        QuadrlError: Unknown name; the message lists the choices.
+    """
+    name = named(name)
+    return EvenThrustBodyRate if name == EvenThrustBodyRate.name else CONTROL_MODES[name]
 
 
 def make(name: str, vehicle: Vehicle) -> ControlMode:
@@ -231,4 +283,4 @@ def make(name: str, vehicle: Vehicle) -> ControlMode:
     Raises:
         QuadrlError: Unknown name; the message lists the choices.
     """
-    return CONTROL_MODES[choice("control_mode", name, CONTROL_MODES)](vehicle)
+    return kind(name)(vehicle)

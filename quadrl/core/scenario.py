@@ -23,7 +23,7 @@ from quadrl.conditions import observing, randomization
 from quadrl.conditions.observing import Observed, Observing
 from quadrl.conditions.randomization import Randomization, Randomized
 from quadrl.conditions.weather import Weather, Weathered
-from quadrl.control.modes import CONTROL_MODES
+from quadrl.control import modes
 from quadrl.core import catalogue
 from quadrl.core.task import Task
 from quadrl.engines import mjcf
@@ -102,7 +102,7 @@ class Scenario:
     """What is drawn for each aircraft at each reset and disturbs it."""
     observe: Observing = _condition(Observing(), observing.resolve)
     """Options of the observation."""
-    control_mode: str = _condition("rotor", _one_of("control_mode", CONTROL_MODES))
+    control_mode: str = _condition("rotor", modes.named)
     """What actions mean."""
     engine: EngineName = _condition("mujoco", _one_of("engine", ENGINES))
     """What flies it."""
@@ -193,6 +193,8 @@ class Scenario:
             value = getattr(self, field.name)
             if value != field.default:
                 found[field.name] = _differing(value) if dataclasses.is_dataclass(value) else value
+        if "control_mode" in found:
+            found["control_mode"] = modes.to_save(self.control_mode)
         return found
 
     @functools.cached_property
@@ -228,9 +230,12 @@ def as_saved(conditions: Mapping[str, Any]) -> dict[str, Any]:
     """Conditions from a file, as `Scenario.of` takes them.
 
     Where the air acts on the rotors in wind, `Scenario.to_json` says so. Files that do not are of
-    versions in which wind acted by drag alone, and go on flying like that.
+    versions in which wind acted by drag alone, and go on flying like that. So do those with a
+    control mode whose actions meant something else.
     """
     found = dict(conditions)
+    if "control_mode" in found:
+        found["control_mode"] = modes.as_saved(found["control_mode"])
     vehicle: Any = found.get("vehicle")
     own: Any = isinstance(vehicle, dict) and vehicle.get("aerodynamics")  # pyright: ignore
     if "aerodynamics" in found or (own and _effects(own).effects):

@@ -94,8 +94,8 @@ def described(policy: Policy) -> dict[str, str]:
 
     Returns:
         scenario, as `Scenario.of` takes it; observation, as `describe_observation` gives it;
-        action: name, unit, meaning, value at 0 and change at 1 of each number; control_timestep
-        [s]; quadrl: its version.
+        action: name, unit, meaning, value at 0 and changes at 1 and at -1 of each number;
+        control_timestep [s]; quadrl: its version.
 
     Raises:
         QuadrlError: Its task is not known here, or does not fit it.
@@ -103,11 +103,15 @@ def described(policy: Policy) -> dict[str, str]:
     environment = Environment(policy.scenario, seed=0)
     policy.check_fits(environment)
     mode = environment.control_mode
-    numbers = zip(mode.terms, mode.centre.tolist(), mode.scale.tolist(), strict=True)
+    arrays = (mode.centre, mode.scale, -mode.scale_down)
+    reach = [
+        dict(zip(("at_0", "change", "change_down"), map(float, numbers), strict=True))
+        for numbers in zip(*arrays, strict=True)
+    ]
     whole = {
         "scenario": policy.scenario.to_json(),
         "observation": describe_observation(environment),
-        "action": [dataclasses.asdict(n) | {"at_0": at_0, "change": c} for n, at_0, c in numbers],
+        "action": [dataclasses.asdict(n) | r for n, r in zip(mode.terms, reach, strict=True)],
         "control_timestep": environment.vehicle.control_timestep,
         "quadrl": __version__,
     }

@@ -12,6 +12,7 @@ import numpy as np
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.conditions.sampler import AircraftSampler
+from quadrl.control import modes
 from quadrl.control.feasibility import (
     MARGIN,
     Reach,
@@ -22,7 +23,6 @@ from quadrl.control.feasibility import (
     samples,
     unreached,
 )
-from quadrl.control.modes import CONTROL_MODES
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import html_table
@@ -144,7 +144,7 @@ def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Ite
     yield Row("resolved speed", float(table["resolved_speed"].min()), "m/s")
     yield Row("resolved body rate", float(table["resolved_turn"].min()), "rad/s")
     # The loops of the other modes see the true state at every physics step.
-    looped = CONTROL_MODES[control_mode].has_loops
+    looped = modes.kind(control_mode).has_loops
     given = sampler.randomization
     seen = 0.0 if looped else max(given.observation_delay[1], given.rate_delay[1])
     late = vehicle.dead_time + given.command_delay[1] + seen

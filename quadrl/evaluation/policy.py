@@ -20,6 +20,7 @@ from quadrl.aircraft.presets import resolve as resolve_vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
+from quadrl.control.modes import named
 from quadrl.core.scenario import KEYWORDS, Scenario, as_saved
 from quadrl.evaluation import policy_file
 from quadrl.evaluation.memory import GRU, PolicyInFlight
@@ -62,7 +63,7 @@ class Policy:
     @property
     def control_mode(self) -> str:
         """What its actions mean."""
-        return str(self.metadata.get("control_mode", "rotor"))
+        return named(as_saved(self.metadata).get("control_mode", "rotor"))
 
     @property
     def conditions(self) -> dict[str, Any]:

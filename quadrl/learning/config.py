@@ -22,6 +22,7 @@ from quadrl.conditions.observing import resolve as resolve_observing
 from quadrl.conditions.randomization import Randomization
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
+from quadrl.control import modes
 from quadrl.core.scenario import KEYWORDS, Scenario
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
@@ -79,6 +80,8 @@ class TrainConfig(TrainSettings):
             settings["weather"] = dataclasses.asdict(given)
         if isinstance(given := settings.get("observe"), Observing):
             settings["observe"] = given.given()
+        if "control_mode" in settings:
+            settings["control_mode"] = modes.named(settings["control_mode"])
         if isinstance(given := settings.get("task_options"), dict):
             usual = values["training_options"]  # not in place of what is asked for
             values["training_options"] = {k: v for k, v in usual.items() if k not in given}
@@ -193,6 +196,7 @@ class TrainConfig(TrainSettings):
         """The settings and everything that their names stand for, as JSON gives them back."""
         flown = self.training_scenario
         whole = dataclasses.asdict(self) | {
+            "control_mode": modes.to_save(self.control_mode),
             "resolved_task": dataclasses.asdict(flown.task),
             "resolved_vehicle": dataclasses.asdict(flown.aircraft),
             "resolved_weather": dataclasses.asdict(flown.weather),
@@ -265,6 +269,8 @@ def as_saved(settings: dict[str, Any]) -> dict[str, Any]:
     Those of wind without effects of the air are of a version in which it acted by drag alone.
     """
     settings = renamed(settings)
+    if "control_mode" in settings:
+        settings["control_mode"] = modes.as_saved(settings["control_mode"])
     old = settings.get("aerodynamics") == "" and not Weather.of(settings.get("weather")).calm
     return settings | ({"aerodynamics": "none"} if old else {})
 

@@ -56,7 +56,8 @@ def control_modes() -> str:
         if not kind.has_loops:  # as many terms as rotors, and all alike
             terms = [("one number per rotor: its speed command, from hover", terms[0][1])]
         for k, term in enumerate(terms):
-            scales = (f"{mode.scale[k]:.3g}" for mode in modes)
+            ends = ((f"{mode.scale[k]:.3g}", f"{mode.scale_down[k]:.3g}") for mode in modes)
+            scales = (up if up == down else f"{up} up, {down} down" for up, down in ends)
             rows.append((f"`{name}`" if k == 0 else "", *term, *scales))
     scales = (f"scale, {name}" for name in VEHICLES)
     return table(("`control_mode=`", "what it asks for", "unit", *scales), rows)

@@ -28,10 +28,13 @@ from quadrl.control.loops import (
     turned,
 )
 from quadrl.core.environment import Environment
+from quadrl.core.scenario import Scenario, as_saved
 from quadrl.core.task import Snapshot, TaskState
 from quadrl.engines.state import Start, State
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.rollout import fly, summarize
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.config import as_saved as config_as_saved
 from quadrl.tasks.hover import Hover
 
 PAPER = Vehicle()
@@ -306,12 +309,14 @@ def test_the_linear_model_is_the_derivative_of_the_engine(vehicle):
 def test_scales_by_worked_numbers():
     """Of the paper's aircraft: hover at 225.678 rad/s, commands from 190.678 to 260.678 rad/s."""
     # 0.8 g (1 - (190.678 / 225.678)^2) = 2.246 m/s^2 down; up 2.623; the smaller counts.
+    # Thrust: (260.678 / 225.678)^2 - 1 = 0.334 weights to add, 1 - (190.678 / 225.678)^2 = 0.286
+    # to take away.
     # Tilted by 0.4 rad: g tan 0.4 = 4.148 m/s^2. In a second: m/s; over another: m.
     # Roll: 0.8 l k_T (260.678^2 - 190.678^2) / J_x = 24.26 rad/s^2; sqrt(24.26 * 0.4) = 3.115.
     # Yaw: 0.8 * 2 k_Q (260.678^2 - 190.678^2) / J_z = 2.917; sqrt(2.917 * 0.5) = 1.208.
     expected = {
         "rotor": ([225.678] * 4, [35.0] * 4),
-        "thrust_body_rate": ([1, 0, 0, 0], [0.229, 3.115, 3.115, 1.208]),
+        "thrust_body_rate": ([1, 0, 0, 0], [0.334, 3.115, 3.115, 1.208]),
         "velocity": ([0] * 4, [4.148, 4.148, 2.246, 1.208]),
         "position": ([0] * 4, [4.148, 4.148, 2.246, 0.5]),
     }
@@ -320,6 +325,8 @@ def test_scales_by_worked_numbers():
         mode = modes.make(name, PAPER)
         np.testing.assert_allclose(mode.centre, centre, atol=6e-4)
         np.testing.assert_allclose(mode.scale, scale, atol=6e-4)
+        down = [0.286, *scale[1:]] if name == "thrust_body_rate" else scale
+        np.testing.assert_allclose(mode.scale_down, down, atol=6e-4)
     hexa = [modes.make(name, VEHICLES["hexa"]) for name in ("rotor", "velocity")]
     assert [term.name for term in hexa[0].terms] == [f"rotor_{k}" for k in range(1, 7)]
     assert [mode.size for mode in hexa] == [6, 4]
@@ -359,7 +366,7 @@ def test_wild_actions_stay_within_the_rotors_limits_and_do_not_flip_the_aircraft
 
 
 @presets
-@pytest.mark.parametrize("action", [-1.0, 0.5])
+@pytest.mark.parametrize("action", [-1.0, 0.5, 1.0])
 def test_thrust_gives_the_acceleration_that_it_says(vehicle, action):
     """m a = (share - 1) m g less drag, after twelve time constants of rotor and step."""
     flyer, vertical = Flyer("thrust_body_rate", vehicle), np.array([[action, 0, 0, 0]])
@@ -372,6 +379,38 @@ def test_thrust_gives_the_acceleration_that_it_says(vehicle, action):
     drag = vehicle.drag_coefficient / vehicle.mass * np.abs(middle) * middle
     expected = np.array([0, 0, (share - 1) * GRAVITY]) - drag
     np.testing.assert_allclose(acceleration, expected, atol=1e-4 * GRAVITY)
+
+
+def test_the_largest_thrust_is_that_of_all_rotors_and_the_least_is_none():
+    """With a scale beyond what its rotors can do, hover minus and plus it is all that they do."""
+    full = dataclasses.replace(VEHICLES["racer"], action_scale=1e4)
+    flyer = Flyer("thrust_body_rate", full)
+    most = sum(r.thrust_coefficient * r.max_speed**2 for r in full.rotors) / full.mass / GRAVITY
+    values = flyer.mode.values(np.array([[1.0, 0, 0, 0], [0.0] * 4, [-1.0, 0, 0, 0]]))
+    np.testing.assert_allclose(values[:, 0], [most, 1.0, 0.0], rtol=0, atol=1e-12)
+    assert most > 4.5
+    for action, expected in ((1.0, full.max_speed), (-1.0, 0.0)):
+        flyer.fly(np.array([[action, 0.0, 0.0, 0.0]]), 1.0)
+        np.testing.assert_allclose(flyer.state.rotor_speed, expected, atol=1.0)
+
+
+def test_what_was_saved_asks_for_as_much_thrust_as_it_did():
+    before, now = "thrust_body_rate-v0", "thrust_body_rate"
+    old, new = (modes.make(name, VEHICLES["racer"]) for name in (before, now))
+    ends = np.array([[1.0, 1.0, -1.0, 1.0], [-1.0] * 4])
+    assert np.ptp(old.values(ends)[:, 0]) < 0.7 * np.ptp(new.values(ends)[:, 0])
+    np.testing.assert_array_equal(old.values(ends)[:, 1:], new.values(ends)[:, 1:])
+    assert old.values(ends)[:, 0].mean() == pytest.approx(1.0)
+    scenario = Scenario.of("hover", control_mode=now)
+    assert Scenario.of(as_saved(scenario.to_json())) == scenario
+    assert Scenario.of(scenario.to_json()) == scenario
+    saved = scenario.to_json() | {"control_mode": now}  # as files of before have it
+    flown = Scenario.of(as_saved(saved))
+    assert flown.control_mode == before and Scenario.of(as_saved(flown.to_json())) == flown
+    for name, value in ((now, before), (scenario.to_json()["control_mode"], now)):
+        config = TrainConfig("hover", control_mode=now).resolved() | {"control_mode": name}
+        config = TrainConfig(control_mode=config_as_saved(config)["control_mode"])
+        assert config.control_mode == config.scenario.control_mode == value
 
 
 def settling(vehicle, poles, share, limit):

@@ -260,7 +260,8 @@ def test_the_file_says_what_its_numbers_are():
     assert terms["action_history"]["last"] == policy.size - 1
     hover = policy.scenario.aircraft.hover_speed
     for number, speed in zip(said["action"], hover, strict=True):
-        assert (number["unit"], number["at_0"], number["change"]) == ("rad/s", speed, 90.0)
+        assert (number["unit"], number["at_0"]) == ("rad/s", speed)
+        assert (number["change"], number["change_down"]) == (90.0, -90.0)
 
 
 def test_the_same_policy_is_the_same_file():

@@ -293,6 +293,15 @@ def test_its_keywords_make_what_it_fits_in_every_api():
     assert truncated and not terminated and info["is_success"]
 
 
+def test_a_policy_of_before_flies_the_thrust_that_it_was_trained_with():
+    policy = linear(22, 4, control_mode="thrust_body_rate")
+    flown = Environment(policy.scenario)
+    policy.check_fits(flown)
+    assert flown.control_mode.name == "thrust_body_rate-v0"
+    with refused("control_mode", "thrust_body_rate"):
+        policy.check_fits(Environment("hover", control_mode="thrust_body_rate"))
+
+
 def test_another_control_mode_is_refused():
     policy = Policy.pretrained("hover")
     with refused("control_mode", "velocity") as caught:

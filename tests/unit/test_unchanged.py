@@ -15,6 +15,7 @@ import pytest
 from quadrl import tasks
 from quadrl.aircraft.rotors import plus
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.control.modes import as_saved
 from quadrl.core.environment import Environment
 from quadrl.engines.state import Start
 
@@ -63,7 +64,7 @@ def flown(case, arrays):
         seed=0,
         vehicle=vehicle_of(case["vehicle"]),
         engine=case["engine"],
-        control_mode=case["control_mode"],
+        control_mode=as_saved(case["control_mode"]),
     )
 
     def flat(observation):
