@@ -391,7 +391,7 @@ def test_the_largest_thrust_is_that_of_all_rotors_and_the_least_is_none():
     assert most > 4.5
     for action, expected in ((1.0, full.max_speed), (-1.0, 0.0)):
         flyer.fly(np.array([[action, 0.0, 0.0, 0.0]]), 1.0)
-        np.testing.assert_allclose(flyer.state.rotor_speed, expected, atol=1.0)
+        np.testing.assert_allclose(flyer.state.rotor_speed[0], expected, atol=1.0)
 
 
 def test_what_was_saved_asks_for_as_much_thrust_as_it_did():
