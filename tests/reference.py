@@ -73,6 +73,7 @@ def lift(rotor, air, speed, climb, across, noise=0.0):
     kappa /= 4 * rotor.thrust_coefficient
     momentum = 2 * air.air_density * area * w0 * w0
     w = flow_through(w0, kappa, min(max(climb, -2 * w0), 3 * w0), across)
+    w -= 1.85 * max(-2 * w0 - climb, 0.0)  # towards the windmill state
     total = rest + (momentum * kappa * (1 - w / w0) if w0 else 0.0)
     total += air.translational_lift * air.air_density * area * across * across
     deep = 1 - ((climb / (w0 + 1e-6) + 1.4) / 1.2) ** 2

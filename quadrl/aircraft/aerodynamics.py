@@ -23,6 +23,10 @@ DENSITIES = (1e-3, 100.0)  # [kg/m^3]
 MAX_BODY_LIFT = 2.0
 MOST_OFFSET = 0.2
 """Largest distance of the centre of lift from the hub by `flapping_moment`, in radii (chosen)."""
+WINDMILL = 1.85
+"""What the flow through a disc falls by over what a descent exceeds 2 w0 by, on the way to the
+windmill state: chosen for 1.58 times the thrust of hover at 2.4 w0, a Crazyflie's by Johnson's
+model (NASA/TP-2005-213477)."""
 STILL_AIR, ROTOR_EFFECTS, GROUND_EFFECT = range(3)
 """`Aerodynamics.effects`: none, those of the air on rotors, and of the ground beside them."""
 

@@ -19,6 +19,7 @@ from quadrl.aircraft.aerodynamics import (
     MOST_OFFSET,
     ROTOR_EFFECTS,
     STILL_AIR,
+    WINDMILL,
     Aerodynamics,
 )
 from quadrl.aircraft.rotors import GRAVITY, Rotor, hover_squares, mixer
@@ -176,6 +177,7 @@ def c_structs() -> str:
     return (
         "// Written by quadrl/aircraft/parameters.py from Rotor, Vehicle and Aerodynamics.\n"
         f"#define QUADRL_MARK {MARK!r}\n#define MOST_OFFSET {MOST_OFFSET!r}\n"
+        f"#define WINDMILL {WINDMILL!r}\n"
         f"enum {{ {sizes} }};\nenum {{ {effects} }};\n"
         f"typedef struct {{\n{fields(ROTOR)}\n}} Rotor;\n"
         f"typedef struct {{\n{fields(AIRCRAFT)}\n}} Aircraft;\n"

@@ -14,7 +14,7 @@ import math
 import operator
 from typing import Any
 
-from quadrl.aircraft.aerodynamics import GROUND_EFFECT, MOST_OFFSET, STILL_AIR
+from quadrl.aircraft.aerodynamics import GROUND_EFFECT, MOST_OFFSET, STILL_AIR, WINDMILL
 from quadrl.aircraft.parameters import WIND, Parameters
 from quadrl.base.rotation import Array, namespace, norm, rotation_matrix, stack, to_body, to_world
 
@@ -92,6 +92,7 @@ def lift_change(
         through = xp.sqrt(w * w + p_square)
         lacking = (w0 + k) * w0 - k * w - (w - v) * through
         w = w + through * lacking / ((k + through) * through + (w - v) * w + 1e-12)
+    w = w - WINDMILL * clip(-2 * w0 - climb, low=0.0)
     over = 1 / (w0 + 1e-6)
     off = (climb * over + 1.4) / 1.2
     steep = clip(1 - off * off, low=0.0)

@@ -125,6 +125,7 @@ AERO double aero_lift_change(const Aircraft* a, const Rotor* rotor, const Disc* 
   double w = 0.5 * (v - k + sqrt((v - k) * (v - k) + 4 * w0 * (w0 + k)));  // exact for p = 0
   w = aero_flow_step(w, w0, k, v, p_square);
   w = aero_flow_step(w, w0, k, v, p_square);
+  w -= WINDMILL * aero_positive(-2 * w0 - climb);
   // Vortex ring state: strongest at a descent of 1.4 w0, gone at p = 0.95 w0.
   const double over = 1 / (w0 + 1e-6);
   const double off = (climb * over + 1.4) * (1 / 1.2);
