@@ -60,7 +60,7 @@ class Hover(Task):
             "apg": {"step": 0.4},
         },
     }
-    variants = {"robust": {"steps": 4_096_000, "training_options": {"tilt": 0.2, "spin": 0.3}}}
+    variants = {"robust": {"training_options": {"tilt": 0.2, "spin": 0.3}}}
     heading_matters = True
 
     radius: float = 0.5

@@ -40,7 +40,7 @@ class RandomWaypoint(Task):
         "trpo": {"training_options": IN_MOTION},
         "apg": {"steps": 102_400, "holds_goal": False},
     }
-    variants = {"robust": {"steps": 4_096_000, "training_options": {"farthest": 2.5, **AT_REST}}}
+    variants = {"robust": {"training_options": {"farthest": 2.5, **AT_REST}}}
 
     nearest: float = 1.0
     """Smallest distance of the waypoint from the start [m]."""
