@@ -436,6 +436,17 @@ def test_fast_descent_loses_thrust(climb, share):
     assert lift_share(bare(VORTEX), climb) == pytest.approx(share, abs=1e-3)
 
 
+def test_lift_rises_towards_the_windmill_state():
+    # A Crazyflie at 2.4 w0, by Johnson's model: 1.58. What is left there of the vortex ring state
+    # is 0.028 of the middle's, in which it loses 0.2.
+    air = with_effects(VEHICLES["crazyflie"], "inflow,vortex_ring").aerodynamics
+    vehicle = bare(dataclasses.replace(air, vortex_ring_noise=0.0), "crazyflie")
+    shares = [lift_share(vehicle, climb) for climb in (-2.0, -2.2, -2.4, -4.0)]
+    assert shares[2] == pytest.approx(1.58, abs=0.01)
+    assert np.diff(shares[:3]) == pytest.approx(0.22, abs=0.02)
+    assert shares[3] == pytest.approx(1.6)  # the blades stall
+
+
 @pytest.mark.parametrize(("climb", "across"), [(-0.19, 0.0), (0.5, 0.0), (-1.3, 0.96), (-1, 1.5)])
 def test_there_is_exactly_no_vortex_ring_state_in_slow_descent_and_out_sideways(climb, across):
     with_it, without = (bare(a) for a in (VORTEX, INFLOW))

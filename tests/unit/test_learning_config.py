@@ -14,6 +14,7 @@ import quadrl
 from quadrl import tasks
 from quadrl.evaluation import evaluate as evaluation
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.defaults import VARIANTS
 from quadrl.learning.environments import make_env
 from quadrl.learning.folder import read_config, write_config
 from quadrl.learning.settings import PPOConfig, VPGConfig
@@ -210,7 +211,7 @@ def test_a_run_with_an_old_name_of_a_setting_goes_on(tmp_path):
 def test_a_variant_is_settings_that_go_together():
     config, usual = TrainConfig("hover", variant="robust"), TrainConfig("hover")
     assert (config.weather, usual.weather) == ("light", "calm")
-    assert config.steps == Hover.variants["robust"]["steps"] != usual.steps
+    assert config.steps == VARIANTS["robust"]["steps"] != usual.steps
     assert config.ppo.learning_rate < usual.ppo.learning_rate
     assert config.scenario.aircraft.action_scale > usual.scenario.aircraft.action_scale
     assert usual.scenario.to_json() == {"task": "hover", "vehicle": "paper"}
