@@ -50,8 +50,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
             "noise": dataclasses.asdict(RANDOMIZATIONS["light"].noise),
         },
         # Commands arrive late: what was sent belongs to the state. Mass and wind show as
-        # acceleration, and what they leave of the offset in its sum. No aircraft measures the speeds
-        # of its rotors.
+        # acceleration, and what they leave of the offset in its sum. No aircraft measures the
+        # speeds of its rotors.
         "observe": {
             "action_history": 2,
             "disturbance": True,
