@@ -109,10 +109,12 @@ class ProgressBar:
         share = (now.iteration - first) / now.iteration
         rate = now.steps * share / max(now.seconds - since, 1e-9)
         self._metrics |= now.metrics
+        # Until the first whole episodes end there is neither.
+        gained, success = (self._metrics.get(name) for name in ("return", "success"))
         report = (
             f"{now.steps:>9,} steps  {rate:>7,.0f}/s  "
-            f"return {self._metrics.get('return', float('nan')):>7.0f}  "
-            f"success {100 * self._metrics.get('success', float('nan')):>3.0f} %"
+            f"return {'-' if gained is None else f'{gained:.0f}':>7}  "
+            f"success {'-' if success is None else f'{100 * success:.0f}':>3} %"
         )
         self.update(now.iteration, now.iterations, report)
 

@@ -22,6 +22,10 @@ from quadrl.learning.train import Training
 from quadrl.rendering import write_video
 from quadrl.rendering.scenarios import comment
 
+DEAD_TIMES = (0.01, 0.02)
+"""With which the policy of an aircraft that has a dead time flies, beside its own [s]: those of
+Crazyflies, and what a radio adds."""
+
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run:
@@ -37,6 +41,9 @@ class Run:
     """Metrics in MuJoCo, in episodes that the training has not seen."""
     seconds: float
     """Wall clock of the training [s], without imports and evaluation."""
+    late: dict[float, float] = dataclasses.field(default_factory=dict)
+    """Share of the flights that succeed, by the dead time of the aircraft [s]; empty where it has
+    none."""
 
     def __repr__(self) -> str:
         trained = f"trained with {self.config.algo.upper()} in {self.seconds:.1f} s"
@@ -126,5 +133,12 @@ def train_in(
     found = evaluate(policy, scenario, episodes=episodes)
     seconds = round(training.seconds, 2)
     record = {"training_s": seconds, "scenario": scenario.to_json()}
+    late: dict[float, float] = {}
+    for dead_time in DEAD_TIMES if scenario.vehicle.dead_time else ():
+        other = evaluate(policy, scenario, episodes=episodes, engine="free_flight",
+                         vehicle_options={"dead_time": dead_time})  # fmt: skip
+        late[dead_time] = float(other.metrics["success_rate"])
+    if late:
+        record["success_rate_by_dead_time"] = {f"{s:g}": share for s, share in late.items()}
     write_json(folder / EVALUATION, found.metrics | record)
-    return Run(folder, config, policy, found, seconds)
+    return Run(folder, config, policy, found, seconds, late)
