@@ -5,6 +5,7 @@ from __future__ import annotations
 from quadrl.core.catalogue import TASKS, make, register
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
+from quadrl.tasks.race import Race
 from quadrl.tasks.random_waypoint import RandomWaypoint
 from quadrl.tasks.static_waypoint import StaticWaypoint
 from quadrl.tasks.straight_and_level import StraightAndLevel
@@ -12,5 +13,8 @@ from quadrl.tasks.target_following import TargetFollowing
 
 __all__ = ["TASKS", "make", "register"]
 
-for _task in (Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing):
+for _task in (
+    *(Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing),
+    Race,
+):
     register(_task)

@@ -288,7 +288,7 @@ def look_up(table: np.ndarray, index: Array) -> Array:
     Returns:
         Numbers (..., *table.shape[1:]) of the index's kind.
     """
-    table, xp = np.asarray(table, dtype=np.float64), namespace(index)
+    table, xp = np.array(table, dtype=np.float64), namespace(index)
     last = float(len(table) - 1)
     place = xp.where(index > 0, xp.where(index < last, index, last), 0.0)
     if not isinstance(place, Symbols):

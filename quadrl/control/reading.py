@@ -42,7 +42,10 @@ class Reading:
             size, allowed = observation.shape[1], f"{ends[-1]} for this task and aircraft"
             raise QuadrlError(name="observation size", value=size, allowed=allowed)
         term = dict(zip(terms, np.split(observation, ends[:-1], axis=-1), strict=True))
-        rotation = rotation_of_angles(term["sin_attitude"], term["cos_attitude"])
+        if "rotation" in term:
+            rotation = term["rotation"].reshape(-1, 3, 3)
+        else:
+            rotation = rotation_of_angles(term["sin_attitude"], term["cos_attitude"])
         velocity = to_world(rotation, term["velocity"])
         relative = to_world(rotation, term.get("target_velocity", -term["velocity"]))
         ahead = [

@@ -125,6 +125,7 @@ class Rollout:
     error: np.ndarray  # (T, N) [m]
     reward: np.ndarray  # (T, N)
     wind: np.ndarray  # (T, N, 3) [m/s], world frame; that of the step which led to each state
+    remembered: Mapping[str, np.ndarray]  # (T, N, ...) by name: the task's own TaskState
     length: np.ndarray  # (N,) steps of each episode
     terminated: np.ndarray  # (N,) bool
     is_success: np.ndarray  # (N,) bool

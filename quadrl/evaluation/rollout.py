@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Unpack
 
 import numpy as np
 
-from quadrl.base import machine
+from quadrl.base import machine, records
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import action
 from quadrl.core.environment import Environment
@@ -59,10 +60,14 @@ def fly(
     environment = Environment(scenario, num_envs=episodes, seed=seed)
     controller = begun(controller, environment)
     flown, timestep = environment.task, environment.vehicle.control_timestep
-    steps, numbers = environment.time_limit_steps, 24 + 2 * len(environment.vehicle.rotors)
-    machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
     observation = environment.flatten(environment.reset())
+    steps, own = environment.time_limit_steps, records.leaves(environment.snapshot.task)
+    numbers = 24 + 2 * len(environment.vehicle.rotors) + sum(a.size for a in own) // episodes
+    machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
     history: dict[str, list[np.ndarray]] = {name: [] for name in HISTORY}
+    remembered: dict[str, list[np.ndarray]] = {
+        field.name: [] for field in dataclasses.fields(environment.snapshot.task)
+    }
     alive = np.ones(episodes, dtype=bool)
     shape = episodes, environment.action_size
     length = np.zeros(episodes, dtype=int)
@@ -80,15 +85,17 @@ def fly(
         moment["target_velocity"] = np.zeros_like(goal) if velocity is None else velocity
         moment["rotor_command"] = environment.snapshot.rotor_command / environment.vehicle.max_speed
         for name, values in history.items():
-            value = np.array(moment[name] if name in moment else getattr(state, name), dtype=float)
-            value[~alive] = np.nan
-            values.append(value)
+            value = moment[name] if name in moment else getattr(state, name)
+            values.append(_while(alive, value))
+        for name, values in remembered.items():
+            values.append(_while(alive, getattr(environment.snapshot.task, name)))
         length += alive
         for name, flag in ends.items():
             flag |= alive & getattr(now, name)
         alive &= ~(now.terminated | now.truncated)
     return Rollout(
         **{name: np.stack(values) for name, values in history.items()},
+        remembered={name: np.stack(values) for name, values in remembered.items()},
         length=length,
         **ends,
         markers=tuple(markers),
@@ -228,6 +235,13 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
         "length_mean_s": float(flown["length_s"].mean()),
         "diverged": int(flown["diverged"].sum()),
     } | rollout.task.metrics(rollout)
+
+
+def _while(alive: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A copy of values (N, ...) as numbers, NaN where an aircraft's episode is over."""
+    kept = np.array(values, dtype=float)
+    kept[~alive] = np.nan
+    return kept
 
 
 def _means(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:

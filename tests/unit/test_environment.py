@@ -122,7 +122,9 @@ def test_a_new_goal_is_seen_at_once_and_costs_nothing():
 
 
 @pytest.mark.parametrize("vehicle", ["paper", "hexa"])
-@pytest.mark.parametrize("name", tasks.TASKS)
+@pytest.mark.parametrize(
+    "name", [n for n, task in tasks.TASKS.items() if "position" in task.observation]
+)
 def test_the_flat_observation_is_that_of_the_documentation(name, vehicle):
     environment = begun(name, 4, vehicle=vehicle)
     rotors = environment.vehicle.rotor_count

@@ -44,6 +44,7 @@ def make_rollout(**changes) -> Rollout:
         terminated=np.array([False, True, True]),
         is_success=np.array([False, False, True]),
         diverged=np.array([False, True, False]),
+        remembered={},
         markers=(),
         origin=np.array([0.0, 0.0, 3.0]),
         control_timestep=0.05,
@@ -213,6 +214,22 @@ def test_episode_i_is_the_single_environment_of_its_seed(weather):
         assert now.terminated[0] or now.truncated[0]
         for after in (rollout.reward, rollout.wind):
             assert np.isnan(after[rollout.length[i] :, i]).all()
+
+
+def test_what_a_task_remembers_is_kept():
+    route = tasks.make("static_waypoint", waypoints=((0, 0, 0.3), (0, 0, 3)), reach=0.25)
+    rollout = fly(lambda seen: np.ones((len(seen), 4)), route, episodes=2, seed=3)
+    alone = Environment(route, seed=4)
+    alone.reset()
+    for t in range(rollout.length[1]):
+        alone.step(np.ones((1, 4)))
+        for name in ("goal", "leg"):
+            expected = getattr(alone.snapshot.task, name)[0]
+            np.testing.assert_array_equal(rollout.remembered[name][t, 1], expected)
+    assert set(rollout.remembered["leg"][: rollout.length[1], 1]) == {0.0, 1.0}
+    for name in ("goal", "leg"):
+        kept = rollout.remembered[name]
+        assert all(np.isnan(kept[rollout.length[i] :, i]).all() for i in range(2))
 
 
 def test_an_evaluation_is_the_same_every_time_and_another_with_another_seed():

@@ -203,7 +203,7 @@ def test_a_route_is_flown_in_order():
     assert not task.succeeded(now, held).any()
 
 
-@pytest.mark.parametrize("name", tasks.TASKS)
+@pytest.mark.parametrize("name", [name for name in tasks.TASKS if name != "race"])
 def test_the_heading_counts_where_it_is_asked_for(name):
     task, degrees = tasks.make(name), np.array([0.0, 9.9, -9.9, 10.1, -10.1, 180.0])
     start = placed([(0, 0, 0)] * len(degrees))
@@ -238,7 +238,7 @@ def test_a_task_that_remembers_nothing_gives_its_state_back(name):
     task = tasks.make(name)
     before, episode = snapshot(task, (0, 0, 0.5))
     now, *_ = finished(task, before, episode, (0, 0, 0.4))
-    assert (now.task is before.task) == (name not in ("static_waypoint", "landing"))
+    assert (now.task is before.task) == (name not in ("static_waypoint", "landing", "race"))
 
 
 def test_straight_and_level():

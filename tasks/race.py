@@ -1,0 +1,271 @@
+"""Race: through the gates of a track in order, as fast as possible."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from quadrl.aircraft.parameters import Parameters
+from quadrl.base.primitives import Primitive
+from quadrl.base.rotation import Array, namespace, norm, to_body
+from quadrl.base.trace import look_up
+from quadrl.base.validation import number
+from quadrl.core import rewards
+from quadrl.core.contact import touches_ground
+from quadrl.core.observation import OBSERVATION, ROTATION, ObservationTerm
+from quadrl.core.task import EpisodeEnd, Snapshot, Target, Task, TaskState
+from quadrl.engines.rng import Rng, hovering
+from quadrl.engines.state import Start
+from quadrl.tasks.tracks import Track, crossing
+
+if TYPE_CHECKING:
+    from quadrl.control.reading import Reading
+    from quadrl.core.snapshot import Rollout
+
+# How the yardstick controllers fly: to a place so far behind a gate [m], and so fast there [m/s].
+OVERSHOOT, CRUISE = 0.5, 2.0
+ASTRAY = 5.0  # [m], farther from the next gate than where the last was passed
+FARTHEST_MISS = 1.0  # [m], from the edge of the opening, up to which a miss costs more
+
+
+@dataclasses.dataclass(frozen=True)
+class Course(TaskState):
+    """How far a race is; the goal is the centre of the next gate."""
+
+    gate: Array  # (N,) number of the next gate, from 0
+    through: Array  # (N, 3) unit vector through it
+    left: Array  # (N, 3) unit vector to its left
+    passed: Array  # (N,) gates so far
+    time: Array  # (N,) [s] since the start, when the last of them was passed; 0 before
+    position: Array  # (N, 3) [m], before this control step
+    leg: Array  # (N,) [m], from where the last gate was passed to the next
+
+
+@dataclasses.dataclass(frozen=True)
+class Race(Task):
+    """Fly through all gates of a track, in order and in their direction, for some laps."""
+
+    name = "race"
+    asks = "fly through the gates of a track in order, as fast as possible"
+    starts = "at rest within 0.1 m of the track's start, any heading, tilted up to 0.3 rad"
+    ends = (
+        "through the last gate (success); through the frame of any gate, on the ground, more than "
+        "5 m farther from the next gate than when the last was passed"
+    )
+    solved = "through every gate of every lap"
+    targets = (
+        Target("success_rate", "successful", 0.95, True),
+        Target("race_time_mean_s", "to the last gate", 6.0),
+    )
+    training = {"vehicle_options": {"action_scale": 1250.0}}
+    keeps_place = False
+    observation = {
+        **ROTATION,
+        **{name: OBSERVATION[name] for name in ("velocity", "body_rate", "rotor_speed", "goal")},
+        "through": ObservationTerm(3, "1", "unit vector through the next gate, body frame"),
+        "next_goal": ObservationTerm(3, "m", "to the centre of the gate after it, body frame"),
+        "next_through": ObservationTerm(3, "1", "unit vector through that, body frame"),
+    }
+
+    time_limit: float = 30.0
+    """Time limit of an episode [s]."""
+    altitude: float = 0.0
+    """Height of the origin of the track above the ground [m]; that of the aircraft on its feet at
+    least."""
+    progress_weight: float = 10.0
+    """Reward per metre by which the distance to the centre of the next gate falls."""
+    turn_weight: float = 0.1
+    """Cost per rad/s of body rate, for each 0.05 s."""
+    pass_weight: float = 10.0
+    """Reward for each gate."""
+    miss_weight: float = 50.0
+    """Cost per metre by which an opening is missed, up to 1 m."""
+    crash_weight: float = 100.0
+    """Cost of a failure."""
+    track: str = "split_s"
+    """Name of the track: airsim, alphapilot or split_s."""
+    gates: tuple[tuple[float, ...], ...] = ()
+    """Gates of one's own: x, y, z [m], heading and climb [deg] of the way through each; () for
+    those of the track."""
+    start: tuple[float, ...] = ()
+    """Where a race begins [m]; () for that of the track, or 5 m before the first of own gates."""
+    opening: float = 0.0
+    """Edge of the openings [m]; 0 for that of the track."""
+    frame: float = 0.0
+    """Outer edge of the frames [m]; 0 for that of the track."""
+    margin: float = 0.0
+    """How far from the edge of an opening the aircraft's centre has to pass [m]."""
+    laps: int = 1
+    """How often the track is flown."""
+    radius: float = 0.1
+    """Largest distance from the start [m]."""
+    tilt: float = 0.3
+    """Largest tilt at the start [rad]."""
+    flying: float = 0.0
+    """Share of the episodes that begin in flight, at a gate drawn anew."""
+    flying_speed: float = 15.0
+    """Largest speed of those [m/s]."""
+
+    def __post_init__(self) -> None:
+        """Validate the track."""
+        super().__post_init__()
+        number(f"{self.name} margin", self.margin, 0, self.course.opening / 2)
+        number(f"{self.name} flying", self.flying, 0, 1)
+        number(f"{self.name} laps", self.laps, 1, whole=True)
+
+    @functools.cached_property
+    def course(self) -> Track:
+        """The track that is flown."""
+        return Track.of(self.track, self.gates, self.start, self.opening, self.frame)
+
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Course]:
+        """At rest at the start, tilted; or in flight from the gate before the next one."""
+        track, count = self.course, len(self.course.gates)
+        gate = rng.uniform(0.0, float(count))
+        xp = namespace(gate)
+        gate, flies = xp.floor(gate), rng.uniform(0.0, 1.0) < self.flying
+        rest, away = rng.vector(self.radius), rng.vector(track.opening / 2)
+        gate = xp.where(flies, gate, 0.0 * gate)
+        goal = look_up(track.centre, gate)
+        last = look_up(np.roll(track.centre, 1, axis=0), gate) + away
+        first = look_up(np.array([track.start]), 0.0 * gate) + rest
+        position = xp.where(flies[..., None], last, first)
+        leg = norm(goal - position)
+        # On the way that the gate before has, or straight to the next one, or between.
+        through = look_up(np.roll(track.axes[:, 0], 1, axis=0), gate)
+        share = rng.uniform(0.0, 1.0)[..., None]
+        way = share * through + (1 - share) * (goal - position) / leg[..., None]
+        speed = xp.where(flies, rng.uniform(0.0, self.flying_speed), 0.0 * leg)
+        start = Start(
+            position=position,
+            quaternion=rng.attitude(self.tilt),
+            velocity=speed[..., None] * way,
+            body_rate=0.0 * way,
+            rotor_speed=hovering(position, parameters),
+        )
+        none = 0.0 * gate
+        return start, Course(goal, gate, *self._axes(gate), none, none, position, leg)
+
+    def update(self, before: Snapshot, now: Snapshot) -> Course:
+        """Go on to the next gate when this one is passed."""
+        task, (passes, _, _, share) = now.task, self._crossed(now)
+        xp, last = namespace(task.gate), float(len(self.course.gates) - 1)
+        following = xp.where(task.gate == last, 0.0 * task.gate, task.gate + 1)
+        gate = xp.where(passes, following, task.gate)
+        goal = look_up(self.course.centre, gate)
+        through, left = self._axes(gate)
+        moment = now.time - (1 - share) * now.parameters.control_timestep
+        return Course(
+            goal=goal,
+            gate=gate,
+            through=through,
+            left=left,
+            passed=xp.where(passes, task.passed + 1, task.passed),
+            time=xp.where(passes, moment, task.time),
+            position=now.state.position + 0.0,
+            leg=xp.where(passes, norm(goal - now.state.position), task.leg),
+        )
+
+    def observe(self, now: Snapshot) -> dict[str, Array]:
+        """The aircraft's motion, and the next two gates as it sees them."""
+        state, track, gate = now.state, self.course, now.task.gate
+        following = look_up(np.roll(track.centre, -1, axis=0), gate)
+        seen = {
+            "goal": now.potentials.to_goal,
+            "through": now.task.through,
+            "next_goal": following - state.position,
+            "next_through": look_up(np.roll(track.axes[:, 0], -1, axis=0), gate),
+        }
+        return {
+            "rotation": state.rotation_entries,
+            "velocity": state.body_velocity,
+            "body_rate": state.body_rate,
+            "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
+            **{name: to_body(state.rotation, vector) for name, vector in seen.items()},
+        }
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Nearer to the next gate and through it, without turning more than it takes."""
+        passes, _, missed, _ = self._crossed(now)
+        xp, zero = namespace(missed), 0.0 * missed
+        turning = self.turn_weight * rewards.time_share(now.parameters)
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "turn": -turning * now.potentials.angular_speed,
+            "pass": xp.where(passes, zero + self.pass_weight, zero),
+            "miss": -self.miss_weight * missed,
+            "crash": xp.where(end.failed, zero - self.crash_weight, zero),
+        }
+
+    def terminated(self, now: Snapshot) -> Array:
+        """Through the last gate or a frame, on the ground, or astray."""
+        return self._failed(now) | self._finished(now)
+
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
+        """Through every gate, and nothing else."""
+        return end.terminated & self._finished(now) & ~self._failed(now)
+
+    def guide(self, reading: Reading) -> tuple[Array, Array]:
+        """Through the gate: straight to a place behind it."""
+        away = namespace(reading.to_goal).clip(norm(reading.to_goal), 1e-9, None)[..., None]
+        way = reading.to_goal / away
+        return reading.to_goal + OVERSHOOT * way, CRUISE * way
+
+    def markers(self, now: Snapshot) -> Sequence[Primitive]:
+        """The gates; the next one in another colour."""
+        return [*self.course.drawn(int(now.task.gate[0]))]
+
+    def metrics(self, rollout: Rollout) -> dict[str, float]:
+        """Times of those that came through, and how many gates all of them passed."""
+        passed, time = (rollout.remembered[name] for name in ("passed", "time"))
+        count, done = len(self.course.gates), rollout.is_success
+        passed, time = passed[:, done], time[:, done]
+        at = [np.nanmin(np.where(passed == k * count, time, np.inf), 0) for k in self._laps]
+        laps = np.diff([np.zeros(done.sum()), *at], axis=0)  # (laps, successful flights)
+        found = {
+            "race_time_mean_s": at[-1].mean() if done.any() else math.nan,
+            "race_time_best_s": at[-1].min() if done.any() else math.nan,
+            "gates_passed_mean": np.nanmax(rollout.remembered["passed"], 0).mean(),
+        }
+        if len(laps) > 1:
+            found["flying_lap_mean_s"] = laps[1:].mean() if done.any() else math.nan
+        return {name: float(value) for name, value in found.items()}
+
+    def _axes(self, gate: Array) -> tuple[Array, Array]:
+        """Unit vectors through gates with some numbers (N,), and to their left, (N, 3)."""
+        through, left = self.course.axes[:, 0], self.course.axes[:, 1]
+        return look_up(through, gate), look_up(left, gate)
+
+    @property
+    def _laps(self) -> range:
+        return range(1, int(self.laps) + 1)
+
+    def _crossed(self, now: Snapshot) -> tuple[Array, Array, Array, Array]:
+        """What becomes of the next gate in this control step, (N,).
+
+        Returns:
+            Whether it is passed, and whether its frame is hit, bool; by how much the opening is
+            missed [m], 0 where it is not; and the share of the control step that led there.
+        """
+        task, xp = now.task, namespace(now.task.gate)
+        gate = now.task.goal, task.through, task.left
+        forwards, backwards, aside, share = crossing(task.position, now.state.position, *gate)
+        beside = aside - (self.course.opening / 2 - self.margin)
+        struck = (beside > 0) & (aside < self.course.frame / 2 + self.margin)
+        missed = xp.where(forwards, xp.clip(beside, 0.0, FARTHEST_MISS), 0.0 * beside)
+        return forwards & (beside <= 0), (forwards | backwards) & struck, missed, share
+
+    def _failed(self, now: Snapshot) -> Array:
+        """Through a frame, on the ground, or astray, (N,) bool."""
+        astray = now.potentials.distance > now.task.leg + ASTRAY
+        return self._crossed(now)[1] | astray | touches_ground(now)
+
+    def _finished(self, now: Snapshot) -> Array:
+        """Whether this control step passes the last gate of the last lap, (N,) bool."""
+        last = now.task.passed == self.laps * len(self.course.gates) - 1
+        return last & self._crossed(now)[0]

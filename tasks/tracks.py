@@ -1,0 +1,182 @@
+"""Race tracks: gates as arrays, and what an aircraft crosses between two moments.
+
+The known ones stand in assets/tracks, each with its source and licence.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.resources
+import json
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.primitives import Primitive
+from quadrl.base.rotation import Array, namespace, stack
+from quadrl.base.validation import MAX_OPTION, choice, number, numbers
+
+RUN_IN = 5.0
+"""Distance of the start before the first gate of a track that names no start [m]."""
+THICKNESS = 0.06  # [m], of the frames that are drawn
+NEXT, OTHER = (1.0, 0.55, 0.15, 1.0), (0.25, 0.45, 0.80, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Track:
+    """Square gates that are flown through in order, and again from the first."""
+
+    name: str
+    gates: tuple[tuple[float, ...], ...]
+    """Centre x, y, z [m], task frame; heading and climb [deg] of the way through: from east
+    counter-clockwise, from level up."""
+    start: tuple[float, ...]
+    """Where a race begins [m]."""
+    opening: float
+    """Edge of the openings [m]."""
+    frame: float
+    """Outer edge of the frames [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse a track that cannot be flown.
+
+        Raises:
+            QuadrlError: It has no gates, or a number is impossible, or gates overlap.
+        """
+        if not len(self.gates):
+            allowed = "at least one gate (x, y, z, heading, climb)"
+            raise QuadrlError(name=f"{self.name} gates", value=self.gates, allowed=allowed)
+        number(f"{self.name} opening", self.opening, positive=True)
+        number(f"{self.name} frame", self.frame, self.opening)
+        for k, gate in enumerate(self.gates):
+            for other in range(k):
+                apart = math.dist(gate[:3], self.gates[other][:3])
+                if apart < self.frame:
+                    reason = f"gates {other + 1} and {k + 1} overlap: their frames are as wide"
+                    allowed = f"centres at least {self.frame:g} m apart"
+                    what = f"{self.name} gates"
+                    raise QuadrlError(reason, name=what, value=round(apart, 3), allowed=allowed)
+
+    @classmethod
+    def of(
+        cls, name: str, gates: Any = (), start: Any = (), opening: float = 0, frame: float = 0
+    ) -> Track:
+        """The track of a name, or of gates of one's own, with what differs from it.
+
+        Args:
+            name: A name of `NAMES`.
+            gates: As `Track.gates`; () for those of the track.
+            start: As `Track.start`; () for that of the track, or before the first of own gates.
+            opening: As `Track.opening`; 0 for that of the track.
+            frame: As `Track.frame`; 0 for that of the track.
+
+        Raises:
+            QuadrlError: The name is unknown, or what is given no track.
+        """
+        known = _known(choice("track", name, NAMES))
+        size, rows = (-MAX_OPTION, MAX_OPTION), known.gates
+        if isinstance(gates, str) or not hasattr(gates, "__len__"):
+            raise QuadrlError(name="gates", value=gates, allowed="rows x, y, z, heading, climb")
+        if len(gates):
+            rows = tuple(numbers(f"gates[{k}]", gate, 5, *size) for k, gate in enumerate(gates))
+            name, known = "own", dataclasses.replace(known, start=_before(rows[0]))
+        if len(numbers("start", start)):
+            known = dataclasses.replace(known, start=numbers("start", start, 3, *size))
+        return cls(name, rows, known.start, opening or known.opening, frame or known.frame)
+
+    @functools.cached_property
+    def centre(self) -> np.ndarray:
+        """Centres of the gates, (G, 3) [m]."""
+        return _fixed([gate[:3] for gate in self.gates])
+
+    @functools.cached_property
+    def axes(self) -> np.ndarray:
+        """Unit vectors through each gate, to its left and up along it, (G, 3, 3)."""
+        heading, climb = np.radians([gate[3:] for gate in self.gates]).T
+        zero = 0 * heading
+        level = np.array([np.cos(heading), np.sin(heading), zero])
+        through = level * np.cos(climb) + np.array([zero, zero, np.sin(climb)])
+        left = np.array([-np.sin(heading), np.cos(heading), zero])
+        return _fixed(np.stack([through.T, left.T, np.cross(through.T, left.T)], axis=1))
+
+    def drawn(self, following: int) -> Iterator[Primitive]:
+        """The frames; that of the gate with a number in another colour."""
+        wide = max(self.frame - self.opening, THICKNESS) / 4
+        for k, (centre, axes) in enumerate(zip(self.centre, self.axes, strict=True)):
+            rgba = NEXT if k == following else OTHER
+            heading, climb = np.radians(self.gates[k][3:]) / 2
+            turn = (
+                math.cos(heading) * math.cos(climb),
+                math.sin(heading) * math.sin(climb),
+                -math.cos(heading) * math.sin(climb),
+                math.sin(heading) * math.cos(climb),
+            )
+            for across, size in ((1, (wide, self.frame / 2)), (2, (self.opening / 2, wide))):
+                for side in (-1, 1):
+                    place = centre + side * (self.opening / 2 + wide) * axes[across]
+                    yield Primitive("box", (THICKNESS / 2, *size), place, turn, rgba)
+
+
+@functools.cache
+def _known(name: str) -> Track:
+    """A track of assets/tracks."""
+    read = json.loads((TRACKS / f"{name}.json").read_text())
+    rows = tuple(map(tuple, read["gates"]))
+    return Track(name, rows, tuple(read["start"]), read["opening"], read["frame"])
+
+
+def _before(gate: tuple[float, ...]) -> tuple[float, ...]:
+    """A start before a gate (x, y, z, heading, climb), as high [m]."""
+    heading = math.radians(gate[3])
+    return gate[0] - RUN_IN * math.cos(heading), gate[1] - RUN_IN * math.sin(heading), gate[2]
+
+
+def _fixed(values: Any) -> np.ndarray:
+    array = np.array(values)
+    array.flags.writeable = False
+    return array
+
+
+def crossing(
+    last: Array, position: Array, centre: Array, through: Array, left: Array
+) -> tuple[Array, Array, Array, Array]:
+    """How an aircraft that flies straight from one place to another crosses the plane of a gate.
+
+    Args:
+        last: The one place, (N, 3) [m].
+        position: The other, (N, 3) [m].
+        centre: Centre of the gate, (N, 3) [m].
+        through: Unit vector through it, (N, 3).
+        left: Unit vector to its left, (N, 3).
+
+    Returns:
+        Whether forwards, and whether backwards, (N,) bool; how far from the centre, (N,) [m], the
+        larger of sideways and along the upright edges; on which share of the way, (N,). The latter
+        two mean nothing where it does not cross it.
+    """
+    xp = namespace(position)
+    up = stack(
+        through[..., 1] * left[..., 2] - through[..., 2] * left[..., 1],
+        through[..., 2] * left[..., 0] - through[..., 0] * left[..., 2],
+        through[..., 0] * left[..., 1] - through[..., 1] * left[..., 0],
+    )
+    was, now = dot(last - centre, through), dot(position - centre, through)
+    forwards, backwards = (was < 0) & (now >= 0), (was >= 0) & (now < 0)
+    way = xp.where(forwards | backwards, now - was, xp.ones_like(was))
+    share = -was / way
+    point = last + share[..., None] * (position - last) - centre
+    return forwards, backwards, xp.maximum(abs(dot(point, left)), abs(dot(point, up))), share
+
+
+def dot(first: Array, second: Array) -> Array:
+    """Scalar products (...) of vectors (..., 3)."""
+    product = first * second
+    return product[..., 0] + product[..., 1] + product[..., 2]
+
+
+TRACKS = importlib.resources.files("quadrl") / "assets" / "tracks"
+NAMES = tuple(sorted(file.name.removesuffix(".json") for file in TRACKS.iterdir()))
