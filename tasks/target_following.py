@@ -56,8 +56,8 @@ class TargetFollowing(Task):
         Target("circling_m_s", "circling over the last 2 s", 0.1),
     )
     training_with = {
-        # With the task's own weights a lasting turn of 0.5 rad/s costs next to nothing, and it circles
-        # around the place to keep.
+        # With the task's own weights a lasting turn of 0.5 rad/s costs next to nothing, and it
+        # circles around the place to keep.
         "ppo": {"training_options": {"spin_weight": 10.0, "speed_weight": 40.0}},
         # With the task's own weight it speeds up after the target with its rotors at their ends,
         # where the physics have no derivative, and tips over in up to 9 of 100 flights.
