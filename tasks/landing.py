@@ -61,8 +61,8 @@ class Landing(Task):
     training_with = {
         # With the task's own weight, two of four policies come down before they have turned east.
         "ppo": {"training_options": {"attitude_weight": 60.0}, "ppo": {"beta2": 0.99}},
-        # With the task's own weight it settles on hanging in the air.
-        "trpo": {"training_options": {"attitude_weight": 60.0}},
+        # With the task's own weights it settles on hanging in the air.
+        "trpo": {"training_options": {"attitude_weight": 60.0, "progress_weight": 200.0}},
         # Chosen by a search: docs/paper.md.
         "vpg": {
             "num_envs": 128,

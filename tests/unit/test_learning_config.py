@@ -142,7 +142,7 @@ def test_the_settings_of_a_run_are_found_again(tmp_path):
     assert TrainConfig.of_folder(tmp_path) == TINY
     saved = read_config(tmp_path)
     assert saved["resolved_task"]["time_limit"] == 0.5
-    assert saved["resolved_task"]["radius"] == 0.5
+    assert saved["resolved_task"]["radius"] == 0.75  # as it is practised
     assert saved["resolved_vehicle"]["mass"] == 0.65
     assert len(saved["resolved_vehicle"]["rotors"]) == 4
     assert set(saved["versions"]) == {"quadrl", "mujoco", "torch", "torchrl", "numpy"}
