@@ -108,8 +108,13 @@ class Randomizer:
             self.forget(rows)
 
     def forget(self, rows: np.ndarray) -> None:
-        """Take the present coordinates of aircraft for those that they had before."""
+        """Take the present coordinates of aircraft for those that they had before.
+
+        Commands on their way that are no numbers become their present rotor speeds.
+        """
         self.past[:, rows] = self._coordinates[rows]
+        late = self.queue[:, rows]
+        self.queue[:, rows] = np.where(np.isfinite(late), late, self._engine.act[rows])
 
     @property
     def _coordinates(self) -> Array:

@@ -72,7 +72,7 @@ class ControlMode(abc.ABC):
 
     def values(self, action: Array) -> Array:
         """The values that actions (N, k), clipped to [-1, 1], stand for, in the terms' units."""
-        share = within(np.asfortranarray(action), -1.0, 1.0)
+        share = within(np.asanyarray(action, order="F"), -1.0, 1.0)
         return self.centre + np.where(share > 0.0, self.scale, self.scale_down) * share
 
     def setpoint(self, state: State, action: Array) -> Array:

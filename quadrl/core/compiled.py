@@ -41,13 +41,12 @@ _REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
 """Tasks of which was said that they are not compiled."""
 
 
-def make(now: Snapshot, episode: Episode, loops: bool, parameters: np.ndarray, *parts: Any) -> Step:
+def make(now: Snapshot, episode: Episode, parameters: np.ndarray, *parts: Any) -> Step:
     """The step of a task, compiled if it can be; a task that cannot is reported once.
 
     Args:
         now: Any snapshot of the task.
         episode: Any of its episodes.
-        loops: Whether the control mode reads the state in the middle of a step.
         parameters: Rows that the task sees, (N,) or (1,), read live.
         *parts: As `Step` takes them.
     """
@@ -56,7 +55,7 @@ def make(now: Snapshot, episode: Episode, loops: bool, parameters: np.ndarray, *
         step.not_compiled = "the task has `compiled = False`"
         return step
     try:
-        return CompiledStep(step, now, episode, loops, parameters, *parts)
+        return CompiledStep(step, now, episode, parameters, *parts)
     except NotCompilable as error:
         return _reported(step, str(error))
 
@@ -106,7 +105,6 @@ class CompiledStep(Step):
         written: WrittenStep,
         now: Snapshot,
         episode: Episode,
-        loops: bool,
         parameters: np.ndarray,
         *parts: Any,
     ) -> None:
@@ -116,7 +114,6 @@ class CompiledStep(Step):
             written: The same step as it is written, to go on with where it must be.
             now: Any snapshot of the task, with those parameters.
             episode: Any of its episodes.
-            loops: Whether the control mode reads the state in the middle of a step.
             parameters: Rows that the task sees, (N,) or (1,), read live.
             *parts: As `Step` takes them.
 
@@ -143,8 +140,6 @@ class CompiledStep(Step):
         (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
         if (body, trace.constants) != (other, again.constants) or self._reads.changed:
             raise NotCompilable("it gives something else each time")
-        if loops and "last_state[" in body:
-            raise NotCompilable("the control mode reads the state in between, into the same memory")
         try:
             self._call = compiling.compile_generated(
                 SOURCE.format(flags=self.flags, body=body)
@@ -242,9 +237,6 @@ class CompiledStep(Step):
         for into, array in zip(self._pages[0].kept, arrays, strict=True):
             into[:] = array
         self._show(self._pages[0], now.sensed, now.around)
-
-    def hold(self) -> None:
-        """Keep nothing: where the engine is read in between, no step looks back at the state."""
 
     def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""

@@ -26,6 +26,7 @@ from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.scene import Scene
 from quadrl.conditions.weather import WeatherProcess
 from quadrl.control import modes
+from quadrl.control.autopilot import Autopilot
 from quadrl.control.trim import trimmed
 from quadrl.core import compiled, observer, saving, transition
 from quadrl.core.markers import Marker
@@ -118,7 +119,9 @@ class Environment(saving.Copied):
         rotors = self.vehicle.rotor_count
         self._inputs = Inputs.zeros(self.num_envs, self.action_size, rotors)
         self.transition: Transition | None = None  # what the last step gave
-        self._setpoint: Any = None
+        loops, given = self.control_mode.has_loops, (self.control_mode, engine, self._inputs.action)
+        self.autopilot = Autopilot(*given) if loops else None
+        """What flies the loops of the control mode; None where it has none."""
         self._flown = 0  # physics steps of this control step that `control` has commanded
         self.seed(seed)
 
@@ -252,8 +255,7 @@ class Environment(saving.Copied):
         if self._step is None:
             estimate = self.observer.frame if self.observer else None
             parts = self.task, self._clock, self.engine, self._inputs, estimate, self.scene
-            given = now, episode, self.control_mode.has_loops, self._rows
-            self._step = compiled.make(*given, *parts)
+            self._step = compiled.make(now, episode, self._rows, *parts)
         self._step.begin(now, episode)
 
     def step(self, action: Array) -> Transition:
@@ -290,15 +292,15 @@ class Environment(saving.Copied):
         self.engine.check_air()
         if self.scene.solids:
             self.engine.hits[:] = 0.0
-        self._setpoint = self.control_mode.setpoint(self.engine.state, taken)
         if self.randomizer.active:
             self.randomizer.begin_step()
         self._flown, self._inputs.diverged[:] = 0, False
-        if self.control_mode.has_loops:
+        if self.autopilot:
             command[:] = 0.0
-            self._step.hold()
+            self.autopilot.begin()
         else:
-            command[:] = self.engine.ctrl[:] = self._setpoint
+            command[:] = self.control_mode.setpoint(self.engine.state, taken)
+            self.engine.ctrl[:] = command
             if self.observer:
                 self.observer.follow(command, self.vehicle.control_timestep)
 
@@ -308,11 +310,9 @@ class Environment(saving.Copied):
         Returns:
             For how many physics steps, of `most` that are left.
         """
-        command, steps = self._setpoint, min(most, self.randomizer.held[self._flown])
-        if self.control_mode.has_loops:
-            if self._flown:
-                self._read()
-            command, steps = self.control_mode.rotor_command(self.engine.state, command), 1
+        command, steps = self._inputs.command, min(most, self.randomizer.held[self._flown])
+        if self.autopilot:
+            command, steps = self.autopilot.command(), 1
             self._inputs.command[:] += command / self.vehicle.substeps  # their mean counts
             if self.observer:
                 self.observer.follow(command, self.vehicle.physics_timestep)
@@ -337,6 +337,8 @@ class Environment(saving.Copied):
         if (diverged := self.engine.read()) is not None:
             self._inputs.diverged[diverged] = True
             self.randomizer.forget(diverged)
+            if self.autopilot:  # what it commanded them may be no numbers
+                self._inputs.command[diverged] = self.engine.act[diverged]
 
     def flatten(self, observation: Observation) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""

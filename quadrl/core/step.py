@@ -79,10 +79,6 @@ class Step(abc.ABC):
             sensed: What the sensors give now, (N, size) by name.
         """
 
-    @abc.abstractmethod
-    def hold(self) -> None:
-        """Keep the snapshot's state while the engine is read in the middle of a step."""
-
     def renewed(self) -> Step:
         """The step to go on with: itself, unless something that it is made from has changed."""
         return self
@@ -98,10 +94,6 @@ class WrittenStep(Step):
     def begin(self, now: Snapshot, episode: Episode) -> None:
         """Take a snapshot of all rows as the present one."""
         self.snapshot, self.episode = now, episode
-
-    def hold(self) -> None:
-        """Copy the snapshot, whose buffers the engine reuses."""
-        self.snapshot = records.copied(self.snapshot)
 
     def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""

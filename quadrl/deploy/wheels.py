@@ -19,6 +19,7 @@ from unittest import mock
 from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import NativeError, QuadrlWarning
+from quadrl.control.autopilot import Reversed
 from quadrl.control.modes import CONTROL_MODES
 from quadrl.core.environment import Environment
 from quadrl.engines import adjoint
@@ -46,8 +47,9 @@ def tag(machine: str) -> str:
 def steps(tasks: Iterable[str]) -> list[str]:
     """C of the steps of tasks: of all their options, for the vehicles and conditions that ship.
 
-    What changes the code, not only its constants: the number of rotors and of actions, whether
-    what is observed is an estimate, a weight of zero, and the number of waypoints.
+    With it is that of the loops of control modes. What changes the code, not only its constants:
+    the number of rotors and of actions, whether what is observed is an estimate, a weight of zero,
+    and the number of waypoints.
     """
     found: dict[str, None] = {}
 
@@ -63,13 +65,17 @@ def steps(tasks: Iterable[str]) -> list[str]:
             tasks, ROTORS.values(), CONTROL_MODES, ("none", "full"), (0.0, 0.1)
         ):
             for options in routes if task == "static_waypoint" else [{}]:
-                Environment(
+                environment = Environment(
                     task,
                     task_options={"smoothness_weight": weight} | options,
                     vehicle=vehicle,
                     control_mode=mode,
                     randomization=randomization,
-                ).reset()
+                )
+                environment.reset()
+                if pilot := environment.autopilot:
+                    back = Reversed(environment.control_mode, environment.engine)
+                    found |= dict.fromkeys(f.source for f in (*pilot.functions, *back.functions))
     return list(found)
 
 

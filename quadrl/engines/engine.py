@@ -71,6 +71,7 @@ class Engine(abc.ABC):
         self._free_flight = FreeFlight(self.model, fields, threads, table) if flies else None
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
+        self._middle: Frame | None = None
         library = native.library()
         self._kernel, self._first_unsound = library.quadrl_state, library.quadrl_unsound_air
         self._use_parameters()
@@ -172,6 +173,13 @@ class Engine(abc.ABC):
         self._write(rows, State.of_table(table[:, rows]))
         self._check_parameters(rows)
         return broken
+
+    def peek(self) -> State:
+        """The state in the middle of a control step, in buffers of its own; nothing is checked."""
+        if self._middle is None:
+            self._middle = Frame(self.num_envs, self.vehicle.rotor_count)
+        self._kernel(self._address, self.num_envs, None, self._middle.address)
+        return self._middle.state
 
     def _check_parameters(self, rows: np.ndarray) -> None:
         """Refuse parameters that are not finite, with which aircraft diverge at every step."""

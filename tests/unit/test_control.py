@@ -1,6 +1,7 @@
 """Control modes and controllers: they do what they say, on every layout of rotors."""
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -14,10 +15,11 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.errors import QuadrlError
+from quadrl.base.errors import NativeError, QuadrlError
 from quadrl.base.rotation import heading_of, quaternion_from_heading_and_tilt
 from quadrl.control import CONTROL_MODES, CONTROLLERS, Gains, Weights, lqr, modes
 from quadrl.control.allocation import Allocation
+from quadrl.control.autopilot import Laws, Reversed
 from quadrl.control.geometric import towards_east
 from quadrl.control.loops import (
     Loops,
@@ -30,6 +32,7 @@ from quadrl.control.loops import (
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario, as_saved
 from quadrl.core.task import Snapshot, TaskState
+from quadrl.engines.native import compiling
 from quadrl.engines.state import Start, State
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.rollout import fly, summarize
@@ -495,6 +498,81 @@ def test_a_position_is_reached_and_held_without_overshoot_and_no_action_brakes(v
 # ----------------------------------------------------------------------------- in the environment
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"num_envs": 1},
+        {"num_envs": 11, "engine": "free_flight", "randomization": {"mass": (0.9, 1.1)}},
+        {"num_envs": 3, "vehicle": "hexa", "randomization": "full", "task": "landing"},
+        {"num_envs": 2, "vehicle": "crazyflie", "engine": "free_flight"},
+    ],
+    ids=["one", "batch", "late", "dead time"],
+)
+@looped
+def test_compiled_loops_command_what_numpy_commands(name, settings, monkeypatch):
+    flown = []
+    for compiled in (True, False):
+        with monkeypatch.context() as patch:
+            if not compiled:
+                patch.setattr(compiling, "compile_generated", fail)
+            environment = Environment(
+                **{"task": "hover", "seed": 3, "control_mode": name} | settings
+            )
+        assert environment.autopilot.is_compiled == compiled
+        environment.reset()
+        rng, track = np.random.default_rng(0), []
+        for _ in range(12):
+            done = environment.step(rng.uniform(-1, 1, (environment.num_envs, 4)))
+            engine, command = environment.engine, environment.snapshot.rotor_command
+            track += [engine.qpos.copy(), engine.act.copy(), command.copy(), done.reward.copy()]
+        flown.append(track)
+    # Only sine and cosine of the yaw are another library's; all else are the same bits.
+    close = {"rtol": 1e-9, "atol": 1e-9} if name == "position" else {"rtol": 0, "atol": 0}
+    for found, expected in zip(*flown, strict=True):
+        np.testing.assert_allclose(found, expected, **close)
+
+
+def fail(source):
+    raise NativeError("there is no C compiler")
+
+
+@looped
+@pytest.mark.parametrize("vehicle", ["paper", "hexa"])
+def test_the_derivatives_of_commands_are_those_of_differences(name, vehicle):
+    rng, count = np.random.default_rng(1), 16
+    flyer = Flyer(name, VEHICLES[vehicle], np.linspace(0, 6, count))
+    flyer.fly(rng.uniform(-1, 1, (count, 4)), 0.3)
+    mode, engine = flyer.mode, flyer.engine
+    laws, back = Laws(mode, engine), Reversed(mode, engine)
+    motion = np.concatenate([engine.qpos, engine.qvel, engine.act], axis=1)
+    action = rng.uniform(-0.9, 0.9, (count, 4))
+
+    def parts(motion):
+        return motion[:, :7], motion[:, 7:13], motion[:, 13:]
+
+    setpoint = laws.setpoint(*parts(motion), action)
+    for function, derivative, other in (
+        (laws.setpoint, back.setpoint, action),
+        (laws.command, back.command, setpoint),
+    ):
+        given = rng.normal(size=function(*parts(motion), other).shape)
+        moves = [rng.normal(size=array.shape) for array in (motion, other)]
+        pairs = zip(derivative(motion, other, given), moves, strict=True)
+        found = sum((slope * move).sum(1) for slope, move in pairs)
+
+        def slope(step, function=function, other=other, given=given, moves=moves):
+            ends = (
+                function(*parts(motion + s * moves[0]), other + s * moves[1]) for s in (step, -step)
+            )
+            return (given * functools.reduce(np.subtract, ends)).sum(1) / (2 * step)
+
+        coarse, fine = slope(1e-6), slope(1e-7)
+        # Where the two agree, no edge lies between: the function is smooth there.
+        smooth = np.isclose(coarse, fine, rtol=1e-4, atol=1e-4)
+        assert smooth.sum() > count / 2
+        np.testing.assert_allclose(found[smooth], fine[smooth], rtol=1e-3, atol=1e-3)
+
+
 @looped
 @pytest.mark.parametrize("broken", [0, 4])
 def test_loops_fly_every_physics_step_and_a_divergence_in_any_ends_the_episode(name, broken):
@@ -512,10 +590,10 @@ def test_loops_fly_every_physics_step_and_a_divergence_in_any_ends_the_episode(n
     environment.control = noted
     now = environment.step(np.tile([0.3, -0.2, 0.1, 0.5], (3, 1)))
     assert len(commands) == PAPER.substeps
-    assert np.ptp(commands, axis=0).max() > 0.1  # the loops were at work [rad/s]
+    assert np.ptp(commands, axis=0)[:2].max() > 0.1  # the loops were at work [rad/s]
     # The reward is of the mean command.
     off = (np.mean(commands, axis=0) - PAPER.hover_speed) / PAPER.max_speed
-    np.testing.assert_allclose(now.reward_terms["control"], -np.sum(off**2, axis=-1))
+    np.testing.assert_allclose(now.reward_terms["control"][:2], -np.sum(off[:2] ** 2, axis=-1))
     np.testing.assert_array_equal(now.diverged, [False, False, True])
     np.testing.assert_array_equal(now.terminated, [False, False, True])
     environment.control = control_rotors

@@ -104,10 +104,10 @@ def test_the_commands_of_loops_are_late_too(kind, drawn, dead):
     late, vehicle = drawn + dead, dataclasses.replace(PAPER, dead_time=dead / 100)
     given = {"control_mode": kind, "randomization": {"command_delay": drawn / 100}}
     environment = helpers.begun("hover", 2, vehicle=vehicle, **given)
-    mode, asked, given = environment.control_mode, [], []
+    pilot, asked, given = environment.autopilot, [], []
     asked += [np.array(environment.engine.act)] * late
-    command = mode.rotor_command
-    mode.rotor_command = lambda *state: asked.append(command(*state)) or asked[-1]
+    command = pilot.command
+    pilot.command = lambda: asked.append(command().copy()) or asked[-1]
     advance = environment.engine.advance
     environment.engine.advance = lambda n: (
         given.append(environment.engine.ctrl.copy()) or advance(n)

@@ -1,0 +1,142 @@
+"""Pure functions of rows, compiled: arrays (N, k) in, one array (N, j) out.
+
+The tracer of `quadrl.base.trace` writes the C of one row, and LANES rows are computed side by side,
+as vector instructions. The operations are NumPy's, in its order; only what is not a number may be
+lost where it is compared. `reverse` makes the function of
+the derivatives, from the same trace.
+"""
+
+# pyright: standard
+# What is traced takes arrays of symbols.
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quadrl.base.rotation import Array
+from quadrl.base.trace import Trace, symbolic, symbols
+from quadrl.engines.native import compiling
+
+SOURCE = """#include <math.h>
+#include <stdint.h>
+#include <string.h>
+{export}
+#pragma GCC optimize("no-trapping-math")
+enum {{ LANES = 8, IN = {taken}, OUT = {given}, CONSTANTS = {constants} }};
+typedef double Lanes[LANES];
+// An array of `width` numbers a row: row i stands at i * stride.
+typedef struct {{
+  double* at;
+  int64_t stride, width;
+}} Rows;
+
+VECTORISED static void compute(const double* constants, const Lanes* restrict x,
+                               Lanes* restrict y) {{
+  double c[CONSTANTS];  // which may be read on either side of a choice
+  memcpy(c, constants, sizeof c);
+  for (int i = 0; i < LANES; ++i) {{
+    {body}
+  }}
+}}
+
+QUADRL_EXPORT void run(const double* constants, const Rows* in, const Rows* out, int64_t n) {{
+  Lanes x[IN], y[OUT];
+  for (int64_t row = 0; row < n; row += LANES) {{
+    const int filled = n - row < LANES ? (int)(n - row) : LANES;
+    Lanes* next = x;
+    for (const Rows* r = in; next < x + IN; ++r) {{
+      for (int64_t k = 0; k < r->width; ++k, ++next) {{
+        for (int i = 0; i < LANES; ++i) {{  // spare lanes: twins
+          (*next)[i] = r->at[(row + (i < filled ? i : 0)) * r->stride + k];
+        }}
+      }}
+    }}
+    compute(constants, (const Lanes*)x, y);
+    for (int k = 0; k < OUT; ++k) {{
+      for (int i = 0; i < filled; ++i) out->at[(row + i) * out->stride + k] = y[k][i];
+    }}
+  }}
+}}
+"""
+
+
+class RowFunction:
+    """A pure function of rows, in C."""
+
+    def __init__(self, function: Callable[..., Array], *widths: int) -> None:
+        """Trace it; it is compiled when it is used first.
+
+        Args:
+            function: From arrays (N, k) to one (N, j).
+            *widths: Numbers k in a row of each of its arguments.
+
+        Raises:
+            NotCompilable: It does more than arithmetic.
+        """
+        trace, taken = Trace(max_operations=math.inf, sound=True), sum(widths)
+        whole = trace.read("x[{}][i]", np.arange(taken)[None])
+        ends = np.cumsum([0, *widths])
+        with symbolic():
+            result = function(*(whole[:, a:b] for a, b in zip(ends, ends[1:], strict=False)))[0]
+        self.width = len(result)
+        """Numbers j in a row of what it gives."""
+        body = trace.body({f"y[{k}][i]": value for k, value in enumerate(result)})
+        export = (Path(compiling.__file__).parent / "export.h").read_text()
+        self._constants = np.array([*trace.constants, 0.0])
+        sizes = {"taken": taken, "given": self.width, "constants": len(self._constants)}
+        self.source = SOURCE.format(export=export, body=body, **sizes)
+        """Its C, in which the constants are not."""
+
+    @functools.cached_property
+    def _run(self) -> Any:
+        run = compiling.compile_generated(self.source).run
+        run.argtypes, run.restype = [*3 * (ctypes.c_void_p,), ctypes.c_int64], None
+        return run
+
+    def on(self, *arrays: np.ndarray) -> Callable[[], None]:
+        """The function on some arrays, which may change but stay where they are.
+
+        Args:
+            *arrays: Its arguments and then what it fills, float64, each row contiguous.
+
+        Raises:
+            NativeError: There is no compiler, or it refused the source.
+        """
+        compiled = self._run
+        places = [[a.ctypes.data, a.strides[0] // 8, a.shape[1]] for a in arrays]
+        kept = arrays, np.array(places), self._constants
+        rows, constants = kept[1].ctypes.data, self._constants.ctypes.data
+        last, count = rows + 24 * (len(arrays) - 1), len(arrays[0])
+
+        def run(kept: Any = kept) -> None:  # which keeps them alive
+            compiled(constants, rows, last, count)
+
+        return run
+
+    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+        """What it gives of arrays (N, k), (N, j)."""
+        found = np.empty((len(arrays[0]), self.width))
+        self.on(*map(np.ascontiguousarray, arrays), found)()
+        return found
+
+
+def reverse(function: Callable[..., Array]) -> Callable[..., Array]:
+    """The derivatives of a number by the arguments of a function, side by side (N, sum of k).
+
+    It takes those arguments, and the derivatives of the number by what the function gives (N, j).
+    """
+
+    def back(*given: Any) -> Array:
+        *arguments, by = given
+        leaves = [leaf for argument in arguments for leaf in argument[0]]
+        results = function(*arguments)[0]
+        found = leaves[0].trace.vector_jacobian_product(results, by[0], leaves)
+        return symbols(found)[None]
+
+    return back
