@@ -102,17 +102,21 @@ class StudyResult:
         # JSON has no NaN.
         return json.loads(json.dumps(content), parse_constant=lambda constant: None)
 
-    def save(self) -> list[Path]:
-        """Write table.csv, study.json, and the learning curves of each task; returns the paths."""
+    def save(self, on_line: Callable[[str], None] = lambda line: None) -> list[Path]:
+        """Write table.csv, study.json, and the learning curves of each task; returns the paths.
+
+        Args:
+            on_line: Called with a line about each run or task of which there is no curve.
+        """
         text = io.StringIO(newline="")
         table = csv.DictWriter(text, [*GROUP, "seeds", *itertools.chain(*map(_columns, FIGURES))])
         table.writeheader()
         table.writerows(self.rows)
         write_whole(self.folder / TABLE, text.getvalue().encode())
         write_json(self.folder / STUDY, self.content)
-        return [self.folder / TABLE, self.folder / STUDY, *self._draw()]
+        return [self.folder / TABLE, self.folder / STUDY, *self._draw(on_line)]
 
-    def _draw(self) -> list[Path]:
+    def _draw(self, on_line: Callable[[str], None]) -> list[Path]:
         """A picture for each task, with a curve for each algorithm and variant."""
         from quadrl.evaluation.plotting import save
 
@@ -121,7 +125,7 @@ class StudyResult:
             for run in self.runs
         }
         # In the shortest trainings no episode ends: there is no curve to draw.
-        figures = curves(labels, on_missing=lambda error: None)
+        figures = curves(labels, on_missing=lambda error: on_line(f"left out: {error}"))
         return [
             save(figure, self.folder / f"learning_curves_{task}.png")
             for task, figure in figures.items()
@@ -173,7 +177,7 @@ def study(
     found = sum_up(plan, failed)
     if not found.runs:
         raise QuadrlError(complaint(failed))
-    found.save()
+    found.save(on_line)
     return found
 
 

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import json
 import math
-import re
 import shutil
 
 import mujoco
@@ -12,7 +11,8 @@ import numpy as np
 import pytest
 
 import quadrl
-from quadrl.core.task import STILL
+from quadrl.core.task import Target
+from quadrl.tasks.hover import Hover
 from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
 from quadrl.learning import benchmark
@@ -205,21 +205,15 @@ def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch, capsys):
     beside = json.loads((tmp_path / "out" / "hover_ppo.json").read_text())
     assert beside["command"] == f"quadrl train hover --algo ppo --seed {seed}"
     assert beside["evaluation"] == summarize(fly(source, "hover", episodes=20))
-    monkeypatch.setattr(measure, "WORTH_HAVING", 0.0)
-    for file in (tmp_path / "out").iterdir():
-        file.rename(file.with_stem("random_waypoint_robust"))  # as if it had come earlier
-    spins = Policy.pretrained("random_waypoint", variant="robust")
-    run("c", spins, seed, variant="robust", task="random_waypoint")
-    measure.ship((tmp_path / "c",), tmp_path / "out")
-    assert not list((tmp_path / "out").iterdir())
-    told = capsys.readouterr().err
-    turning, circling = (target.words for target in STILL)
-    found = re.search(f"successful, {turning} (.+) rad/s, {circling} (.+) m/s", told)
-    assert all(float(x) > one.limit for x, one in zip(found.groups(), STILL, strict=True))
     run("b", Policy.pretrained("hover", variant="robust"), seed, variant="robust")
     measure.ship((tmp_path / "b",), tmp_path / "out")
     beside = json.loads((tmp_path / "out" / "hover_robust.json").read_text())
     assert beside["command"].endswith(f"--seed {seed} --variant robust")
-    monkeypatch.setattr(measure, "WORTH_HAVING", 1.1)  # no more worth having: they go
+    capsys.readouterr()
+    asked = Target("position_error_m", "error over the last 2 s", 1e-12)
+    monkeypatch.setattr(Hover, "targets", (asked,))  # they miss that now, and go
     measure.ship((tmp_path / "a", tmp_path / "b"), tmp_path / "out")
+    told = capsys.readouterr().err
+    assert told.count(f"misses what its task asks: seed {seed}") == 1
+    assert f"successful, {asked.words} " in told
     assert not list((tmp_path / "out").iterdir())
