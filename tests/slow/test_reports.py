@@ -12,12 +12,12 @@ import pytest
 
 import quadrl
 from quadrl.core.task import Target
-from quadrl.tasks.hover import Hover
 from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
+from quadrl.tasks.hover import Hover
 from scripts.reports import measure, pages, report, robustness, task_pages
 
 
