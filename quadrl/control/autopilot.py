@@ -8,6 +8,7 @@ runs them, with the same results.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -71,6 +72,11 @@ class Autopilot:
             at_first = first.on(*live, action, self.setpoint)
             self._compiled = at_first, second.on(*live, self.setpoint, self.rotor_command)
 
+    @functools.cached_property
+    def reversed(self) -> Reversed:
+        """Its derivatives."""
+        return Reversed(self._mode, self._engine)
+
     @property
     def is_compiled(self) -> bool:
         """Whether C runs the loops."""
@@ -112,6 +118,15 @@ class Reversed:
         self._setpoint = RowFunction(reverse(laws.setpoint), *widths, setpoint.width)
         self.functions = self._command, self._setpoint
         """To be compiled."""
+
+    def compile(self) -> None:
+        """Compile them where the cache does not hold them.
+
+        Raises:
+            NativeError: There is no compiler, or it refused the source.
+        """
+        for function in self.functions:
+            function.load()
 
     def command(
         self, motion: np.ndarray, setpoint: np.ndarray, given: np.ndarray

@@ -8,7 +8,7 @@ Row i of a batch seeded with s is the single environment seeded with s + i.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Unpack
 
 import numpy as np
@@ -273,12 +273,21 @@ class Environment(saving.Copied):
             RuntimeError: There was no reset before.
         """
         self.begin(action)
+        for steps in self.commands():
+            self.engine.advance(steps)
+        return self.finish()
+
+    def commands(self) -> Iterator[int]:
+        """Command the rotors through a control step that `begin` began.
+
+        Yields:
+            For how many physics steps, which the engine flies before the next command.
+        """
         left = self.vehicle.substeps
         while left:
             steps = self.control(left) if self.stepwise else left
-            self.engine.advance(steps)
+            yield steps
             left -= steps
-        return self.finish()
 
     def begin(self, action: Array) -> None:
         """First half of a step: the commands to the rotors, or the setpoint of the loops."""

@@ -11,7 +11,6 @@ the derivatives, from the same trace.
 from __future__ import annotations
 
 import ctypes
-import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -93,8 +92,12 @@ class RowFunction:
         self.source = SOURCE.format(export=export, body=body, **sizes)
         """Its C, in which the constants are not."""
 
-    @functools.cached_property
-    def _run(self) -> Any:
+    def load(self) -> Any:
+        """The C function, compiled where the cache does not hold it.
+
+        Raises:
+            NativeError: There is no compiler, or it refused the source.
+        """
         run = compiling.compile_generated(self.source).run
         run.argtypes, run.restype = [*3 * (ctypes.c_void_p,), ctypes.c_int64], None
         return run
@@ -108,7 +111,7 @@ class RowFunction:
         Raises:
             NativeError: There is no compiler, or it refused the source.
         """
-        compiled = self._run
+        compiled = self.load()
         places = [[a.ctypes.data, a.strides[0] // 8, a.shape[1]] for a in arrays]
         kept = arrays, np.array(places), self._constants
         rows, constants = kept[1].ctypes.data, self._constants.ctypes.data
@@ -122,7 +125,8 @@ class RowFunction:
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
         """What it gives of arrays (N, k), (N, j)."""
         found = np.empty((len(arrays[0]), self.width))
-        self.on(*map(np.ascontiguousarray, arrays), found)()
+        given = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
+        self.on(*given, found)()
         return found
 
 

@@ -63,6 +63,8 @@ class RecordingEnv(QuadrotorEnv):
         super().__init__(*given, **settings)
         vehicle = self.environment.vehicle
         kernel(min(vehicle.aerodynamics.effects, ROTOR_EFFECTS), vehicle.rotor_count)
+        if pilot := self.environment.autopilot:
+            pilot.reversed.compile()
         self._moments: list[Moment] = []
 
     def taken(self) -> list[Moment]:

@@ -146,7 +146,6 @@ class APGConfig(AlgorithmConfig):
         unsure = any(getattr(drawn, name) != getattr(NONE, name) for name in LATE_OR_UNSURE)
         observed = scenario.observe != Observing()
         for name, value, wrong, allowed in (
-            ("control_mode", config.control_mode, config.control_mode != "rotor", "'rotor'"),
             ("engine", config.engine, config.engine != "free_flight", "'free_flight'"),
             ("memory", config.memory, config.memory != "none", "'none'"),
             ("device", config.device, config.device != "cpu", "'cpu'"),

@@ -1,8 +1,9 @@
 """A window of flight, and the derivatives of its return by its actions.
 
 The task's own functions give rewards and observations once more, with tensors, for all steps of the
-window at once; the derivatives of the flight between are those of `quadrl.engines.adjoint`. They
-are joined backwards in time.
+window at once; the derivatives of the flight between are those of `quadrl.engines.adjoint`, and
+those of the loops of a control mode of `quadrl.control.autopilot`. They are joined backwards in
+time.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ class Moment:
     was: np.ndarray  # (N, 13 + R), the motion before it: qpos, qvel and rotor speeds
     before: Snapshot
     episode: Episode  # before it
-    leg: Leg
+    legs: tuple[Leg, ...]  # of one command each
+    setpoint: np.ndarray  # (N, n) of the loops, as `Autopilot` has it; (N, 0) without loops
+    command: np.ndarray  # (N, R) [rad/s], mean over the step
     action: np.ndarray  # (N, k)
     end: np.ndarray  # (N, 13 + R), the motion after it
     terminated: np.ndarray  # (N,) bool
@@ -44,14 +47,20 @@ class Moment:
 
 def fly(environment: Environment, action: np.ndarray) -> tuple[Moment, Transition]:
     """Take an `Environment.step`, and record what its derivatives need."""
+    assert not environment.randomizer.late  # late commands have no derivatives here
     was, engine = coordinates(environment.engine), environment.engine
     begun = records.copied(environment.snapshot), records.copied(environment.episode)
     environment.begin(action)
-    leg = engine.leg(environment.vehicle.substeps)
-    engine.advance(leg.steps)
+    legs: list[Leg] = []
+    for steps in environment.commands():
+        legs.append(engine.leg(steps))
+        engine.advance(steps)
+    pilot = environment.autopilot
+    setpoint = pilot.setpoint.copy() if pilot else np.zeros((environment.num_envs, 0))
     done = environment.finish()
+    flown = tuple(legs), setpoint, np.array(environment.snapshot.rotor_command), action
     flags = (np.array(getattr(done, name)) for name in (*FLAGS, "diverged"))
-    return Moment(was, *begun, leg, action, coordinates(engine), *flags), done
+    return Moment(was, *begun, *flown, coordinates(engine), *flags), done
 
 
 def coordinates(engine: Engine) -> np.ndarray:
@@ -72,11 +81,10 @@ class Window:
         self.shape = len(moments), environment.num_envs  # (T, N)
         parts = ("was", "end", "action")
         self.was, self.end, self.action = (_leaf([getattr(m, n) for m in moments]) for n in parts)
-        self.command = _leaf([m.leg.command for m in moments])
+        self.command = _leaf([m.command for m in moments])
         self.last_command = _leaf([m.before.rotor_command for m in moments])
         clock = environment.vehicle.control_timestep
-        assert isinstance(environment.control_mode, Rotor)
-        self._control = environment.control_mode
+        self._control, self._pilot = environment.control_mode, environment.autopilot
         parameters = moments[0].before.parameters.map(_tensor)
         origin = environment.origin
         diverged = torch.from_numpy(np.concatenate([m.diverged for m in moments]))
@@ -126,11 +134,12 @@ class Window:
         later, later_command = np.zeros_like(was[0]), np.zeros_like(last[0])
         for t, moment in reversed(list(enumerate(self.moments))):
             same = ~(moment.terminated | moment.truncated)[:, None]  # the episode goes on
-            from_start, from_command = moment.leg.vector_jacobian_product(
-                np.where(moment.diverged[:, None], 0.0, end[t] + gamma * same * later)
+            from_start, from_action = self._through(
+                moment,
+                np.where(moment.diverged[:, None], 0.0, end[t] + gamma * same * later),
+                command[t] + gamma * same * later_command,
             )
-            from_command += command[t] + gamma * same * later_command
-            by_action[t] = own[t] + self._control.slope(moment.action) * from_command
+            by_action[t] = own[t] + from_action
             later = from_start + was[t]
             for k, row in enumerate(jacobian):
                 later += row[t] * by_action[t, :, k, None]
@@ -138,6 +147,29 @@ class Window:
             lost = ~(np.isfinite(later).all(1) & np.isfinite(by_action[t]).all(1))
             later[lost], by_action[t, lost] = 0.0, 0.0
         return by_action
+
+    def _through(
+        self, moment: Moment, by: np.ndarray, by_command: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of a number by the motion before a step and by its action.
+
+        Args:
+            moment: The step.
+            by: Those by the motion after it, (N, 13 + R).
+            by_command: Those by the mean command, (N, R).
+        """
+        if self._pilot is None:
+            assert isinstance(self._control, Rotor)
+            by, more = moment.legs[0].vector_jacobian_product(by)
+            return by, self._control.slope(moment.action) * (more + by_command)
+        back, by_setpoint = self._pilot.reversed, np.zeros_like(moment.setpoint)
+        for leg in reversed(moment.legs):
+            by, more = leg.vector_jacobian_product(by)
+            more += by_command / len(moment.legs)
+            by_motion, by_own = back.command(leg.start, moment.setpoint, more)
+            by, by_setpoint = by + by_motion, by_setpoint + by_own
+        by_motion, by_action = back.setpoint(moment.was, moment.action, by_setpoint)
+        return by + by_motion, by_action
 
     def _steps(self, gradient: Tensor | None, leaf: Tensor) -> np.ndarray:
         """A gradient by a leaf as (T, N, ...)."""

@@ -37,8 +37,10 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path):
     assert all(float(row["deviation"]) == pytest.approx(0.5, rel=0.1) for row in rows)
 
 
-def test_hover_is_learned_within_a_few_windows(tmp_path):
-    config = TrainConfig("hover", algo="apg", seed=300, num_envs=32, steps=32 * 32 * 20)
+@pytest.mark.parametrize("mode", ["rotor", "thrust_body_rate"])
+def test_hover_is_learned_within_a_few_windows(mode, tmp_path):
+    settings = {"seed": 300, "num_envs": 32, "steps": 32 * 32 * 20, "control_mode": mode}
+    config = TrainConfig("hover", algo="apg", **settings)
     error = [float(row["error"]) for row in metrics(train(config, tmp_path / "run"))]
     assert max(error) > 1.0 and error[-1] < 0.4, error  # [m]
 
@@ -46,7 +48,6 @@ def test_hover_is_learned_within_a_few_windows(tmp_path):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("control_mode", "velocity"),
         ("engine", "mujoco"),
         ("memory", "gru"),
         ("observe", {"action_history": 2}),

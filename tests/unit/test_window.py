@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from quadrl import tasks
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.core.environment import Environment
 from quadrl.learning.window import Window, fly
 
@@ -15,10 +16,14 @@ CASES = {
     "hover": {},
     "random_waypoint": {"randomization": {"mass": (0.8, 1.2), "pushes": {"rate": 3.0}}},
     "static_waypoint": {"weather": {"gust_speed": 8.0, "gust_time": 0.5}},
-    "straight_and_level": {"vehicle": "crazyflie"},
+    # What is late has no derivatives.
+    "straight_and_level": {"vehicle": dataclasses.replace(VEHICLES["crazyflie"], dead_time=0.0)},
     "target_following": {"vehicle": "hexa"},
     "a short hover": {"time_limit": 0.3},
     "smooth": {"smoothness_weight": 10.0},
+    "by thrust and body rates": {"control_mode": "thrust_body_rate", "smoothness_weight": 10.0},
+    "by velocities": {"control_mode": "velocity", "vehicle": "hexa"},
+    "by places": {"control_mode": "position", "time_limit": 0.3},
 }
 
 
@@ -62,7 +67,8 @@ def test_what_comes_after_a_step_is_expected_where_the_window_does_not_hold_it()
 def test_the_derivatives_by_a_policy_are_those_of_its_flights(name):
     rng = np.random.default_rng(0)
     known = name if name in tasks.TASKS else "hover"
-    environment = Environment(known, vehicle=CASES[name].get("vehicle"))
+    flies = {key: CASES[name].get(key) for key in ("vehicle", "control_mode")}
+    environment = Environment(known, **flies)
     size, actions = environment.size, environment.action_size
     weights = 0.02 * rng.normal(size=(size, actions))
     shifts = 0.2 * rng.normal(size=(STEPS, COUNT, actions))
