@@ -7,6 +7,7 @@ from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
 from quadrl.tasks.race import Race
 from quadrl.tasks.random_waypoint import RandomWaypoint
+from quadrl.tasks.recovery import Recovery
 from quadrl.tasks.static_waypoint import StaticWaypoint
 from quadrl.tasks.straight_and_level import StraightAndLevel
 from quadrl.tasks.target_following import TargetFollowing
@@ -15,6 +16,6 @@ __all__ = ["TASKS", "make", "register"]
 
 for _task in (
     *(Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing),
-    Race,
+    *(Race, Recovery),
 ):
     register(_task)

@@ -1,0 +1,118 @@
+"""Recovery: come to rest, level and in the air, after being thrown in any attitude."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from quadrl.aircraft.parameters import Parameters
+from quadrl.base.rotation import Array, namespace, norm, stack, to_body
+from quadrl.core import rewards
+from quadrl.core.contact import touches_ground
+from quadrl.core.observation import OBSERVATION, ROTATION
+from quadrl.core.task import STILL, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
+from quadrl.engines.rng import Rng, hovering
+from quadrl.engines.state import Start
+
+
+@dataclasses.dataclass(frozen=True)
+class Recovery(Task):
+    """Level out, stop and stay off the ground, then fly back to the place above the start."""
+
+    name = "recovery"
+    asks = "come to rest after being thrown in any attitude, at the origin, 3 m above the ground"
+    starts = "3 m above the ground, any attitude, thrown at up to 3 m/s and 6 rad/s"
+    ends = "more than 20 m away, on the ground"
+    solved = "in the air to the end, then level within 10 degrees, under 0.2 m/s and 0.5 rad/s"
+    targets = (Target("success_rate", "successful", 0.95, True), *STILL)
+    training = {
+        "vehicle_options": {"action_scale": 500.0},
+        "training_options": {"lowest": 1.0, "highest": 4.0},
+    }
+    training_with = {
+        "apg": {"steps": 245_760, "num_envs": 128, "gamma": 0.95, "gae_lambda": 0.95},
+    }
+    observation = {
+        **ROTATION,
+        **{name: OBSERVATION[name] for name in ("velocity", "body_rate", "rotor_speed", "goal")},
+    }
+
+    time_limit: float = 5.0
+    """Time limit of an episode [s]."""
+    lowest: float = 3.0
+    """Smallest height of the start above the ground [m]."""
+    highest: float = 3.0
+    """Largest height of the start above the ground [m]."""
+    tilt: float = math.pi
+    """Largest tilt at the start [rad]; the heading is any."""
+    speed: float = 3.0
+    """Largest speed at the start [m/s]."""
+    spin: float = 6.0
+    """Largest body rate at the start [rad/s]."""
+    max_distance: float = 20.0
+    """Distance from the origin that ends the episode [m]."""
+    tilt_tolerance: float = math.radians(10.0)
+    """Largest tilt at the end that counts as success [rad]."""
+    speed_tolerance: float = 0.2
+    """Largest speed at the end that counts as success [m/s]."""
+    spin_tolerance: float = 0.5
+    """Largest body rate at the end that counts as success [rad/s]."""
+
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
+        """Over or under the origin, in any attitude, in motion; the rotors at hover speed."""
+        height = rng.uniform(self.lowest, self.highest) - self.altitude
+        position = stack(0.0 * height, 0.0 * height, height)
+        start = Start(
+            position=position,
+            quaternion=rng.attitude(self.tilt),
+            velocity=rng.vector(self.speed),
+            body_rate=rng.vector(self.spin),
+            rotor_speed=hovering(position, parameters),
+        )
+        return start, TaskState(goal=namespace(position).zeros_like(position))
+
+    def measure(self, now: Snapshot) -> Potentials:
+        """The attitude error is the chord from the body's z axis to the vertical, at most 2.
+
+        Unlike the sum of |sin| and |cos - 1|, which falls again near 180 degrees, it grows with the
+        tilt all the way.
+        """
+        axis = now.state.rotation[..., :, 2]  # (N, 3), body z in the world
+        chord = norm(stack(axis[..., 0], axis[..., 1], 1 - axis[..., 2]))
+        return dataclasses.replace(super().measure(now), attitude=chord)
+
+    def observe(self, now: Snapshot) -> dict[str, Array]:
+        """The aircraft's motion, its attitude as the rotation matrix, and the way to the origin.
+
+        The height above the ground is in the last two.
+        """
+        state = now.state
+        return {
+            "rotation": state.rotation_entries,
+            "velocity": state.body_velocity,
+            "body_rate": state.body_rate,
+            "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
+            "goal": to_body(state.rotation, now.potentials.to_goal),
+        }
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Upright, slower, nearer to the origin, at little effort, in the air."""
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "survival": rewards.survival(self.survival_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
+        }
+
+    def terminated(self, now: Snapshot) -> Array:
+        """Far away or on the ground."""
+        return (now.potentials.distance > self.max_distance) | touches_ground(now)
+
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
+        """Flying at the end, level and slow."""
+        level = now.state.cos_tilt > math.cos(self.tilt_tolerance)
+        slow = now.state.speed < self.speed_tolerance
+        return end.truncated & level & slow & (now.state.angular_speed < self.spin_tolerance)
