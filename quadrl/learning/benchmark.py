@@ -149,6 +149,8 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
               flying(vehicle=air, weather="light"), 1 / 3),
         Layer("the same, different aircraft", FREE_FLIGHT, flying(randomization=DIFFERENT), 0.90),
         Layer("the same, all that is drawn", FREE_FLIGHT, flying(randomization=FULL)),
+        Layer("the same by velocities, flown by loops", FREE_FLIGHT,
+              flying(control_mode="velocity"), 1 / 3),
         Layer(f"Gymnasium make_vec of {size}", ALL_CORES, _vectors(vectors)),
     ]  # fmt: skip
     if importlib.util.find_spec("torchrl"):
