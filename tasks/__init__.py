@@ -11,11 +11,12 @@ from quadrl.tasks.recovery import Recovery
 from quadrl.tasks.static_waypoint import StaticWaypoint
 from quadrl.tasks.straight_and_level import StraightAndLevel
 from quadrl.tasks.target_following import TargetFollowing
+from quadrl.tasks.trajectory import Trajectory
 
 __all__ = ["TASKS", "make", "register"]
 
 for _task in (
     *(Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing),
-    *(Race, Recovery),
+    *(Race, Recovery, Trajectory),
 ):
     register(_task)

@@ -149,6 +149,14 @@ class Task(abc.ABC):
         if self.settle_time != Task.settle_time:
             number(f"{self.name} settle_time", self.settle_time, 0, self.time_limit)
 
+    def check(self, parameters: Parameters) -> None:
+        """Refuse an aircraft that cannot do what is asked, from its parameters (1, ...).
+
+        Raises:
+            QuadrlError: The message names the option that asks for too much.
+        """
+        return
+
     @abc.abstractmethod
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
         """How an episode begins, from random numbers and the aircraft's parameters alone."""

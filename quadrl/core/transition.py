@@ -224,6 +224,7 @@ def check_task(
     Raises:
         QuadrlError: The message names the function.
     """
+    task.check(parameters)
     rows, rotors = SAMPLE, parameters.rotor.hover_speed.shape[-1]
     keys = np.arange(rows)
     begun = task.begin(Rng(keys, 0 * keys), parameters)

@@ -139,7 +139,8 @@ def test_the_flat_observation_is_that_of_the_documentation(name, vehicle):
     lead = np.einsum("nij,nj->ni", state.rotation, flat[:, width : width + 3])
     np.testing.assert_allclose(state.position + lead + [0, 0, environment.origin[2]],
                                environment.goals(), atol=1e-5)  # fmt: skip
-    moving = 3 * (name in ("straight_and_level", "target_following"))
+    # The velocity of what moves; of a trajectory also its acceleration, jerk and ten places ahead.
+    moving = {"straight_and_level": 3, "target_following": 3, "trajectory": 39}.get(name, 0)
     assert flat.shape == (4, width + 3 + moving) == (4, environment.size)
     assert flat.dtype == np.float32
 
