@@ -30,7 +30,28 @@ class Recovery(Task):
         "training_options": {"lowest": 1.0, "highest": 4.0},
     }
     training_with = {
-        "apg": {"steps": 245_760, "num_envs": 128, "gamma": 0.95, "gae_lambda": 0.95},
+        # Smooth, since APG knows no dead time, with which a quick answer to the body rate chatters.
+        "apg": {
+            "steps": 245_760,
+            "num_envs": 128,
+            "gamma": 0.95,
+            "gae_lambda": 0.95,
+            "training_options": {"smoothness_weight": 10.0},
+        },
+        # From APG's networks, `quadrl train --from RUN`: it adds the dead time and the rest.
+        "ppo": {
+            "steps": 400_000,
+            "gamma": 0.95,
+            "gae_lambda": 0.95,
+            "ppo": {"learning_rate": 1e-3},
+            "training_options": {
+                "progress_weight": 200.0,
+                "attitude_weight": 60.0,
+                "speed_weight": 10.0,
+                "spin_weight": 10.0,
+                "smoothness_weight": 10.0,
+            },
+        },
     }
     observation = {
         **ROTATION,

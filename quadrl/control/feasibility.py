@@ -40,6 +40,9 @@ SURE = 1e-9
 """Share of a bound by which rounding may exceed it."""
 BISECTIONS = 24
 PHASE_MARGIN = math.pi / 4  # [rad]
+TURNING = 0.2308
+"""How deep one weight of thrust pushes an aircraft that turns over, over g T^2: twice the integral
+of (1 / 2 - x) cos(2 pi x^2) from 0 to 1 / 2."""
 BY_HOVER = AFFECTS.keys() - {"inertia", "inertia_axes", "drag", "inflow", "lag", "rotor_inertia"}
 """Fields of a randomization that change how fast rotors turn in hover, or may turn."""
 
@@ -259,6 +262,23 @@ def angular_acceleration(vehicle: Vehicle, scale: float) -> Array:
     low, high = Reach(vehicle).speeds(scale)
     squares = Allocation(np.linalg.pinv(vehicle.mixer), low[0] ** 2, high[0] ** 2)
     return squares.moment / np.array(vehicle.inertia)
+
+
+def height_to_turn_over(vehicle: Vehicle, scale: float) -> float:
+    """Height [m] that it takes to turn from rest upside down to level, and to stop; inf if never.
+
+    With the largest moment, one way and then the other, at the middle thrust c (of the weight) that
+    leaves it, half round takes T = 2 sqrt(pi / acceleration). Thrust down in the first half and
+    up in the second cancel: the aircraft then sinks at g T, and is (1 / 2 + c TURNING) g T^2 lower.
+    The largest thrust, L weights, takes g T^2 / (2 (L - 1)) to stop it. Rotors without lag.
+    """
+    least, most = (float(load[0]) for load in Reach(vehicle).loads(scale))
+    if most <= 1 + SURE:
+        return math.inf
+    turning = float(angular_acceleration(vehicle, scale)[:2].max())
+    time = 2 * math.sqrt(math.pi / turning)  # [s]
+    sunk = 1 / 2 + TURNING * (least + most) / 2
+    return GRAVITY * time**2 * (sunk + 1 / (2 * (most - 1)))
 
 
 def held_wind(vehicle: Vehicle, load: float) -> float:

@@ -18,6 +18,7 @@ from quadrl.control.feasibility import (
     Reach,
     angular_acceleration,
     attitude_bandwidth,
+    height_to_turn_over,
     held_command,
     held_wind,
     samples,
@@ -132,6 +133,8 @@ def _moments(vehicle: Vehicle, task: Task) -> Iterator[Row]:
                 verdict = f"half a turn takes {turn:.2g} s, and {task.name} leaves {time:.2g} s"
             name = {"x": "roll", "y": "pitch", "z": "yaw"}[axis]
             yield Row(f"{name} acceleration, {end}", float(most), "rad/s^2", verdict)
+    for end, scale in ends.items():
+        yield Row(f"height to turn over, {end}", height_to_turn_over(vehicle, scale), "m")
 
 
 def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Iterator[Row]:

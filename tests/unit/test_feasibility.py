@@ -418,3 +418,20 @@ def test_the_command_prints_rows_or_json(capsys):
     assert values["drawn that cannot hover"]["unit"] == "%"
     cli.main(["check", "--vehicle-options", "action_scale=10", "--task-options", "time_limit=3"])
     assert "action_scale=22" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("name", "scale"), [("paper", 35.0), ("crazyflie", 500.0)])
+def test_the_height_to_turn_over_is_that_of_a_planar_flight(name, scale):
+    vehicle, step = resolve(name), 1e-5
+    least, most = (float(load[0]) for load in Reach(vehicle).loads(scale))
+    turning = feasibility.angular_acceleration(vehicle, scale)[:2].max()
+    tilt, rate, height, speed = math.pi, 0.0, 0.0, 0.0
+    while tilt > 1e-3 and rate <= 0:  # half round, braked from a quarter on
+        rate += (-turning if tilt > math.pi / 2 else turning) * step
+        tilt += rate * step
+        speed += GRAVITY * ((least + most) / 2 * math.cos(tilt) - 1) * step
+        height += speed * step
+    lost = speed**2 / (2 * GRAVITY * (most - 1)) - height
+    found = feasibility.height_to_turn_over(vehicle, scale)
+    assert found == pytest.approx(lost, rel=0.01)
+    assert feasibility.height_to_turn_over(vehicle, 0.0) == math.inf  # nothing but hover
