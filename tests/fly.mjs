@@ -57,11 +57,11 @@ const jobs = {
       flight.first();
     }
     while (flown.length < steps && !episode.outcome) {
-      const observation = [...Float32Array.from(flight.seen())];
+      const shown = Float32Array.from(flight.seen());
       do episode.tick();
       while (!episode.outcome && episode.ticks % flight.vehicle.substeps);
       const { error, terminated, truncated, succeeded, wind, goal } = flight, action = [...flight.action.subarray(0, flight.vehicle.rotors)];
-      flown.push({ observation, action, coordinates: coordinates(flight), error, reward: flight.given[1], terminated, truncated, succeeded, wind: [...wind.subarray(0, 3)], goal: [...goal] });
+      flown.push({ observation: [...(episode.saw ?? shown)], action, coordinates: coordinates(flight), error, reward: flight.given[1], terminated, truncated, succeeded, wind: [...wind.subarray(0, 3)], goal: [...goal] });
     }
     return { flown, outcome: episode.outcome };
   },

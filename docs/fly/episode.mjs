@@ -12,6 +12,7 @@ export class Episode {
   constructor(kernel, slot, { task, aircraft, seed }, controller, events) {
     this.flight = new Flight(kernel, slot, task, aircraft);
     if (controller?.scale) this.flight.scale[0] = controller.scale;
+    this.flight.estimates = controller?.observe.rotor_speed === "estimated";
     this.flight.begin(seed);
     Object.assign(this, { controller, events });
     this.past = []; // what was seen and done before, the newest first
@@ -59,15 +60,16 @@ export class Episode {
 
   // What the controller sees now: as the options of its observation say (quadrl/core/observer.py).
   #see() {
-    const { disturbance, action_history, observation_history } = this.controller.observe;
-    const seen = this.flight.seen(disturbance), { rotors } = this.flight.vehicle;
+    const { action_history, observation_history } = this.controller.observe;
+    const seen = this.flight.seen(this.controller.observe), { rotors } = this.flight.vehicle;
     const rest = { seen: this.past.at(-1)?.seen ?? seen, action: new Float32Array(rotors) };
     const before = (k) => this.past[k] ?? rest;
     const actions = Array.from({ length: action_history }, (_, k) => [...before(k).action]);
     const older = Array.from({ length: observation_history }, (_, k) => before(k).seen);
     this.past.unshift({ seen });
     this.past.length = Math.min(this.past.length, 1 + Math.max(action_history, observation_history));
-    return Float32Array.from([seen, ...actions, ...older].flat());
+    this.saw = Float32Array.from([seen, ...actions, ...older].flat());
+    return this.saw;
   }
 
   // Gusts: an Ornstein-Uhlenbeck process in each direction, a step per control step.
@@ -90,13 +92,15 @@ export class Episode {
     this.history.push({ time: this.time, error: flight.error, command });
     if (flight.truncated) this.solved = flight.succeeded;
     if (flight.diverged[0]) this.outcome = "faster than a physics step resolves";
-    else if (flight.terminated) this.outcome = this.#failure();
+    else if (flight.terminated) this.outcome = this.#end();
   }
 
-  // Why the task has ended it. Every task here names first how far away that is (`Task.ends`).
-  #failure() {
-    const { qpos, vehicle, task: { ends } } = this.flight, [away] = ends.split(", ");
+  // Why the task has ended it: with success, tipped over, on the ground, or by what else `Task.ends` names.
+  #end() {
+    const { qpos, vehicle, succeeded, task: { ends } } = this.flight, [lost, won] = ends.split("; ").reverse();
+    if (succeeded) return won;
+    const others = lost.split(", ").filter((cause) => !/on the ground|tilted/.test(cause));
     if (qpos[4] ** 2 + qpos[5] ** 2 > 0.5 && /tilted/.test(ends)) return "tipped over";
-    return qpos[2] < vehicle.size ? "on the ground" : away;
+    return qpos[2] < vehicle.size ? "on the ground" : others.join(" or ");
   }
 }

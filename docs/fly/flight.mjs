@@ -47,7 +47,8 @@ export class Flight {
     this.memory = kernel.functions.flight_memory(slot);
     new Float64Array(kernel.functions.memory.buffer, this.memory, book.flightSize).fill(0);
     const motion = ["qpos", "qvel", "act", "ctrl", "wind"];
-    for (const part of [...motion, "action", "scale", "observation", "felt", "given", "drawn"]) {
+    const seen = ["observation", "felt", "modelled", "aim"];
+    for (const part of [...motion, ...seen, "action", "scale", "given", "drawn"]) {
       this[part] = kernel.view(slot, part);
     }
     this.keys = kernel.view(slot, "keys", BigInt64Array);
@@ -59,6 +60,7 @@ export class Flight {
     kernel.view(slot, "origin").set(this.pair.origin);
     const { rotors } = this.vehicle;
     this.scale[0] = this.vehicle.actionScale;
+    this.estimates = false; // whether the rotor speeds that are seen follow from the commands
     const flown = "qpos qvel act ctrl warm wind parameters world near solids";
     this.#point("flight_rows", flown, [0, 0, rotors, 0]);
     this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, rotors]);
@@ -97,6 +99,7 @@ export class Flight {
   // What is seen first, from where the aircraft is.
   first() {
     this.#read();
+    this.modelled.set(this.act);
     this.late = Array.from({ length: this.vehicle.deadSteps }, () => this.act.slice());
     this.call("first");
     this.call("rest");
@@ -107,6 +110,7 @@ export class Flight {
     if (action) this.action.set(action);
     else this.call("geometric");
     this.call("command");
+    if (this.estimates) this.call("follow");
   }
 
   // Flies some physics steps; whether there was nothing near that it could touch.
@@ -128,6 +132,7 @@ export class Flight {
   // The transition of a control step, after its physics steps.
   finish() {
     this.#read();
+    if (!this.estimates) this.modelled.set(this.act);
     this.call("step");
     this.call("feel");
   }
@@ -138,9 +143,11 @@ export class Flight {
     if (broken) this.diverged[0] = 1;
   }
 
-  // What the task shows, and where it is asked for the disturbance that is felt.
-  seen(feels = false) {
-    return [...this.observation.subarray(0, this.pair.size), ...(feels ? this.felt : [])];
+  // What is measured: what the task shows, and what else the options of an observation ask for.
+  seen({ disturbance = false, sensors: { aim } = {} } = {}) {
+    const { observation, pair } = this;
+    const own = aim ? pair.besideAim.map((k) => observation[k]) : observation.subarray(0, pair.size);
+    return [...own, ...(disturbance ? this.felt : []), ...(aim ? this.aim : [])];
   }
 
   get error() { return this.given[0]; } // [m]

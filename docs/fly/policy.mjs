@@ -33,7 +33,19 @@ function readArrays({ entries, data }) {
 }
 
 // Options of the observation that this page knows, by their names in quadrl/conditions/observing.py.
-const KNOWN = { disturbance: false, action_history: 0, observation_history: 0 };
+const KNOWN = { disturbance: false, action_history: 0, observation_history: 0, rotor_speed: "true", sensors: {} };
+
+// What of the options of an observation this page does not know, in words; nothing if it knows all.
+function strange(observe) {
+  const options = Object.keys(observe).filter((name) => !(name in KNOWN));
+  const { rotor_speed: speed, sensors } = observe;
+  if (!["true", "estimated"].includes(speed)) options.push(`rotor_speed ${speed}`);
+  for (const [name, given] of Object.entries(sensors)) {
+    if (name !== "aim") options.push(`the sensor ${name}`);
+    else options.push(...Object.keys(given).map((option) => `aim with its own ${option}`));
+  }
+  return options[0];
+}
 
 export class Policy {
   // rules: the `policy` entry of the book.
@@ -77,9 +89,10 @@ export class Policy {
   // Why this policy cannot fly an aircraft of the book in a task; nothing if it can.
   unfit(book, taskName, vehicleName) {
     const { rotors, layout } = book.vehicles[vehicleName], { actionSize, metadata, observe } = this;
-    const single = book.pairs[`${taskName}_${vehicleName}`].size + 3 * observe.disturbance;
+    const pair = book.pairs[`${taskName}_${vehicleName}`], { aim } = observe.sensors;
+    const single = (aim ? pair.besideAim.length + 3 : pair.size) + 3 * observe.disturbance;
     const size = single * (1 + observe.observation_history) + rotors * observe.action_history;
-    const foreign = Object.keys(observe).find((name) => !(name in KNOWN));
+    const foreign = strange(observe);
     if (foreign) return `It observes ${foreign}, which this page does not know.`;
     const other = Object.keys(metadata.vehicle_options ?? {}).find((name) => name !== "action_scale");
     if (other) return `It has learned another ${other} than the aircraft here have.`;

@@ -8,10 +8,13 @@ the compiled step of `quadrl.core.compiled` is, and become C functions per task 
     step       the transition after the physics, with the next observation
     command    the commands to the rotors of an action
     geometric  the action of the geometric controller
+    follow     the modelled rotor speeds after a control step with those commands
     rest       the disturbance that is felt at the start of an episode
     feel       that after a control step
 
-Each takes the memory of one flight, an array of doubles whose parts are named in `LAYOUT`.
+Each takes the memory of one flight, an array of doubles whose parts are named in `LAYOUT`. What
+is observed follows from the rotor speeds in `modelled`: JavaScript puts the true ones there where
+it does not call `follow`.
 """
 
 from __future__ import annotations
@@ -27,13 +30,13 @@ from quadrl.aircraft.vehicle import MAX_ROTORS, commanded
 from quadrl.base import records
 from quadrl.base.rotation import Array, to_body
 from quadrl.base.trace import Trace
-from quadrl.conditions.sensors import felt, moving
+from quadrl.conditions.sensor import Memory, Moment
+from quadrl.conditions.sensors import Aim, RotorSpeed, felt, moving
 from quadrl.control.geometric import GeometricController
 from quadrl.control.reading import Reading
 from quadrl.core.environment import Environment
-from quadrl.core.rewards import total
 from quadrl.core.snapshot import Snapshot
-from quadrl.core.transition import Clock, Episode, begin, finish
+from quadrl.core.transition import Clock, Episode, Observation, Transition, begin, finish
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import FIRST, State
 
@@ -58,6 +61,9 @@ PARTS = {
     "moving": 6,  # as quadrl.conditions.sensors.moving gives it
     "disturbance": 3,  # [m/s^2], world frame
     "felt": 3,  # the same in the body frame, as policies see it
+    "modelled": MAX_ROTORS,  # rotor speeds that are seen [rad/s]: true, or following the commands
+    "aim_sum": 3,  # what quadrl.conditions.sensors.Aim remembers [m], world frame
+    "aim": 3,  # what it gives [m], body frame
     "given": 8,  # error [m], reward, goal (3) [m, world], terminated, truncated, is_success
     "keys": 1,  # of the random numbers, an int64 each
     "episodes": 1,
@@ -102,6 +108,21 @@ class _Memory:
         """The state that native/state.c fills."""
         places = State.of_table(np.arange(FIRST["rotor_speed"] + self._rotors)[:, None])
         return records.mapped(lambda numbers: self.read("state", numbers), places)
+
+    def estimate(self) -> State:
+        """The same with the rotor speeds that are seen."""
+        seen = self.read("modelled", self._rotors)
+        return dataclasses.replace(self.state(), rotor_speed=seen)
+
+    def aim(self, now: Snapshot, seen: Observation, *, begins: bool) -> dict[str, Any]:
+        """What the sensor of that name remembers and gives with an observation."""
+        state, sensor = now.state, Aim()
+        nothing: Any = None  # of a batch
+        given = state.rotor_speed, self.read("wind", 3), now.action, now.parameters
+        moment = Moment(state, state, *given, nothing, nothing, nothing, estimated=seen)
+        moment.memory = {"sum": self.read("aim_sum", 3)}
+        moment.memory = sensor.begin(moment) if begins else sensor.update(moment)
+        return {"aim_sum": moment.memory["sum"], "aim": sensor.sense(moment)}
 
     def kept(self, *like: Any) -> list[Any]:
         """Records of the same shapes as those before, read from `kept` one after the other."""
@@ -161,14 +182,18 @@ def write(environment: Environment) -> Written:
         constants = ", ".join(repr(float(number)) for number in (*memory.trace.constants, 0.0))
         functions.append(FUNCTION.format(name=name, constants=constants, body=body))
 
-    def given(now: Snapshot, episode: Episode, *done: Array) -> dict[str, Any]:
+    def given(now: Snapshot, episode: Episode, done: Transition | None = None) -> dict[str, Any]:
         """Where everything goes that a first observation or a step gives."""
-        goal = task.goal(now) + origin
-        reward, *flags = [part[0] for part in done] if done else [0.0] * 4
+        goal, seen, error = task.goal(now) + origin, task.observe(now), task.error(now)
+        reward, *flags = [0.0] * 4
+        if done:
+            seen, error, reward = done.observation, done.error, done.reward[0]
+            flags = [part[0] for part in (done.terminated, done.truncated, done.is_success)]
         return {
             "kept": [*_row(now.task), *_row(now.potentials), *_row(episode), *_flat(now.time)],
-            "observation": [x for term in task.observe(now).values() for x in _flat(term)],
-            "given": [*_flat(task.error(now)), reward, *_flat(goal), *flags],
+            "observation": [x for term in seen.values() for x in _flat(term)],
+            **memory.aim(now, seen, begins=done is None),
+            "given": [*_flat(error), reward, *_flat(goal), *flags],
         }
 
     memory = _Memory(environment)
@@ -192,9 +217,8 @@ def write(environment: Environment) -> Written:
     action, command = memory.read("action", rotors), memory.read("ctrl", rotors)
     flag = np.array([f"m[{LAYOUT['diverged']}] != 0"], object)
     diverged = memory.trace.inputs(flag, is_flag=True)
-    now, episode, done = finish(task, clock, episode, before, state, action, command, diverged)
-    ends = done.terminated, done.truncated, done.is_success
-    emit("step", memory, **given(now, episode, total(done.reward_terms), *ends))
+    taken = action, command, diverged, memory.estimate()
+    emit("step", memory, **given(*finish(task, clock, episode, before, state, *taken)))
 
     memory = _Memory(environment)
     action, scale = memory.read("action", rotors), memory.read("scale", 1)
@@ -207,9 +231,15 @@ def write(environment: Environment) -> Written:
     reading = Reading.of(observation, task.observation, vehicle)
     emit("geometric", memory, action=controller.action(reading, *task.guide(reading)))
 
+    memory = _Memory(environment)
+    followed: Memory = {"speed": memory.read("modelled", rotors)}
+    taken = memory.parameters(), memory.read("ctrl", rotors), timestep
+    followed = RotorSpeed(source="estimated").follow(followed, *taken)
+    emit("follow", memory, modelled=followed["speed"])
+
     for name in ("rest", "feel"):
         memory = _Memory(environment)
-        state = memory.state()
+        state = memory.estimate()
         motion = moving(memory.parameters(), state)
         disturbance = np.zeros((1, 3))
         if name == "feel":

@@ -26,6 +26,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
 from quadrl.base.philox import START
 from quadrl.base.primitives import Primitive
+from quadrl.conditions.sensors import Aim
 from quadrl.core.environment import Environment
 from quadrl.core.markers import Marker
 from quadrl.deploy import flights
@@ -55,6 +56,7 @@ MODULES = ("flight", "policy", "episode", "link", "scene", "plot", "main")
 """Of docs/fly, each after those that it imports."""
 MEMORY = """// Written by quadrl/deploy/flights.py.
 #include <math.h>
+#include <stdint.h>
 static double memory[{slots}][{size}];
 double* flight_memory(int slot) {{ return memory[slot]; }}
 """
@@ -89,6 +91,7 @@ def make_book() -> tuple[dict[str, Any], str]:
             pairs[f"{task.name}_{vehicle.name}"] = {
                 "drawn": written.drawn,
                 "size": environment.size,
+                "besideAim": beside_aim(environment),
                 "origin": environment.origin.tolist(),
                 # JSON knows no infinity, which is where the floor of these tasks is.
                 "world": np.nan_to_num(world(environment.engine.model)).tolist(),
@@ -123,6 +126,12 @@ def make_book() -> tuple[dict[str, Any], str]:
         },
     }
     return book, "\n".join(sources)
+
+
+def beside_aim(environment: Environment) -> list[int]:
+    """Which numbers of an observation are seen where there is an aim."""
+    shown = (part for name, part in environment.layout.items() if name not in Aim().hides)
+    return [place for part in shown for place in range(part.start, part.stop)]
 
 
 def describe(vehicle: Vehicle) -> dict[str, Any]:
