@@ -72,14 +72,8 @@ class Landing(Task):
         },
     }
     # With the wide action scale of that variant, actions as random as usual end in a crash before
-    # anything is learned; with its dearer way down, slow rotors begin to swing.
-    variants = {
-        "robust": {
-            "gamma": 0.97,
-            "initial_deviation": 0.4,
-            "task_options": {"progress_weight": 100.0},
-        }
-    }
+    # anything is learned.
+    variants = {"robust": {"gamma": 0.97, "initial_deviation": 0.4}}
     heading_matters = True
     keeps_place = False
     contact = True

@@ -62,14 +62,15 @@ class Integrating(GeometricController):
 UNDISTURBED: Conditions = {"weather": "calm", "randomization": "none", "aerodynamics": "none"}
 WIDER: Conditions = {"vehicle_options": {"action_scale": WIDE}}  # as the policies command
 UNSURE: dict[str, Conditions] = {  # in which the policies for uncertain aircraft are flown
-    "uncertain, drag only": {"weather": "light", "randomization": UNCERTAIN},
-    "uncertain": {"weather": "light", "randomization": UNCERTAIN, "aerodynamics": "full"},
+    "uncertain": {"weather": "light", "randomization": UNCERTAIN},
+    "uncertain, drag only": {
+        "weather": "light", "randomization": UNCERTAIN, "aerodynamics": "none"
+    },
     "nothing": {},
-    "full air": {"aerodynamics": "full"},
     "50 ms of delay": {"randomization": {"command_delay": 0.05}},
     "half the lag": {"randomization": {"lag": 0.5}},
     "twice the lag": {"randomization": {"lag": 2.0}},
-    "moderate weather": {"weather": "moderate", "aerodynamics": "full"},
+    "moderate weather": {"weather": "moderate"},
     "all together": ALL_TOGETHER,
 }  # fmt: skip
 
@@ -122,7 +123,7 @@ def robust(only: tuple[str, ...] = (), seeds: int = 5, episodes: int = 1000, job
         gains = {"uncertain", "all together"} & {*report.load("tuning")["tasks"][task]}
         for seed in (*flyers, "controller"):
             for name, condition in UNSURE.items():
-                condition = WIDER | condition
+                condition = WIDER | {"aerodynamics": "full"} | condition
                 flyer = flyers.get(seed) or tuned(task, max(gains), condition)
                 found = flown(flyer, task, condition, episodes)
                 rows.append({"task": task, "seed": str(seed), "condition": name} | found)
