@@ -515,7 +515,7 @@ def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, firs
     [
         (["--algo", "sac"], "algo", "sac"),
         (["--task-options", "radius=-1"], "hover radius", -1),
-        (["--task-options", "tilt=10"], "hover options", {"tilt": 10, "spin": 0.6}),
+        (["--task-options", "tilt=10"], "hover options", {"tilt": 10, "spin": 0.6, "radius": 0.75, "speed": 0.5}),
         (["--seed", "4294967296"], "seed", 2**32),
         (["--episodes", "0"], "episodes", 0),
         (["--task-options", "horizn=5"], "hover option", "horizn"),

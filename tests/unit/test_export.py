@@ -253,9 +253,9 @@ def test_the_file_says_what_its_numbers_are():
     assert Scenario.of(said["scenario"]) == policy.scenario
     assert said["control_timestep"] == 0.05 and said["quadrl"] == quadrl.__version__
     terms = {term["name"]: term for term in said["observation"]}
-    assert [*terms][-2:] == ["disturbance", "action_history"]
+    assert [*terms][-2:] == ["aim", "action_history"]
     assert terms["velocity"] == {
-        "name": "velocity", "first": 9, "last": 11, "unit": "m/s", "meaning": "body frame"
+        "name": "velocity", "first": 6, "last": 8, "unit": "m/s", "meaning": "body frame"
     }  # fmt: skip
     assert terms["action_history"]["last"] == policy.size - 1
     hover = policy.scenario.aircraft.hover_speed

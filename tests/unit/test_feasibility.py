@@ -154,9 +154,7 @@ def test_a_policy_is_warned_about_in_its_own_conditions():
 
 @pytest.mark.parametrize("name", sorted(file.stem for file in shipped()))
 def test_what_ships_can_hover_wherever_it_was_trained(name):
-    task, _, algo = name.rpartition("_")
-    robust = algo == "robust"
-    policy = Policy.pretrained(task, "ppo" if robust else algo, *(["robust"] if robust else []))
+    policy, robust = Policy.pretrained(name), "_robust" in name
     vehicle = policy.scenario.aircraft
     given = policy.conditions.get("randomization")
     assert ("mass" in (given or {})) == robust

@@ -170,15 +170,11 @@ def test_a_task_is_not_solved_by_who_turns_or_circles():
         assert not any(x.met({}) or x.met({x.metric: None}) for x in targets)
 
 
-def test_what_ships_is_seen_to_spin_or_to_stand():
-    calm: Any = {"weather": "calm", "randomization": "none"}
-    calm |= {"engine": "free_flight", "episodes": 10}
-    for name, spins in (("random_waypoint", False), ("random_waypoint_robust", True)):
-        found = evaluate(name, **calm)
-        assert found.metrics["success_rate"] == 1.0
-        missed = {x.metric for x in found.task.targets if not x.met(found.metrics)}
-        assert missed == ({"yaw_rate_rad_s", "circling_m_s"} if spins else set())
-        assert ("turning at 4.9 rad/s" in repr(found)) == spins
+@pytest.mark.parametrize("name", ["random_waypoint", "random_waypoint_robust"])
+def test_what_ships_is_seen_to_stand(name):
+    calm: Any = {"weather": "calm", "randomization": "none", "engine": "free_flight"}
+    found = evaluate(name, episodes=10, **calm)
+    assert [x.metric for x in found.task.targets if not x.met(found.metrics)] == []
 
 
 @pytest.mark.parametrize("mode", ["rotor", "velocity"])
