@@ -62,7 +62,19 @@ class Race(Task):
         Target("success_rate", "successful", 0.95, True),
         Target("race_time_mean_s", "to the last gate", 6.0),
     )
+    # With its usual actions no aircraft has the thrust for it.
     training = {"vehicle_options": {"action_scale": 1250.0}}
+    training_with = {
+        "apg": {"steps": 320_000},
+        # From the networks that apg has found (`--from`). With openings as wide as they are it
+        # passes gates too near to their edges: 74 % of 300 flights came through, not 90 %.
+        "ppo": {
+            "gamma": 0.95,
+            "steps": 1_600_000,
+            "ppo": {"learning_rate": 1e-3},
+            "training_options": {"margin": 0.2, "miss_weight": 100.0, "crash_weight": 200.0},
+        },
+    }
     keeps_place = False
     observation = {
         **ROTATION,

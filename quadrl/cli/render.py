@@ -40,6 +40,8 @@ class Render(Flown):
     """Height of a picture [pixels]; by default 480, 360 for .gif, 270 for .png and .jpg."""
     fps: float | None = None
     """Frames per second; by default 20, and 12.5 for .gif."""
+    speed_trail: bool = False
+    """Show the whole way so far, in the colours of its speeds, instead of the last seconds."""
 
     def run(self) -> None:
         """Fly an episode of each and draw them."""
@@ -64,6 +66,7 @@ class Render(Flown):
             width=self.width,
             height=self.height,
             fps=self.fps,
+            speed_trail=self.speed_trail,
             progress=not console.quiet,
             **self.conditions(),
         )

@@ -42,6 +42,7 @@ def render(
     width: int | None = None,
     height: int | None = None,
     fps: float | None = None,
+    speed_trail: bool = False,
     progress: bool = True,
     **conditions: Unpack[Conditions],
 ) -> Media:
@@ -60,6 +61,7 @@ def render(
             of several flights has a picture of this size.
         height: Height of a picture [pixels]; by default 480, 360 for gif, 270 for png and jpg.
         fps: Frames a second; by default 20, and 12.5 for gif.
+        speed_trail: Show the whole way so far, in the colours of its speeds.
         progress: Whether to show a progress bar.
         **conditions: As `quadrl.evaluate` takes them.
 
@@ -69,9 +71,10 @@ def render(
     """
     sheet = choice("kind", kind, (*VIDEOS, *SHEETS)) in SHEETS
     asked = {"width": width, "height": height, "fps": fps}
-    picture = PICTURES["sheet" if sheet else kind] | {
+    picture: dict[str, Any] = PICTURES["sheet" if sheet else kind] | {
         name: value for name, value in asked.items() if value is not None
     }
+    picture["speed_trail"] = speed_trail
     several = controller if isinstance(controller, Mapping) else {"": controller}
     flown = [
         evaluate(one, scenario, episodes=1, seed=seed)

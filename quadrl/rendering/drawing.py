@@ -39,6 +39,8 @@ LETTER = ((-0.17, 0.045, 0.29), (0.17, 0.045, 0.29), (0.0, 0.17, 0.04))
 TRAIL_SECONDS = 4.0
 TRAIL_PIECES = 60
 TRAIL_WIDTH = 0.008  # [m], of an aircraft with scale 1
+SPEED_PIECES = 240  # of a trail of a whole flight
+SLOW, FAST = np.array([0.15, 0.35, 0.95, 1.0]), np.array([1.0, 0.85, 0.10, 1.0])
 TRAIL_OLD, TRAIL_NEW = np.array([0.35, 0.55, 0.80, 1.0]), np.array([1.0, 0.72, 0.30, 1.0])
 
 STREAKS = 60
@@ -163,6 +165,14 @@ def trail(points: Array, scale: float) -> Primitive:
     kept = np.unique(np.linspace(0, len(points) - 1, TRAIL_PIECES + 1).astype(int))
     width = scale * TRAIL_WIDTH * np.linspace(0, 1, len(kept)) ** 0.7
     return Primitive("line", width, rgba=trail_colours(len(kept)), points=points[kept])
+
+
+def speed_trail(points: Array, speed: Array, fastest: float, scale: float) -> Primitive:
+    """Where an aircraft has been, (n, 3) [m], in the colours of its speeds there, (n,) [m/s]."""
+    kept = np.unique(np.linspace(0, len(points) - 1, SPEED_PIECES + 1).astype(int))
+    share = (speed[kept] / max(fastest, STILL))[:, None]
+    colours = SLOW + share * (FAST - SLOW)
+    return Primitive("line", 2 * scale * TRAIL_WIDTH, rgba=colours, glow=1.0, points=points[kept])
 
 
 def streaks(position: Array, wind: Array, drift: Array, scale: float) -> tuple[Primitive, ...]:

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
+from quadrl.base.primitives import Primitive
 from quadrl.base.validation import number
 from quadrl.core.trajectory import Trajectory
+from quadrl.rendering import drawing
 from quadrl.rendering.camera import (
     FOLLOW,
     MOVING,
@@ -57,6 +59,7 @@ def render_trajectory(
     label: str = "",
     times: ArrayLike | None = None,
     fine: bool | None = None,
+    speed_trail: bool = False,
 ) -> Generator[NDArray[np.uint8]]:
     """Draw a flight.
 
@@ -72,6 +75,8 @@ def render_trajectory(
         times: Increasing moments to draw [s]; None for the whole flight, `fps` a second. Beyond its
             ends a flight stands still.
         fine: As for `Renderer`.
+        speed_trail: Show the whole way so far in the colours of its speeds, from blue at rest to
+            yellow at the fastest, in place of the last seconds.
 
     Yields:
         Pictures (height, width, 3).
@@ -116,14 +121,20 @@ def render_trajectory(
         before, picture = -1, np.empty(0, np.uint8)
         for k in map(int, drawn):
             if k != before:
+                first = max(0, k - round(TRAIL_SECONDS * rate))
+                own: tuple[Primitive, ...] = ()
+                if speed_trail:
+                    way = position[: k + 1], speed[: k + 1]
+                    own, first = (drawing.speed_trail(*way, speed.max(), renderer.scale),), k
                 picture = renderer.frame(
                     flight.qpos[k],
                     camera=cameras[k],
                     rotor_angles=angles[k],
                     goal=flight.goal[k],
-                    trail=position[max(0, k - round(TRAIL_SECONDS * rate)) : k + 1],
+                    trail=position[first : k + 1],
                     markers=(
                         *markers[k],
+                        *own,
                         *streaks(position[k], wind[k], drift[k], renderer.scale),
                     ),
                 )
@@ -187,8 +198,8 @@ def write_video(
         command = (*FFMPEG, "-metadata", f"{COMMENT}={carried}")
         encoding = dict(crf=20, encoded_format="yuv420p", ffmpeg_args=command)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.{kind}")
-    drawing = _together(flights, model, label, fps=fps, times=times, **options)
-    with contextlib.closing(drawing) as frames:
+    drawn = _together(flights, model, label, fps=fps, times=times, **options)
+    with contextlib.closing(drawn) as frames:
         first = next(frames)  # what cannot be drawn fails here, before ffmpeg begins
         writer = _mediapy().VideoWriter(temporary, first.shape[:2], fps=fps, **encoding)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -5,10 +5,11 @@ import tyro
 from scripts.reports.measure import goals, ship, speed, training
 from scripts.reports.pages import pages
 from scripts.reports.pictures import pictures
+from scripts.reports.race import race
 from scripts.reports.robustness import robust, robustness
 from scripts.reports.task_pages import shipped
 
-REPORTS = (training, goals, speed, robust, robustness, ship, shipped, pictures, pages)
+REPORTS = (training, goals, speed, robust, robustness, race, ship, shipped, pictures, pages)
 
 if __name__ == "__main__":
     commands = {each.__name__: each for each in REPORTS}

@@ -182,7 +182,7 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     usual = TrainConfig(
         config.task, algo=config.algo, vehicle=config.vehicle, variant=config.variant
     )
-    free = {name: getattr(usual, name) for name in (*FREE, "seed", "engine")}
+    free = {name: getattr(usual, name) for name in (*FREE, "seed", "engine", "from_run")}
     if dataclasses.replace(config, **free) != usual:
         return f"left out, {run} has other settings than `quadrl train` gives"
     policy, given = Policy.load(run), {"vehicle": config.scenario.aircraft}
@@ -196,6 +196,8 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
             old.unlink(missing_ok=True)
         return f"left out, misses what its task asks: {said} successful{ways}"
     command = f"quadrl train {config.task} --algo {config.algo} --seed {config.seed}"
+    command += "" if config.vehicle == TrainConfig.vehicle else f" --vehicle {config.vehicle}"
+    command += f" --from {config.from_run.partition('@')[0]}" if config.from_run else ""
     command += "" if config.engine == usual.engine else f" --engine {config.engine}"
     command += "" if config.variant == "ideal" else f" --variant {config.variant}"
     command += "" if config.vehicle == TrainConfig.vehicle else f" --vehicle {config.vehicle}"

@@ -33,6 +33,7 @@ from quadrl.engines import mjcf
 from quadrl.envs.common import Pictures
 from quadrl.rendering import (
     Renderer,
+    drawing,
     gl,
     read_scenarios,
     render_trajectory,
@@ -171,6 +172,18 @@ def test_a_goal_a_pad_on_the_ground_and_a_trail_are_where_they_should_be(rendere
     rows, columns = drawn(renderer, looking(), trail=path)
     assert columns.max() == pytest.approx(SIZE / 2 + 0.5 * PER_METRE, abs=2)
     np.testing.assert_allclose(rows, SIZE / 2 - 0.2 * PER_METRE, atol=2)
+
+
+def test_a_trail_shows_the_speeds_of_the_whole_way():
+    # From rest to the fastest, 4 m/s, of a flight that has come to 3 m/s: three quarters of it.
+    points, speed = np.zeros((1000, 3)), np.linspace(0.0, 3.0, 1000)
+    points[:, 0] = np.linspace(0.0, 1.0, 1000)
+    trail = drawing.speed_trail(points, speed, 4.0, 1.0)
+    assert len(trail.points) == drawing.SPEED_PIECES + 1
+    np.testing.assert_array_equal(trail.points[[0, -1]], points[[0, -1]])
+    np.testing.assert_array_equal(trail.rgba[0], drawing.SLOW)
+    end = 0.25 * drawing.SLOW + 0.75 * drawing.FAST
+    np.testing.assert_allclose(trail.rgba[-1], end)
 
 
 @pytest.mark.parametrize("rotor", [0, 1])
