@@ -200,7 +200,6 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     command += f" --from {config.from_run.partition('@')[0]}" if config.from_run else ""
     command += "" if config.engine == usual.engine else f" --engine {config.engine}"
     command += "" if config.variant == "ideal" else f" --variant {config.variant}"
-    command += "" if config.vehicle == TrainConfig.vehicle else f" --vehicle {config.vehicle}"
     file.parent.mkdir(parents=True, exist_ok=True)
     policy.save(file)
     beside = {"command": command, "evaluation": metrics, "config": config.resolved()}
