@@ -20,6 +20,7 @@ it does not call `follow`.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -89,7 +90,8 @@ class _Memory:
 
     def __init__(self, environment: Environment) -> None:
         """Begin a trace."""
-        self.trace = Trace()
+        # Compiled once for all visitors: no number of operations is too large.
+        self.trace = Trace(max_operations=math.inf)
         self._rotors = environment.vehicle.rotor_count
         self._timestep = environment.vehicle.control_timestep
 
