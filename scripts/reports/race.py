@@ -63,9 +63,10 @@ def picture(rows: list[Result]) -> Figure:
     """Time from rest to the last gate, and the share of the flights that reach it."""
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axis: Any = figure.subplots()
-    for label, (success, time) in PUBLISHED.items():
+    for k, (label, (success, time)) in enumerate(PUBLISHED.items()):
         axis.plot(time, 100 * success, "s", color=GREY)
-        axis.annotate(label, (time, 100 * success), (6, -9), textcoords="offset points", size=7)
+        place = (6, (-9, 5)[k % 2])  # below and above in turn, since two have the same success
+        axis.annotate(label, (time, 100 * success), place, textcoords="offset points", size=7)
     for row in rows:
         if row["race"] == "one lap":
             axis.plot(row["race_time_mean_s"], 100 * row["success_rate"], "o", color=BLUE)
