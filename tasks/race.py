@@ -63,6 +63,7 @@ class Race(Task):
         Target("race_time_mean_s", "to the last gate", 6.0),
     )
     # With its usual actions no aircraft has the thrust for it.
+    trained_on = "racer"
     training = {"vehicle_options": {"action_scale": 1250.0}}
     training_with = {
         "apg": {"steps": 320_000},

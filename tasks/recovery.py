@@ -25,6 +25,7 @@ class Recovery(Task):
     ends = "more than 20 m away, on the ground"
     solved = "in the air to the end, then level within 10 degrees, under 0.2 m/s and 0.5 rad/s"
     targets = (Target("success_rate", "successful", 0.95, True), *STILL)
+    trained_on = "crazyflie"  # which can turn over within these heights
     training = {
         "vehicle_options": {"action_scale": 500.0},
         "training_options": {"lowest": 1.0, "highest": 4.0},

@@ -50,6 +50,12 @@ class Trajectory(Task):
         Target("settled_m", "distance, settled", 0.05),
         TURNING,
     )
+    trained_on = "crazyflie"
+    training = {
+        "vehicle_options": {"action_scale": 540.0},  # the whole range of its rotors
+        # Faster curves than are asked, and more of their beginnings, where it speeds up from rest.
+        "training_options": {"acceleration": 8.0, "time_limit": 6.0},
+    }
     heading_matters = True
     observation = OBSERVATION | TARGET_VELOCITY | TARGET_MOTION | PREVIEW
 

@@ -80,8 +80,11 @@ class Task(abc.ABC):
     targets: ClassVar[tuple[Target, ...]] = (Target("success_rate", "successful", 0.99, True),)
     """What a trained policy has to reach over many episodes that nothing disturbs; wind alone moves
     an aircraft that holds its place at more than `STILL` allows."""
+    trained_on: ClassVar[str] = "paper"
+    """The aircraft of a training where none is named."""
     training: ClassVar[dict[str, Any]] = {}
-    """Training settings that differ from the defaults of `quadrl.learning.config.TrainConfig`."""
+    """Training settings that differ from the defaults of `quadrl.learning.config.TrainConfig`;
+    `vehicle_options` are those of that aircraft, and no other's."""
     training_with: ClassVar[dict[str, dict[str, Any]]] = {}
     """What is different again with an algorithm, by its name."""
     gains: ClassVar[dict[str, float]] = {}

@@ -30,6 +30,7 @@ from quadrl.learning.defaults import CHOSEN, PAIRS, flat, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, free_folder, read_config
 from quadrl.learning.origin import Origin, with_networks
 from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
+from quadrl.tasks import TASKS
 
 ALGORITHMS = ("ppo", "trpo", "vpg", "apg")
 ALIASES = {"gae": "vpg"}
@@ -62,7 +63,7 @@ class TrainConfig(TrainSettings):
         settings, _ = with_networks(settings)
         algo = settings.get("algo", TrainConfig.algo)
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
-        vehicle = settings.get("vehicle", TrainConfig.vehicle)
+        vehicle = settings.setdefault("vehicle", _trained_on(task))
         variant = settings.get("variant", TrainConfig.variant)
         chosen = task, algo, vehicle, variant, settings.get("memory")
         values, _ = training_defaults(_fields(), *chosen)
@@ -123,6 +124,9 @@ class TrainConfig(TrainSettings):
         """
         usual, layers = self._defaults()
         usual |= {name: getattr(TrainConfig, name) for name in CHOSEN}
+        usual["vehicle"] = _trained_on(self.task)
+        if usual["vehicle"] != TrainConfig.vehicle:
+            layers["vehicle"] = f"{self.task} x {self.algo}"
         others = {*ALGORITHMS} - {self.algo}
         values = dict(flat(usual | {name: dataclasses.asdict(usual[name]) for name in ALGORITHMS}))
         for name, value in flat(dataclasses.asdict(self)):
@@ -280,6 +284,11 @@ def _fields() -> dict[str, Any]:
     names = [field.name for field in dataclasses.fields(TrainConfig)]
     own = {name: dataclasses.asdict(kind()) for name, kind in ALGORITHM_CONFIGS.items()}
     return {name: getattr(TrainConfig, name, {}) for name in names} | own
+
+
+def _trained_on(task: str) -> str:
+    """The aircraft of a training of a task where none is named; an unknown one has the usual."""
+    return TASKS[task].trained_on if task in TASKS else TrainConfig.vehicle
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:

@@ -126,10 +126,13 @@ def training_defaults(
     kind = tasks.TASKS[choice("task", task, tasks.TASKS)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
     choice("vehicle", vehicle, VEHICLES)
+    own = own_settings(kind, algo)
+    if own.pop("vehicle", "paper") != vehicle:  # the numbers of another aircraft
+        own.pop("vehicle_options", None)
     varied = (shared, OF_VEHICLE.get((variant, vehicle), {}), kind.variants.get(variant, {}))
     layers = {
         "field": merged(fields, ALGORITHM_CONFIGS[algo].training),
-        f"{task} x {algo}": own_settings(kind, algo),
+        f"{task} x {algo}": own,
         f"variant {variant}": merged(*varied),
     }
     if (memory or merged(*layers.values())["memory"]) != "none":
@@ -162,7 +165,8 @@ def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
 
 def own_settings(task: Task | type[Task], algo: str = "ppo") -> dict[str, Any]:
     """Settings that have other defaults with a task and an algorithm."""
-    return merged(task.training, task.training_with.get(algo, {}))
+    aircraft = {} if task.trained_on == "paper" else {"vehicle": task.trained_on}
+    return merged(aircraft, task.training, task.training_with.get(algo, {}))
 
 
 def merged(*settings: dict[str, Any]) -> dict[str, Any]:

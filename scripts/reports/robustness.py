@@ -90,7 +90,7 @@ def conditions() -> dict[str, Conditions]:
 def tuned(task: str, name: str, condition: Conditions) -> Integrating:
     """The controller with the gains that were found for a task in a condition; for one flight."""
     gains = report.load("tuning")["tasks"][task]
-    bandwidth, integral = gains.get(name) or gains["all together"]  # of draws that came later
+    bandwidth, integral = gains.get(name) or gains["all together"]  # where none were
     scenario = Scenario.of(task, **condition)
     own = Gains(**{**scenario.task.gains, "level": bandwidth, "height": bandwidth})
     return Integrating(scenario.aircraft, scenario.task, own, integral)
@@ -121,11 +121,10 @@ def robust(only: tuple[str, ...] = (), seeds: int = 5, episodes: int = 1000, job
         configs = [TrainConfig(task, variant="robust", seed=seed, num_threads=1) for seed in SEEDS]
         runs = runs_of("robust", configs[:seeds], jobs, 100)
         flyers: dict[int, Any] = {run.config.seed: Policy.load(run.folder) for run in runs}
-        gains = {"uncertain", "all together"} & {*report.load("tuning")["tasks"][task]}
         for seed in (*flyers, "controller"):
             for name, condition in UNSURE.items():
                 condition = WIDER | {"aerodynamics": "full"} | condition
-                flyer = flyers.get(seed) or tuned(task, max(gains), condition)
+                flyer = flyers.get(seed) or tuned(task, "uncertain", condition)
                 found = flown(flyer, task, condition, episodes)
                 rows.append({"task": task, "seed": str(seed), "condition": name} | found)
             say(f"{task}, {seed}: {rows[-1]}")

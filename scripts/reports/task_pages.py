@@ -27,8 +27,8 @@ PAGE = """{asks}
 import gymnasium
 import quadrl
 
-env = gymnasium.make("quadrl/{camel}-v0")
-{make}observation, info = env.reset(seed=0)
+{make}env = gymnasium.make("quadrl/{camel}-v0"{given})
+observation, info = env.reset(seed=0)
 for _ in range(10):
     observation, reward, terminated, truncated, info = env.step({fly})
 print(info["error"], info["reward_terms"])
@@ -139,6 +139,7 @@ def page(name: str) -> str:
         name=name,
         camel=camel,
         make=f'policy = quadrl.Policy.pretrained("{name}")\n' if flies else "",
+        given=", **policy.keywords" if flies and task.trained_on != "paper" else "",
         fly="policy(observation)" if flies else "env.action_space.sample()",
         asks=line(known["asks"]),
         facts=table(("property", "value"), facts),
