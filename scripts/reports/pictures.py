@@ -1,6 +1,6 @@
 """Draw the tasks and a training in motion.
 
-The PPO policy that ships for a task flies it; the geometric controller flies what has no policy.
+The PPO policy that ships for a task flies it, in the aircraft of its trainings.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from PIL import Image, ImageDraw, ImageFont
 from quadrl import tasks
 from quadrl.base.progress import Progress
 from quadrl.core.scenario import Scenario
-from quadrl.core.task import Task
-from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly
 from quadrl.learning.config import TrainConfig
@@ -34,9 +32,10 @@ RELEASED = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
 PANEL = (400, 225)  # [pixels]
 FPS, LAST = 12.5, 1.5  # [1/s], [s] that the end is shown
 QUALITY = 30  # a task is then under 250 kB
+FLOWN = tuple(name for name in tasks.TASKS if (SHIPPED / f"{name}_ppo.safetensors").exists())
 
 
-def pictures(only: tuple[str, ...] = (*tasks.TASKS, "learning")) -> None:
+def pictures(only: tuple[str, ...] = (*FLOWN, "learning")) -> None:
     """Draw the tasks and a training in motion.
 
     Args:
@@ -55,9 +54,8 @@ def save(frames: Iterable[Image.Image], file: Path) -> None:
     first.save(file, loop=0, quality=QUALITY, method=6, **moving)
 
 
-def flown(flyer: Any, task: Task, seed: int = EVALUATION_SEED) -> tuple[Any, Any, bool]:
+def flown(flyer: Any, scenario: Scenario, seed: int = EVALUATION_SEED) -> tuple[Any, Any, bool]:
     """A flight, the model of what is drawn of it, and whether it ended early."""
-    scenario = Scenario.of(task)
     rollout = fly(flyer, scenario, episodes=1, seed=seed)
     flight = rollout.trajectory(scenario.aircraft)
     return flight, scenario.compile_model(), bool(rollout.terminated[0])
@@ -90,7 +88,7 @@ def learning() -> Iterator[Image.Image]:
 
 def panel(policy: Policy, name: str) -> list[np.ndarray]:
     """A flight of a policy until its end, with a name in the corner."""
-    flight, model, early = flown(policy, tasks.make("hover", **RELEASED), 5)
+    flight, model, early = flown(policy, Scenario.of("hover", **RELEASED), 5)
     width, height = PANEL
     drawn = render_trajectory(flight, model, fps=FPS, width=width, height=height, overlay=False)
     frames = [np.asarray(named(Image.fromarray(frame), name)) for frame in drawn]
@@ -107,9 +105,7 @@ def named(image: Image.Image, name: str) -> Image.Image:
 
 def flight(name: str) -> Iterator[Image.Image]:
     """Frames of a flight of a task, until little happens."""
-    task, file = tasks.make(name), SHIPPED / f"{name}_ppo.safetensors"
-    controller = Policy.load(file) if file.exists() else make_controller("geometric", task)
-    flight, model, _ = flown(controller, task)
+    flight, model, _ = flown(Policy.pretrained(name), TrainConfig(name).scenario)
     away = np.linalg.norm(flight.qpos[:, :3] - flight.qpos[-1, :3], axis=1)
     settled = flight.time[np.flatnonzero(away > SETTLED * away.max())[-1]]
     times = np.arange(0.0, min(settled + LAST, LONGEST), 1.0 / FPS)
