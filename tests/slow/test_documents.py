@@ -177,7 +177,7 @@ def test_studies_of_the_paper_can_be_trained(file, tmp_path):
 
 def test_quickstart_makes_the_run_folder_that_the_page_lists(trained):
     (table,) = re.findall(
-        r"^\| file \|.*?\n\n", TEXTS["docs/training.md"], re.MULTILINE | re.DOTALL
+        r"^A run is a folder:\n\n(.*?)\n\n", TEXTS["docs/training.md"], re.MULTILINE | re.DOTALL
     )
     listed = {name.rstrip("/") for name in re.findall(r"`([\w.]+/?)`", table)}
     assert listed - {"flight.mp4"} == {path.name for path in (trained / RUN).iterdir()}

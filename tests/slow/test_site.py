@@ -86,7 +86,7 @@ def test_the_search_knows_the_pages(site):
     asked = (
         "payload battery ONNX PX4 Betaflight gate camera lidar obstacles swarm GPU MJX Isaac ROS"
     )
-    page = REPOSITORY / "docs" / "coming_from.md"
-    answers = page.read_text().partition("## What is there, what is not yet")[2]
+    page = REPOSITORY / "docs" / "clients.md"
+    answers = page.read_text().partition("### What is there, what is not yet")[2]
     assert not [word for word in asked.split() if word not in answers]
     assert "class Hover(Task)" not in index  # the sources are not searched

@@ -137,7 +137,7 @@ def test_intervals_by_hand():
 
 
 def test_the_file_on_the_page(write):
-    page = (Path(__file__).parents[2] / "docs" / "study.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text()
     plan = read_plan(write(page.partition("```toml\n")[2].partition("```")[0]), None)
     assert len(plan.runs) == 40 and {run.config.seed for run in plan.runs[:8]} == {0}
 
