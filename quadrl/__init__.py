@@ -56,19 +56,12 @@ LAZY = {
 """Functions that are imported on first use, and their modules."""
 
 MOVED = {
-    "errors": "base.errors",
     "rotation": "base.rotation",
-    "vehicle": "aircraft.presets",
-    "aerodynamics": "aircraft.presets",
     "native": "engines.native",
     "weather": "conditions.weather",
     "randomization": "conditions.randomization",
     "task": "core.task",
     "contact": "core.contact",
-    "markers": "core.markers",
-    "environment": "core.environment",
-    "policy": "evaluation.policy",
-    "rollout": "evaluation.rollout",
 }
 """Modules that have moved, by the names under which users' files import them, until 0.2."""
 for _old, _new in MOVED.items():

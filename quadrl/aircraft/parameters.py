@@ -31,8 +31,8 @@ AIR = WIND + MAX_ROTORS
 """Numbers of a row of air, in the simulation's `userdata`: the wind [m/s], world frame, and for
 each rotor the noise of its thrust in the vortex ring state, of unit variance."""
 HIT = 2
-"""Numbers behind the air, in a world with solids: 1 + the number of the one that was hit fastest in
-this control step, 0 for none, and how fast [m/s]."""
+"""Numbers behind the air, in a world with solids: the number of the solid that was hit fastest in
+this control step, from 1 on (0 for none), and the speed of that hit [m/s]."""
 MARK = 1903518052.0
 """Tells the actuators and bodies of quadrl from everybody else's: "quad" in ASCII."""
 SETTINGS = (

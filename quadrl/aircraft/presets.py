@@ -109,9 +109,7 @@ HEXA = Vehicle(
     physics_timestep=0.005,  # chosen
     control_timestep=0.02,  # chosen
 )
-OPTIONS = (
-    *("mass", "inertia", "drag_coefficient", "moment_coefficient", "action_scale", "dead_time"),
-)
+OPTIONS = "mass inertia drag_coefficient moment_coefficient action_scale dead_time".split()
 """Fields that may differ from an aircraft's without making another one of it."""
 VEHICLES = {
     vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, CRAZYFLIE_BRUSHLESS, RACER, HEXA)

@@ -275,7 +275,14 @@ class Vehicle:
 
 
 def commanded(action: Array, hover: Array, scale: Any, most: Array | None = None) -> Array:
-    """Rotor speed commands (N, R) [rad/s] of actions, within 0 and `most` unless that is None."""
+    """Compute the rotor speed commands (N, R) [rad/s] of actions.
+
+    Args:
+        action: (N, R), clipped to [-1, 1].
+        hover: Speeds at an action of 0, (R,) or (N, R) [rad/s].
+        scale: Change of the speed at an action of 1 [rad/s].
+        most: Largest speeds (R,) [rad/s], to which commands are cut, as to 0; None for no limits.
+    """
     command = hover + scale * np.minimum(np.maximum(action, -1.0), 1.0)
     return command if most is None else np.minimum(np.maximum(command, 0.0), most)
 

@@ -37,11 +37,11 @@ def check_seed(seed: Any) -> int:
 
 
 def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
-    """Select the rows (n,) that get a seed, and their seeds.
+    """Select the rows that get a seed, (m,), and the seed of each of them, (m,).
 
     Args:
         seed: Row i gets seed + i, or seed[i] unless that is None.
-        rows: Numbers of rows.
+        rows: Numbers (n,) of the rows that it is for.
         count: Number of all rows.
 
     Raises:

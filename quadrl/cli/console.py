@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from quadrl.base.signals import Stopped, handling
-from quadrl.evaluation.evaluate import comes_with_quadrl
+from quadrl.evaluation.controllers import comes_with_quadrl
 
 console = Console()
 own_files: list[Path] = []

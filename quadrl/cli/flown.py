@@ -17,7 +17,7 @@ from quadrl.base.validation import choice, tuples
 from quadrl.cli import choices
 from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import Conditions
-from quadrl.evaluation.evaluate import comes_with_quadrl
+from quadrl.evaluation.controllers import comes_with_quadrl
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE
 from quadrl.learning.defaults import PAIRS
@@ -106,8 +106,12 @@ class Flown(Conditioned):
             return choice("controller", self.controller, CONTROLLERS)
         if self.algo:
             return Policy.pretrained(self.policy, self.algo)
-        # The name of a controller is no policy here: a folder may be called so.
-        return self.policy if comes_with_quadrl(self.policy) else Path(self.policy)
+        return policy_named(self.policy)
+
+
+def policy_named(word: str) -> str | Path:
+    """A policy as the Python functions take it; a controller's name is no policy, but a folder."""
+    return word if comes_with_quadrl(word) else Path(word)
 
 
 def parse_named(name: str, text: Any) -> Any:

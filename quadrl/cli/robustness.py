@@ -11,9 +11,8 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
 from quadrl.cli import choices
 from quadrl.cli.console import console, going_on, make_table, print_json, say
-from quadrl.cli.flown import Conditioned
+from quadrl.cli.flown import Conditioned, policy_named
 from quadrl.control import CONTROLLERS
-from quadrl.evaluation.evaluate import comes_with_quadrl
 from quadrl.evaluation.robustness import robustness
 
 
@@ -55,11 +54,9 @@ class Robustness(Conditioned):
             )
         for name in self.controller:
             choice("controller", name, CONTROLLERS)
-        # The name of a controller is no policy here: a folder may be called so.
-        flown = [name if comes_with_quadrl(name) else Path(name) for name in self.policies]
         with going_on():
             card = robustness(
-                [*flown, *(str(name) for name in self.controller)],
+                [*map(policy_named, self.policies), *map(str, self.controller)],
                 self.task or None,
                 episodes=self.episodes,
                 seed=self.seed,

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from quadrl.aircraft.rotors import MAX
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice, keys, number, numbers
+from quadrl.base.validation import choice, number, numbers, record
 
 Range = tuple[float, float]
 LEAST, MOST = 0.01, 100.0  # of a factor
@@ -88,15 +88,16 @@ class Pushes:
 
 
 def _record(name: str, given: Any, kind: type, also: str = "") -> Any:
-    """A record of a kind, from one or from some of its fields; `also` says what else is allowed."""
-    if isinstance(given, kind):
-        return given
-    if not isinstance(given, Mapping):
+    """Make a record of a kind from a mapping of some of its fields, or take one that is given.
+
+    Raises:
+        QuadrlError: It is neither, nor what `also` names, or a field is unknown.
+    """
+    made = record(name, given, kind)
+    if not isinstance(made, kind):
         allowed = f"a {kind.__name__}, or a mapping of its fields{also}"
         raise QuadrlError(name=name, value=given, allowed=allowed)
-    given = cast(Mapping[str, Any], given)
-    keys(f"field of {name}", given, [field.name for field in dataclasses.fields(kind)])
-    return kind(**given)
+    return made
 
 
 def _pair(name: str, given: Any, low: float, high: float) -> Range:

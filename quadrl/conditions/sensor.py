@@ -20,9 +20,9 @@ from quadrl.base.validation import choice, keys, number, whole_steps
 from quadrl.conditions.randomization import LONGEST_DELAY
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.engines import native
-from quadrl.engines.engine import Engine, Frame
+from quadrl.engines.engine import Engine
 from quadrl.engines.rng import normal, uniform
-from quadrl.engines.state import State
+from quadrl.engines.state import Frame, State
 
 Memory = dict[str, Array]
 Kind = TypeVar("Kind", bound=type)

@@ -26,7 +26,6 @@ from quadrl.conditions.randomization import AFFECTS, Randomization, Randomized
 from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control import modes, trim
-from quadrl.control.allocation import Allocation
 from quadrl.engines.rng import uniform
 
 MARGIN = 1.2
@@ -39,10 +38,6 @@ SAMPLES, CORNERS = 1024, 256
 SURE = 1e-9
 """Share of a bound by which rounding may exceed it."""
 BISECTIONS = 24
-PHASE_MARGIN = math.pi / 4  # [rad]
-TURNING = 0.2308
-"""How deep one weight of thrust pushes an aircraft that turns over, over g T^2: twice the integral
-of (1 / 2 - x) cos(2 pi x^2) from 0 to 1 / 2."""
 BY_HOVER = AFFECTS.keys() - {"inertia", "inertia_axes", "drag", "inflow", "lag", "rotor_inertia"}
 """Fields of a randomization that change how fast rotors turn in hover, or may turn."""
 
@@ -257,30 +252,6 @@ def limit(
     return None
 
 
-def angular_acceleration(vehicle: Vehicle, scale: float) -> Array:
-    """Largest about x, y and z (3,) [rad/s^2], each alone, with a thrust that suits it."""
-    low, high = Reach(vehicle).speeds(scale)
-    squares = Allocation(np.linalg.pinv(vehicle.mixer), low[0] ** 2, high[0] ** 2)
-    return squares.moment / np.array(vehicle.inertia)
-
-
-def height_to_turn_over(vehicle: Vehicle, scale: float) -> float:
-    """Height [m] that it takes to turn from rest upside down to level, and to stop; inf if never.
-
-    With the largest moment, one way and then the other, at the middle thrust c (of the weight) that
-    leaves it, half round takes T = 2 sqrt(pi / acceleration). Thrust down in the first half and
-    up in the second cancel: the aircraft then sinks at g T, and is (1 / 2 + c TURNING) g T^2 lower.
-    The largest thrust, L weights, takes g T^2 / (2 (L - 1)) to stop it. Rotors without lag.
-    """
-    least, most = (float(load[0]) for load in Reach(vehicle).loads(scale))
-    if most <= 1 + SURE:
-        return math.inf
-    turning = float(angular_acceleration(vehicle, scale)[:2].max())
-    time = 2 * math.sqrt(math.pi / turning)  # [s]
-    sunk = 1 / 2 + TURNING * (least + most) / 2
-    return GRAVITY * time**2 * (sunk + 1 / (2 * (most - 1)))
-
-
 def held_wind(vehicle: Vehicle, load: float) -> float:
     """Steady wind [m/s] against which a thrust of `load` times the weight still holds the place.
 
@@ -293,14 +264,3 @@ def held_wind(vehicle: Vehicle, load: float) -> float:
     linear = vehicle.aerodynamics.rotor_drag * math.sqrt(load) * float(vehicle.hover_speed.sum())
     root = math.sqrt(linear**2 + 4 * vehicle.drag_coefficient * sideways)
     return 2 * sideways / (linear + root) if linear + root > 0 else math.inf
-
-
-def attitude_bandwidth(lag: float, late: float) -> float:
-    """Bandwidth of the attitude [rad/s] that is left by a rotor lag and by delays [s].
-
-    From moment to attitude there are two integrators, 180 degrees of phase lag, of which feedback
-    of the body rate makes up for 90 at most. At a rate w a delay T takes w T, and a lag T at most
-    as much. For a phase margin of 45 degrees, in the middle of the usual 30 to 60 (Astrom and
-    Murray, "Feedback Systems", chapter 10), both together may take pi / 4.
-    """
-    return PHASE_MARGIN / (lag + late)

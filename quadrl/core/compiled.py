@@ -31,9 +31,8 @@ from quadrl.core.step_source import FLAGS, SOURCE, Rows
 from quadrl.core.task import Task
 from quadrl.core.transition import Episode, Transition, finish
 from quadrl.engines import native
-from quadrl.engines.engine import padded
 from quadrl.engines.native import compiling
-from quadrl.engines.state import State
+from quadrl.engines.state import State, padded
 
 METHODS = ("measure", "terminated", "error", "succeeded", "reward", "update", "observe")
 """Functions of a task that a step calls."""

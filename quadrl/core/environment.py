@@ -126,7 +126,7 @@ class Environment(saving.Copied):
         self.seed(seed)
 
     def seed(self, seed: Seed = None, rows: np.ndarray | None = None) -> Seed:
-        """Begin the episodes of a seed anew; returns the seed.
+        """Begin with the first episode of a seed at the next reset; returns the seed.
 
         Args:
             seed: Row i gets seed + i, or seed[i] unless that is None; None for one from the system.
@@ -411,6 +411,9 @@ def row_memory(task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Obs
     rotors, (command, *ages) = vehicle.rotor_count, (most for _, most in sampler.delays.values())
     aged, late = max(ages), command + round(vehicle.dead_time / vehicle.physics_timestep)
     single = sum(term.width(rotors) for term in task.observation.values())
-    kept = single * (1 + seen.observation_history) + 13 * aged + rotors * max(late, aged)
-    flat = single * (1 + seen.observation_history) + rotors * seen.action_history
+    sensors = seen.made(task.sensors)
+    names = "observation_history", "action_history"
+    observations, actions = (getattr(sensors.get(name), "length", 0) for name in names)
+    kept = single * (1 + observations) + 13 * aged + rotors * max(late, aged)
+    flat = single * (1 + observations) + rotors * actions
     return 3_000 + 5_000 * sampler.randomization.per_row + 8 * (kept + 2 * flat)

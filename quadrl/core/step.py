@@ -17,7 +17,8 @@ from quadrl.core import transition
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
-from quadrl.engines.engine import Engine, Frame
+from quadrl.engines.engine import Engine
+from quadrl.engines.state import Frame
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

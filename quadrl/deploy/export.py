@@ -15,7 +15,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import free_name, write_whole
 from quadrl.base.validation import choice
 from quadrl.core.environment import Environment
-from quadrl.evaluation.evaluate import comes_with_quadrl
+from quadrl.evaluation.controllers import comes_with_quadrl, policy_of
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.learning.description import describe_observation
 from quadrl.rendering.video import checked
@@ -77,13 +77,11 @@ def _found(what: Any) -> Vehicle | Policy:
     if isinstance(what, str) and what in VEHICLES:
         return VEHICLES[what]
     found = getattr(what, "policy", what)  # of what `quadrl.train` returned
-    if isinstance(found, str) and comes_with_quadrl(found):
-        return Policy.pretrained(found)
-    if isinstance(found, str) and not Path(found).exists():
+    if isinstance(found, str) and not (comes_with_quadrl(found) or Path(found).exists()):
         known = *VEHICLES, *tasks.TASKS, *(file.stem for file in shipped())
         choice("what", found, ("a run folder", "a .safetensors file", *known))
     if isinstance(found, (str, Path)):
-        return Policy.load(found)
+        return policy_of(found)
     if not isinstance(found, Policy):
         raise QuadrlError(name="what", value=what, allowed="a policy or an aircraft")
     return found

@@ -24,7 +24,8 @@ HEAD = """<!--
   The aircraft {name} for MuJoCo alone, written by quadrl {version}.
   Body frame: x forward, y left, z up, the origin at the centre of mass. It begins on the ground;
   the key frame "hover" holds it at {height:g} m with ctrl = act = (hover_speed / max_speed)^2.
-  ctrl, one a rotor, 0 to 1: thrust over its largest, (speed / max_speed)^2; act: what it gives now.
+  ctrl, one number a rotor, 0 to 1: the thrust that is asked for, as a share of the rotor's largest
+  thrust, which is (speed / max_speed)^2; act: the share that it gives now.
   An action a of a policy of quadrl is, for a control_timestep (custom/numeric, SI units),
   ctrl = (clip(hover_speed + action_scale * a, 0, max_speed) / max_speed)^2.
   Left out: the lag is of the square of the speed, not of the speed; what the air does to rotors

@@ -73,7 +73,7 @@ def main() -> None:
     SITE.mkdir(parents=True, exist_ok=True)
     (SITE / "index.html").write_text(page)
     size = f"{len(page) / 1e6:.2f} MB, WebAssembly {len(wasm) / 1e3:.0f} kB"
-    print(f"{SITE / 'index.html'}: {size}", file=sys.stderr)
+    sys.stderr.write(f"{SITE / 'index.html'}: {size}\n")
 
 
 def make_book() -> tuple[dict[str, Any], str]:

@@ -7,14 +7,12 @@ hold (`quadrl.engines.native.compiling`), under the same names and with the same
 from __future__ import annotations
 
 import itertools
-import os
 import platform
 import re
 import sys
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from unittest import mock
 
 from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR
 from quadrl.aircraft.presets import VEHICLES
@@ -51,15 +49,9 @@ def steps(tasks: Iterable[str]) -> list[str]:
     the number of rotors and of actions, whether what is observed is an estimate, a weight of zero,
     and the number of waypoints.
     """
-    found: dict[str, None] = {}
-
-    def note(source: str) -> None:
-        found[source] = None
-        raise NativeError("only the source is wanted")
-
     many = range(1, MAX_WAYPOINTS + 1)
     routes = [{"waypoints": [[1.0, 1.0, 0.5]] * count} for count in many]
-    with mock.patch.object(compiling, "compile_generated", note), warnings.catch_warnings():
+    with compiling.noted() as found, warnings.catch_warnings():
         warnings.simplefilter("ignore", QuadrlWarning)
         for task, vehicle, mode, randomization, weight in itertools.product(
             tasks, ROTORS.values(), CONTROL_MODES, ("none", "full"), (0.0, 0.1)
@@ -75,14 +67,14 @@ def steps(tasks: Iterable[str]) -> list[str]:
                 environment.reset()
                 if pilot := environment.autopilot:
                     back = Reversed(environment.control_mode, environment.engine)
-                    found |= dict.fromkeys(f.source for f in (*pilot.functions, *back.functions))
-    return list(found)
+                    found += (f.source for f in (*pilot.functions, *back.functions))
+        return list(dict.fromkeys(found))
 
 
 def fill(
     folder: Path,
     machine: str,
-    compiler: str | None = None,
+    compiler: str = "",
     tasks: Iterable[str] = TASKS,
     airs: Iterable[int] = AIRS,
 ) -> None:
@@ -91,7 +83,7 @@ def fill(
     Args:
         folder: Where to; what it holds already is not compiled again.
         machine: The kind of machine that it is for, as `platform.machine` names it there.
-        compiler: The command that compiles for it; None for the one of this machine.
+        compiler: The command that compiles for it; empty for the one of this machine.
         tasks: Those whose steps it brings.
         airs: Kinds of air whose derivatives it brings, as `Aerodynamics.effects`.
 
@@ -100,10 +92,10 @@ def fill(
     """
     sources = steps(tasks)  # first, since flights need libraries of this machine
     folder.mkdir(parents=True, exist_ok=True)
-    variables = {"QUADRL_CACHE": str(folder)} | ({"CC": compiler} if compiler else {})
-    with mock.patch.dict(os.environ, variables), mock.patch("platform.machine", lambda: machine):
-        paths = [compiling.build(), *map(compiling.build_generated, sources)]
-        paths += itertools.starmap(adjoint.build, itertools.product(airs, ROTORS))
+    target = compiling.Target(machine, compiler, folder)
+    paths = [compiling.build(target=target)]
+    paths += [compiling.build_generated(source, target) for source in sources]
+    paths += [adjoint.build(*each, target) for each in itertools.product(airs, ROTORS)]
     for path in paths:
         versions = map(int, re.findall(rb"GLIBC_2\.(\d+)", path.read_bytes()))
         if (newest := max(versions, default=0)) > GLIBC:
@@ -112,7 +104,7 @@ def fill(
 
 if __name__ == "__main__":
     chosen, *other = sys.argv[1:]
-    machine, compiler = other or (platform.machine(), None)
+    machine, compiler = other or (platform.machine(), "")
     folder = Path(chosen) / tag(machine)
     fill(folder, machine, compiler)
-    print(folder)
+    sys.stdout.write(f"{folder}\n")

@@ -72,9 +72,10 @@ def reverse(effects: int, rotors: int) -> str:
     return SOURCE.format(effects=effects, rotors=rotors, constants=constants, body=body)
 
 
-def build(effects: int, rotors: int) -> Path:
+def build(effects: int, rotors: int, target: compiling.Target = compiling.HERE) -> Path:
     """Compile native/adjoint.c as `compiling.build` does, for what `kernel` takes."""
-    return compiling.build(("adjoint.c",), "adjoint", {"reverse.h": reverse(effects, rotors)})
+    generated = {"reverse.h": reverse(effects, rotors)}
+    return compiling.build(("adjoint.c",), "adjoint", generated, target=target)
 
 
 @functools.cache

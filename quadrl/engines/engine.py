@@ -19,7 +19,7 @@ from quadrl.engines import native
 from quadrl.engines.adjoint import Leg
 from quadrl.engines.free_flight import FreeFlight
 from quadrl.engines.solids import Solids
-from quadrl.engines.state import FIRST, Start, State
+from quadrl.engines.state import FIRST, Frame, Start, State
 
 EngineName = Literal["mujoco", "free_flight"]
 ENGINES: tuple[EngineName, ...] = ("mujoco", "free_flight")
@@ -294,21 +294,3 @@ class Engine(abc.ABC):
         """Run the C kernel; how many aircraft are not sound."""
         count, ids = (self.num_envs, None) if rows is None else (len(rows), rows.ctypes.data)
         return self._kernel(self._address, count, ids, self.frames[0].address)
-
-
-def padded(count: int) -> int:
-    """Columns of a table for some aircraft: a cache line more, against set conflicts between rows.
-
-    A few aircraft have none, and contiguous arrays are faster in NumPy.
-    """
-    return count + 8 * (1 + count // 8 % 2) if count > 8 else count
-
-
-class Frame:
-    """One table of state with its named views and its address."""
-
-    def __init__(self, count: int, rotors: int) -> None:
-        self.columns = padded(count)
-        self.table = np.zeros((FIRST["rotor_speed"] + rotors, self.columns))[:, :count]
-        self.state = State.of_table(self.table)
-        self.address = self.table.ctypes.data

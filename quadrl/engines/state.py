@@ -164,3 +164,21 @@ def c_rows() -> str:
     """The rows of the table as C constants."""
     rows = ", ".join(f"ROW_{name.upper()} = {first}" for name, first in FIRST.items())
     return f"enum {{ {rows} }};\n"
+
+
+def padded(count: int) -> int:
+    """Columns of a table for some aircraft: a cache line more, against set conflicts between rows.
+
+    A few aircraft have none, and contiguous arrays are faster in NumPy.
+    """
+    return count + 8 * (1 + count // 8 % 2) if count > 8 else count
+
+
+class Frame:
+    """One table of state with its named views and its address."""
+
+    def __init__(self, count: int, rotors: int) -> None:
+        self.columns = padded(count)
+        self.table = np.zeros((FIRST["rotor_speed"] + rotors, self.columns))[:, :count]
+        self.state = State.of_table(self.table)
+        self.address = self.table.ctypes.data

@@ -167,10 +167,14 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         self._resting = np.zeros(num_envs, dtype=bool)  # NEXT_STEP: reset at the next step
 
     def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Array, Info]:
-        """Begin episodes in the rows of `options["reset_mask"]` (N,) bool, by default in all.
+        """Begin an episode in every row, or in those of `options["reset_mask"]`.
 
-        Row i is seeded with seed + i, or with seed[i] unless that is None. Other options are arrays
-        (N, k) or (k,) of the start, as above.
+        Args:
+            seed: Row i is seeded with seed + i, or with seed[i] unless that is None.
+            options: `reset_mask`, (N,) bool; and arrays (N, k) or (k,) of the start, as above.
+
+        Returns:
+            The observations of all rows (N, size) float32, and the info of the rows that began.
         """
         start = dict(options or {})
         rows = np.asarray(start.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))

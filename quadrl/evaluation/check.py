@@ -11,14 +11,14 @@ import numpy as np
 
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.rotation import Array
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.control import modes
+from quadrl.control.allocation import Allocation
 from quadrl.control.feasibility import (
     MARGIN,
+    SURE,
     Reach,
-    angular_acceleration,
-    attitude_bandwidth,
-    height_to_turn_over,
     held_command,
     held_wind,
     samples,
@@ -33,6 +33,11 @@ DRIFT = 0.5  # [m], chosen: how far a tilted aircraft may go until it is level
 TILT = 0.2  # [rad], with which hover starts
 SLOWEST = math.sqrt(GRAVITY * TILT / DRIFT)
 """Bandwidth w of the attitude [rad/s] below which it goes farther: about g tilt / w^2."""
+
+PHASE_MARGIN = math.pi / 4  # [rad]
+TURNING = 0.2308
+"""How deep one weight of thrust pushes an aircraft that turns over, over g T^2: twice the integral
+of (1 / 2 - x) cos(2 pi x^2) from 0 to 1 / 2."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,3 +169,38 @@ def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Ite
     slow = f"under {SLOWEST:.2g}: tilted by {TILT:g} rad it goes {drift:.2g} m until it is level"
     verdict = OK if bandwidth >= SLOWEST else slow
     yield Row("attitude bandwidth", bandwidth, "rad/s", verdict)
+
+
+def angular_acceleration(vehicle: Vehicle, scale: float) -> Array:
+    """Largest about x, y and z (3,) [rad/s^2], each alone, with a thrust that suits it."""
+    low, high = Reach(vehicle).speeds(scale)
+    squares = Allocation(np.linalg.pinv(vehicle.mixer), low[0] ** 2, high[0] ** 2)
+    return squares.moment / np.array(vehicle.inertia)
+
+
+def height_to_turn_over(vehicle: Vehicle, scale: float) -> float:
+    """Height [m] that it takes to turn from rest upside down to level, and to stop; inf if never.
+
+    With the largest moment, one way and then the other, at the middle thrust c (of the weight) that
+    leaves it, half round takes T = 2 sqrt(pi / acceleration). Thrust down in the first half and
+    up in the second cancel: the aircraft then sinks at g T, and is (1 / 2 + c TURNING) g T^2 lower.
+    The largest thrust, L weights, takes g T^2 / (2 (L - 1)) to stop it. Rotors without lag.
+    """
+    least, most = (float(load[0]) for load in Reach(vehicle).loads(scale))
+    if most <= 1 + SURE:
+        return math.inf
+    turning = float(angular_acceleration(vehicle, scale)[:2].max())
+    time = 2 * math.sqrt(math.pi / turning)  # [s]
+    sunk = 1 / 2 + TURNING * (least + most) / 2
+    return GRAVITY * time**2 * (sunk + 1 / (2 * (most - 1)))
+
+
+def attitude_bandwidth(lag: float, late: float) -> float:
+    """Bandwidth of the attitude [rad/s] that is left by a rotor lag and by delays [s].
+
+    From moment to attitude there are two integrators, 180 degrees of phase lag, of which feedback
+    of the body rate makes up for 90 at most. At a rate w a delay T takes w T, and a lag T at most
+    as much. For a phase margin of 45 degrees, in the middle of the usual 30 to 60 (Astrom and
+    Murray, "Feedback Systems", chapter 10), both together may take pi / 4.
+    """
+    return PHASE_MARGIN / (lag + late)

@@ -1,6 +1,8 @@
-"""Make the controllers that policies are compared with, by name."""
+"""What flies, by its name: the controllers that policies are compared with, and policies."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from quadrl import tasks
 from quadrl.aircraft.presets import resolve
@@ -8,6 +10,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.validation import choice
 from quadrl.control import CONTROLLERS, Controller
 from quadrl.core.task import Task
+from quadrl.evaluation.policy import Policy, shipped
 
 
 def make_controller(
@@ -25,3 +28,23 @@ def make_controller(
     """
     kind = CONTROLLERS[choice("controller", name, CONTROLLERS)]
     return kind(resolve(vehicle), tasks.make(task))
+
+
+def comes_with_quadrl(name: str) -> bool:
+    """Whether a name is that of a task, or of a policy that comes with quadrl."""
+    return name in tasks.TASKS or name in {file.stem for file in shipped()}
+
+
+def policy_of(given: str | Path) -> Policy:
+    """Load a policy by its name, or from a file or a run folder.
+
+    Args:
+        given: A name as `comes_with_quadrl` knows it, that of a task for its policy by PPO; else a
+            path, as a Path is whatever it is called.
+
+    Raises:
+        QuadrlError: As `Policy.load` raises it.
+    """
+    if isinstance(given, str) and comes_with_quadrl(given):
+        return Policy.pretrained(given)
+    return Policy.load(given)

@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Unpack, cast
 
-from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
@@ -22,8 +21,8 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.snapshot import Rollout
 from quadrl.core.task import Task
 from quadrl.core.trajectory import Trajectory
-from quadrl.evaluation.controllers import make_controller
-from quadrl.evaluation.policy import Policy, shipped
+from quadrl.evaluation.controllers import make_controller, policy_of
+from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import (
     EVALUATION_SEED,
     MAX_EPISODES,
@@ -143,7 +142,6 @@ def evaluate(
 def setting(
     controller: Any,
     task: str | Task | Scenario | None = None,
-    algo: str = "ppo",
     **conditions: Unpack[Conditions],
 ) -> tuple[str, Controller, Scenario]:
     """Resolve a controller, its name, and the scenario that it flies.
@@ -155,7 +153,6 @@ def setting(
             or any function of flat observations (N, size) that gives actions (N, k).
         task: A task or its name, or a whole scenario; None for what the policy was trained for,
             hover for a controller.
-        algo: Which of the policies that come with quadrl.
         **conditions: As `evaluate` takes them.
 
     Returns:
@@ -171,9 +168,7 @@ def setting(
         return f"{flown} controller", made, scenario
     name = "policy" if isinstance(flown, Policy) else getattr(flown, "__name__", "controller")
     if isinstance(flown, (str, Path)):
-        shipped = isinstance(flown, str) and comes_with_quadrl(flown)
-        name, path = str(flown), flown
-        flown = Policy.pretrained(str(path), algo) if shipped else Policy.load(path)
+        name, flown = str(flown), policy_of(flown)
     if not callable(flown):
         allowed = "a policy, a run, a path, the name of a task or a controller, or a function"
         raise QuadrlError(name="controller", value=flown, allowed=allowed)
@@ -215,11 +210,6 @@ def beside(
         (flies, dataclasses.replace(one, **same, aerodynamics=one.aerodynamics or air))
         for flies, one in flown
     ]
-
-
-def comes_with_quadrl(name: str) -> bool:
-    """Whether a name is that of a task, or of a policy that comes with quadrl."""
-    return name in tasks.TASKS or name in {file.stem for file in shipped()}
 
 
 def html_table(rows: list[tuple[str, ...]]) -> str:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 LOG_VARIANCE = (-12.0, 2.0)
 """Bounds of the log-variance of the actions."""
+OWN = ("algo", "seed", "vehicle")  # what a policy says of itself
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -56,7 +57,7 @@ class Policy:
 
     def __repr__(self) -> str:
         layers = "-".join(str(x) for x in (self.size, *(len(bias) for bias in self.biases)))
-        known = ", ".join(f"{k} {self.metadata[k]}" for k in REPR if k in self.metadata)
+        known = ", ".join(f"{k} {self.metadata[k]}" for k in OWN if k in self.metadata)
         memory = f"; memory of {self.state_size}" if self.memory else ""
         return f"Policy for {self.task} ({known or 'made by hand'}; layers {layers}{memory})"
 
@@ -296,6 +297,3 @@ class Policy:
         if task not in known:
             name = f"{task}_{SHIPPED_AS.get(algo, algo) if variant == 'ideal' else variant}"
         return cls.load(SHIPPED / f"{choice('pretrained policy', name, known)}.safetensors")
-
-
-REPR = ("algo", "seed", "vehicle")  # what a policy says of itself

@@ -149,11 +149,8 @@ class TrainConfig(TrainSettings):
             ("reward_scale", 0, math.inf, {"positive": True}),
         ):
             object.__setattr__(self, name, number(name, getattr(self, name), low, high, **rest))
-        for name, kind in (
-            ("hidden", tuple),
-            ("critic_hidden", tuple),
-            *((n, dict) for n in PAIRS),
-        ):
+        widths: dict[str, type] = {"hidden": tuple, "critic_hidden": tuple}
+        for name, kind in (widths | dict.fromkeys(PAIRS, dict)).items():
             if not isinstance(value := getattr(self, name), kind):
                 raise QuadrlError(name=name, value=value, allowed=f"a {kind.__name__}")
             if kind is dict and not all(isinstance(key, str) for key in value):

@@ -1,8 +1,4 @@
-"""Carry out trainings side by side, each in a process of its own, and again if one dies.
-
-A process reads its order, a line of JSON, from standard input, and ends as soon as standard input
-ends: whoever ordered it is gone. A run that is killed at any moment can be continued.
-"""
+"""Carry out trainings side by side, each in a process of its own, and again if one dies."""
 
 from __future__ import annotations
 
@@ -10,10 +6,8 @@ import contextlib
 import dataclasses
 import json
 import os
-import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -22,19 +16,16 @@ from typing import Any
 from quadrl.base.errors import QuadrlError
 from quadrl.base.machine import cores
 from quadrl.base.progress import TimeLeft
-from quadrl.base.signals import Stopped, heeded, unheeded
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import CONFIG, EVALUATION, FREE, METRICS, lock_folder
+from quadrl.learning.folder import CONFIG, EVALUATION, FREE, METRICS
 
 ATTEMPTS = 3
 """Times that a training is begun or continued before it counts as failed."""
-LOCKED_SECONDS = 120.0
-"""For which a training waits until a lost one has left its folder, as a shared file system sees."""
 STOP_SECONDS = 30.0
 """That a training has for its last iteration and checkpoint when the study is stopped."""
 POLL_SECONDS, NEWS_SECONDS = 0.1, 10.0  # the latter between two lines of progress
-FAILED = 2
-"""Exit code of a process: the training ended with an error that the log tells."""
+WORKER = "quadrl.learning.worker"
+"""What a process runs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,64 +84,6 @@ def order(run: PlannedRun, episodes: int, own: Iterable[Path] = ()) -> dict[str,
     }
 
 
-def carry_out(what: dict[str, Any]) -> None:
-    """Begin or continue a training, evaluate it, draw its curve and its flights.
-
-    Raises:
-        QuadrlError: It cannot be trained, or other versions are installed here than where it was
-            ordered.
-    """
-    from quadrl.core.rules import import_own
-    from quadrl.learning.run import train_in
-
-    for path in what["own"]:
-        import_own(Path(path))
-    config, folder = TrainConfig(**what["config"]), Path(what["folder"])
-    if (here := config.resolved()["versions"]) != what["versions"]:
-        name = next(name for name in here if here[name] != what["versions"].get(name))
-        allowed = f"{what['versions'].get(name)}, as where the study was started"
-        raise QuadrlError(name=f"version of {name}", value=here[name], allowed=allowed)
-    folder.mkdir(parents=True, exist_ok=True)
-    until = time.monotonic() + LOCKED_SECONDS
-    while True:  # a training that is lost may work here for a while
-        try:
-            lock_folder(folder)()
-            break
-        except QuadrlError:
-            if time.monotonic() > until:
-                raise
-        time.sleep(POLL_SECONDS)
-    if PlannedRun(config, folder).done:  # by the one that was lost
-        return
-    given: Any = {"resume": (folder / CONFIG).exists(), "episodes": what["episodes"]}
-    finished = train_in(folder, config, **given, show=lambda progress: None, heed=heeded)
-    for _ in finished.draw(video=False):
-        pass
-
-
-def main() -> None:
-    """Read the order and carry it out."""
-    what = json.loads(sys.stdin.buffer.readline())
-
-    def watch() -> None:
-        sys.stdin.buffer.raw.read()  # type: ignore[attr-defined] - returns once nobody can write
-        os._exit(FAILED)
-
-    threading.Thread(target=watch, daemon=True).start()
-    signal.signal(signal.SIGUSR1, unheeded)
-    try:
-        carry_out(what)
-    except (QuadrlError, OSError) as error:
-        print(f"quadrl: {error}", flush=True)
-        sys.exit(FAILED)
-    except Stopped as stop:  # its run can be continued, as that of a process that was killed
-        signal.signal(stop.number, signal.SIG_DFL)
-        signal.raise_signal(stop.number)
-    # What hangs at the end of the interpreter must not turn a finished training into a lost one.
-    sys.stdout.flush()
-    os._exit(0 if (Path(what["folder"]) / EVALUATION).exists() else FAILED)
-
-
 class Process:
     """A process on this machine, in a session of its own: a Ctrl-C does not reach it."""
 
@@ -161,7 +94,7 @@ class Process:
         search = os.pathsep.join(path or os.getcwd() for path in sys.path)
         with open(log, "wb") as file:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", f"from {__name__} import main; main()"],
+                [sys.executable, "-P", "-c", f"from {WORKER} import main; main()"],
                 env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": search},
                 stdin=subprocess.PIPE,
                 stdout=file,

@@ -15,33 +15,21 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import read_table, write_whole
+from quadrl.base.files import write_whole
 from quadrl.base.units import quantity
-from quadrl.base.validation import keys, names, number
-from quadrl.base.validation import seeds as seeds_of
+from quadrl.base.validation import number
 from quadrl.core.scenario import as_saved
 from quadrl.evaluation.evaluate import html_table
-from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning.cluster import on_ray
-from quadrl.learning.config import TrainConfig
-from quadrl.learning.defaults import merged
-from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
+from quadrl.learning.executor import Local, complaint, train_all
 from quadrl.learning.folder import EVALUATION, write_json
+from quadrl.learning.plan import Plan, read_plan
 from quadrl.learning.show import curves
 
-KEYS = ("tasks", "algorithms", "seeds", "episodes", "settings", "variants")
-OWN = {
-    "task": "the key tasks",
-    "algo": "the key algorithms",
-    "seed": "the key seeds",
-    "num_threads": "left out: a training of a study has one thread",
-}
-"""Settings of a training that no table of a study may hold, and what to write instead."""
-MAX_RUNS, MAX_JOBS = 10_000, 4096
-EPISODES = 100
+MAX_JOBS = 4096
 FIGURES = {
     "success_rate": 1.0,
     "position_error_m": math.inf,
@@ -53,15 +41,6 @@ FIGURES = {
 TABLE, STUDY = "table.csv", "study.json"
 GROUP = ("task", "algo", "variant")
 CONFIDENCE = 0.95
-
-
-class Plan(NamedTuple):
-    """All trainings of a study."""
-
-    folder: Path
-    runs: tuple[PlannedRun, ...]
-    episodes: int
-    """Episodes of the evaluation at the end of each."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -232,79 +211,3 @@ def _text(row: dict[str, Any], name: str) -> str:
         return "none"
     around = "" if low is None else f" ({quantity(name, low)} to {quantity(name, high)})"
     return f"{quantity(name, mean)}{around}"
-
-
-def read_plan(what: str | Path | Mapping[str, Any], out: Path | None) -> Plan:
-    """Expand a study file (.toml or .json), or a dict with the same keys, to its trainings.
-
-    Args:
-        what: The file, or the dict.
-        out: Folder of the run folders; by default runs/NAME, NAME that of the file.
-
-    Raises:
-        QuadrlError: The file cannot be read, or something in it is unknown, out of range, or does
-            not fit together; the line names the file and the key.
-    """
-    if isinstance(what, Mapping):
-        source, name, content = "the study", "study", what
-    else:
-        source, name, content = str(what), Path(what).stem, read_table(Path(what), "study")
-    try:
-        return _plan(content, out or Path("runs", name))
-    except QuadrlError as error:
-        raise QuadrlError(f"{source}: {error}") from error
-
-
-def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
-    """The trainings of a study's content: seed by seed, so that a stopped one has whole seeds."""
-    keys("key", content, KEYS)
-    if "tasks" not in content:
-        raise QuadrlError('tasks is missing: name what to train, such as tasks = ["hover"]')
-    tasks = names("tasks", content["tasks"])
-    algorithms = names("algorithms", content.get("algorithms", ["ppo"]))
-    seeds = seeds_of(content.get("seeds", [0]), MAX_SEED)
-    episodes = number("episodes", content.get("episodes", EPISODES), 1, MAX_EPISODES, whole=True)
-    common = _settings("settings", content.get("settings", {}))
-    variants = _variants(content.get("variants", []))
-    number("trainings", len(tasks) * len(algorithms) * len(seeds) * len(variants), 1, MAX_RUNS)
-    runs: list[PlannedRun] = []
-    known: dict[str, str] = {}
-    for seed, task, algo, variant in itertools.product(seeds, tasks, algorithms, variants):
-        name = "-".join([task, algo, *filter(None, [variant]), str(seed)])
-        settings = merged(common, variants[variant])
-        try:
-            config = TrainConfig(task, algo=algo, seed=seed, num_threads=1, **settings)
-        except QuadrlError as error:
-            raise QuadrlError(f"{name}: {error}") from error
-        other = known.setdefault(json.dumps(dataclasses.asdict(config), sort_keys=True), name)
-        if other != name:
-            raise QuadrlError(f"{other} and {name} have the same settings: remove one of them")
-        runs.append(PlannedRun(config, folder / name, variant))
-    return Plan(folder, tuple(runs), episodes)
-
-
-def _settings(key: str, given: Any) -> dict[str, Any]:
-    """A table of settings; `TrainConfig` judges their values."""
-    if not isinstance(given, dict):
-        raise QuadrlError(name=key, value=given, allowed="a table of settings of a training")
-    for name in OWN.keys() & given.keys():
-        raise QuadrlError(name=f"{key}.{name}", value=given[name], allowed=OWN[name])
-    known = [field.name for field in dataclasses.fields(TrainConfig) if field.name not in OWN]
-    keys(f"setting in {key}", given, known)
-    return given
-
-
-def _variants(given: Any) -> dict[str, dict[str, Any]]:
-    """Settings by the name of the variant; one without a name where there are none."""
-    if not isinstance(given, (list, tuple)) or not all(isinstance(one, dict) for one in given):
-        raise QuadrlError(name="variants", value=given, allowed="a list of tables: [[variants]]")
-    variants: dict[str, dict[str, Any]] = {}
-    for one in given:
-        name = one.get("name")
-        plain = isinstance(name, str) and name.replace("_", "").replace(".", "").isalnum()
-        if not plain or name in variants or name.startswith("."):
-            allowed = "a name of its own, of letters, digits, _ and ."
-            raise QuadrlError(name="variants.name", value=name, allowed=allowed)
-        rest = {key: value for key, value in one.items() if key != "name"}
-        variants[name] = _settings(f"variants.{name}", rest)
-    return variants or {"": {}}

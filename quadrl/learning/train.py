@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives.value import GAE
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import PART
@@ -61,12 +63,6 @@ from quadrl.learning.origin import Origin
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
-
-with warnings.catch_warnings():
-    # TorchRL 0.14 warns about its own classes at this import.
-    warnings.filterwarnings("ignore", message=".*WeightUpdater.*", category=DeprecationWarning)
-    from torchrl.modules import set_recurrent_mode
-    from torchrl.objectives.value import GAE
 
 LEARNED_FROM = ("action", "action_log_prob", "loc", "scale", "advantage", "value_target")
 """Of a batch, beside what actor and critic read."""

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from quadrl import tasks
-from quadrl.learning.study import read_plan
+from quadrl.learning.plan import read_plan
 from scripts.reports import pages, report
 
 REPOSITORY = Path(__file__).parents[2]

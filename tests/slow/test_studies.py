@@ -24,8 +24,8 @@ from quadrl.learning import executor
 from quadrl.learning.cluster import carry_out_here
 from quadrl.learning.executor import Process
 from quadrl.learning.folder import lock_folder
+from quadrl.learning.plan import read_plan
 from quadrl.learning.run import train
-from quadrl.learning.study import read_plan
 
 SETTINGS = {
     "num_envs": 8,

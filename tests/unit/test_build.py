@@ -88,7 +88,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(
 def generated(function="f"):
     """A library of generated C, loaded as for the first time."""
     seen = '__attribute__((visibility("default")))'
-    return compiling.compile_generated.__wrapped__(f"{seen} int {function}(void) {{ return 1; }}")
+    return compiling.opened_generated.__wrapped__(f"{seen} int {function}(void) {{ return 1; }}")
 
 
 DAMAGES = {

@@ -355,7 +355,7 @@ def test_what_cannot_change_is_compiled():
 
 def test_options_share_the_compiled_code(monkeypatch, tmp_path):
     monkeypatch.setenv("QUADRL_CACHE", str(tmp_path))
-    compiling.compile_generated.cache_clear()
+    compiling.opened_generated.cache_clear()
     for limit, weight in ((5.0, 17.0), (7.0, 19.0)):
         task = tasks.make("hover", time_limit=limit, progress_weight=weight)
         assert not helpers.begun(task, 1).not_compiled

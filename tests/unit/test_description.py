@@ -74,5 +74,5 @@ def test_modules_that_have_moved_are_found_under_their_old_names():
     for old, new in quadrl.MOVED.items():
         module = importlib.import_module(f"quadrl.{old}")
         assert module is importlib.import_module(f"quadrl.{new}") is getattr(quadrl, old)
-    code = "from quadrl.rotation import namespace; from quadrl.errors import QuadrlError"
+    code = "from quadrl.rotation import namespace; from quadrl.base.errors import QuadrlError"
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)

@@ -26,7 +26,7 @@ from quadrl.control import feasibility
 from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
 from quadrl.evaluation import card_figures
 from quadrl.evaluation.card import Card
-from quadrl.evaluation.check import OK
+from quadrl.evaluation.check import OK, angular_acceleration, height_to_turn_over
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.robustness import DISTURBANCES
 from quadrl.evaluation.rollout import BEHAVIOUR
@@ -422,7 +422,7 @@ def test_the_command_prints_rows_or_json(capsys):
 def test_the_height_to_turn_over_is_that_of_a_planar_flight(name, scale):
     vehicle, step = resolve(name), 1e-5
     least, most = (float(load[0]) for load in Reach(vehicle).loads(scale))
-    turning = feasibility.angular_acceleration(vehicle, scale)[:2].max()
+    turning = angular_acceleration(vehicle, scale)[:2].max()
     tilt, rate, height, speed = math.pi, 0.0, 0.0, 0.0
     while tilt > 1e-3 and rate <= 0:  # half round, braked from a quarter on
         rate += (-turning if tilt > math.pi / 2 else turning) * step
@@ -430,6 +430,6 @@ def test_the_height_to_turn_over_is_that_of_a_planar_flight(name, scale):
         speed += GRAVITY * ((least + most) / 2 * math.cos(tilt) - 1) * step
         height += speed * step
     lost = speed**2 / (2 * GRAVITY * (most - 1)) - height
-    found = feasibility.height_to_turn_over(vehicle, scale)
+    found = height_to_turn_over(vehicle, scale)
     assert found == pytest.approx(lost, rel=0.01)
-    assert feasibility.height_to_turn_over(vehicle, 0.0) == math.inf  # nothing but hover
+    assert height_to_turn_over(vehicle, 0.0) == math.inf  # nothing but hover

@@ -12,7 +12,8 @@ from quadrl.learning import executor
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import End, PlannedRun, train_all
 from quadrl.learning.folder import EVALUATION, write_config, write_json
-from quadrl.learning.study import interval, read_plan
+from quadrl.learning.plan import read_plan
+from quadrl.learning.study import interval
 
 STUDY = """
 tasks = ["hover", "landing"]

@@ -17,6 +17,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import dataclasses
 import functools
 import hashlib
 import os
@@ -57,6 +58,8 @@ PREBUILT = _FOLDER / "prebuilt"
 _SCRATCH = "quadrl-build-"
 _ALONE: dict[Path, contextlib.ExitStack] = {}
 """Libraries of this process alone that are not loaded yet, and what removes each."""
+_NOTED: list[list[str]] = []
+"""Of each `noted` that is entered, the sources."""
 
 
 def cache_folder() -> Path:
@@ -92,11 +95,27 @@ def compiler() -> str:
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """What libraries are compiled for."""
+
+    machine: str = platform.machine()
+    """The kind of machine, as `platform.machine` names it there."""
+    compiler: str = ""
+    """The command that compiles for it; empty for what `compiler` finds."""
+    folder: Path | None = None
+    """Where the libraries go, and nowhere else; None for the cache."""
+
+
+HERE = Target()
+
+
 def build(
     sources: Sequence[str] = SOURCES,
     name: str = "mujoco",
     generated: Mapping[str, str] | None = None,
     include: Path | None = None,
+    target: Target = HERE,
 ) -> Path:
     """Compile a library unless it is prebuilt or the cache holds it.
 
@@ -105,6 +124,7 @@ def build(
         name: Name of the library, with the version of mujoco behind it.
         generated: Headers that they include besides, by name.
         include: Folder with mujoco's headers; None for those of the installed package.
+        target: What it is compiled for.
 
     Returns:
         The path of the shared library.
@@ -113,7 +133,7 @@ def build(
         NativeError: There is no compiler, or it refused the sources.
     """
     include = include or Path(mujoco.__file__).parent / "include"
-    digest = hashlib.sha256(" ".join((*flags(), platform.machine())).encode())
+    digest = hashlib.sha256(" ".join((*flags(), target.machine)).encode())
     written = {"layout.h": c_structs() + c_rows() + c_weather()} | dict(generated or {})
     digest.update("".join(written.values()).encode())
     for file in (*HEADERS, *sources):
@@ -121,11 +141,15 @@ def build(
     digest.update((include / "mujoco" / "mujoco.h").read_bytes())
     whole = f"quadrl-{name}-{mujoco.__version__}-{digest.hexdigest()[:16]}"
     paths = [str(_FOLDER / source) for source in sources]
-    return _cached(whole, [f"-I{include}", *paths], written)
+    return _cached(whole, [f"-I{include}", *paths], written, target)
 
 
-def build_generated(source: str) -> Path:
+def build_generated(source: str, target: Target = HERE) -> Path:
     """Compile a library of C that was generated, unless it is prebuilt or the cache holds it.
+
+    Args:
+        source: The C.
+        target: What it is compiled for.
 
     Returns:
         Its path.
@@ -133,27 +157,46 @@ def build_generated(source: str) -> Path:
     Raises:
         NativeError: There is no compiler, or it refused the source.
     """
-    digest = hashlib.sha256(" ".join((*flags(), platform.machine(), source)).encode())
+    digest = hashlib.sha256(" ".join((*flags(), target.machine, source)).encode())
     name = digest.hexdigest()[:16]
-    return _cached(f"quadrl-generated-{name}", [], {f"{name}.c": source})
+    return _cached(f"quadrl-generated-{name}", [], {f"{name}.c": source}, target)
+
+
+def compile_generated(source: str) -> ctypes.CDLL:
+    """Open the library of C that was generated, as `build_generated` makes it, once."""
+    if _NOTED:
+        _NOTED[-1].append(source)
+        raise NativeError("the source is noted, not compiled")
+    return opened_generated(source)
 
 
 @functools.cache
-def compile_generated(source: str) -> ctypes.CDLL:
-    """Open the library of C that was generated, as `build_generated` makes it."""
+def opened_generated(source: str) -> ctypes.CDLL:
+    """The library that `compile_generated` opens."""
     return open_library(build_generated(source))
 
 
-def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
+@contextlib.contextmanager
+def noted() -> Generator[list[str]]:
+    """Note what `compile_generated` is asked for, and compile nothing."""
+    _NOTED.append([])
+    try:
+        yield _NOTED[-1]
+    finally:
+        _NOTED.pop()
+
+
+def _cached(name: str, arguments: list[str], written: dict[str, str], target: Target) -> Path:
     """A library, prebuilt or of the cache, compiled first where there is no sound one.
 
     Args:
         name: Name of its file, without digest and ending; another one for other contents.
         arguments: Further ones of the compiler.
         written: Files that are written first, by name: headers, and sources to compile.
+        target: What it is compiled for.
     """
-    folder = cache_folder()
-    for place in (PREBUILT, folder):
+    folder = target.folder or cache_folder()
+    for place in [folder] if target.folder else [PREBUILT, folder]:
         with contextlib.suppress(OSError):  # a folder that may not be looked into
             for path in place.glob(f"{name}-*.so"):
                 if path == _place(path, name):
@@ -168,8 +211,8 @@ def _cached(name: str, arguments: list[str], written: dict[str, str]) -> Path:
         for file, text in written.items():
             (scratch / file).write_text(text)
         sources = [f"{scratch}/{file}" for file in written if file.endswith(".c")]
-        command = [compiler(), *flags(), f"-I{scratch}", "-o", f"{scratch}/built.so"]
-        command += [*arguments, *sources, "-lm"]
+        command = [target.compiler or compiler(), *flags(), f"-I{scratch}"]
+        command += ["-o", f"{scratch}/built.so", *arguments, *sources, "-lm"]
         # What a compiler that is killed leaves behind goes with the rest.
         environment = os.environ | {"TMPDIR": str(scratch)}
         outcome = subprocess.run(command, capture_output=True, text=True, env=environment)

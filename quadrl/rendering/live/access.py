@@ -39,20 +39,20 @@ class Update(msgspec.Struct):
 # The messages of viser's that the page needs, by their names. Others let a client open a tunnel to
 # the internet, upload files, or have things kept for ever.
 class GuiUpdateMessage(msgspec.Struct, tag=True):
-    """A control was moved."""
+    """The message that a control was moved, with its new value."""
 
     uuid: str
     updates: Update
 
 
 class CommandTriggerMessage(msgspec.Struct, tag=True):
-    """A key was pressed."""
+    """The message that a key was pressed."""
 
     uuid: str
 
 
 class ViewerCameraMessage(msgspec.Struct, tag=True):
-    """A camera was moved; with the first one a client counts as connected."""
+    """The message that a camera was moved; with the first one a client counts as connected."""
 
     wxyz: tuple[Number, Number, Number, Number]
     position: Vector

@@ -1,0 +1,85 @@
+"""A process that carries out one training of a study.
+
+It reads its order, a line of JSON, from standard input, and ends as soon as standard input ends:
+whoever ordered it is gone. A run that is killed at any moment can be continued.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.signals import Stopped, heeded, unheeded
+from quadrl.core.rules import import_own
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.executor import POLL_SECONDS, PlannedRun
+from quadrl.learning.folder import CONFIG, EVALUATION, lock_folder
+
+LOCKED_SECONDS = 120.0
+"""For which a training waits until a lost one has left its folder, as a shared file system sees."""
+FAILED = 2
+"""Exit code of a process: the training ended with an error that the log tells."""
+
+
+def carry_out(what: dict[str, Any]) -> None:
+    """Begin or continue a training, evaluate it, draw its curve and its flights.
+
+    Raises:
+        QuadrlError: It cannot be trained, or other versions are installed here than where it was
+            ordered.
+    """
+    from quadrl.learning.run import train_in  # which takes seconds
+
+    for path in what["own"]:
+        import_own(Path(path))
+    config, folder = TrainConfig(**what["config"]), Path(what["folder"])
+    if (here := config.resolved()["versions"]) != what["versions"]:
+        name = next(name for name in here if here[name] != what["versions"].get(name))
+        allowed = f"{what['versions'].get(name)}, as where the study was started"
+        raise QuadrlError(name=f"version of {name}", value=here[name], allowed=allowed)
+    folder.mkdir(parents=True, exist_ok=True)
+    until = time.monotonic() + LOCKED_SECONDS
+    while True:  # a training that is lost may work here for a while
+        try:
+            lock_folder(folder)()
+            break
+        except QuadrlError:
+            if time.monotonic() > until:
+                raise
+        time.sleep(POLL_SECONDS)
+    if PlannedRun(config, folder).done:  # by the one that was lost
+        return
+    given: Any = {"resume": (folder / CONFIG).exists(), "episodes": what["episodes"]}
+    finished = train_in(folder, config, **given, show=lambda progress: None, heed=heeded)
+    for _ in finished.draw(video=False):
+        pass
+
+
+def main() -> None:
+    """Read the order and carry it out."""
+    what = json.loads(sys.stdin.buffer.readline())
+
+    def watch() -> None:
+        sys.stdin.buffer.raw.read()  # type: ignore[attr-defined] - returns once nobody can write
+        os._exit(FAILED)
+
+    threading.Thread(target=watch, daemon=True).start()
+    signal.signal(signal.SIGUSR1, unheeded)
+    try:
+        carry_out(what)
+    except (QuadrlError, OSError) as error:
+        sys.stdout.write(f"quadrl: {error}\n")
+        sys.exit(FAILED)
+    except Stopped as stop:  # its run can be continued, as that of a process that was killed
+        signal.signal(stop.number, signal.SIG_DFL)
+        signal.raise_signal(stop.number)
+    # What hangs at the end of the interpreter must not turn a finished training into a lost one.
+    sys.stdout.flush()
+    os._exit(0 if (Path(what["folder"]) / EVALUATION).exists() else FAILED)
