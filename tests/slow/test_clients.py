@@ -133,9 +133,10 @@ def test_torchrl_learns_as_in_its_tutorial(make):
     collector.shutdown()
 
 
-@pytest.mark.parametrize("example", ["sb3_ppo", "cleanrl_ppo", "torchrl_ppo"])
+@pytest.mark.parametrize("example", ["sb3_ppo", "cleanrl_ppo", "torchrl_ppo", "learning_curve"])
 def test_an_example_trains(example):
     command = [sys.executable, EXAMPLES / f"{example}.py", "--total-steps", "4096"]
+    command += ["--algo", "sac"] if example == "learning_curve" else []
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert '"successful"' in done.stdout or '"success' in done.stdout

@@ -19,7 +19,7 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
-from scripts.reports import measure, pages, report, robustness, task_pages
+from scripts.reports import learning, measure, pages, report, robustness, task_pages
 
 
 @pytest.fixture(autouse=True)
@@ -222,3 +222,34 @@ def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch, capsys):
     assert told.count(f"misses what its task asks: seed {seed}") == 1
     assert f"successful, {asked.words} " in told
     assert not list((tmp_path / "out").iterdir())
+
+
+def test_who_is_ahead_is_said_where_it_is_no_chance():
+    # Of 1,000 flights shares of a half have a standard error of 0.022 between two of them.
+    for figures, found in (
+        (("success_rate", 1000, 0.52, 0.48), "level"),
+        (("success_rate", 1000, 0.53, 0.48), "policy"),
+        (("success_rate", 1000, 0.0, 0.01), "controller"),
+        (("settled_m", 1000, 0.02, 0.019), "level"),
+        (("settled_m", 1000, 0.02, 0.01), "controller"),
+        (("settled_m", 1000, None, 0.01), "controller"),  # all its flights fall
+    ):
+        assert learning.ahead(*figures) == found
+    robust = [
+        {"task": "hover", "seed": seed, "condition": name, "success": share, "position_error_m": 1}
+        for name in learning.UNSURE
+        for seed, share in (("640", 0.75), ("641", 0.25), ("controller", 0.25))
+    ]
+    both = {"robust policy": 1.0, "tuned controller": 0.0}
+    windy = {"task": "hover", "condition": "weather light"} | both
+    laps = [
+        {"race": "one lap", "success_rate": share, "race_time_mean_s": time}
+        for share, time in ((0.8, 5.0), (1.0, 20.0))
+    ]
+    report.save("robust", {"episodes": 1000, "rows": robust})
+    report.save("robustness", {"episodes": 100, "alone": [windy]})
+    report.save("wins", {"episodes": 100, "rows": []})
+    report.save("race", {"episodes": 300, "rows": laps})
+    lines = learning.wins_table().splitlines()
+    assert "| nothing | success_rate | 50 % | 25 % | policy | `scripts/report robust` |" in lines
+    assert "| one lap | success_rate | 80 % | 100 % | controller | `scripts/report race` |" in lines
