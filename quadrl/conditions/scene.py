@@ -193,9 +193,9 @@ class Scene:
                     name=f"{solid.name}_{k}", type=part.kind, size=part.size, pos=position,
                     quat=quaternion, rgba=solid.rgba, contype=1, conaffinity=0, group=HIDDEN,
                 )  # fmt: skip
-                geom.userdata = [MARK, index]
+                geom.userdata = [MARK, index, *part.offset]
         if self.solids:
-            spec.nuser_geom = 2
+            spec.nuser_geom = 5
 
     def check(self, engine: Engine) -> None:
         """Refuse an engine, made already, whose world has other solids.
@@ -220,9 +220,12 @@ class Scene:
         """
         if unknown := set(placed) - set(self.names):
             raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(self.names))
-        made: list[Array] = []
-        for solid in self.solids:
-            pose = placed.get(solid.name) or Pose(np.tile(solid.position, (count, 1)))
+        centres, offsets = self._declared
+        made = np.zeros((count, len(centres), 7))
+        made[..., :3], made[..., 3] = centres + origin + offsets, 1.0
+        for solid, first in zip(self.solids, self._first, strict=False):
+            if (pose := placed.get(solid.name)) is None:
+                continue
             turn = pose.quaternion
             turn = heading(np.zeros(count)) if turn is None else np.asarray(turn, dtype=float)
             position = np.asarray(pose.position, dtype=float)
@@ -231,11 +234,22 @@ class Scene:
                     allowed = f"finite arrays, position ({count}, 3) and quaternion ({count}, 4)"
                     raise QuadrlError(name=f"pose of {solid.name}", value=array, allowed=allowed)
             turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
-            for part in solid.parts:
+            for k, part in enumerate(solid.parts, first):
                 offset = np.broadcast_to(part.offset, (count, 3)).copy()
-                moved = position + origin + _rotated(turn, offset)
-                made.append(np.concatenate([moved, turn], axis=-1))
-        return np.stack(made, axis=1) if made else np.zeros((count, 0, 7))
+                made[:, k, :3] = position + origin + _rotated(turn, offset)
+                made[:, k, 3:] = turn
+        return made
+
+    @functools.cached_property
+    def _first(self) -> list[int]:
+        """Number of the first geom of each solid, and of all."""
+        return np.cumsum([0, *(len(solid.parts) for solid in self.solids)]).tolist()
+
+    @functools.cached_property
+    def _declared(self) -> np.ndarray:
+        """Centres (K, 3) of the geoms' solids, task frame, and the ways from there [m]."""
+        parts = [(solid.position, part.offset) for solid in self.solids for part in solid.parts]
+        return np.array(parts, dtype=float).reshape(-1, 2, 3).swapaxes(0, 1)
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -262,19 +276,16 @@ class Scene:
         return tuple(shown)
 
     def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
-        """The present surroundings of some aircraft (n,) of an engine, or of all; copies."""
-        chosen = np.arange(engine.num_envs) if rows is None else rows
-        table, (which, speed) = engine.solids.table[chosen], engine.hits[chosen].T
-        first = np.cumsum([0, *(len(solid.parts) for solid in self.solids)])
-        centres = [
-            part["position"] - part["turn"].reshape(-1, 3, 3) @ np.asarray(solid.parts[0].offset)
-            for solid, part in zip(self.solids, table.T[first[:-1]], strict=True)
-        ]
-        position = np.stack(centres, axis=1) - engine.origin
+        """The present surroundings of some aircraft (n,) of an engine, or of all.
+
+        They are copies, but for the positions of all: those are live, since they change with an
+        episode and not with a step.
+        """
+        chosen = slice(None) if rows is None else rows
+        which, speed = engine.hits[chosen].T
         touched = which[:, None] == 1 + np.arange(len(self.solids))
-        return Surroundings(
-            self.names, position, engine.clearance[chosen].copy(), touched, speed.copy()
-        )
+        clear, centres = engine.clearance(rows), engine.solids.centres[chosen]
+        return Surroundings(self.names, centres, clear, touched, speed.copy())
 
 
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -79,8 +79,7 @@ class _Page:
         table = whole[:, : step.count]
         self.address = native.address(whole)
         sensed = np.empty((step.sensed.end + 1, step.columns))  # at least a row has an address
-        self.sensed_address = native.address(sensed)
-        self.sensed, self.around = step.given(step.sensed.views(sensed[:, : step.count]))
+        self.sensed_address, self.sensed = native.address(sensed), sensed[:, : step.count]
         self.kept = step.kept.views(table)
         parts = iter(self.kept)
         self.now, self.episode = (records.filled(like, parts) for like in (now, episode))
@@ -147,6 +146,12 @@ class CompiledStep(Step):
             raise NotCompilable(str(error).partition("\n")[0]) from error
         self._call.argtypes, self._call.restype = [ctypes.c_void_p, ctypes.c_int64], None
         self._constants = np.array([*trace.constants, 0.0])
+        # Of a hundred solids a task may look at one.
+        self._wanted = [
+            (places[0], np.array([k for k in places if f"sensed[{k} * columns" in body], int))
+            for numbers in self.sensed.views(np.arange(self.sensed.end)[:, None])
+            for places in [numbers.ravel().tolist()]
+        ]
         inputs = (getattr(self._inputs, f.name) for f in dataclasses.fields(self._inputs))
         self._arguments = Rows(
             *(array.ctypes.data for array in (self._constants, parameters, *inputs)),
@@ -245,15 +250,8 @@ class CompiledStep(Step):
         rows.state, rows.last_state = now.address, before.address
         around = self.scene.surroundings(self._engine) if self.scene.solids else None
         # A reset since the last step has given its rows what the sensors show then.
-        for given, solids, own in (
-            (self.snapshot.sensed, self.snapshot.around, last),
-            (sensed, around, page),
-        ):
-            for name, array in own.sensed.items():
-                array[:] = given[name]
-            if own.around:
-                for into, array in zip(*map(records.leaves, (own.around, solids)), strict=True):
-                    into[:] = array
+        self._take(self.snapshot.sensed, self.snapshot.around, last)
+        self._take(sensed, around, page)
         rows.sensed, rows.last_sensed = page.sensed_address, last.sensed_address
         rest, count = np.empty((self.flags + 1, self.columns)), self.count
         rows.was, rows.out, rows.rest = last.address, page.address, native.address(rest)
@@ -274,6 +272,15 @@ class CompiledStep(Step):
             error=error,
             truth=page.truth or self._observation,
         )
+
+    def _take(
+        self, sensed: Mapping[str, np.ndarray], around: Surroundings | None, page: _Page
+    ) -> None:
+        """Write what the compiled step reads of sensors and solids into its table."""
+        given = [sensed[name] for name in self._shown] + (records.leaves(around) if around else [])
+        for array, (first, places) in zip(given, self._wanted, strict=True):
+            if places.size:
+                page.sensed[places] = array.reshape(self.count, -1)[:, places - first].T
 
     def _show(
         self, page: _Page, sensed: Mapping[str, np.ndarray], around: Surroundings | None

@@ -229,7 +229,7 @@ class Engine(abc.ABC):
         if table is not None:
             self.write_parameters(rows, table)
         if solids is not None:
-            self.solids.place(rows, solids, self._model_field)
+            self.solids.place(rows, solids, self.origin, self._model_field)
         self.clear(rows)
         self._write(rows, start)
         self._fill(rows)
@@ -267,7 +267,8 @@ class Engine(abc.ABC):
         if not np.array_equal(table, self.parameters):
             self.write_parameters(np.arange(len(table)), table)
         if "solids" in saved:
-            self.solids.place(np.arange(self.num_envs), saved["solids"], self._model_field)
+            rows = np.arange(self.num_envs)
+            self.solids.place(rows, saved["solids"], self.origin, self._model_field)
         self._fill(None)
 
     def _saved(self, rows: np.ndarray) -> dict[str, np.ndarray]:
@@ -280,10 +281,9 @@ class Engine(abc.ABC):
         """Whether there are solids in the world."""
         return bool(len(self.solids.geoms))
 
-    @property
-    def clearance(self) -> np.ndarray:
-        """Lower bound of each aircraft's distance to a solid, (N,) [m]; infinite without solids."""
-        return self.solids.clearance(self.qpos, self.parameters, self.vehicle.rotor_count)
+    def clearance(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """Lower bound of aircraft's distance to a solid, (n,) [m]; infinite without solids."""
+        return self.solids.clearance(self.qpos, self.parameters, self.vehicle.rotor_count, rows)
 
     def _write(self, rows: np.ndarray, start: Start | State) -> None:
         self.qpos[rows] = np.concatenate([start.position + self.origin, start.quaternion], axis=-1)

@@ -45,26 +45,37 @@ class Solids:
             count: Number of aircraft, N.
         """
         self.geoms = geoms_of_solids(model)
+        _, which, *offset = model.geom_user[self.geoms].T[:5] if len(self.geoms) else [[]] * 5
+        self._first = np.unique(which, return_index=True)[1]  # geom of each solid
+        self._offsets = np.transpose(offset)[self._first]
+        self.centres = np.zeros((count, len(self._first), 3))
+        """Of the S solids, (N, S, 3) [m], task frame, live."""
         self.table = np.zeros((count, len(self.geoms)), dtype=SOLID)
         self.table["kind"] = model.geom_type[self.geoms]
         self.table["size"] = model.geom_size[self.geoms]
         self.table["turn"] = np.eye(3).reshape(-1)
-        self._clearance = np.full(count, np.inf)
 
     def place(
-        self, rows: np.ndarray, poses: np.ndarray, field: Callable[[str], np.ndarray]
+        self,
+        rows: np.ndarray,
+        poses: np.ndarray,
+        origin: np.ndarray,
+        field: Callable[[str], np.ndarray],
     ) -> None:
         """Put the solids of some rows (n,) somewhere.
 
         Args:
             rows: Which.
             poses: (n, K, 7) position [m], world frame, and quaternion (w, x, y, z).
+            origin: (3,) of the task frame [m], world frame.
             field: Gives a field of the model with a leading axis N, live.
         """
         position, quaternion = poses[..., :3], poses[..., 3:]
         turn = rotation_matrix(quaternion)
         self.table["position"][rows] = position
         self.table["turn"][rows] = turn.reshape(*turn.shape[:-2], 9)
+        offset = turn[:, self._first] @ self._offsets[..., None]
+        self.centres[rows] = position[:, self._first] - offset[..., 0] - origin
         field("geom_pos")[np.ix_(rows, self.geoms)] = position
         field("geom_quat")[np.ix_(rows, self.geoms)] = quaternion
 
@@ -73,22 +84,29 @@ class Solids:
         parts = (field(name)[:, self.geoms] for name in ("geom_pos", "geom_quat"))
         return np.ascontiguousarray(np.concatenate(list(parts), axis=-1))
 
-    def clearance(self, qpos: np.ndarray, parameters: np.ndarray, rotors: int) -> np.ndarray:
-        """Lower bound of each aircraft's distance to the nearest solid, (N,) [m].
+    def clearance(
+        self, qpos: np.ndarray, parameters: np.ndarray, rotors: int, rows: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Lower bound of each aircraft's distance to the nearest solid, (n,) [m].
 
         Args:
             qpos: (N, 7), live.
             parameters: Rows (N,), or (1,) for all.
             rotors: How many each has.
+            rows: Of which aircraft; by default of all.
         """
+        table = self.table
+        if rows is not None:
+            qpos, table = qpos[rows], table[rows]
+            parameters = parameters[rows] if len(parameters) > 1 else parameters
+        out = np.full(len(qpos), np.inf)
         if len(self.geoms):
             row = parameters.strides[0] // 8 if len(parameters) > 1 else 0
-            arrays = (qpos, parameters, self.table)
+            arrays = (qpos, parameters, table)
             # As `Rows` in native/solids.c.
             where = np.array(
                 [*(array.ctypes.data for array in arrays), qpos.strides[0] // 8, row,
                  len(self.geoms), rotors]
             )  # fmt: skip
-            out = self._clearance
             native.library().quadrl_clearance(where.ctypes.data, len(qpos), out.ctypes.data)
-        return self._clearance
+        return out

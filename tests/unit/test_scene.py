@@ -59,7 +59,7 @@ def test_clearance_is_the_distance_that_mujoco_measures(solid):
     turn /= np.linalg.norm(turn, axis=1)[:, None]
     poses = {solid.name: Pose(rng.uniform(-4, 4, (count, 3)), turn)}
     engine, *_ = flown(scene, poses, np.zeros((count, 3)), steps=0)
-    found = engine.clearance
+    found = engine.clearance()
     spec = mujoco.MjSpec()
     scene.add_to(spec)
     centres = [np.zeros(3)] + [
@@ -158,7 +158,7 @@ def test_what_was_saved_stands_again():
                 made.advance(10)
                 made.read()
         np.testing.assert_array_equal(one.qpos, other.qpos)
-        np.testing.assert_array_equal(one.clearance, other.clearance)
+        np.testing.assert_array_equal(one.clearance(), other.clearance())
 
 
 @pytest.mark.parametrize(

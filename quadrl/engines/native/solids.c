@@ -26,9 +26,9 @@ QUADRL_EXPORT void quadrl_clearance(const Rows* rows, int64_t n, double* out) {
     const double r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
                          2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                          2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
-    double least = HUGE_VAL;
+    double points[MAX_ROTORS + 1][3], radii[MAX_ROTORS + 1], reach = 0, least = HUGE_VAL;
     for (int k = -1; k < rows->rotors; ++k) {
-      double centre[3] = {0}, radius = 0, point[3];
+      double centre[3] = {0}, radius = 0, out = 0;
       if (k < 0) {
         for (int j = 0; j < 3; ++j) radius = a->hull[j][0] > radius ? a->hull[j][0] : radius;
       } else {
@@ -39,10 +39,19 @@ QUADRL_EXPORT void quadrl_clearance(const Rows* rows, int64_t n, double* out) {
         }
       }
       for (int j = 0; j < 3; ++j) {
-        point[j] = p[j] + r[3 * j] * centre[0] + r[3 * j + 1] * centre[1] + r[3 * j + 2] * centre[2];
+        points[k + 1][j] =
+            p[j] + r[3 * j] * centre[0] + r[3 * j + 1] * centre[1] + r[3 * j + 2] * centre[2];
+        out += centre[j] * centre[j];
       }
-      for (int64_t s = 0; s < rows->count; ++s) {
-        const double free = solid_distance(rows->solids + i * rows->count + s, point) - radius;
+      radii[k + 1] = radius;
+      reach = sqrt(out) + radius > reach ? sqrt(out) + radius : reach;
+    }
+    for (int64_t s = 0; s < rows->count; ++s) {
+      const Solid* solid = rows->solids + i * rows->count + s;
+      // No part of the aircraft is nearer to it than this, which spares most solids a closer look.
+      if (solid_distance(solid, p) - reach > least) continue;
+      for (int k = 0; k <= rows->rotors; ++k) {
+        const double free = solid_distance(solid, points[k]) - radii[k];
         least = free < least ? free : least;
       }
     }
