@@ -29,6 +29,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.machine import cores, machine
 from quadrl.conditions.randomization import FACTORS, RANDOMIZATIONS, Randomization
 from quadrl.conditions.sampler import AircraftSampler
+from quadrl.conditions.scene import Cylinder
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
@@ -46,6 +47,7 @@ FULL = RANDOMIZATIONS["full"]
 DIFFERENT = Randomization(**{name: getattr(FULL, name) for name in (*FACTORS, "rotors")})
 """Aircraft that differ, and nothing else."""
 FREE_FLIGHT_ENVS = 4096
+POSTS = 100
 FREE_FLIGHT = "free flight"  # Environment of FREE_FLIGHT_ENVS
 KERNEL = "kernel"  # free flight of FREE_FLIGHT_ENVS on one core and nothing else
 
@@ -151,6 +153,9 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
         Layer("the same, all that is drawn", FREE_FLIGHT, flying(randomization=FULL)),
         Layer("the same by velocities, flown by loops", FREE_FLIGHT,
               flying(control_mode="velocity"), 1 / 3),
+        Layer(f"the same among {POSTS} posts", FREE_FLIGHT,
+              _environment(_among_posts(task), num_envs=FREE_FLIGHT_ENVS, engine="free_flight"),
+              0.80),
         Layer(f"Gymnasium make_vec of {size}", ALL_CORES, _vectors(vectors)),
     ]  # fmt: skip
     if importlib.util.find_spec("torchrl"):
@@ -258,6 +263,16 @@ def _environment(task: Task, **settings: Any) -> Work:
         if over.any():
             observation[over] = environment.flatten(environment.reset(over))
         yield num_envs
+
+
+def _among_posts(task: Task) -> Task:
+    """The task in a world with posts, none of them near enough to be hit."""
+    places = np.random.default_rng(0).uniform(8, 30, (POSTS, 2)) * (-1, 1)
+    posts = [
+        Cylinder(f"post_{k}", height=8.0, position=(x, y, 4.0)) for k, (x, y) in enumerate(places)
+    ]
+    own = {"name": f"{task.name}_among_posts", "solids": lambda _: posts}
+    return type("AmongPosts", (type(task),), own)()
 
 
 def _vectors(envs: Any) -> Work:
