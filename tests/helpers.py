@@ -191,8 +191,6 @@ ROUTE = ((0.0, 0.0, -0.05), (0.0, 0.0, -1.0))
 SHORT = {name: tasks.make(name, time_limit=0.6) for name in tasks.TASKS}
 SHORT["a short route"] = tasks.make("static_waypoint", time_limit=0.6, waypoints=ROUTE, reach=0.04)
 SHORT["a low landing"] = tasks.make("landing", time_limit=0.6, start_height=0.05)
-SHORT_CASES = [(name, "mujoco") for name in SHORT]
-SHORT_CASES += [(name, "free_flight") for name in ("hover", "a low landing")]
 
 
 def begun(task="hover", num_envs=1, seed=0, **settings):

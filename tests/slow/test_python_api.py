@@ -85,21 +85,6 @@ def test_an_evaluation_has_the_task_and_the_vehicle_of_the_training(run):
     assert quadrl.evaluate(run, "static_waypoint", episodes=1).task.time_limit == 10.0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [
-        (dict(controller=3), "controller"),
-        (dict(controller=lambda seen: seen), "task"),
-        (dict(controller="hover", episodes=0), "episodes"),
-        (dict(controller="hover", seed=-1), "seed"),
-        (dict(controller="hover", vehicle="brick"), "vehicle"),
-    ],
-)
-def test_evaluations_that_cannot_be(arguments, name):
-    with refused(name):
-        quadrl.evaluate(**arguments)
-
-
 @pytest.mark.parametrize(("kind", "begins"), [("mp4", b"ftyp"), ("gif", b"GIF8"), ("png", b"PNG")])
 def test_render(run, tmp_path, kind, begins):
     video = quadrl.render(run, kind=kind, **SMALL)

@@ -22,7 +22,6 @@ from quadrl.aircraft.parameters import WIND, Parameters, rows
 from quadrl.aircraft.presets import VEHICLES, at_air_density, in_real_air, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.core.environment import Environment
 from quadrl.engines import dynamics, mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 
@@ -596,25 +595,6 @@ def test_the_ground_is_nearer_for_rotors_that_can_lift_more():
         assert near is not None and (np.diff(near) == 1).all()  # the lowest
         marked.append(len(near))
     assert marked[0] < marked[1] < marked[2]
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_saved_flight_in_real_air_goes_on_bit_for_bit(engine):
-    settings = {"num_envs": 3, "vehicle": in_real_air(PAPER), "engine": engine}
-    flying, other = (Environment("landing", seed=seed, **settings) for seed in (1, 9))
-    for environment in (flying, other):
-        environment.reset()
-    actions = helpers.random_actions(16, 3)
-    for action in actions[:8]:
-        flying.step(action)
-    flying.engine.air[:] = np.random.default_rng(0).normal(size=flying.engine.air.shape)
-    other.restore(flying.save())
-    ends = []
-    for environment in (flying, other):
-        for action in actions[8:]:
-            environment.step(action)
-        ends.append(helpers.coordinates(environment.engine))
-    np.testing.assert_array_equal(*ends)
 
 
 @pytest.mark.parametrize("engine", ENGINES)

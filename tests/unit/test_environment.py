@@ -23,21 +23,6 @@ def held(environment, positions):
 # ------------------------------------------------------------------- one definition of the numbers
 
 
-@pytest.mark.parametrize(("name", "engine"), helpers.SHORT_CASES)
-def test_row_i_is_the_single_environment_seeded_with_seed_plus_i(name, engine):
-    actions = helpers.random_actions(40, 5)
-    batch = begun(helpers.SHORT[name], 5, seed=40, engine=engine)
-    first = helpers.observed(batch)
-    records = helpers.fly(batch, actions)
-    ends = np.array([r["terminated"] | r["truncated"] for r in records])
-    assert (ends.sum(0) >= 3).all()
-    for i in (0, 1, 4):  # the first, the one that dives, the last
-        single = begun(helpers.SHORT[name], seed=40 + i, engine=engine, num_threads=1)
-        for key, value in helpers.observed(single).items():
-            np.testing.assert_array_equal(value[0], first[key][i], err_msg=key)
-        helpers.assert_records(helpers.fly(single, actions[:, i : i + 1]), records, [i])
-
-
 def test_seeding_again_gives_the_same_episodes_and_another_seed_others():
     actions = helpers.random_actions(10, 2)
     environment = begun(num_envs=2, seed=5)
@@ -159,16 +144,6 @@ def test_truncated_at_exactly_the_time_limit(time_limit, steps):
         now = idle(environment)
         assert not now.terminated[0] and now.truncated[0] == (k == steps)
     assert environment.snapshot.time[0] == pytest.approx(steps * 0.05)
-
-
-def test_a_crash_on_the_last_step_is_a_crash():
-    # From 2.95 m east at 3 m/s: 3 m are past on the first step, which is also the last.
-    position, velocity = [(0, 0, 0), (2.95, 0, 0)], [(0, 0, 0), (3, 0, 0)]
-    options = {"time_limit": 0.05}
-    now = idle(helpers.placed(count=2, position=position, velocity=velocity, options=options))
-    np.testing.assert_array_equal(now.terminated, [False, True])
-    np.testing.assert_array_equal(now.truncated, [True, False])
-    assert not (now.is_success & now.terminated).any()
 
 
 def test_what_ends_a_hover_early():

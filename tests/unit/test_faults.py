@@ -119,30 +119,6 @@ def test_whoever_flies_faster_than_the_step_resolves_has_diverged():
 # ----------------------------------------------------------------------------------------- saving
 
 
-@pytest.mark.parametrize(("name", "engine"), helpers.SHORT_CASES)
-def test_a_restored_environment_continues_bit_by_bit(name, engine, tmp_path):
-    # Of contacts, the solver's warm start is part of what is saved.
-    task, actions = helpers.SHORT[name], helpers.random_actions(30, 4)
-    environment = begun(task, 4, seed=3, engine=engine)
-    helpers.fly(environment, actions[:11])
-    np.savez(tmp_path / "saved.npz", **environment.save())
-    seen = helpers.observed(environment)
-    expected = helpers.fly(environment, actions[11:])  # with resets, so that the streams matter
-    with np.load(tmp_path / "saved.npz") as file:
-        saved = dict(file)
-    kept = {name: value.copy() for name, value in saved.items()}
-    other = begun(task, 4, seed=77, engine=engine)
-    helpers.fly(other, actions[:5])
-    fresh = Environment(task, num_envs=4, seed=78, engine=engine)  # never reset
-    for restored in (other, fresh, environment):
-        observation = restored.restore(saved)
-        for part, value in seen.items():
-            np.testing.assert_array_equal(observation[part], value, err_msg=part)
-        helpers.assert_records(helpers.fly(restored, actions[11:]), expected)
-    for name, value in kept.items():  # what is saved does not change any more
-        np.testing.assert_array_equal(saved[name], value, err_msg=name)
-
-
 def test_a_saved_environment_of_another_shape_is_refused():
     environment = begun(num_envs=2)
     kept = environment.save()
@@ -161,27 +137,6 @@ def test_a_saved_environment_of_another_shape_is_refused():
 
 
 # --------------------------------------------------------------------------------- what is refused
-
-
-@pytest.mark.parametrize("shape", [(4,), (2, 4), (3, 5), (4, 3), (), (3, 4, 1)])
-def test_an_action_of_the_wrong_shape_is_refused(shape):
-    with pytest.raises(QuadrlError) as caught:
-        begun(num_envs=3).step(np.zeros(shape))
-    error = caught.value
-    assert (error.name, error.value, error.allowed) == ("action shape", shape, "(3, 4)")
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_an_action_that_is_not_finite_is_refused_by_name(value):
-    environment, action = begun(num_envs=5), np.zeros((5, 4))
-    before = helpers.coordinates(environment.engine)
-    action[3, 2] = value
-    with pytest.raises(QuadrlError) as caught:
-        environment.step(action)
-    assert caught.value.name == "action[3, 2]"
-    np.testing.assert_array_equal(caught.value.value, value)
-    np.testing.assert_array_equal(helpers.coordinates(environment.engine), before)
-    assert environment.snapshot.time[3] == 0
 
 
 NUMBERS = [0, -1, 10**9, 1.5, MAX_ENVS + 1, "4", True, None]

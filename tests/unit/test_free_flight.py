@@ -241,10 +241,3 @@ def test_a_task_that_builds_a_wall_is_refused_in_free_flight_and_flown_in_mujoco
     with pytest.raises(QuadrlError) as caught:
         Environment(Touching(), engine="free_flight")
     assert caught.value.name == "engine"
-
-
-def test_an_unknown_engine_lists_the_choices():
-    with pytest.raises(QuadrlError) as caught:
-        Environment("hover", engine="warp")  # pyright: ignore
-    assert caught.value.name == "engine" and caught.value.value == "warp"
-    assert "mujoco, free_flight" in caught.value.allowed

@@ -172,15 +172,6 @@ def test_vehicle_task_options_randomization_and_the_time_limit_arrive(make):
     assert [np.all(step[4]["is_success"]) for step in flown] == [False, False, True]
 
 
-def test_the_crazyflie_and_a_hexacopter_have_spaces_of_their_own():
-    for name, rotors in (("crazyflie", 4), ("hexa", 6)):
-        environment = gym.make(HOVER, vehicle=name)
-        assert environment.action_space.shape == (rotors,)
-        assert environment.observation_space.shape == (18 + rotors,)
-        environment.reset(seed=0)
-        assert environment.step(np.zeros(rotors))[4]["error"] < 1.0
-
-
 @pytest.mark.parametrize(
     ("kind", "name", "value"),
     [

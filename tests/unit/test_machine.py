@@ -15,6 +15,10 @@ from quadrl.tasks.hover import Hover
 GIB = 1 << 30
 LARGE = {
     "long histories": {"num_envs": 1 << 20, "observe": {"observation_history": 1000}},
+    "a sensor's long history": {
+        "num_envs": 1 << 20,
+        "observe": {"sensors": {"observation_history": {"length": 1000}}},
+    },
     "long delays": {
         "num_envs": 1 << 20,
         "randomization": {"observation_delay": (0, 10.0), "command_delay": (0, 10.0)},

@@ -66,14 +66,6 @@ def test_free_fall_without_drag_is_minus_g(engine):
     np.testing.assert_allclose(falling.qpos[0, :3], [0, 0, 95.095], atol=1e-10)
 
 
-@both
-def test_four_rotors_at_hover_speed_carry_the_weight(engine):
-    hovering = aircraft(engine, speed=HOVER)
-    hovering.advance(1000)  # 10 s
-    np.testing.assert_allclose(hovering.qpos, [[0, 0, 100, *UPRIGHT]], atol=1e-9)
-    np.testing.assert_allclose(hovering.qvel, 0, atol=1e-10)
-
-
 # Rotors that lean push it sideways, and in air that turns it.
 HOVERING = {n: v for n, v in (helpers.LAYOUTS | helpers.IN_AIR).items() if n != "leaning in air"}
 

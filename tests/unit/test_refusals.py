@@ -1,6 +1,5 @@
 """What is refused has changed nothing: resets, air that is not finite, counters that cannot be."""
 
-import gymnasium as gym
 import helpers
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import quadrl  # noqa: F401 - registers the ids
 from quadrl.base.philox import MAX_SEED
 from quadrl.core.environment import Environment
 from quadrl.engines.air import ROWS as WEATHER_ROWS
-from quadrl.envs.gymnasium import QuadrotorVectorEnv
 
 ROWS, ROW_OF_STEPS = 9, WEATHER_ROWS.index("steps")
 ACTIONS = 0.3 * helpers.random_actions(12, ROWS)
@@ -51,17 +49,6 @@ def test_a_refused_reset_changes_nothing(setting, engine):
     helpers.assert_records(*flown)
     for got, expected in zip(environment.reset().values(), other.reset().values(), strict=True):
         np.testing.assert_array_equal(got, expected)
-
-
-def test_a_refused_reset_of_gymnasium_leaves_the_seed():
-    single = [gym.make("quadrl/Hover-v0") for _ in range(2)]
-    vector = [QuadrotorVectorEnv("hover", 3) for _ in range(2)]
-    for one, other in (single, vector):
-        for each in (one, other):
-            each.reset(seed=1)
-        with refused("velocity at the start"):
-            one.reset(seed=2, options=STARTS["velocity"])
-        np.testing.assert_array_equal(one.reset()[0], other.reset()[0])
 
 
 @pytest.mark.parametrize("settings", [{}, {"randomization": "full", "weather": "light"}])

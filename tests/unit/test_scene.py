@@ -144,23 +144,6 @@ def test_a_gate_is_open_in_its_middle_and_turns_with_its_pose():
     np.testing.assert_allclose(bars[0, 2, :3], ahead[0] + turned[0], atol=1e-12)
 
 
-def test_what_was_saved_stands_again():
-    scene, velocity = Scene([Sphere("ball", radius=0.3)]), np.array([[3.0, 0, 0]] * 2)
-    poses = {"ball": Pose(np.array([[1.0, 0, 0], [0, 1.2, 0]]))}
-    for engine in ("mujoco", "free_flight"):
-        one, *_ = flown(scene, poses, velocity, steps=1, engine=engine)
-        away = {"ball": Pose(np.full((2, 3), 9.0))}
-        other, *_ = flown(scene, away, velocity, steps=1, engine=engine)
-        other.restore(one.save())
-        for made in (one, other):
-            made.ctrl[:] = PAPER.hover_speed
-            for _ in range(6):
-                made.advance(10)
-                made.read()
-        np.testing.assert_array_equal(one.qpos, other.qpos)
-        np.testing.assert_array_equal(one.clearance(), other.clearance())
-
-
 @pytest.mark.parametrize(
     ("make_it", "name"),
     [

@@ -210,22 +210,6 @@ def test_row_i_senses_what_the_single_aircraft_of_seed_plus_i_does(randomization
     np.testing.assert_array_equal(alone[-1]["compass"], whole[-1]["compass"])
 
 
-def test_a_copy_goes_on_bit_for_bit():
-    environment = helpers.begun("hover", 3, observe=WILD, weather="light")
-    for action in ACTIONS[:5]:
-        environment.step(action)
-    environment.reset(np.array([2]))
-    other = copy.deepcopy(environment)
-    restored = helpers.begun("hover", 3, observe=WILD, weather="light")
-    restored.restore(environment.save())
-    for action in ACTIONS[5:]:
-        expected = environment.flatten(environment.step(action).observation)
-        for one in (other, restored):
-            np.testing.assert_array_equal(one.flatten(one.step(action).observation), expected)
-            for name, sensed in environment.snapshot.sensed.items():
-                np.testing.assert_array_equal(one.snapshot.sensed[name], sensed)
-
-
 @pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
 def test_every_api_shows_a_sensor_of_ones_own(api):
     observe = {"sensors": {"compass": {"strength": 2.0}}}
