@@ -13,6 +13,9 @@ export class Episode {
     this.flight = new Flight(kernel, slot, task, aircraft);
     if (controller?.scale) this.flight.scale[0] = controller.scale;
     this.flight.estimates = controller?.observe.rotor_speed === "estimated";
+    const { smoothing = kernel.book.smoothing } = controller?.observe.sensors.disturbance ?? {};
+    const { controlTimestep } = this.flight.vehicle;
+    this.flight.share[0] = smoothing ? 1 - Math.exp(-controlTimestep / smoothing) : 1;
     this.flight.begin(seed);
     Object.assign(this, { controller, events });
     this.past = []; // what was seen and done before, the newest first

@@ -47,7 +47,7 @@ export class Flight {
     this.memory = kernel.functions.flight_memory(slot);
     new Float64Array(kernel.functions.memory.buffer, this.memory, book.flightSize).fill(0);
     const motion = ["qpos", "qvel", "act", "ctrl", "wind"];
-    const seen = ["observation", "felt", "modelled", "aim"];
+    const seen = ["observation", "felt", "share", "modelled", "aim"];
     for (const part of [...motion, ...seen, "action", "scale", "given", "drawn"]) {
       this[part] = kernel.view(slot, part);
     }
@@ -144,10 +144,12 @@ export class Flight {
   }
 
   // What is measured: what the task shows, and what else the options of an observation ask for.
-  seen({ disturbance = false, sensors: { aim } = {} } = {}) {
+  seen({ disturbance = false, sensors = {} } = {}) {
     const { observation, pair } = this;
+    const { aim } = sensors;
+    const felt = disturbance || "disturbance" in sensors;
     const own = aim ? pair.besideAim.map((k) => observation[k]) : observation.subarray(0, pair.size);
-    return [...own, ...(disturbance ? this.felt : []), ...(aim ? this.aim : [])];
+    return [...own, ...(felt ? this.felt : []), ...(aim ? this.aim : [])];
   }
 
   get error() { return this.given[0]; } // [m]

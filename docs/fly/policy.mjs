@@ -35,14 +35,20 @@ function readArrays({ entries, data }) {
 // Options of the observation that this page knows, by their names in quadrl/conditions/observing.py.
 const KNOWN = { disturbance: false, action_history: 0, observation_history: 0, rotor_speed: "true", sensors: {} };
 
+// Sensors that it knows, with the options that it knows of each.
+const SENSORS = { aim: [], disturbance: ["smoothing"] };
+
 // What of the options of an observation this page does not know, in words; nothing if it knows all.
 function strange(observe) {
   const options = Object.keys(observe).filter((name) => !(name in KNOWN));
   const { rotor_speed: speed, sensors } = observe;
   if (!["true", "estimated"].includes(speed)) options.push(`rotor_speed ${speed}`);
   for (const [name, given] of Object.entries(sensors)) {
-    if (name !== "aim") options.push(`the sensor ${name}`);
-    else options.push(...Object.keys(given).map((option) => `aim with its own ${option}`));
+    if (!(name in SENSORS)) options.push(`the sensor ${name}`);
+    else {
+      const own = Object.keys(given).filter((option) => !SENSORS[name].includes(option));
+      options.push(...own.map((option) => `${name} with its own ${option}`));
+    }
   }
   return options[0];
 }

@@ -27,7 +27,6 @@ from quadrl.engines.dynamics import thrust_wrench
 from quadrl.engines.state import State
 
 LONGEST_HISTORY = 1000
-SMOOTHING = 0.1  # [s], of the acceleration that thrust does not explain
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
 
 
@@ -175,6 +174,18 @@ class Disturbance(Sensor):
 
     name, size, unit = "disturbance", 3, "m/s^2"
 
+    smoothing: float = 0.1
+    """Time constant of its low pass [s]; with 0 it is what the last control step shows."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        super().__post_init__()
+        number("disturbance smoothing", self.smoothing, 0, MAX)
+
+    def share(self, timestep: float) -> float:
+        """What of a change arrives within a control step [s]."""
+        return 1 - math.exp(-timestep / self.smoothing) if self.smoothing else 1.0
+
     def begin(self, now: Moment) -> Memory:
         """Nothing is felt yet."""
         motion = moving(now.parameters, now.state)
@@ -184,7 +195,8 @@ class Disturbance(Sensor):
         """Smooth what the last control step shows."""
         last, motion = now.memory["motion"], moving(now.parameters, now.state)
         timestep = float(now.parameters.control_timestep)
-        return {"motion": motion, "felt": felt(now.memory["felt"], last, motion, timestep)}
+        share = self.share(timestep)
+        return {"motion": motion, "felt": felt(now.memory["felt"], last, motion, timestep, share)}
 
     def sense(self, now: Moment) -> Array:
         """In the body frame."""
@@ -328,7 +340,9 @@ def moving(specified: Parameters, state: State) -> Array:
     return np.concatenate([state.velocity, thrust], axis=-1)
 
 
-def felt(disturbance: Array, last: Array, now: Array, timestep: float) -> Array:
+def felt(
+    disturbance: Array, last: Array, now: Array, timestep: float, share: Array | float
+) -> Array:
     """The acceleration that weight and specified thrust do not explain, smoothed.
 
     Args:
@@ -336,7 +350,8 @@ def felt(disturbance: Array, last: Array, now: Array, timestep: float) -> Array:
         last: What `moving` gave a control step ago, (n, 6).
         now: What it gives now.
         timestep: Control timestep [s].
+        share: What of a change arrives within it, as `Disturbance.share`.
     """
     rate = (now[:, :3] - last[:, :3]) / timestep
     rate = rate - (0.5 * (now[:, 3:] + last[:, 3:]) + WEIGHT)
-    return disturbance + (1 - math.exp(-timestep / SMOOTHING)) * (rate - disturbance)
+    return disturbance + share * (rate - disturbance)

@@ -62,6 +62,7 @@ PARTS = {
     "moving": 6,  # as quadrl.conditions.sensors.moving gives it
     "disturbance": 3,  # [m/s^2], world frame
     "felt": 3,  # the same in the body frame, as policies see it
+    "share": 1,  # of a change in it that a control step shows, as Disturbance.share
     "modelled": MAX_ROTORS,  # rotor speeds that are seen [rad/s]: true, or following the commands
     "aim_sum": 3,  # what quadrl.conditions.sensors.Aim remembers [m], world frame
     "aim": 3,  # what it gives [m], body frame
@@ -246,7 +247,8 @@ def write(environment: Environment) -> Written:
         disturbance = np.zeros((1, 3))
         if name == "feel":
             last = memory.read("moving", 6)
-            disturbance = felt(memory.read("disturbance", 3), last, motion, timestep)
+            disturbance, share = memory.read("disturbance", 3), memory.read("share", 1)
+            disturbance = felt(disturbance, last, motion, timestep, share)
         seen = to_body(state.rotation, disturbance)
         emit(name, memory, moving=motion, disturbance=disturbance, felt=seen)
     return Written("\n".join(functions), draws.used)

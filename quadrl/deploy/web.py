@@ -26,7 +26,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
 from quadrl.base.philox import START
 from quadrl.base.primitives import Primitive
-from quadrl.conditions.sensors import Aim
+from quadrl.conditions.sensors import Aim, Disturbance
 from quadrl.core.environment import Environment
 from quadrl.core.markers import Marker
 from quadrl.deploy import flights
@@ -108,6 +108,7 @@ def make_book() -> tuple[dict[str, Any], str]:
         "flightSize": flights.SIZE,
         "startStream": START,
         "gustTime": GUST_TIME,
+        "smoothing": Disturbance.smoothing,
         "policy": {"formats": [FORMAT, UNSEALED], "header": HEADER, "clip": CLIP},
         "tasks": {
             name: {

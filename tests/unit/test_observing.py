@@ -14,7 +14,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import to_body, to_world
 from quadrl.conditions.observing import Observing
-from quadrl.conditions.sensors import SMOOTHING
+from quadrl.conditions.sensors import Disturbance
 from quadrl.core.environment import Environment
 from quadrl.core.observation import OBSERVATION, ROTATION
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
@@ -196,10 +196,19 @@ def test_a_mass_that_is_not_the_specified_one_shows_as_acceleration(mass, rotor_
     environment.reset(start=REST)
     for k in range(1, 6):
         found = helpers.idle(environment).observation["disturbance"]
-        arrived = 1 - math.exp(-k * PAPER.control_timestep / SMOOTHING)
+        arrived = 1 - math.exp(-k * PAPER.control_timestep / Disturbance.smoothing)
         expected = arrived * GRAVITY * (1 / mass - 1)  # the rotors turn as if it were the specified
         np.testing.assert_allclose(found, [[0, 0, expected]] * 2, atol=0.05)
     assert not environment.reset(np.array([1]), REST)["disturbance"].any()
+
+
+@pytest.mark.parametrize(("smoothing", "arrived"), [(0.0, 1.0), (0.05, 1 - math.exp(-1))])
+def test_a_disturbance_is_smoothed_as_asked(smoothing, arrived):
+    options = {"sensors": {"disturbance": {"smoothing": smoothing}}}
+    environment = helpers.begun("hover", 1, observe=options, randomization={"mass": 0.8})
+    environment.reset(start=REST)
+    found = helpers.idle(environment).observation["disturbance"]
+    np.testing.assert_allclose(found, [[0, 0, arrived * GRAVITY * 0.25]], atol=0.05)
 
 
 def test_the_push_of_the_wind_shows_as_acceleration_in_the_body_frame():
@@ -209,7 +218,7 @@ def test_the_push_of_the_wind_shows_as_acceleration_in_the_body_frame():
     environment.engine.wind[:] = 4.0, 0.0, 0.0
     for _ in range(4):
         found = helpers.idle(environment).observation["disturbance"]
-    push = PAPER.drag_coefficient * 4.0**2 / PAPER.mass * (1 - math.exp(-4 * 0.05 / SMOOTHING))
+    push = PAPER.drag_coefficient * 4.0**2 / PAPER.mass * (1 - math.exp(-4 * 0.05 / Disturbance.smoothing))
     np.testing.assert_allclose(found, [[0, -push, 0]], atol=0.1 * push)
 
 
