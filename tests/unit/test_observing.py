@@ -218,7 +218,8 @@ def test_the_push_of_the_wind_shows_as_acceleration_in_the_body_frame():
     environment.engine.wind[:] = 4.0, 0.0, 0.0
     for _ in range(4):
         found = helpers.idle(environment).observation["disturbance"]
-    push = PAPER.drag_coefficient * 4.0**2 / PAPER.mass * (1 - math.exp(-4 * 0.05 / Disturbance.smoothing))
+    arrived = 1 - math.exp(-4 * 0.05 / Disturbance.smoothing)
+    push = PAPER.drag_coefficient * 4.0**2 / PAPER.mass * arrived
     np.testing.assert_allclose(found, [[0, -push, 0]], atol=0.1 * push)
 
 
