@@ -9,7 +9,16 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.core.task import (
+    IN_GUSTS,
+    STILL,
+    EpisodeEnd,
+    Snapshot,
+    Target,
+    Task,
+    TaskState,
+    heads_east,
+)
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
@@ -63,7 +72,7 @@ class Hover(Task):
             "apg": {"step": 0.4},
         },
     }
-    variants = {"robust": {"training_options": AS_ASKED}}
+    variants = {"robust": {"training_options": AS_ASKED, **IN_GUSTS}}
     heading_matters = True
 
     radius: float = 0.5

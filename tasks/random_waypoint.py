@@ -8,7 +8,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState
+from quadrl.core.task import IN_GUSTS, STILL, EpisodeEnd, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
@@ -40,7 +40,7 @@ class RandomWaypoint(Task):
         "trpo": {"training_options": IN_MOTION},
         "apg": {"steps": 102_400, "holds_goal": False},
     }
-    variants = {"robust": {"training_options": {"farthest": 2.5, **AT_REST}}}
+    variants = {"robust": {"training_options": {"farthest": 2.5, **AT_REST}, **IN_GUSTS}}
 
     nearest: float = 1.0
     """Smallest distance of the waypoint from the start [m]."""

@@ -15,7 +15,16 @@ from quadrl.base.validation import MAX_OPTION, numbers
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
-from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
+from quadrl.core.task import (
+    IN_GUSTS,
+    STILL,
+    EpisodeEnd,
+    Snapshot,
+    Target,
+    Task,
+    TaskState,
+    heads_east,
+)
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
@@ -52,6 +61,7 @@ class StaticWaypoint(Task):
     )
     training = {"gamma": 0.9, "holds_goal": True, "ppo": {"learning_rate": 8e-3}}
     training_with = {"apg": {"steps": 153_600, "holds_goal": False}}
+    variants = {"robust": IN_GUSTS}
     heading_matters = True
 
     waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)

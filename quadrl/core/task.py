@@ -61,6 +61,11 @@ TURNING = Target("yaw_rate_rad_s", "turning over the last 2 s", 0.3)
 STILL = (TURNING, Target("circling_m_s", "circling over the last 2 s", 0.05))
 """What is asked of who should stand, beside the place: one that turns or circles has not solved
 its task."""
+IN_GUSTS: dict[str, Any] = {
+    "steps": 16_384_000,
+    "task_options": {"progress_weight": 300.0, "attitude_weight": 90.0},
+}
+"""Settings of the variant `robust` where a place is kept: in gusts that takes a dearer distance."""
 
 
 @dataclasses.dataclass(frozen=True)

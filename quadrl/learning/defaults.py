@@ -130,7 +130,7 @@ def training_defaults(
     own = own_settings(kind, algo)
     if own.pop("vehicle", "paper") != vehicle:  # the numbers of another aircraft
         own.pop("vehicle_options", None)
-    varied = (shared, OF_VEHICLE.get((variant, vehicle), {}), kind.variants.get(variant, {}))
+    varied = (shared, kind.variants.get(variant, {}), OF_VEHICLE.get((variant, vehicle), {}))
     layers = {
         "field": merged(fields, ALGORITHM_CONFIGS[algo].training),
         f"{task} x {algo}": own,

@@ -12,9 +12,10 @@ from runs import TINY, refused
 
 import quadrl
 from quadrl import tasks
+from quadrl.core.task import IN_GUSTS
 from quadrl.evaluation import evaluate as evaluation
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.defaults import VARIANTS
+from quadrl.learning.defaults import OF_VEHICLE, VARIANTS
 from quadrl.learning.environments import make_env
 from quadrl.learning.folder import read_config, write_config
 from quadrl.learning.settings import PPOConfig, VPGConfig
@@ -211,7 +212,12 @@ def test_a_run_with_an_old_name_of_a_setting_goes_on(tmp_path):
 def test_a_variant_is_settings_that_go_together():
     config, usual = TrainConfig("hover", variant="robust"), TrainConfig("hover")
     assert (config.weather, usual.weather) == ("light", "calm")
-    assert config.steps == VARIANTS["robust"]["steps"] != usual.steps
+    assert config.steps == IN_GUSTS["steps"] > VARIANTS["robust"]["steps"] > usual.steps
+    landing, small = TrainConfig("landing", variant="robust"), "crazyflie_brushless"
+    assert landing.steps == VARIANTS["robust"]["steps"]
+    often = config.scenario.aircraft.control_timestep / 0.02
+    quick = TrainConfig("hover", variant="robust", vehicle=small)
+    assert quick.steps == OF_VEHICLE["robust", small]["steps"] * often
     assert config.ppo.learning_rate < usual.ppo.learning_rate
     assert config.scenario.aircraft.action_scale > usual.scenario.aircraft.action_scale
     assert usual.scenario.to_json() == {"task": "hover", "vehicle": "paper"}
