@@ -42,14 +42,14 @@ class Args:
     algo: str = "ppo"  # ppo, trpo, vpg, apg, sac; or geometric, the controller
     seed: int = 0  # seed of the networks, the exploration and the episodes
     points: int = 24  # of the curve
-    total_steps: int = 1_000_000  # control steps of all aircraft, after which SAC ends
+    total_steps: int = 102_400  # control steps of all aircraft, after which SAC ends
     seconds: float = float("inf")  # processor time after which SAC ends, if that is earlier
-    num_envs: int = 32  # aircraft flown together
-    gradient_steps: int = 1  # for each control step of all of them
+    num_envs: int = 16  # aircraft flown together
+    gradient_steps: int = 2  # for each control step of all of them
     batch_size: int = 256  # transitions in a gradient step
-    learning_rate: float = 1e-3  # of Adam
-    gamma: float = 0.92  # discount of a control step
-    tau: float = 0.005  # share of the networks that their slow copies take on
+    learning_rate: float = 6e-3  # of Adam
+    gamma: float = 0.88  # discount of a control step
+    tau: float = 0.01  # share of the networks that their slow copies take on
     width: int = 64  # of the two hidden layers of each network
 
 

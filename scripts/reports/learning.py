@@ -34,6 +34,11 @@ FLOWN: dict[str, tuple[str, str, Any]] = {
 TRIED, FIRST = 16, FRESH + 100_000  # settings of the controller; first episode to choose by
 LOW, HIGH = (0.7, 0.5, 1.0, 0.3), (2.5, 1.0, 8.0, 1.5)
 """Of its bandwidth, its authority, its speed [m/s] and its tilt [rad]."""
+ALONE = ("weather light", "weather moderate", "command_delay as in `full`", "lag as in `full`",
+         "randomization full", "all together")  # fmt: skip
+WORDS = {RATE: "successful", ERROR: "error, median", "settled_m": "distance, mean",
+         "race_time_mean_s": "time, mean"}  # fmt: skip
+GAINS = {"robust": "one set", "robustness": "for the row", "wins": "for the row", "race": "usual"}
 
 
 def curves(file: Annotated[Path, tyro.conf.Positional]) -> None:
@@ -50,7 +55,7 @@ def curves(file: Annotated[Path, tyro.conf.Positional]) -> None:
         algorithms.setdefault(told["algo"], []).append({k: np.array(x) for k, x in columns.items()})
     report.save("curves", {"rows": rows})
     for task, runs in groups.items():
-        (own,) = runs.pop("geometric")
+        own, *_ = runs.pop("geometric")
         level = {name: float(own[name][0]) for name in LEVELS}
         figure = learning_curves(runs, task, CLOCKS, LEVELS, level)
         save(figure, report.IMAGES / "curves" / f"{task}_compared.png")
@@ -115,10 +120,10 @@ def compared() -> Iterator[tuple[str, str, int, str, dict[str, Any]]]:
                 both[row["seed"] == "controller"].append(row[key])
         means = {task: tuple(float(np.mean(x)) for x in both) for task, both in found.items()}
         yield name, RATE if key == "success" else key, robust["episodes"], "robust", means
-    for name in ("weather light", "weather moderate"):
+    for name in ALONE:
         found = {row["task"]: (row["robust policy"], row["tuned controller"])
                  for row in alone["alone"] if row["condition"] == name}  # fmt: skip
-        yield f"{name}, drag only", RATE, alone["episodes"], "robustness", found
+        yield name, RATE, alone["episodes"], "robustness", found
     for row in own["rows"]:
         sides = {row["task"]: (row["policy"], row["controller"])}
         yield row["condition"], row["metric"], own["episodes"], "wins", sides
@@ -144,19 +149,16 @@ def wins_table() -> str:
     """Who is ahead, condition by condition."""
     rows = []
     for name, metric, flights, source, sides in compared():
-        groups: dict[str, list[str]] = {}
+        groups: dict[str, list[str]] = {"policy": [], "level": [], "controller": []}
         for task, both in sides.items():
-            groups.setdefault(ahead(metric, flights, *both), []).append(task)
-        told = (
-            ", ".join(quantity(metric, x) for x in side)
-            for side in zip(*sides.values(), strict=True)
-        )
-        who = (
-            f"{who} ({', '.join(tasks)})" if len(groups) > 1 else who
-            for who, tasks in groups.items()
-        )
-        rows.append((name, metric, *told, "; ".join(who), f"`scripts/report {source}`"))
-    return table(("flown in", "figure", "policy", "tuned controller", "ahead", "measured by"), rows)
+            groups[ahead(metric, flights, *both)].append(task)
+        told = (", ".join(quantity(metric, side[k]) for side in sides.values()) for k in (0, 1))
+        who = [f"{who}: {', '.join(each)}" for who, each in groups.items() if each]
+        first = f"{name} ({', '.join(sides)})" if len(sides) == 1 else name
+        given = (GAINS[source], "; ".join(who), f"`scripts/report {source}`")
+        rows.append((first, WORDS[metric], *told, *given))
+    head = ("flown in", "figure", "policy", "controller", "its gains", "ahead", "measured by")
+    return table(head, rows)
 
 
 PARTS: report.Parts = {"curves": curves_table, "wins": wins_table}
