@@ -95,10 +95,7 @@ def moving_views(
     half = np.array([(box.max(0) - box.min(0)) / 2 for box in boxes])
     aside = np.array([box.min(0) for box in boxes]) + half - position
     radius = np.linalg.norm(half, axis=-1, keepdims=True)
-    # Pictures are wider than high, and depth takes little of either.
-    level = max(1.0, WIDE / aspect)
-    room = np.linalg.norm(half * ROOM * (level, level, 1.0), axis=-1, keepdims=True)
-    distance = np.clip(0.75 * scale + room, nearest * scale, farthest)
+    distance = np.clip(_back(half, scale, aspect), nearest * scale, farthest)
     # The aircraft itself stays in view, however far away the rest is.
     aside = aside * np.minimum(1.0, farthest / 4 / np.maximum(radius, 1e-9))
     angles = np.empty((len(position), 2))
@@ -106,6 +103,19 @@ def moving_views(
     if chase:
         angles[:] = np.stack([_headings(qpos), np.full(len(qpos), CHASE_ELEVATION)], axis=-1)
     return np.concatenate([position + aside, distance, angles], axis=1)
+
+
+def keeping(views: Array, position: Array, scale: float, aspect: float) -> Array:
+    """Views (T, 6) that step back where the aircraft, at (T, 3) [m], has left them in haste."""
+    back = _back(np.abs(position - views[:, :3]), scale, aspect)[:, 0]
+    return np.column_stack([views[:, :3], np.maximum(views[:, 3], back), views[:, 4:]])
+
+
+def _back(half: Array, scale: float, aspect: float) -> Array:
+    """Distance (T, 1) [m] that shows a box with half the edges (T, 3) and an aircraft in it."""
+    # Pictures are wider than high, and depth takes little of either.
+    level = max(1.0, WIDE / aspect)
+    return 0.75 * scale + np.linalg.norm(half * ROOM * (level, level, 1.0), axis=-1, keepdims=True)
 
 
 def _headings(qpos: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.core.markers import Marker
-from quadrl.rendering.camera import MOVING, eased, moving_camera, moving_views
+from quadrl.rendering.camera import MOVING, eased, keeping, moving_camera, moving_views
 from quadrl.rendering.drawing import TRAIL_SECONDS, streaks
 from quadrl.rendering.scene import Renderer
 
@@ -68,7 +68,8 @@ class LiveFlight:
             seen = qpos[None], goal[None], [markers]
             view = moving_views(camera, *seen, renderer.scale, renderer.aspect)[0]
             self._view = view if begins else eased(view, self._view, seconds)
-            shown = moving_camera(self._view)
+            size = renderer.scale, renderer.aspect
+            shown = moving_camera(keeping(self._view[None], position[None], *size)[0])
         if wind is not None:
             self._drift = self._drift + wind * max(seconds, 0.0)
             markers = (*markers, *streaks(position, wind, self._drift, renderer.scale))

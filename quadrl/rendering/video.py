@@ -25,6 +25,7 @@ from quadrl.rendering.camera import (
     FOLLOW,
     MOVING,
     SMOOTHING,
+    keeping,
     moving_camera,
     moving_views,
     smoothed,
@@ -113,7 +114,9 @@ def render_trajectory(
         if camera in MOVING:
             seen = flight.qpos, flight.goal, markers
             views = moving_views(camera, *seen, renderer.scale, renderer.aspect)
-            cameras = [moving_camera(view) for view in smoothed(views, SMOOTHING * rate)]
+            views = smoothed(views, SMOOTHING * rate)
+            views = keeping(views, position, renderer.scale, renderer.aspect)
+            cameras = [moving_camera(view) for view in views]
         panel = None
         if overlay:
             colours = [model.mat(f"rotor_{k + 1}_paint").rgba[:3] for k in range(model.nu)]

@@ -44,6 +44,7 @@ from quadrl.rendering.camera import (
     aircraft_scale,
     eased,
     in_view,
+    keeping,
     moving_camera,
     moving_views,
     smoothed,
@@ -268,6 +269,20 @@ def test_moving_cameras_keep_aircraft_and_goal_in_view(renderer, camera, heading
     # A goal fades and a ring on the ground may hide it: its ball and its line cover some pixels.
     assert changed(*pictures).sum() > 8
     assert changed(pictures[1], renderer.frame(away, camera=view)).sum() > 30
+
+
+@pytest.mark.parametrize("way", [(0, 0, -1.5), (0, 5, 0), (3, 0, 2)])
+def test_a_camera_steps_back_for_an_aircraft_that_leaves_its_view_in_haste(renderer, way):
+    pose, away = POSE + np.array([*way, 0, 0, 0, 0]), POSE + np.array([0, 0, 90, 0, 0, 0, 0])
+    slow = moving_views("follow", POSE[None], POSE[None, :3], [()], aspect=renderer.aspect)
+    size = 1.0, renderer.aspect
+    quick = keeping(slow, pose[None, :3], *size)
+    np.testing.assert_array_equal(keeping(slow, POSE[None, :3], *size), slow)
+    shown = [
+        changed(*(renderer.frame(p, camera=moving_camera(view[0])) for p in (pose, away))).sum()
+        for view in (slow, quick)
+    ]
+    assert shown[0] == 0 and shown[1] > 4
 
 
 def test_the_camera_of_a_flight_in_progress_lags():
