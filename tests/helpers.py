@@ -88,11 +88,6 @@ class Motion:
     wind: np.ndarray  # (n, 3) [m/s]
 
 
-def sign(matrix):
-    """1 of a rotation (3, 3), -1 of a mirror image."""
-    return float(np.sign(np.linalg.det(matrix)))
-
-
 def matrices(quaternion):
     """Rotation matrices (n, 3, 3) of quaternions wxyz (n, 4), by SciPy."""
     return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()

@@ -95,6 +95,18 @@ def sin_cos_attitude(rotation: Array) -> tuple[Array, Array]:
     return stack(*sines), stack(*cosines)
 
 
+def roll_pitch_yaw(quaternion: np.ndarray) -> np.ndarray:
+    """The Z-Y-X angles (..., 3) [rad] of unit quaternions (..., 4).
+
+    Right wing down and nose up are positive, and yaw is counted from east to north.
+    """
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x**2 + y**2))
+    pitch = np.arcsin(np.clip(2 * (x * z - w * y), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    return np.stack([roll, pitch, yaw], axis=-1)
+
+
 def quaternion_from_heading_and_tilt(heading: Array, tilt: Array, direction: Array) -> Array:
     """Unit quaternion (..., 4) of a heading, then a tilt about a level body axis.
 

@@ -139,9 +139,8 @@ class CompiledStep(Step):
         if (body, trace.constants) != (other, again.constants) or self._reads.changed:
             raise NotCompilable("it gives something else each time")
         try:
-            self._call = compiling.compile_generated(
-                SOURCE.format(flags=self.flags, body=body)
-            ).step
+            source = SOURCE.format(flags=self.flags, body=body)
+            self._call = compiling.compile_generated(source).step
         except NativeError as error:
             raise NotCompilable(str(error).partition("\n")[0]) from error
         self._call.argtypes, self._call.restype = [ctypes.c_void_p, ctypes.c_int64], None
@@ -260,17 +259,13 @@ class CompiledStep(Step):
         self._observation = page.observation.copy()
         *terms, reward, error = rest[:-1, :count]
         flags = rest[-1].view(np.bool_).reshape(-1, self.columns)[: len(FLAGS), :count]
-        terminated, truncated, is_success, diverged = flags
         return Transition(
             observation=self._observation,
             reward=reward,
             reward_terms=dict(zip(self._rewarded, terms, strict=True)),
-            terminated=terminated,
-            truncated=truncated,
-            is_success=is_success,
-            diverged=diverged,
             error=error,
             truth=page.truth or self._observation,
+            **dict(zip(FLAGS, flags, strict=True)),
         )
 
     def _take(

@@ -28,6 +28,9 @@ from quadrl.core.observation import ROTATION as ROTATION  # for users' tasks
 from quadrl.core.observation import TARGET_MOTION as TARGET_MOTION
 from quadrl.core.observation import TARGET_VELOCITY as TARGET_VELOCITY
 from quadrl.core.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
+from quadrl.core.solved import STILL as STILL
+from quadrl.core.solved import TURNING as TURNING
+from quadrl.core.solved import Target
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
 
@@ -38,29 +41,6 @@ if TYPE_CHECKING:
     from quadrl.core.snapshot import Rollout
 
 
-@dataclasses.dataclass(frozen=True)
-class Target:
-    """A figure of an evaluation that a policy has to reach for a task to count as solved."""
-
-    metric: str
-    """Name of the figure in `quadrl.evaluation.rollout.summarize`."""
-    words: str
-    """What it is."""
-    limit: float
-    """In the unit of the metric's name, in which it is shown too; shares as shares."""
-    at_least: bool = False
-    """Whether the figure must reach the limit, or stay under it."""
-
-    def met(self, metrics: Mapping[str, Any]) -> bool:
-        """Whether an evaluation reaches it; a figure that is missing or no number does not."""
-        value = math.nan if (found := metrics.get(self.metric)) is None else found
-        return value >= self.limit if self.at_least else value <= self.limit
-
-
-TURNING = Target("yaw_rate_rad_s", "turning over the last 2 s", 0.3)
-STILL = (TURNING, Target("circling_m_s", "circling over the last 2 s", 0.05))
-"""What is asked of who should stand, beside the place: one that turns or circles has not solved
-its task."""
 IN_GUSTS: dict[str, Any] = {
     "steps": 16_384_000,
     "task_options": {"progress_weight": 300.0, "attitude_weight": 90.0},

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_whole
+from quadrl.base.rotation import roll_pitch_yaw
 from quadrl.base.validation import choice
 from quadrl.core.snapshot import Rollout
 
@@ -253,9 +254,10 @@ def _quantities(rollout: Rollout, shown: int) -> tuple[dict[str, np.ndarray], ..
     """Values (T, n) over time by their labels: place, wind and error; attitude and speeds."""
     wind, velocity = rollout.wind[:, :shown], rollout.velocity[:, :shown]
     windy = bool(np.nan_to_num(wind).any())
-    attitude = _attitude(rollout.quaternion[:, :shown])
+    roll, pitch, yaw = np.moveaxis(roll_pitch_yaw(rollout.quaternion[:, :shown]), -1, 0)
+    attitude = np.degrees([roll, pitch, np.unwrap(yaw, axis=0)])
     left = {name: rollout.position[:, :shown, k] for k, name in enumerate(PLACE)}
-    right = {name: attitude[..., k] for k, name in enumerate(MOTION)}
+    right = dict(zip(MOTION, attitude, strict=True))
     if windy:
         left["wind [m/s]"] = np.linalg.norm(wind, axis=-1)
         right["airspeed [m/s]"] = np.linalg.norm(velocity - wind, axis=-1)
@@ -307,15 +309,3 @@ def _commands(lower: Any, rollout: Rollout, shown: int) -> None:
     rows[1][0].set(ylabel="action", ylim=(-1.05, 1.05))
     for axis in rows[1]:
         axis.set_xlabel("time [s]")
-
-
-def _attitude(quaternion: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw (..., 3) [deg] of (T, ..., 4); right wing down and nose up are positive.
-
-    Yaw is counted from east to north, and does not jump.
-    """
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x**2 + y**2))
-    pitch = np.arcsin(np.clip(2 * (x * z - w * y), -1, 1))
-    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)), axis=0)
-    return np.degrees(np.stack([roll, pitch, yaw], axis=-1))

@@ -10,6 +10,7 @@ import numpy as np
 
 from quadrl.base import machine, records
 from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import roll_pitch_yaw
 from quadrl.base.validation import action
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Conditions, Scenario
@@ -157,8 +158,7 @@ def flights(rollout: Rollout) -> dict[str, np.ndarray]:
     steps = max(1, round(FINAL_STRETCH / rollout.control_timestep))
     index = np.arange(len(rollout.error))[:, None]
     last = (index >= rollout.length - steps) & (index < rollout.length)
-    w, x, y, z = np.moveaxis(rollout.quaternion, -1, 0)
-    yaw = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
+    yaw = np.degrees(roll_pitch_yaw(rollout.quaternion)[..., 2])
     heading = {"heading_error_deg": _means(np.abs(yaw), last)}
     return {
         "success": rollout.is_success,

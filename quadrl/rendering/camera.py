@@ -10,7 +10,7 @@ import numpy as np
 
 from quadrl.aircraft.vehicle import DRAWN_SIZE
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array
+from quadrl.base.rotation import Array, roll_pitch_yaw
 from quadrl.core.markers import Marker
 
 FOLLOW, CHASE = "follow", "chase"
@@ -101,7 +101,8 @@ def moving_views(
     angles = np.empty((len(position), 2))
     angles[:] = AZIMUTH, ELEVATION
     if chase:
-        angles[:] = np.stack([_headings(qpos), np.full(len(qpos), CHASE_ELEVATION)], axis=-1)
+        yaw = np.unwrap(roll_pitch_yaw(qpos[..., 3:7])[..., 2])  # it does not jump
+        angles[:] = np.stack([np.degrees(yaw), np.full(len(qpos), CHASE_ELEVATION)], axis=-1)
     return np.concatenate([position + aside, distance, angles], axis=1)
 
 
@@ -116,12 +117,6 @@ def _back(half: Array, scale: float, aspect: float) -> Array:
     # Pictures are wider than high, and depth takes little of either.
     level = max(1.0, WIDE / aspect)
     return 0.75 * scale + np.linalg.norm(half * ROOM * (level, level, 1.0), axis=-1, keepdims=True)
-
-
-def _headings(qpos: Array) -> Array:
-    """Bearing (T,) [deg] of the nose, from east to north; it does not jump."""
-    w, x, y, z = np.moveaxis(qpos[..., 3:7], -1, 0)
-    return np.degrees(np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))))
 
 
 def _drawn_near(position: Array, points: Array, reach: float) -> Array:

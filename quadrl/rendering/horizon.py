@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from quadrl.base.rotation import Array
+from quadrl.base.rotation import Array, roll_pitch_yaw
 
 FIELD = 50.0  # [deg] of pitch from the middle to the edge
 LADDER = (-40, -20, 20, 40)  # [deg], of the short lines
@@ -26,9 +26,7 @@ def horizon(size: int, attitude: Array) -> tuple[NDArray[np.uint8], NDArray[np.u
     Returns:
         Colours (size, size, 3), and how much each pixel covers what is below, (size, size).
     """
-    w, x, y, z = attitude
-    pitch = math.asin(min(1.0, max(-1.0, 2 * (x * z - w * y))))  # of the nose above the horizon
-    roll = math.atan2(2 * (y * z + w * x), 1 - 2 * (x**2 + y**2))  # right wing down
+    roll, pitch, _ = roll_pitch_yaw(attitude)
     across, up, fixed, cover = _dial(size)
     soft = functools.partial(_soft, pixel=2.0 / size)
     along = math.cos(roll) * across + math.sin(roll) * up

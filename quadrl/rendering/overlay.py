@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import RenderingUnavailable
-from quadrl.base.rotation import Array
+from quadrl.base.rotation import Array, roll_pitch_yaw
 from quadrl.base.units import length
 from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER
 from quadrl.rendering.horizon import horizon
@@ -172,8 +172,7 @@ def task_title(task: str) -> str:
 
 def bearing(attitude: ArrayLike) -> float:
     """Where the nose points, as a compass shows it: 0 north, 90 east [deg]."""
-    w, x, y, z = np.asarray(attitude, dtype=float)
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    yaw = roll_pitch_yaw(np.asarray(attitude, dtype=float))[2]
     return round(90.0 - math.degrees(yaw)) % 360
 
 

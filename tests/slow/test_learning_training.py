@@ -49,21 +49,6 @@ def test_same_seed_same_run_on_any_threads_of_torch(finished, tmp_path):
         torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("engine", "num_envs"), [("mujoco", 8), ("free_flight", 600)])
-def test_threads_of_the_simulation_change_nothing(tmp_path, engine, num_envs):
-    # A thread of free flight is worth 256 aircraft; landing's come down into MuJoCo's hands.
-    settings = dict(
-        task="landing",
-        task_options={"time_limit": 0.5, "start_height": 0.3},
-        engine=engine,
-        num_envs=num_envs,
-        steps=num_envs * 4 * 3,
-        ppo={"epochs": 1, "minibatch": num_envs},
-    )
-    one, three = (train(changed(**settings, num_threads=n), tmp_path / str(n)) for n in (1, 3))
-    assert_same_run(one, three)
-
-
 @pytest.mark.parametrize("seed", [1, 2**32 - 1])
 def test_another_seed_is_another_run(finished, tmp_path, seed):
     other = train(changed(seed=seed), tmp_path / "other")

@@ -2,8 +2,7 @@
 
 Numbers are for the paper's aircraft unless said otherwise: T_h = 0.65 * 9.81 / 4 = 1.594125 N a
 rotor, A = pi 0.15^2 = 0.0706858 m^2, v_h = sqrt(T_h / (2 * 1.225 A)) = 3.03397 m/s. That
-`quadrl/engines/dynamics.py` has the same as the C of both engines is in test_dynamics.py, that the
-symmetries of a layout are those of its flights in test_symmetry.py.
+`quadrl/engines/dynamics.py` has the same as the C of both engines is in test_dynamics.py.
 """
 
 import dataclasses

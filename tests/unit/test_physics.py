@@ -221,31 +221,3 @@ def test_angular_momentum_is_conserved_in_torque_free_tumbling(engine):
     turn = helpers.matrices(tumbling.qpos[0, 3:])
     assert np.arccos((np.trace(turn) - 1) / 2) > 0.5
     np.testing.assert_allclose(turn @ (INERTIA * tumbling.qvel[0, 3:]), before, atol=2e-8)
-
-
-@both
-def test_drag_takes_as_much_energy_as_its_work(engine):
-    finer = dataclasses.replace(PAPER, physics_timestep=0.001)
-    flying = aircraft(engine, finer, velocity=(6, -3, 8), rate=(2, -1, 3))
-    energy, power = [], []
-    for step in range(2001):
-        energy.append(energies(flying).sum())
-        speed, turn = (np.linalg.norm(part) for part in (flying.qvel[0, :3], flying.qvel[0, 3:]))
-        power.append(9e-3 * speed**3 + 9e-4 * turn**3)  # [W]
-        if step < 2000:
-            flying.advance(1)
-    assert (np.diff(energy) < 0).all()
-    work = np.trapezoid(power, dx=0.001)
-    assert energy[0] - energy[-1] == pytest.approx(work, rel=1e-6)
-    assert work > 1.0
-
-
-@both
-def test_thrust_adds_as_much_energy_as_its_work(engine):
-    # Climbing straight up at a constant rotor speed of 300, drag off: the net force is
-    # 4 * 3.13e-5 * 9e4 - 0.65 * 9.81 = 11.268 - 6.3765 = 4.8915 N, 7.525385 m/s^2.
-    climbing = aircraft(engine, VACUUM, speed=300.0)
-    climbing.advance(100)
-    expected = [0, 0, 7.525385, 0, 0, 0]
-    np.testing.assert_allclose(climbing.qvel[0], expected, atol=1e-5)
-    assert climbing.qpos[0, 2] == pytest.approx(100 + 7.525385 / 2, abs=1e-5)

@@ -82,16 +82,6 @@ def test_a_row_has_its_own_numbers_whatever_its_neighbours_and_the_order():
     np.testing.assert_array_equal(Rng(keys, episodes).uniform(2, 6, 20), 2 + 4 * whole)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2**31 - 3, 2**32 - 1, 2**53])
-def test_row_i_of_seed_s_is_row_0_of_seed_s_plus_i(seed):
-    zero = np.zeros(5, dtype=np.int64)
-    whole = rng.uniform(seed + np.arange(5), zero, philox.START, 0, 8)
-    for i in range(5):
-        np.testing.assert_array_equal(
-            rng.uniform(np.array([seed + i]), zero[:1], philox.START, 0, 8), whole[i : i + 1]
-        )
-
-
 def test_streams_do_not_overlap():
     # 4 keys, 5 episodes, 4 streams and 50 blocks of four numbers, 128 bits each: all different,
     # and that stream 1 goes on where stream 0 ends would show.

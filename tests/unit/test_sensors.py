@@ -7,7 +7,6 @@ import json
 import helpers
 import numpy as np
 import pytest
-from apis import APIS
 from policies import linear
 from test_observing import ACTIONS, seen
 
@@ -208,18 +207,6 @@ def test_row_i_senses_what_the_single_aircraft_of_seed_plus_i_does(randomization
     # Another sensor beside it changes nothing.
     alone, _ = seen({"sensors": {"compass": WILD["sensors"]["compass"]}}, **settings)
     np.testing.assert_array_equal(alone[-1]["compass"], whole[-1]["compass"])
-
-
-@pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
-def test_every_api_shows_a_sensor_of_ones_own(api):
-    observe = {"sensors": {"compass": {"strength": 2.0}}}
-    flown = api(seed=4, observe=observe)
-    found = flown.observation(flown.reset())
-    core = flown.core
-    assert core.layout["compass"] == slice(22, 25) and found.shape[-1] == 25
-    np.testing.assert_allclose(np.linalg.norm(found[:, 22:], axis=1), 2.0, rtol=1e-6)
-    flown.step(np.zeros((flown.rows, 4)))
-    np.testing.assert_array_equal(core.snapshot.sensed["compass"], core.sensed["compass"])
 
 
 @pytest.mark.parametrize("rotor_speed", ["true", "none"])

@@ -237,47 +237,6 @@ def test_tensors_of_length_zero_have_a_gradient():
     np.testing.assert_allclose(vectors.grad, [[0.6, 0.8], [0, 0]])
 
 
-def test_a_quarter_turn_to_the_left_looks_north():
-    # Heading 90 degrees counter-clockwise from east: the nose (body x) points north (world y), the
-    # left side west, and a wind to the north is felt from behind: along body x.
-    half = math.pi / 4
-    matrix = rotation.rotation_matrix(np.array([math.cos(half), 0, 0, math.sin(half)]))
-    for function, given, expected in (
-        (rotation.to_world, [1.0, 0, 0], [0, 1, 0]),
-        (rotation.to_world, [0, 1.0, 0], [-1, 0, 0]),
-        (rotation.to_body, [0, 1.0, 0], [1, 0, 0]),
-    ):
-        np.testing.assert_allclose(function(matrix, np.array(given)), expected, atol=1e-15)
-    sines, cosines = rotation.sin_cos_attitude(matrix)
-    np.testing.assert_allclose(sines, [0, 0, 1], atol=1e-15)
-    np.testing.assert_allclose(cosines, [1, 1, 0], atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("command", "angle", "direction"),
-    [
-        # Quick left rotor: positive roll, right side down, thrust to the right: south at yaw 0.
-        ((225, 235, 225, 215), 0, (0, -1)),
-        # Quick rear rotor: positive pitch, nose down, thrust ahead: east.
-        ((215, 225, 235, 225), 1, (1, 0)),
-        # Quick 2 and 4: positive yaw, nose to the left.
-        ((215, 235, 215, 235), 2, (0, 0)),
-    ],
-)
-def test_angles_have_the_sign_of_the_flight(command, angle, direction):
-    engine = BatchEngine(Vehicle(), 1, altitude=ALTITUDE)
-    engine.place(np.array([0]), helpers.level(1))
-    engine.ctrl[:] = command
-    engine.advance(20)
-    engine.read()
-    sines, moved = engine.state.sin_attitude[0], engine.state.velocity[0, :2]
-    assert sines[angle] > 0.005
-    assert np.argmax(np.abs(sines)) == angle
-    if direction != (0, 0):
-        assert moved @ direction > 0.02
-        assert np.abs(moved @ (direction[1], -direction[0])) < 0.01 * (moved @ direction)
-
-
 def test_body_velocity_is_what_the_aircraft_itself_feels():
     # Flying east at 3 m/s, heading north: the motion is to its right, -y of the body.
     half = math.sqrt(0.5)

@@ -64,23 +64,6 @@ def test_the_layout_says_which_way_each_rotor_lifts_and_turns():
     np.testing.assert_array_equal(PAPER.layout, signs)
 
 
-def test_the_mixer_of_tilted_rotors():
-    # Rotors 1 and 3 lean towards each other by 30 degrees, 0.1 m above the centre of mass. Of
-    # rotor 1 at (0.23, 0, 0.1), axis (-0.5, 0, 0.866025): position x axis =
-    # (0, -0.05 - 0.199186, 0) m; the reaction is -7.5e-7 times the axis.
-    leaning = []
-    for k, way in ((0, 1.0), (2, -1.0)):
-        axis = (-0.5 * way, 0.0, math.sqrt(0.75))
-        leaning.append(
-            dataclasses.replace(PAPER_ROTORS[k], position=(0.23 * way, 0, 0.1), axis=axis)
-        )
-    vehicle = Vehicle(rotors=(leaning[0], PAPER_ROTORS[1], leaning[1], PAPER_ROTORS[3]))
-    pitch = 3.13e-5 * (-0.05 - 0.23 * math.sqrt(0.75))
-    expected = [3.13e-5 * math.sqrt(0.75), 3.75e-7, pitch, -7.5e-7 * math.sqrt(0.75)]
-    np.testing.assert_allclose(vehicle.mixer[:, 0], expected, rtol=1e-13)
-    np.testing.assert_allclose(vehicle.mixer[:, 2], expected * np.array([1, -1, -1, 1]), rtol=1e-13)
-
-
 @pytest.mark.parametrize("name", VEHICLES)
 def test_every_preset_hovers_without_turning(name):
     vehicle = VEHICLES[name]

@@ -114,16 +114,6 @@ def test_mean_wind_follows_the_profile(height, share):
     np.testing.assert_allclose(wind, expected, rtol=1e-3)
 
 
-def test_the_wind_is_that_at_the_height_of_the_moment():
-    made, engine = process(LIGHT, 2)
-    made.begin(np.arange(2), np.zeros(2, np.int64), np.zeros(2, np.int64))  # the same numbers
-    engine.qpos[:, 2] = 2.0, 0.5
-    made.advance()
-    # (0.772 - 0.489) W20 apart; both in the same turbulence.
-    apart = (engine.wind[0] - engine.wind[1])[:2]
-    assert np.linalg.norm(apart) == pytest.approx((0.7722 - 0.4889) * 7.72, rel=1e-3)
-
-
 def test_upward_gusts_fade_towards_the_ground_and_level_ones_do_not():
     heights = np.array([0.0, 0.1, 1.524, 3.048, 6.0, -1.0])
     made, engine = process(dataclasses.replace(LIGHT, direction=0.0), 6)
