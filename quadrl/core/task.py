@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 IN_GUSTS: dict[str, Any] = {
     "steps": 16_384_000,
-    "task_options": {"progress_weight": 300.0, "attitude_weight": 90.0},
+    "task_options": {"progress_weight": 300.0, "attitude_weight": 75.0},
 }
 """Settings of the variant `robust` where a place is kept: in gusts that takes a dearer distance."""
 
