@@ -142,6 +142,7 @@ class TrainConfig(TrainSettings):
             ("steps", 1, math.inf, {"whole": True}),
             ("num_threads", 0, MAX_THREADS, {"whole": True}),
             ("memory_width", 1, MAX_WIDTH, {"whole": True}),
+            ("evaluations", 0, math.inf, {"whole": True}),
             ("gamma", 0, 1, {}),
             ("gae_lambda", 0, 1, {}),
             ("initial_deviation", 0.01, math.e, {}),
@@ -215,7 +216,7 @@ class TrainConfig(TrainSettings):
         Raises:
             QuadrlError: The folder holds no run, or what its names stand for has changed since.
         """
-        saved = {"from_run": ""} | as_saved(read_config(folder))
+        saved = {"from_run": "", "evaluations": 0} | as_saved(read_config(folder))
         names = [field.name for field in dataclasses.fields(cls)]
         if missing := set(names) - set(saved):
             raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks {sorted(missing)[0]}")

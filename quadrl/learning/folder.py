@@ -25,6 +25,8 @@ from quadrl.evaluation.policy_file import RUN_FORMAT
 
 CHECKPOINT = "checkpoint.safetensors"
 METRICS = "metrics.csv"
+EVALUATIONS = "evaluations.csv"
+"""What the policy reached along the training; where it was asked for."""
 EVENTS = "events"
 EVALUATION = "evaluation.json"
 """A run with this file is trained and evaluated."""
@@ -35,7 +37,7 @@ WARNINGS = "warnings.txt"
 """MuJoCo's, of the training; where it had any."""
 LOCK = "training.lock"
 """Host and process of the training that works here, where the file system has no locks."""
-FREE = ("num_threads", "checkpoint_seconds")
+FREE = ("num_threads", "checkpoint_seconds", "evaluations")
 """Settings that change no result."""
 CHANGEABLE = (*FREE, "steps", "device")
 """Settings that a run may be continued with other values of."""

@@ -11,14 +11,16 @@ from typing import Any, NamedTuple
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import read_table
-from quadrl.base.validation import keys, names, number
+from quadrl.base.validation import choice, keys, names, number
 from quadrl.base.validation import seeds as seeds_of
 from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import merged
 from quadrl.learning.executor import PlannedRun
 
-KEYS = ("tasks", "algorithms", "seeds", "episodes", "settings", "variants")
+KEYS = ("tasks", "algorithms", "seeds", "episodes", "settings", "only", "variants")
+SOME = ("tasks", "algorithms")
+"""What a table of `only` may be limited to."""
 OWN = {
     "task": "the key tasks",
     "algo": "the key algorithms",
@@ -70,13 +72,15 @@ def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
     seeds = seeds_of(content.get("seeds", [0]), MAX_SEED)
     episodes = number("episodes", content.get("episodes", EPISODES), 1, MAX_EPISODES, whole=True)
     common = _settings("settings", content.get("settings", {}))
+    only = _only(content.get("only", []), {"tasks": tasks, "algorithms": algorithms})
     variants = _variants(content.get("variants", []))
     number("trainings", len(tasks) * len(algorithms) * len(seeds) * len(variants), 1, MAX_RUNS)
     runs: list[PlannedRun] = []
     known: dict[str, str] = {}
     for seed, task, algo, variant in itertools.product(seeds, tasks, algorithms, variants):
         name = "-".join([task, algo, *filter(None, [variant]), str(seed)])
-        settings = merged(common, variants[variant])
+        own = (some for of, some in only if task in of["tasks"] and algo in of["algorithms"])
+        settings = merged(common, *own, variants[variant])
         try:
             config = TrainConfig(task, algo=algo, seed=seed, num_threads=1, **settings)
         except QuadrlError as error:
@@ -99,13 +103,31 @@ def _settings(key: str, given: Any) -> dict[str, Any]:
     return given
 
 
+def _only(given: Any, of: dict[str, list[str]]) -> list[tuple[dict[str, list[str]], dict]]:
+    """Settings of some tasks and algorithms, each with those that it is for; by default all."""
+    found = []
+    for table in _tables("only", given):
+        whom = {key: names(f"only.{key}", table.get(key, of[key])) for key in SOME}
+        for key, wanted in whom.items():
+            for name in wanted:
+                choice(f"only.{key}", name, of[key])
+        rest = {key: value for key, value in table.items() if key not in SOME}
+        found.append((whom, _settings("only", rest)))
+    return found
+
+
+def _tables(key: str, given: Any) -> list[dict[str, Any]]:
+    """A list of tables."""
+    if not isinstance(given, (list, tuple)) or not all(isinstance(one, dict) for one in given):
+        raise QuadrlError(name=key, value=given, allowed=f"a list of tables: [[{key}]]")
+    return [dict(one) for one in given]
+
+
 def _variants(given: Any) -> dict[str, dict[str, Any]]:
     """Settings by the name of the variant; one without a name where there are none."""
-    if not isinstance(given, (list, tuple)) or not all(isinstance(one, dict) for one in given):
-        raise QuadrlError(name="variants", value=given, allowed="a list of tables: [[variants]]")
     variants: dict[str, dict[str, Any]] = {}
-    for one in given:
-        name = one.get("name")
+    for one in _tables("variants", given):
+        name: Any = one.get("name")
         plain = isinstance(name, str) and name.replace("_", "").replace(".", "").isalnum()
         if not plain or name in variants or name.startswith("."):
             allowed = "a name of its own, of letters, digits, _ and ."

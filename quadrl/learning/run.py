@@ -16,6 +16,7 @@ from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning.config import TrainConfig, prepare
+from quadrl.learning.evaluations import evaluating
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO, write_json
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training
@@ -129,7 +130,7 @@ def train_in(
     warn_of_unreached(scenario.aircraft, *asked)
     training = Training(config, folder, resume=resume)
     with heed(training):
-        policy = training.run(show)
+        policy = training.run(evaluating(training, show) if config.evaluations else show)
     found = evaluate(policy, scenario, episodes=episodes)
     seconds = round(training.seconds, 2)
     record = {"training_s": seconds, "scenario": scenario.to_json()}

@@ -250,3 +250,6 @@ class TrainSettings:
     """Threads of the simulation; 0 for one per core. The results do not depend on it."""
     checkpoint_seconds: float = 5.0
     """Least time between two checkpoints [s]."""
+    evaluations: int = 0
+    """Times, evenly over the training, that the policy of the moment flies 50 episodes with its
+    mean action, in free flight: the rows of evaluations.csv. Their seconds count."""

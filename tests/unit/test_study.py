@@ -191,3 +191,36 @@ def test_what_follows_the_end_of_a_training(tmp_path, monkeypatch, ends, begun, 
     attempts = [line for line in lines if "attempt" in line]
     assert len(attempts) == len(begun) - len(runs)
     assert len(runs) == sum(run.done for run in runs) + len(failed)
+
+
+def test_settings_of_some_tasks_and_algorithms_alone():
+    only = [
+        {"tasks": ["landing"], "steps": 8192},
+        {"tasks": ["landing"], "algorithms": ["vpg"], "num_envs": 32},
+    ]
+    given = {"tasks": ["hover", "landing"], "algorithms": ["ppo", "vpg"]}
+    usual, changed = (read_plan(given | more, None).runs for more in ({}, {"only": only}))
+    usual, changed = ({run.name: run.config for run in runs} for runs in (usual, changed))
+    assert [name for name in usual if usual[name] != changed[name]] == [
+        "landing-ppo-0",
+        "landing-vpg-0",
+    ]
+    ppo, vpg = changed["landing-ppo-0"], changed["landing-vpg-0"]
+    assert ppo.steps == vpg.steps == 8192 and vpg.num_envs == 32
+    assert ppo.num_envs == usual["landing-ppo-0"].num_envs
+
+
+@pytest.mark.parametrize(
+    ("only", "said"),
+    [
+        (3, r"only = 3: must be a list of tables: \[\[only\]\]"),
+        ([{"tasks": ["lading"]}], "only.tasks = 'lading': must be one of hover"),
+        ([{"algorithms": ["trpo"]}], "only.algorithms = 'trpo': must be one of ppo"),
+        ([{"algorithms": "ppo"}], "only.algorithms = 'ppo': must be a list"),
+        ([{"num_env": 32}], "setting in only = 'num_env'"),
+        ([{"seed": 1}], "only.seed = 1: must be the key seeds"),
+    ],
+)
+def test_wrong_settings_of_some(only, said):
+    with pytest.raises(QuadrlError, match=said):
+        read_plan({"tasks": ["hover"], "algorithms": ["ppo"], "only": only}, None)

@@ -1,0 +1,53 @@
+"""What the policy of a training reaches along the way: evaluations.csv in the folder of a run."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from typing import Any
+
+from quadrl.base.files import write_whole
+from quadrl.base.progress import Progress
+from quadrl.evaluation.evaluate import evaluate
+from quadrl.learning.folder import EVALUATIONS
+from quadrl.learning.train import Training
+
+EPISODES = 50
+COLUMNS = {
+    "success": "success_rate",
+    "survival": "survival_rate",
+    "error": "position_error_m",
+    "return": "return_mean",
+}
+"""The columns beside steps and seconds, as metrics.csv has them, and figures of an evaluation."""
+
+
+def evaluating(training: Training, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
+    """Evaluate the policy of the moment as often as the settings say; then `show` the progress.
+
+    A success is that of the mean action in episodes of their own. metrics.csv has that of sampled
+    actions in episodes that began up to two time limits of every aircraft ago.
+    """
+    config, file = training.config, training.folder / EVALUATIONS
+    times = range(1, config.evaluations + 1)
+    due = {max(1, round(time * config.iterations / config.evaluations)) for time in times}
+    rows: list[dict[str, Any]] = []
+    if file.exists():  # a row after the checkpoint is made again
+        with open(file, newline="") as opened:
+            rows = [row for row in csv.DictReader(opened) if int(row["steps"]) <= training.steps]
+
+    def after(progress: Progress) -> None:
+        if progress.iteration in due:
+            policy = training.policy()
+            found = evaluate(policy, config.scenario, episodes=EPISODES, engine="free_flight")
+            row = {"steps": progress.steps, "seconds": round(progress.seconds, 3)}
+            rows.append(row | {name: found.metrics[of] for name, of in COLUMNS.items()})
+            text = io.StringIO(newline="")
+            table = csv.DictWriter(text, ["steps", "seconds", *COLUMNS])
+            table.writeheader()
+            table.writerows(rows)
+            write_whole(file, text.getvalue().encode())
+        show(progress)
+
+    return after
