@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,16 +29,21 @@ class Study:
     """Address of a Ray cluster that carries out the trainings, such as 10.0.0.1:6379; auto for the
     one that this machine belongs to, local for Ray on this machine alone."""
 
+    compare: str = ""
+    """Compare every two algorithms and variants by a figure of study.json, such as success_rate or,
+    with the setting evaluations, solved_after_steps: by how many seeds it is smaller."""
     json: bool = False
     """Print what study.json holds as one JSON object and nothing else."""
 
     def run(self) -> None:
         """Train what is missing, print the table, write the files."""
         given = {"jobs": self.jobs, "out": self.out, "ray": self.ray or None}
-        carry_out(self.file, json=self.json, **given)
+        carry_out(self.file, json=self.json, compare=self.compare, **given)
 
 
-def carry_out(what: Path | Mapping[str, Any], *, json: bool = False, **given: Any) -> None:
+def carry_out(
+    what: Path | Mapping[str, Any], *, json: bool = False, compare: str = "", **given: Any
+) -> None:
     """Carry out a study, as `quadrl.study` takes it, and print what it reached."""
     from quadrl.learning.study import complaint, study
 
@@ -47,12 +53,25 @@ def carry_out(what: Path | Mapping[str, Any], *, json: bool = False, **given: An
 
     with going_on():
         found = study(what, own=tuple(shared.own_files), on_line=on_line, **given)
+    compared = found.compare(compare) if compare else []
     if json:
-        print_json(found.content)
+        print_json(found.content | {"compared": [dataclasses.asdict(one) for one in compared]})
     else:
         head, *rows = found.table
         console.print("", make_table(head, rows, numbers=4))
         say("\nmeans over the seeds, with their 95 % intervals in brackets")
+        if compared:
+            head = ("the one", "the other", f"smaller {compare}", "verdict", "power")
+            console.print("", make_table(head, [_row(one) for one in compared], numbers=3))
+            say(f"\nchance that a seed of the one has the smaller {compare}, within a task;")
+            say("power to show a chance of three in four, and to show no difference")
         say(f"in {found.folder}: table.csv, study.json, learning_curves_TASK.png, the runs")
     if found.failed:
         raise QuadrlError(complaint(found.failed))
+
+
+def _row(one: Any) -> tuple[str, ...]:
+    """A comparison in words."""
+    chance = f"{one.chance:.2f} ({one.low:.2f} to {one.high:.2f})"
+    power = f"{one.power_differs:.2f}, {one.power_equal:.2f}"
+    return one.one, one.other, chance, one.verdict, power

@@ -5,15 +5,21 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from quadrl.base.files import write_whole
 from quadrl.base.progress import Progress
 from quadrl.evaluation.evaluate import evaluate
-from quadrl.learning.folder import EVALUATIONS
-from quadrl.learning.train import Training
+from quadrl.learning.folder import EVALUATIONS, read_metrics
+
+if TYPE_CHECKING:
+    from quadrl.learning.train import Training
 
 EPISODES = 50
+SOLVED = 0.95
 COLUMNS = {
     "success": "success_rate",
     "survival": "survival_rate",
@@ -51,3 +57,23 @@ def evaluating(training: Training, show: Callable[[Progress], None]) -> Callable
         show(progress)
 
     return after
+
+
+def along(folder: Path) -> dict[str, float | None]:
+    """Figures without a ceiling of a run that was evaluated along the way; none of another.
+
+    Returns:
+        solved_after_steps: control steps after which its success stays at 95 % or above, None
+        where it ends below; success_area: its mean over the training; success_lost: the largest
+        of it less the last.
+    """
+    if not (folder / EVALUATIONS).exists():
+        return {}
+    curve = read_metrics(folder / EVALUATIONS)
+    success, (below,) = curve["success"], np.nonzero(curve["success"] < SOLVED)
+    after = curve["steps"][below[-1] + 1 if len(below) else 0 :]
+    return {
+        "solved_after_steps": float(after[0]) if len(after) else None,
+        "success_area": float(success.mean()),
+        "success_lost": float(success.max() - success[-1]),
+    }

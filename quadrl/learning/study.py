@@ -24,6 +24,8 @@ from quadrl.base.validation import number
 from quadrl.core.scenario import as_saved
 from quadrl.evaluation.evaluate import html_table
 from quadrl.learning.cluster import on_ray
+from quadrl.learning.comparison import LEVEL, Comparison, arm, compare
+from quadrl.learning.evaluations import along
 from quadrl.learning.executor import Local, complaint, train_all
 from quadrl.learning.folder import EVALUATION, write_json
 from quadrl.learning.plan import Plan, read_plan
@@ -73,6 +75,18 @@ class StudyResult:
 
     def _repr_html_(self) -> str:
         return html_table(self.table)
+
+    def compare(self, figure: str) -> list[Comparison]:
+        """Compare a metric of `runs` for every two algorithms and variants, within each task.
+
+        A verdict is that of `quadrl.learning.comparison`; one of all of them is false with a
+        chance of 5 % at most.
+
+        Raises:
+            QuadrlError: There is no such metric, or fewer than two seeds.
+        """
+        arms = [*itertools.combinations(dict.fromkeys(map(arm, self.runs)), 2)]
+        return [compare(self.runs, figure, *two, LEVEL / len(arms)) for two in arms]
 
     @property
     def content(self) -> dict[str, Any]:
@@ -166,6 +180,7 @@ def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
     for run in plan.runs:
         if run.done:
             config, metrics = run.config, json.loads((run.folder / EVALUATION).read_text())
+            metrics |= along(run.folder)
             known = {"name": run.name, "task": config.task, "algo": config.algo}
             known |= {"variant": run.variant, "seed": config.seed}
             known |= {"scenario": as_saved(metrics.pop("scenario")), "metrics": metrics}
