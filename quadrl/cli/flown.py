@@ -72,7 +72,7 @@ class Flown(Conditioned):
     one such as hover_robust (write ./NAME for a folder of that name). Conditions that are not given
     are those of its training."""
     algo: choices.Algorithm = ""
-    """Algorithm of the policy that comes with quadrl; ppo by default."""
+    """Algorithm of the policy that comes with quadrl; by default that of its task's trainings."""
     controller: choices.ControllerName = ""
     """A controller instead of a policy: geometric or lqr."""
     task: choices.TaskName = ""

@@ -29,7 +29,7 @@ class View(Flown):
             view(
                 self.flies(),
                 self.task or None,
-                label=f"{name}_{self.algo or 'ppo'}" if name in TASKS else name,
+                label=f"{name}_{self.algo or TASKS[name].trained_by}" if name in TASKS else name,
                 num_envs=self.num_envs,
                 seed=self.seed,
                 host=self.host,

@@ -67,6 +67,8 @@ class Task(abc.ABC):
     an aircraft that holds its place at more than `STILL` allows."""
     trained_on: ClassVar[str] = "paper"
     """The aircraft of a training where none is named."""
+    trained_by: ClassVar[str] = "ppo"
+    """The algorithm of a training, and of a policy that comes with quadrl, where none is named."""
     training: ClassVar[dict[str, Any]] = {}
     """Training settings that differ from the defaults of `quadrl.learning.config.TrainConfig`;
     `vehicle_options` are those of that aircraft, and no other's."""

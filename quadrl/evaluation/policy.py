@@ -22,9 +22,11 @@ from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
 from quadrl.control.modes import named
 from quadrl.core.scenario import KEYWORDS, Scenario, as_saved
+from quadrl.core.task import Task
 from quadrl.evaluation import policy_file
 from quadrl.evaluation.memory import GRU, PolicyInFlight
 from quadrl.evaluation.policy_file import CLIP, RUN, SHIPPED, SHIPPED_AS, shipped
+from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
     from quadrl.core.environment import Environment
@@ -282,12 +284,13 @@ class Policy:
         return policy
 
     @classmethod
-    def pretrained(cls, task: str, algo: str = "ppo", variant: str = "ideal") -> Policy:
+    def pretrained(cls, task: str, algo: str = "", variant: str = "ideal") -> Policy:
         """A policy that comes with the package; the .json beside it says how it was made.
 
         Args:
             task: The task that it was trained for, or the name of its file, such as hover_robust.
-            algo: The algorithm that it was trained with: ppo, trpo or vpg (or gae, its alias).
+            algo: The algorithm that it was trained with: ppo, trpo, vpg (or gae, its alias) or apg;
+                by default that of the task's trainings.
             variant: The variant of the training: ideal, or robust, for an uncertain aircraft.
 
         Raises:
@@ -295,5 +298,6 @@ class Policy:
         """
         name, known = task, [file.stem for file in shipped()]
         if task not in known:
+            algo = algo or TASKS.get(task, Task).trained_by
             name = f"{task}_{SHIPPED_AS.get(algo, algo) if variant == 'ideal' else variant}"
         return cls.load(SHIPPED / f"{choice('pretrained policy', name, known)}.safetensors")

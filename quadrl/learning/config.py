@@ -24,6 +24,7 @@ from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control import modes
 from quadrl.core.scenario import KEYWORDS, Scenario
+from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning.defaults import CHOSEN, PAIRS, flat, training_defaults
@@ -61,9 +62,9 @@ class TrainConfig(TrainSettings):
         settings = _given(renamed(settings))
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
         settings, _ = with_networks(settings)
-        algo = settings.get("algo", TrainConfig.algo)
+        algo = settings.get("algo", _of(task).trained_by)
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
-        vehicle = settings.setdefault("vehicle", _trained_on(task))
+        vehicle = settings.setdefault("vehicle", _of(task).trained_on)
         variant = settings.get("variant", TrainConfig.variant)
         chosen = task, algo, vehicle, variant, settings.get("memory")
         values, _ = training_defaults(_fields(), *chosen)
@@ -124,9 +125,10 @@ class TrainConfig(TrainSettings):
         """
         usual, layers = self._defaults()
         usual |= {name: getattr(TrainConfig, name) for name in CHOSEN}
-        usual["vehicle"] = _trained_on(self.task)
-        if usual["vehicle"] != TrainConfig.vehicle:
-            layers["vehicle"] = f"{self.task} x {self.algo}"
+        task = _of(self.task)
+        for name, own in (("vehicle", task.trained_on), ("algo", task.trained_by)):
+            if own != usual[name]:
+                usual[name], layers[name] = own, f"{self.task} x {self.algo}"
         others = {*ALGORITHMS} - {self.algo}
         values = dict(flat(usual | {name: dataclasses.asdict(usual[name]) for name in ALGORITHMS}))
         for name, value in flat(dataclasses.asdict(self)):
@@ -284,9 +286,9 @@ def _fields() -> dict[str, Any]:
     return {name: getattr(TrainConfig, name, {}) for name in names} | own
 
 
-def _trained_on(task: str) -> str:
-    """The aircraft of a training of a task where none is named; an unknown one has the usual."""
-    return TASKS[task].trained_on if task in TASKS else TrainConfig.vehicle
+def _of(task: str) -> type[Task]:
+    """The task of a name; where it is unknown, which is refused later, what all have in common."""
+    return TASKS.get(task, Task)
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.validation import choice, keys
 from quadrl.conditions.randomization import RANDOMIZATIONS
 from quadrl.core.task import Task
-from quadrl.learning.settings import ALGORITHM_CONFIGS
+from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
 """Settings that the defaults follow from, or that have no better default than another."""
@@ -128,6 +128,7 @@ def training_defaults(
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
     choice("vehicle", vehicle, VEHICLES)
     own = own_settings(kind, algo)
+    own.pop("algo", None)
     if own.pop("vehicle", "paper") != vehicle:  # the numbers of another aircraft
         own.pop("vehicle_options", None)
     varied = (shared, kind.variants.get(variant, {}), OF_VEHICLE.get((variant, vehicle), {}))
@@ -164,10 +165,11 @@ def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
     return layer | {name: PER_STEP[name](layer[name], often) for name in PER_STEP if name in layer}
 
 
-def own_settings(task: Task | type[Task], algo: str = "ppo") -> dict[str, Any]:
-    """Settings that have other defaults with a task and an algorithm."""
-    aircraft = {} if task.trained_on == "paper" else {"vehicle": task.trained_on}
-    return merged(aircraft, task.training, task.training_with.get(algo, {}))
+def own_settings(task: Task | type[Task], algo: str = "") -> dict[str, Any]:
+    """Settings that have other defaults with a task and an algorithm, by default its own."""
+    chosen = {"vehicle": task.trained_on, "algo": task.trained_by}
+    unusual = {name: own for name, own in chosen.items() if own != getattr(TrainSettings, name)}
+    return merged(unusual, task.training, task.training_with.get(algo or task.trained_by, {}))
 
 
 def merged(*settings: dict[str, Any]) -> dict[str, Any]:

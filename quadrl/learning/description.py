@@ -24,7 +24,7 @@ def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]
 
     Returns:
         name, asks, starts, ends, solved (texts); time_limit [s]; training: settings that have other
-        defaults with this task and PPO; observation: name, first, last, unit and meaning of each
+        defaults with this task; observation: name, first, last, unit and meaning of each
         term of the flat vector; action (text); reward: name, weight (None without an option of that
         name) and meaning of each term; options: name, value and meaning of the others.
     """

@@ -1,6 +1,6 @@
 """Draw the tasks and a training in motion.
 
-The PPO policy that ships for a task flies it, in the aircraft of its trainings.
+The policy that ships for a task, of its own algorithm, flies it, in the aircraft of its trainings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,11 @@ RELEASED = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
 PANEL = (400, 225)  # [pixels]
 FPS, LAST = 12.5, 1.5  # [1/s], [s] that the end is shown
 QUALITY = 30  # a task is then under 250 kB
-FLOWN = tuple(name for name in tasks.TASKS if (SHIPPED / f"{name}_ppo.safetensors").exists())
+FLOWN = tuple(
+    name
+    for name, task in tasks.TASKS.items()
+    if (SHIPPED / f"{name}_{task.trained_by}.safetensors").exists()
+)
 
 
 def pictures(only: tuple[str, ...] = (*FLOWN, "learning")) -> None:

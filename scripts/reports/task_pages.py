@@ -78,7 +78,7 @@ counts as successful when the mean action reaches this in {episodes} fresh episo
 ## Policies
 
 {policies}"""
-SHIPS = """`quadrl.Policy.pretrained("{name}", algo="ppo")` and `quadrl render {name}` fly them. A
+SHIPS = """`quadrl.Policy.pretrained("{name}", algo="{by}")` and `quadrl render {name}` fly them. A
 policy is a safetensors file, with a .json of all its settings beside it, in
 `quadrl/assets/policies`.
 
@@ -132,7 +132,7 @@ def page(name: str) -> str:
         for x in (usual, *known["options"])
     ]
     own = " ".join(f"`{setting}`" for setting in settings(own_settings(task)))
-    flies = (SHIPPED / f"{name}_ppo.safetensors").exists()
+    flies = (SHIPPED / f"{name}_{task.trained_by}.safetensors").exists()
     moving = f"![A flight of a policy that comes with quadrl](images/tasks/{name}.webp)\n\n"
     drawn = (report.IMAGES / "tasks" / f"{name}.webp").exists()
     return moving * drawn + PAGE.format(
@@ -211,7 +211,7 @@ def policies(name: str = "") -> str:
         return "None comes with quadrl."
     head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "asked and missed")
     note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result))
-    how = SHIPS.format(name=name) if name else ""
+    how = SHIPS.format(name=name, by=tasks.TASKS[name].trained_by) if name else ""
     return f"{how}{table(head, rows)}\n\n{note}"
 
 

@@ -253,11 +253,13 @@ def test_a_randomization_and_options_of_the_observation_are_settings():
     assert TrainConfig("hover").scenario.to_json() == {"task": "hover", "vehicle": "paper"}
 
 
-def test_a_task_names_the_aircraft_of_its_trainings_and_no_others_options():
+def test_a_task_names_aircraft_and_algorithm_of_its_trainings_and_no_others_options():
     config = TrainConfig("race")
     assert (config.vehicle, config.vehicle_options) == ("racer", {"action_scale": 1250.0})
     sources = {name: origin for name, _, origin in config.sources()}
-    assert sources["vehicle"] == sources["vehicle_options.action_scale"] == "race x ppo"
+    assert sources["vehicle"] == sources["vehicle_options.action_scale"] == "race x apg"
+    assert (config.algo, sources["algo"]) == ("apg", "race x apg")
+    assert TrainConfig("race", algo="ppo").algo == "ppo" and TrainConfig("hover").algo == "ppo"
     other = TrainConfig("race", vehicle="paper")
     assert (other.vehicle, other.vehicle_options) == ("paper", {})
     assert TrainConfig("hover").vehicle == "paper"
