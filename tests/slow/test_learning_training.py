@@ -1,7 +1,6 @@
 """Training: the same seed, checkpoints that lose nothing, what the critic sees, the metrics."""
 
 import dataclasses
-import errno
 import os
 import shutil
 from pathlib import Path
@@ -15,13 +14,12 @@ from safetensors.torch import save as to_safetensors
 from tensordict import TensorDict
 
 import quadrl
-from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.core.environment import Environment
 from quadrl.engines import native
 from quadrl.learning import checkpoint
 from quadrl.learning.config import ALGORITHMS
 from quadrl.learning.environments import SEED_STRIDE
-from quadrl.learning.folder import LOCK, WARNINGS
+from quadrl.learning.folder import WARNINGS
 from quadrl.learning.train import Training
 
 
@@ -229,21 +227,6 @@ def test_a_full_disk_does_not_destroy_what_is_there(finished, tmp_path, monkeypa
         assert (folder / name).read_bytes() == before[name]
     assert not list(folder.glob("*.part"))
     assert_same_run(finished, train(TINY, folder, resume=True))
-
-
-def test_a_file_system_without_locks_trains(finished, tmp_path, monkeypatch):
-    def refuse(descriptor, operation):
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr("fcntl.flock", refuse)
-    with pytest.warns(QuadrlWarning, match="has no locks"):
-        training = Training(TINY, tmp_path / "run")
-    assert (tmp_path / "run" / LOCK).exists()
-    with pytest.raises(QuadrlError, match=f"another training works in .*{LOCK}"):
-        Training(TINY, tmp_path / "run", resume=True)
-    training.run()
-    assert not (tmp_path / "run" / LOCK).exists()
-    assert_same_run(finished, tmp_path / "run")
 
 
 def test_mujocos_warnings_stand_in_the_run_folder(tmp_path, capfd):

@@ -283,25 +283,6 @@ def test_stopped_it_has_a_checkpoint_and_says_how_to_go_on(tmp_path, number, see
     assert checkpoint.load(folder / "checkpoint.safetensors")[1]["iteration"] * 32 == steps
 
 
-def test_asked_for_a_checkpoint_it_writes_one_and_goes_on(tmp_path):
-    def wait_for(file):
-        while not file.exists() and process.poll() is None:
-            time.sleep(0.01)
-
-    words, policy = [sys.executable, "-m", "quadrl", *RARELY], tmp_path / "policy.safetensors"
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-    with subprocess.Popen([*words, "--out", str(tmp_path)], env=environment) as process:
-        wait_for(tmp_path / "metrics.csv")
-        steps = []
-        for _ in range(2):
-            process.send_signal(signal.SIGUSR1)
-            wait_for(policy)
-            steps.append(Policy.load(policy).metadata["steps"])
-            policy.unlink()
-        process.kill()
-    assert steps[0] < steps[1] and process.returncode == -signal.SIGKILL
-
-
 def test_terminated_while_it_draws_it_leaves_nothing_half_written(tmp_path):
     folder = tmp_path / "run"
     words = ["train", "hover", *TINY]

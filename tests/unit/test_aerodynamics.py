@@ -226,26 +226,6 @@ def test_inflow_damps_heave_and_roll():
     assert 0.02220 / 7.5e-3 == pytest.approx(2.96, abs=1e-3)
 
 
-def test_the_thrust_is_what_the_air_gets():
-    # lift = 2 rho A (w - V) sqrt(w^2 + p^2), with the flow that gives this lift by blade theory.
-    vehicle = bare(INFLOW)
-    p = Parameters.of(rows(vehicle))
-    flow, induced = (value[0, 0] for value in dynamics._disc(p))
-    kappa = flow * 0.15 * 0.953 * induced / (8 * 3.13e-5)
-    assert kappa == pytest.approx(1.3293, abs=1e-3)
-    climb, across = np.meshgrid(np.linspace(-1, 2, 31), np.linspace(0, 4, 41))
-    speed = np.broadcast_to(vehicle.hover_speed, (climb.size, 4))
-    given = (np.broadcast_to(k.reshape(-1, 1), speed.shape) * V_H for k in (climb, across))
-    v, across = (next(given) for _ in range(2))
-    change = dynamics.lift_change(p, speed, v, across**2, 0.0)
-    unclipped = np.abs(change[:, 0] / T_H + 0.2) < 0.799  # -1 to 0.6
-    w = V_H - change[:, 0] / (flow * kappa * V_H)
-    lift = T_H + change[:, 0]
-    balance = lift - flow * (w - v[:, 0]) * np.hypot(w, across[:, 0])
-    assert unclipped.mean() > 0.5
-    assert np.abs(balance[unclipped]).max() < 2e-3 * T_H
-
-
 # The share of k_T Omega^2 that two Newton steps may lack, anywhere and above a descent at w0. The
 # Crazyflie's largest is at -1.95 w0, in the vortex ring state, which is less certain than that.
 LACKING = {"paper": (1.2e-4, 1.2e-4), "racer": (4e-4, 4e-4), "crazyflie": (0.024, 2e-3)}
@@ -500,28 +480,6 @@ def test_the_gyroscopic_moment_does_no_work():
     # H = 6e-5 * (300 + 300 - 100 - 100) = 0.024 N m s about z: (-omega_y H, omega_x H, 0).
     np.testing.assert_allclose(gyroscopic, [2.0 * 0.024, 1.5 * 0.024, 0], rtol=1e-9, atol=1e-14)
     assert gyroscopic @ rate == pytest.approx(0, abs=1e-14)
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_the_angular_momentum_of_body_and_rotors_is_conserved(engine):
-    # Hardly any thrust and torque: the rotors change speed, the body turns, the sum stays.
-    vehicle = dataclasses.replace(bare(INERTIA), physics_timestep=0.001)
-    flying = BatchEngine(vehicle, 1, altitude=3.0, engine=engine, per_row=True)
-    table = rows(vehicle)
-    table["rotor"]["thrust_coefficient"], table["rotor"]["torque_coefficient"] = 1e-15, 1e-18
-    flying.write_parameters(np.array([0]), table)
-    flying.qpos[:], flying.qvel[:, 3:] = (0, 0, HIGH, 1, 0, 0, 0), (0.7, -1.2, 0.4)
-    flying.act[:], flying.ctrl[:] = (300, 100, 250, 120), (100, 400, 150, 380)
-
-    def momentum():
-        inner = vehicle.aerodynamics.rotor_inertia * flying.act[0] @ [1, -1, 1, -1]
-        body = np.array(vehicle.inertia) * flying.qvel[0, 3:] + (0, 0, inner)
-        return helpers.matrices(flying.qpos[0, 3:]) @ body
-
-    before, rate = momentum(), flying.qvel[0, 3:].copy()
-    flying.advance(400)
-    np.testing.assert_allclose(momentum(), before, atol=1e-8)
-    assert np.abs(flying.qvel[0, 3:] - rate).max() > 1
 
 
 # -------------------------------------------------------------------------- the exact solution

@@ -628,17 +628,6 @@ def test_a_disk_that_fills_up(capsys, tmp_path, monkeypatch, undrawn):
     assert command("train", "--resume", folder, "--no-video", "--episodes", "2") == 0
 
 
-def test_a_policy_for_another_layout(refusal, run):
-    # Beside the 22 numbers of hover, tasks with a moving target show its velocity.
-    error, _ = refusal("evaluate", run, "--task", "target_following")
-    assert error.value == 22 and error.allowed.startswith("25 ")
-    error, _ = refusal("evaluate", run, "--vehicle", "hexa")
-    assert error.value == 22 and error.allowed.startswith("24 ")
-    # As many rotors as the aircraft that it was trained with, but an X.
-    error, _ = refusal("evaluate", run, "--vehicle", "racer")
-    assert (error.name, error.value) == ("vehicle", "racer") and "paper" in error.allowed
-
-
 @pytest.mark.parametrize(
     ("arguments", "name"),
     [

@@ -178,15 +178,6 @@ def test_rotors_speed_up_and_slow_down_at_rates_of_their_own(engine):
     np.testing.assert_allclose(flying.act, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
-def test_a_rotor_at_its_command_stays_there(engine):
-    flying = BatchEngine(UNEVEN, 1, altitude=3.0, engine=engine)
-    flying.qpos[:, 2] = 100.0
-    flying.act[:] = flying.ctrl[:] = 123.456
-    flying.advance(20)
-    np.testing.assert_array_equal(flying.act, 123.456)
-
-
 def test_acceleration_of_a_rotor_by_hand():
     # -10 (200 - 300) = 1000; -(1/0.3) (200 - 140) = -200 rad/s^2. 320 rad/s is the fastest: of a
     # command of 900, -10 (200 - 320) = 1200.
