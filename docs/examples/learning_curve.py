@@ -47,7 +47,7 @@ class Args:
     num_envs: int = 16  # aircraft flown together
     gradient_steps: int = 2  # for each control step of all of them
     batch_size: int = 256  # transitions in a gradient step
-    learning_rate: float = 6e-3  # of Adam
+    learning_rate: float = 6e-3  # of Adam at the start; it falls linearly to zero
     gamma: float = 0.88  # discount of a control step
     tau: float = 0.01  # share of the networks that their slow copies take on
     width: int = 64  # of the two hidden layers of each network
@@ -125,7 +125,7 @@ def sac_curve(args: Args) -> list[dict]:
         learning_starts=FIRST,
         gradient_steps=args.gradient_steps,
         batch_size=args.batch_size,
-        learning_rate=args.learning_rate,
+        learning_rate=lambda left: args.learning_rate * left,  # of the training, from 1 to 0
         gamma=args.gamma,
         tau=args.tau,
         policy_kwargs={"net_arch": [args.width] * 2},

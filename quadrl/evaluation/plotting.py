@@ -179,8 +179,7 @@ def learning_curves(
             if controller is None:
                 axis.set_xlim(left=0)
             else:
-                level = max(controller[panel], LEAST_ERROR)
-                axis.axhline(level, color=BLACK, lw=1.2, ls="--", label="geometric controller")
+                axis.axhline(controller[panel], color=BLACK, lw=1.2, ls="--", label="controller")
             if panel == "success":
                 axis.set_ylim(-0.03, 1.03)
             elif panel == "error":
