@@ -5,13 +5,12 @@ import tyro
 from scripts.reports.learning import curves
 from scripts.reports.measure import goals, ship, speed, training
 from scripts.reports.pages import pages
-from scripts.reports.paper import paper
 from scripts.reports.pictures import pictures
 from scripts.reports.race import race
 from scripts.reports.robustness import robust, robustness
 from scripts.reports.task_pages import shipped
 
-REPORTS = (training, goals, speed, robust, robustness, race, curves, paper, ship, shipped,
+REPORTS = (training, goals, speed, robust, robustness, race, curves, ship, shipped,
            pictures, pages)  # fmt: skip
 
 if __name__ == "__main__":
