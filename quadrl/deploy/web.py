@@ -29,6 +29,7 @@ from quadrl.base.primitives import Primitive
 from quadrl.conditions.sensors import Aim, Disturbance
 from quadrl.core.environment import Environment
 from quadrl.core.markers import Marker
+from quadrl.core.task import Task
 from quadrl.deploy import flights
 from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import world
@@ -81,7 +82,6 @@ def make_book() -> tuple[dict[str, Any], str]:
     (slots,) = re.findall(r"export const SLOTS = (\d+)", (SOURCE / "flight.mjs").read_text())
     # Those that leave the air's laws alone: contact is MuJoCo's.
     tasks = {name: kind() for name, kind in TASKS.items() if not kind.contact}
-    plain = VEHICLES["paper"]
     pairs, sources = {}, [MEMORY.format(slots=slots, size=flights.SIZE)]
     for task in tasks.values():
         for vehicle in VEHICLES.values():
@@ -114,7 +114,7 @@ def make_book() -> tuple[dict[str, Any], str]:
             name: {
                 **{word: getattr(task, word) for word in ("asks", "starts", "ends", "solved")},
                 "timeLimit": task.time_limit,
-                "scene": shapes(drawing.world(mjcf.compile_model(plain, scene=task.scene))),
+                "scene": surroundings(task),
             }
             for name, task in tasks.items()
         },
@@ -127,6 +127,16 @@ def make_book() -> tuple[dict[str, Any], str]:
         },
     }
     return book, "\n".join(sources)
+
+
+def surroundings(task: Task) -> dict[str, Any]:
+    """The world of a task, and what stands in it for whole episodes, such as gates."""
+    environment = Environment(task)
+    environment.reset()
+    asked = task.markers(environment.snapshot)
+    stands = (one.moved(environment.origin) for one in asked if isinstance(one, Primitive))
+    world = drawing.world(mjcf.compile_model(VEHICLES["paper"], scene=task.scene))
+    return shapes([*world, *stands])
 
 
 def beside_aim(environment: Environment) -> list[int]:

@@ -177,18 +177,21 @@ def observations(task: Task, known: dict[str, Any]) -> str:
     return table(("number", "term", "entry", "unit", "meaning and frame"), rows)
 
 
-def shipped(episodes: int = 300) -> None:
+def shipped(episodes: int = 300, only: tuple[str, ...] = ()) -> None:
     """Fly every policy that comes with quadrl, as it was trained and where nothing disturbs it.
 
     Args:
         episodes: Flights of each in each of the two conditions.
+        only: Names of tasks, beside what was measured of the others; by default all.
     """
     rows = []
-    for name in sorted(file.stem for file in SHIPPED.glob("*.safetensors")):
+    files = (file for task in only or [""] for file in SHIPPED.glob(f"{task}*.safetensors"))
+    for name in sorted(file.stem for file in files):
         found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, measure.CALM))
         rows.append({"policy": name} | found | {"undisturbed": still})
         report.say(f"{name}: {[x.words for x in measure.unmet(found['task'], still)]}")
-    report.save("shipped", {"rows": rows})
+    rows = report.beside("shipped", {"rows": rows}, only)["rows"]
+    report.save("shipped", {"rows": sorted(rows, key=lambda row: row["policy"])})
 
 
 def policies(name: str = "") -> str:
@@ -196,21 +199,21 @@ def policies(name: str = "") -> str:
     result = report.load("shipped")
     targets = tasks.TASKS[name].targets if name else ()
     own, rows = [x for x in targets if x.metric not in FIGURES], []
-    for row in result["rows"]:
-        if name in ("", row["task"]):
-            made = json.loads((SHIPPED / f"{row['policy']}.json").read_text())["command"]
-            cells = [quantity(x, row[x]) if x in row else "" for x in FIGURES]
-            cells += [quantity(x.metric, row[x.metric]) for x in own]
-            still = row["undisturbed"]
-            missed = (
-                f"{x.words}: {quantity(x.metric, still[x.metric])}, asked {asked(x)}"
-                for x in measure.unmet(row["task"], still)
-            )
-            rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "nothing"))
+    flown = [row for row in result["rows"] if name in ("", row["task"])]
+    for row in flown:
+        made = json.loads((SHIPPED / f"{row['policy']}.json").read_text())["command"]
+        cells = [quantity(x, row[x]) if x in row else "" for x in FIGURES]
+        cells += [quantity(x.metric, row[x.metric]) for x in own]
+        still = row["undisturbed"]
+        missed = (
+            f"{x.words}: {quantity(x.metric, still[x.metric])}, asked {asked(x)}"
+            for x in measure.unmet(row["task"], still)
+        )
+        rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "nothing"))
     if not rows:
         return "None comes with quadrl."
     head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "asked and missed")
-    note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result))
+    note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result, flown))
     how = SHIPS.format(name=name, by=tasks.TASKS[name].trained_by) if name else ""
     return f"{how}{table(head, rows)}\n\n{note}"
 
