@@ -65,14 +65,16 @@ def picture(rows: list[Result]) -> Figure:
     axis: Any = figure.subplots()
     for k, (label, (success, time)) in enumerate(PUBLISHED.items()):
         axis.plot(time, 100 * success, "s", color=GREY)
-        place = (6, (-9, 5)[k % 2])  # below and above in turn, since two have the same success
-        axis.annotate(label, (time, 100 * success), place, textcoords="offset points", size=7)
+        # The first to the left, since quadrl's are on its right; then above and below in turn.
+        place, side = ((6, (-9, 5)[k % 2]), "left") if k else ((-6, -9), "right")
+        how = {"textcoords": "offset points", "ha": side, "size": 7}
+        axis.annotate(label, (time, 100 * success), place, **how)
     for row in rows:
         if row["race"] == "one lap":
             axis.plot(row["race_time_mean_s"], 100 * row["success_rate"], "o", color=BLUE)
     axis.axvline(IN_TIME, color=ORANGE, lw=0.8)
     axis.axhline(100 * ENOUGH, color=ORANGE, lw=0.8)
-    axis.set(xlabel="time [s]", ylabel="successful [%]", xlim=(4.6, 6.4), ylim=(40, 104))
+    axis.set(xlabel="time [s]", ylabel="successful [%]", xlim=(4.3, 6.3), ylim=(40, 104))
     axis.set_title("One lap of split_s: quadrl (circles), Song et al. 2023 (squares)")
     tidy(axis)
     return figure
