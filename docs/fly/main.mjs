@@ -13,7 +13,9 @@ const RATES = [0.25, 0.5, 1, 2];
 const LONGEST_FRAME = 0.25; // [s]; a page that was hidden does not catch up
 const TUMBLE = 0.35; // of the largest body rate that stays resolved, at most TUMBLE_MOST
 const TUMBLE_MOST = 6; // [rad/s]
-const LABELS = { ppo: "PPO", trpo: "TRPO", gae: "Policy gradient", vpg: "Policy gradient", robust: "Robust" };
+const LABELS = {
+  ppo: "PPO", trpo: "TRPO", gae: "Policy gradient", vpg: "Policy gradient", apg: "APG", robust: "Robust",
+};
 
 const at = (id) => document.getElementById(id);
 const words = (name) => name.replaceAll("_", " ");

@@ -11,6 +11,7 @@ from runs import refused
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.core.environment import Environment
+from quadrl.deploy.web import surroundings
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.rollout import fly, summarize
 from quadrl.tasks.race import Race
@@ -151,6 +152,14 @@ def test_known_tracks_lead_through_their_gates_and_are_compiled(name):
     environment = Environment(task, num_envs=2, vehicle="racer")
     environment.reset()
     assert environment.not_compiled == ""
+
+
+def test_gates_stand_on_the_page_in_the_browser():
+    task = Race(track="alphapilot")
+    bars = np.array([bar["position"] for bar in surroundings(task)["shapes"]])
+    # The four bars of a frame lie around its centre, as far above the ground as the feet reach.
+    centres = bars.reshape(11, 4, 3).mean(1) - task.course.centre
+    np.testing.assert_allclose(centres, [[0, 0, Vehicle().ground_clearance]] * 11, atol=1e-3)
 
 
 def test_the_tracks_have_their_lengths():
