@@ -192,14 +192,14 @@ class Policy:
                 stand or turn otherwise, or an action of 1 is another change of their speed.
         """
         vehicle, name = environment.vehicle, self.metadata.get("vehicle")
+        as_trained = f"as in the training of the policy for {self.task}"
         # One that is not known here is taken for the one that it is to fly.
         known = name if isinstance(name, dict) or name in VEHICLES else vehicle
         trained = resolve_vehicle(known, self.metadata.get("vehicle_options"))
         needed = observing.resolve(self.metadata.get("observe")).for_policy()
         seen = environment.scenario.observe.for_policy()
         if needed != seen:
-            allowed = f"{needed}, as in the training of the policy for {self.task}"
-            raise QuadrlError(name="observe", value=seen, allowed=allowed)
+            raise QuadrlError(name="observe", value=seen, allowed=f"{needed}, {as_trained}")
         for what, own, needed in (
             ("observation", self.size, environment.size),
             ("action", self.action_size, environment.action_size),
@@ -209,7 +209,7 @@ class Policy:
                 where = f"{environment.task.name} with the vehicle {vehicle.name}"
                 raise QuadrlError(name=name, value=own, allowed=f"{needed} for {where}")
         if (mode := environment.control_mode.name) != self.control_mode:
-            allowed = f"{self.control_mode!r}, as in the training of the policy for {self.task}"
+            allowed = f"{self.control_mode!r}, {as_trained}"
             raise QuadrlError(name="control_mode", value=mode, allowed=allowed)
         if self.control_mode != "rotor":
             return
@@ -217,9 +217,8 @@ class Policy:
             allowed = f"one with the rotor layout of {trained.name}, which the policy has learned"
             raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
         if trained.action_scale != vehicle.action_scale:
-            allowed = f"{trained.action_scale:g}, as in the training of the policy for {self.task}"
             reason = "make the environment with **policy.keywords, or its aircraft with that scale"
-            scale = vehicle.action_scale
+            scale, allowed = vehicle.action_scale, f"{trained.action_scale:g}, {as_trained}"
             raise QuadrlError(reason, name="action_scale", value=scale, allowed=allowed)
 
     def _without_memory(self) -> np.ndarray:
@@ -241,11 +240,9 @@ class Policy:
         """Actions (..., k) and the next state."""
         observation = np.asarray(observation, dtype=np.float32)
         if observation.shape[-1:] != self.mean.shape:
-            allowed = f"(..., {self.size}) for the policy for {self.task}"
+            shape, allowed = observation.shape, f"(..., {self.size}) for the policy for {self.task}"
             reason = "an environment that is made with **policy.keywords gives that"
-            raise QuadrlError(
-                reason, name="observation shape", value=observation.shape, allowed=allowed
-            )
+            raise QuadrlError(reason, name="observation shape", value=shape, allowed=allowed)
         hidden = np.clip((observation - self.mean) / self.deviation, -CLIP, CLIP)
         if self.memory:
             state = self.memory.step(hidden, state)

@@ -226,10 +226,8 @@ class TrainConfig(TrainSettings):
         now = config.resolved()
         for part in ("task", "vehicle", "weather", "randomization"):
             if saved.get(f"resolved_{part}") != now[f"resolved_{part}"]:
-                raise QuadrlError(
-                    f"{folder} was trained with other parameters of the {part} "
-                    f"{saved[part]}; start a new run"
-                )
+                what = f"{folder} was trained with other parameters of the {part} {saved[part]}"
+                raise QuadrlError(f"{what}; start a new run")
         return config
 
 
