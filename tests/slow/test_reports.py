@@ -67,7 +67,15 @@ def test_rows_of_other_tasks_are_kept_with_their_commit(monkeypatch):
 
 def test_shares_of_the_benchmark_are_within_one_turn():
     measured = benchmark.benchmark("hover", num_envs=3, seconds=0.01, repeats=2)
-    assert {row["target"] for row in measured["rates"]} == {None, 0.90, 20.0, 0.75, 0.35, 1 / 3}
+    assert {row["target"] for row in measured["rates"]} == {
+        None,
+        0.90,
+        20.0,
+        0.80,
+        0.75,
+        0.35,
+        1 / 3,
+    }
     for of in (benchmark.ALL_CORES, benchmark.ONE_CORE, benchmark.FREE_FLIGHT, benchmark.KERNEL):
         group = [row for row in measured["rates"] if row["of"] == of]
         bare = [row for row in group if row["what"].startswith("mj_step")]
