@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 UNITS = {"_rad_s": "rad/s", "_m_s": "m/s", "_deg": "°", "_s": "s"}
 """Units by the end of a metric's name; lengths (`_m`) and shares choose their own."""
@@ -34,13 +35,13 @@ def quantity(name: str, value: object) -> str:
     return percent(value) if name.endswith(SHARES) else digits(value)
 
 
-def length(metres: float) -> str:
-    """A length [m] in µm, mm, cm or m, whichever gives two or three digits."""
+def length(metres: float, units: Sequence[tuple[str, float]] = LENGTHS) -> str:
+    """A length [m] in the unit that gives two or three digits: µm, mm, cm or m."""
     size = abs(metres)
     # What would be rounded up to the next unit is shown in it: 0.999 mm is 1.0 mm.
-    fitting = (unit for unit in LENGTHS if size >= 0.9995 * unit[1])
-    name, unit = next(fitting, LENGTHS[-1])
-    if 0.0 < size < 0.05e-6:
+    fitting = (unit for unit in units if size >= 0.9995 * unit[1])
+    name, unit = next(fitting, units[-1])
+    if name == "µm" and 0.0 < size < 0.05 * unit:
         return "under 0.1 µm"
     return f"{digits(metres / unit)} {name}"
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.rotation import Array, roll_pitch_yaw
-from quadrl.base.units import length
+from quadrl.base.units import LENGTHS, length
 from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER
 from quadrl.rendering.horizon import horizon
 
@@ -158,7 +158,7 @@ def flight_lines(
     """
     return {
         "time": f"{time:.2f} s",
-        "error": length(error),
+        "error": length(error, LENGTHS[:-1]),  # the font has no µ
         "speed": f"{speed:.2f} m/s",
         "reward": f"{reward:+.2f}",
         **({} if wind is None else {"wind": f"{wind:.1f} m/s"}),

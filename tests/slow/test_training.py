@@ -214,15 +214,19 @@ def test_a_shipped_policy_still_reaches_its_metrics(file):
     assert reached["position_error_m"] <= error + 4 * standard_error
 
 
-@pytest.mark.parametrize("file", shipped(), ids=lambda file: file.stem)
+def judged(file):
+    """What the task of a policy asks of its behaviour; who races need not stand still."""
+    targets = quadrl.tasks.TASKS[Policy.load(file).task].targets
+    return [x for x in targets if x.metric in ("yaw_rate_rad_s", "circling_m_s")]
+
+
+@pytest.mark.parametrize("file", [*filter(judged, shipped())], ids=lambda file: file.stem)
 def test_a_shipped_policy_neither_turns_nor_circles(file):
     task = quadrl.tasks.TASKS[Policy.load(file).task]
     engine = "mujoco" if task.contact else "free_flight"
     given = {"weather": "calm", "randomization": "none", "engine": engine}
     reached = evaluate(file.stem, episodes=FRESH_EPISODES, **given).metrics
-    judged = [x for x in task.targets if x.metric in ("yaw_rate_rad_s", "circling_m_s")]
-    assert judged
-    assert [x.metric for x in judged if not x.met(reached)] == []
+    assert [x.metric for x in judged(file) if not x.met(reached)] == []
 
 
 # ------------------------------------------------------------------- the command, in a process

@@ -16,7 +16,7 @@ import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFont
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -35,6 +35,7 @@ from quadrl.rendering import (
     Renderer,
     drawing,
     gl,
+    overlay,
     read_scenarios,
     render_trajectory,
     write_contact_sheet,
@@ -371,6 +372,16 @@ def test_the_panel_shows_rotor_speeds_in_its_corner_and_the_outcome_below(rotors
     assert green[1] > red[1] and red[0] > green[0]
 
 
+def test_the_font_has_all_that_the_panel_writes():
+    font = ImageFont.load_default(size=20)
+    errors = (0.0, 1e-9, 6.3e-5, 0.0063, 0.063, 63.0, 1234.5, math.nan)
+    lines = [overlay.flight_lines(1.0, x, 2.0, -3.0, 4.0) for x in errors]
+    assert lines[2]["error"] == "0.063 mm"
+    text = "".join(name + value for each in lines for name, value in each.items()) + "…°"
+    box, *glyphs = (bytes(font.getmask(x)) for x in ("\ufffe", *sorted({*text} - {" "})))
+    assert box not in glyphs
+
+
 def test_the_outcome_in_words():
     ends = [(True, False, True), (False, True, True), (True, False, False), (False, True, False)]
     assert [outcome(*end) for end in ends] == [SUCCESS, SUCCESS, FAILURE, TIME_OVER]
@@ -540,8 +551,8 @@ def test_gymnasium_shows_the_panel_and_the_outcome():
     assert changed(late[119:144, 13:100], end[119:144, 13:100]).mean() > 0.5  # the outcome
     environment = Environment("hover", seed=0)
     environment.reset()
-    for size, overlay in (((160, 96), True), ((400, 300), False)):
-        with contextlib.closing(Pictures(environment, "follow", *size, overlay=overlay)) as drawing:
+    for size, shown in (((160, 96), True), ((400, 300), False)):
+        with contextlib.closing(Pictures(environment, "follow", *size, overlay=shown)) as drawing:
             plain = drawing.frame()
         assert plain[:12].mean() > 150  # sky in the corner
     assert begin[13:112, 13:270].mean() < 0.8 * plain[13:112, 13:270].mean()
