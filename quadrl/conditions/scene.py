@@ -223,7 +223,7 @@ class Scene:
         centres, offsets = self._declared
         made = np.zeros((count, len(centres), 7))
         made[..., :3], made[..., 3] = centres + origin + offsets, 1.0
-        for solid, first in zip(self.solids, self._first, strict=False):
+        for solid, first in zip(self.solids, self._first, strict=True):
             if (pose := placed.get(solid.name)) is None:
                 continue
             turn = pose.quaternion
@@ -242,8 +242,9 @@ class Scene:
 
     @functools.cached_property
     def _first(self) -> list[int]:
-        """Number of the first geom of each solid, and of all."""
-        return np.cumsum([0, *(len(solid.parts) for solid in self.solids)]).tolist()
+        """Number of the first geom of each solid."""
+        counts = [len(solid.parts) for solid in self.solids]
+        return (np.cumsum(counts) - counts).astype(int).tolist()
 
     @functools.cached_property
     def _declared(self) -> np.ndarray:
