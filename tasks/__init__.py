@@ -5,6 +5,7 @@ from __future__ import annotations
 from quadrl.core.catalogue import TASKS, make, register
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
+from quadrl.tasks.perching import Perching
 from quadrl.tasks.race import Race
 from quadrl.tasks.random_waypoint import RandomWaypoint
 from quadrl.tasks.recovery import Recovery
@@ -17,6 +18,6 @@ __all__ = ["TASKS", "make", "register"]
 
 for _task in (
     *(Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing),
-    *(Race, Recovery, Trajectory),
+    *(Race, Recovery, Trajectory, Perching),
 ):
     register(_task)

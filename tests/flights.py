@@ -2,18 +2,22 @@
 
 import dataclasses
 import itertools
+import types
 
 import mujoco
 import numpy as np
 
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.base.philox import SOLIDS
+from quadrl.conditions.scene import Scene
 from quadrl.control import modes
 from quadrl.core.environment import Environment
 from quadrl.core.rewards import total
 from quadrl.core.snapshot import EpisodeEnd, Snapshot
 from quadrl.engines import mjcf
 from quadrl.engines.rng import Rng
+from quadrl.engines.solids import Solids
 from quadrl.engines.state import State
 
 
@@ -68,10 +72,14 @@ def together(one):
 def by_mj_step(task, seed, mode):
     """Bare mj_step and the task's own functions: what every API has to give, bit for bit."""
     vehicle = VEHICLES["paper"]
-    model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.scene)
-    data = mujoco.MjData(model)
+    model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.build)
+    data, scene = mujoco.MjData(model), Scene(task.solids())
+    solids, row = Solids(model, 1), parameters.rows(vehicle)
+    hits, held = np.split(data.userdata[None, parameters.AIR :], [parameters.HIT], axis=1)
+    world = types.SimpleNamespace(solids=solids, hits=hits, held=held)
+    world.clearance = lambda rows: solids.clearance(data.qpos[None], row, vehicle.rotor_count)
     control = modes.make(mode, vehicle)
-    own = parameters.Parameters.of(parameters.rows(vehicle), vehicle.control_timestep)
+    own = parameters.Parameters.of(row, vehicle.control_timestep)
     origin = np.array([0.0, 0.0, max(task.altitude, vehicle.ground_clearance)])
     settle = round(min(task.settle_time, task.time_limit) / vehicle.control_timestep)
     errors, episode = [], itertools.count()
@@ -88,13 +96,18 @@ def by_mj_step(task, seed, mode):
 
     def snapshot(remembered, action, command):
         time = np.array([len(errors) * vehicle.control_timestep])
-        now = Snapshot(state(), remembered, own, action, command, time)
+        around = scene.surroundings(world) if scene.solids else None
+        now = Snapshot(state(), remembered, own, action, command, time, around=around)
         return dataclasses.replace(now, potentials=task.measure(now))
 
     def begin():
         errors.clear()
-        start, remembered = task.begin(Rng(np.array([seed]), np.array([next(episode)])), own)
+        keys = np.array([seed]), np.array([next(episode)])
+        start, remembered = task.begin(Rng(*keys), own)
         mujoco.mj_resetData(model, data)
+        if scene.solids:
+            poses = scene.poses(task.place(Rng(*keys, SOLIDS), start, remembered), 1, origin)
+            solids.place(np.array([0]), poses, origin, lambda name: getattr(model, name)[None])
         data.qpos[:] = np.concatenate([start.position + origin, start.quaternion], axis=-1)[0]
         data.qvel[:] = np.concatenate([start.velocity, start.body_rate], axis=-1)[0]
         data.act[:] = start.rotor_speed[0]
@@ -106,6 +119,7 @@ def by_mj_step(task, seed, mode):
         action = (yield led_to)[None].astype(np.float64)
         setpoint = control.setpoint(before.state, action)
         command = np.zeros((1, vehicle.rotor_count))
+        hits[:] = 0.0
         for _ in range(vehicle.substeps):
             seen = state() if control.has_loops else before.state
             data.ctrl[:] = control.rotor_command(seen, setpoint)[0]

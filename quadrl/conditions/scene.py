@@ -1,4 +1,4 @@
-"""Solids in the world of a task: what stands there, and where in each episode.
+"""The world of a task: what stands there, and where in each episode.
 
 A task declares its solids (`Task.solids`) and places them at each reset (`Task.place`), each row
 for itself. Aircraft collide with them in both engines; free flight hands whoever comes near one to
@@ -7,7 +7,6 @@ MuJoCo. What is free, and what was hit, stands in the `Surroundings` of a snapsh
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
@@ -16,137 +15,20 @@ from typing import Any, cast
 import mujoco
 import numpy as np
 
-from quadrl.aircraft.parameters import MARK
+from quadrl.aircraft.parameters import HELD, MARK
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, namespace
-from quadrl.base.validation import number
+from quadrl.base.rotation import Array
+from quadrl.conditions.solids import Pose, Solid, heading
 from quadrl.engines.engine import Engine
 from quadrl.engines.solids import KINDS
 
-Vector = tuple[float, float, float]
 FAR = 1000.0  # [m]
 HIDDEN = 3
 """Group of the geoms: pictures have the solids as markers, where they stand in the episode."""
 ELSEWHERE = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
 """Pose that the geoms are compiled with. At the origin, upright, MuJoCo would take them to stay
 there."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """A geom of a solid."""
-
-    kind: mujoco.mjtGeom
-    size: Vector
-    """As MuJoCo has it: radius; radius and half the height; halves of the edges [m]."""
-    offset: Vector = (0.0, 0.0, 0.0)
-    """Offset of its centre from the solid's, in the solid's frame [m]."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Solid(abc.ABC):
-    """Something that an aircraft can hit."""
-
-    name: str
-    """Name by which the task places it."""
-    position: Vector = dataclasses.field(default=(0.0, 0.0, 0.0), kw_only=True)
-    """Position of its centre where `Task.place` says nothing, task frame [m]."""
-    rgba: tuple[float, float, float, float] = dataclasses.field(
-        default=(0.55, 0.58, 0.62, 1.0), kw_only=True
-    )
-    """Colour and opacity, each between 0 and 1."""
-
-    def __post_init__(self) -> None:
-        """Validate the name and the lengths."""
-        if not isinstance(name := cast(Any, self.name), str) or not name.isidentifier():
-            raise QuadrlError(name="solid", value=self.name, allowed="a name such as 'post'")
-        for field in dataclasses.fields(self):
-            if field.type == "float":
-                number(f"{self.name} {field.name}", getattr(self, field.name), positive=True)
-
-    @property
-    @abc.abstractmethod
-    def parts(self) -> tuple[Part, ...]:
-        """The geoms that it is made of."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Sphere(Solid):
-    """A ball."""
-
-    radius: float = 0.2
-    """[m]"""
-
-    @property
-    def parts(self) -> tuple[Part, ...]:
-        """One sphere."""
-        return (Part(mujoco.mjtGeom.mjGEOM_SPHERE, (self.radius, 0.0, 0.0)),)
-
-
-@dataclasses.dataclass(frozen=True)
-class Cylinder(Solid):
-    """A post, a tree, or, lower than wide, a pad; upright unless it is turned."""
-
-    radius: float = 0.1
-    """[m]"""
-    height: float = 2.0
-    """[m]"""
-
-    @property
-    def parts(self) -> tuple[Part, ...]:
-        """One cylinder."""
-        size = (self.radius, self.height / 2, 0.0)
-        return (Part(mujoco.mjtGeom.mjGEOM_CYLINDER, size),)
-
-
-@dataclasses.dataclass(frozen=True)
-class Box(Solid):
-    """A block, a wall or a floor."""
-
-    length: float = 1.0
-    """Along x [m]."""
-    width: float = 1.0
-    """Along y [m]."""
-    height: float = 1.0
-    """Along z [m]."""
-
-    @property
-    def parts(self) -> tuple[Part, ...]:
-        """One box."""
-        size = (self.length / 2, self.width / 2, self.height / 2)
-        return (Part(mujoco.mjtGeom.mjGEOM_BOX, size),)
-
-
-@dataclasses.dataclass(frozen=True)
-class Gate(Solid):
-    """A square frame to fly through, along its x axis."""
-
-    opening: float = 1.0
-    """Edge of what is free [m]."""
-    frame: float = 0.1
-    """Width and depth of its bars [m]."""
-
-    @property
-    def parts(self) -> tuple[Part, ...]:
-        """Four bars."""
-        half, reach = self.frame / 2, (self.opening + self.frame) / 2
-        box, whole = mujoco.mjtGeom.mjGEOM_BOX, self.opening / 2 + self.frame
-        level, upright = (half, whole, half), (half, half, self.opening / 2)
-        return (
-            Part(box, level, (0.0, 0.0, reach)),
-            Part(box, level, (0.0, 0.0, -reach)),
-            Part(box, upright, (0.0, reach, 0.0)),
-            Part(box, upright, (0.0, -reach, 0.0)),
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class Pose:
-    """Where a solid stands in each episode."""
-
-    position: Array  # (n, 3) [m] of its centre, task frame
-    quaternion: Array = None  # (n, 4) (w, x, y, z); None for upright, its x axis to the east
 
 
 @dataclasses.dataclass(slots=True)
@@ -158,13 +40,8 @@ class Surroundings:
     clearance: Array  # (N,) [m], free at least between the aircraft and the nearest solid
     touched: Array  # (N, K) bool, which one was touched fastest in this control step
     touch_speed: Array  # (N,) [m/s], of that touch towards the solid; 0 without one
-
-
-def heading(angle: Array) -> Array:
-    """Quaternions (n, 4) of solids turned by angles (n,) [rad] from the east to the north."""
-    xp = namespace(angle)
-    none = xp.zeros_like(angle)
-    return xp.stack([xp.cos(angle / 2), none, none, xp.sin(angle / 2)], axis=-1)
+    held: Array  # (N,) bool, whether a foot has touched a solid that grips
+    touch: Array  # (N, 4) of that moment: speed into it and along it [m/s], cosine, rate [rad/s]
 
 
 class Scene:
@@ -179,7 +56,7 @@ class Scene:
         self.solids = tuple(solids)
         for solid in self.solids:
             if not isinstance(cast(Any, solid), Solid):
-                allowed = "Sphere, Cylinder, Box and Gate of quadrl.conditions.scene"
+                allowed = "Sphere, Cylinder, Box and Gate of quadrl.conditions.solids"
                 raise QuadrlError(name="solids", value=solid, allowed=allowed)
         if len(set(self.names)) < len(self.names):
             raise QuadrlError(name="solids", value=self.names, allowed="a name of its own for each")
@@ -193,9 +70,9 @@ class Scene:
                     name=f"{solid.name}_{k}", type=part.kind, size=part.size, pos=position,
                     quat=quaternion, rgba=solid.rgba, contype=1, conaffinity=0, group=HIDDEN,
                 )  # fmt: skip
-                geom.userdata = [MARK, index, *part.offset]
+                geom.userdata = [MARK, index, *part.offset, solid.grip]
         if self.solids:
-            spec.nuser_geom = 5
+            spec.nuser_geom = 6
 
     def check(self, engine: Engine) -> None:
         """Refuse an engine, made already, whose world has other solids.
@@ -262,7 +139,10 @@ class Scene:
         position = np.tile([solid.position for solid in self.solids], (count, 1, 1))
         touched = np.zeros((count, len(self.solids)), dtype=bool)
         far = np.full(count, FAR)
-        return Surroundings(self.names, position + 0.0, far, touched, 0.0 * far)
+        none = np.zeros((count, HELD))
+        return Surroundings(
+            self.names, position + 0.0, far, touched, 0.0 * far, none[:, 0] > 0, none[:, 1:]
+        )
 
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
         """The solids as pictures show them, where they stand in the world of a row."""
@@ -286,7 +166,10 @@ class Scene:
         which, speed = engine.hits[chosen].T
         touched = which[:, None] == 1 + np.arange(len(self.solids))
         clear, centres = engine.clearance(rows), engine.solids.centres[chosen]
-        return Surroundings(self.names, centres, clear, touched, speed.copy())
+        held = engine.held[chosen].copy()
+        return Surroundings(
+            self.names, centres, clear, touched, speed.copy(), held[:, 0] > 0, held[:, 1:]
+        )
 
 
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -199,7 +199,7 @@ class CompiledStep(Step):
         )
         (before.sensed, before.around), (sensed, around) = given
         for solids in filter(None, (before.around, around)):
-            solids.touched = solids.touched != 0.0
+            solids.touched, solids.held = solids.touched != 0.0, solids.held != 0.0
         seen_from = estimate if self._estimate else None
         inputs = state, action, command, diverged, seen_from, around, sensed
         with symbolic():

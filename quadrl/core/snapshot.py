@@ -65,6 +65,20 @@ class Snapshot:
         """How fast it was touched, (N,) [m/s]; 0 where none was."""
         return self._surroundings.touch_speed
 
+    @property
+    def held(self) -> Array:
+        """Whether a foot has touched a solid that grips, in this episode, (N,) bool."""
+        return self._surroundings.held
+
+    @property
+    def touch(self) -> Array:
+        """How it did, (N, 4); 0 before.
+
+        Speed into the solid and along it [m/s], cosine of the angle between the body's z axis and
+        its normal, body rate [rad/s].
+        """
+        return self._surroundings.touch
+
     def solid(self, name: str) -> Array:
         """Centre of a solid, (N, 3) [m], task frame."""
         around = self._surroundings

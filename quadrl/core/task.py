@@ -20,7 +20,8 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, norm, to_body
 from quadrl.base.validation import keys, like, number
-from quadrl.conditions.scene import Pose, Scene, Solid
+from quadrl.conditions.scene import Scene
+from quadrl.conditions.solids import Pose, Solid
 from quadrl.core import rewards
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, ObservationTerm

@@ -64,8 +64,12 @@ class Engine(abc.ABC):
         self.air = fields["userdata"][:, : parameters.AIR]
         self.wind = self.air[:, :3]
         self.solids = Solids(self.model, self.num_envs)
-        self.hits = fields["userdata"][:, parameters.AIR :]
-        """(N, HIT) of this control step, live; (N, 0) in a world without solids."""
+        self.hits, self.held = (
+            fields["userdata"][:, parameters.AIR :][:, part]
+            for part in (np.s_[: parameters.HIT], np.s_[parameters.HIT :])
+        )
+        """(N, HIT) of this control step and (N, HELD) of this episode, live; (N, 0) in a world
+        without solids."""
         table = self.solids.table
         flies = name != "mujoco"
         self._free_flight = FreeFlight(self.model, fields, threads, table) if flies else None

@@ -29,7 +29,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.machine import cores, machine
 from quadrl.conditions.randomization import FACTORS, RANDOMIZATIONS, Randomization
 from quadrl.conditions.sampler import AircraftSampler
-from quadrl.conditions.scene import Cylinder
+from quadrl.conditions.solids import Cylinder
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task

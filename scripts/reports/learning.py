@@ -22,7 +22,12 @@ ALONE = ("weather light", "weather moderate", "command_delay as in `full`", "lag
          "randomization full", "all together")  # fmt: skip
 WORDS = {RATE: "successful", ERROR: "error, median", "settled_m": "distance, mean",
          "race_time_mean_s": "time, mean"}  # fmt: skip
-GAINS = {"robust": "one set", "robustness": "for the row", "wins": "for the row", "race": "usual"}
+GAINS = {
+    "robust": "one set",
+    "robustness": "for the row",
+    "missions": "for the row",
+    "race": "usual",
+}
 
 
 def curves(file: Annotated[Path, tyro.conf.Positional]) -> None:
@@ -46,7 +51,7 @@ def curves(file: Annotated[Path, tyro.conf.Positional]) -> None:
 
 def compared() -> Iterator[tuple[str, str, int, str, dict[str, Any]]]:
     """Condition, metric, flights, report, and by task what policy and tuned controller reach."""
-    robust, alone, own, race = map(report.load, ("robust", "robustness", "wins", "race"))
+    robust, alone, own, race = map(report.load, ("robust", "robustness", "missions", "race"))
     for name, key in (*((name, "success") for name in UNSURE), ("nothing", ERROR)):
         found: dict[str, Any] = {}
         for row in robust["rows"]:
@@ -60,8 +65,13 @@ def compared() -> Iterator[tuple[str, str, int, str, dict[str, Any]]]:
                  for row in alone["alone"] if row["condition"] == name}  # fmt: skip
         yield name, RATE, alone["episodes"], "robustness", found
     for row in own["rows"]:
-        sides = {row["task"]: (row["policy"], row["controller"])}
-        yield row["condition"], row["metric"], own["episodes"], "wins", sides
+        if row["who"] == "controller":
+            metric = row["metric"]
+            policies = [x[metric] for x in own["rows"]
+                        if x["condition"] == row["condition"] and x is not row]  # fmt: skip
+            mean = None if None in policies else np.mean(policies)
+            sides = {row["task"]: (mean, row[metric])}
+            yield row["condition"], metric, own["episodes"], "missions", sides
     laps = [row for row in race["rows"] if row["race"] == "one lap"]
     for metric in (RATE, "race_time_mean_s"):
         *policies, controller = (row[metric] for row in laps)

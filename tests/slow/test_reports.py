@@ -256,9 +256,15 @@ def test_who_is_ahead_is_said_where_it_is_no_chance():
     ]
     report.save("robust", {"episodes": 1000, "rows": robust})
     report.save("robustness", {"episodes": 100, "alone": [windy]})
-    report.save("wins", {"episodes": 100, "rows": []})
+    flown = {"condition": "eight", "task": "trajectory", "metric": "settled_m"}
+    settled = {"seed 1": 0.01, "seed 2": 0.02, "controller": 0.03}
+    rows = [flown | {"who": who, "settled_m": value} for who, value in settled.items()]
+    report.save("missions", {"episodes": 300, "rows": rows})
     report.save("race", {"episodes": 300, "rows": laps})
     lines = learning.wins_table().splitlines()
     hover = "| nothing (hover) | successful | 50 % | 25 % | one set | policy: hover |"
     race = "| one lap (race) | successful | 80 % | 100 % | usual | controller: race |"
-    assert {f"{hover} `scripts/report robust` |", f"{race} `scripts/report race` |"} < set(lines)
+    given = "distance, mean | 1.5 cm | 3.0 cm | for the row | policy: trajectory"
+    eight = f"| eight (trajectory) | {given} |"
+    rows = {hover: "robust", race: "race", eight: "missions"}
+    assert {f"{row} `scripts/report {name}` |" for row, name in rows.items()} < set(lines)

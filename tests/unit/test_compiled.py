@@ -12,7 +12,7 @@ from quadrl import tasks
 from quadrl.base import trace
 from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace, look_up
-from quadrl.conditions.scene import Cylinder, Gate, Pose
+from quadrl.conditions.solids import Cylinder, Gate, Pose
 from quadrl.core.environment import Environment
 from quadrl.engines.native import compiling
 from quadrl.tasks.hover import Hover

@@ -9,7 +9,8 @@ import pytest
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import rotation_matrix
-from quadrl.conditions.scene import Box, Cylinder, Gate, Pose, Scene, Sphere, heading
+from quadrl.conditions.scene import Scene
+from quadrl.conditions.solids import Box, Cylinder, Gate, Pose, Sphere, heading
 from quadrl.core.environment import Environment
 from quadrl.engines.mjcf import compile_model
 from quadrl.engines.mujoco import make

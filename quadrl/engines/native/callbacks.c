@@ -9,8 +9,10 @@
 //   actuator_gear     along and about the rotor's axis: 1, aero_reaction
 //   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/aircraft/parameters.py says;
 //                     in a world with solids then HIT numbers: 1 + the solid that was hit fastest since
-//                     they were cleared, and how fast [m/s]
-//   geom_user         [0] mark, [1] the number of the solid that a geom is of
+//                     they were cleared, and how fast [m/s]; and HELD numbers of a touch that holds
+//   geom_user         [0] mark, [1] the number of the solid that a geom is of, [GRIP] with how many
+//                     times its weight it holds an aircraft whose feet touch it
+#include <math.h>
 #include <mujoco/mujoco.h>
 #include <stdint.h>
 #include <string.h>
@@ -19,7 +21,7 @@
 #include "aero.h"
 #include "export.h"
 
-enum { MARK_SLOT = 9 };
+enum { MARK_SLOT = 9, GRIP = 5, FEET = 4 };
 
 // The struct layouts of mjModel and mjData are compiled in: the loader compares these.
 QUADRL_EXPORT int quadrl_mujoco_version(void) { return mjVERSION_HEADER; }
@@ -84,12 +86,19 @@ static int rotor_of(const mjModel* m, int actuator, const Aircraft** owner) {
   return rotor >= 0 ? rotor : UNSOUND;
 }
 
+// What an actuator of ours commands: nothing once something holds the aircraft.
+static mjtNum command_of(const mjModel* m, const mjData* d, int actuator) {
+  const int grips = m->nuser_geom > GRIP && m->nuserdata >= AIR + HIT + HELD;
+  if (grips && d->userdata[AIR + HIT] > 0) return 0;
+  return d->ctrl[m->actuator_ctrladr[actuator]];
+}
+
 QUADRL_EXPORT mjtNum quadrl_act_dyn(const mjModel* m, const mjData* d, int actuator) {
   const Aircraft* a;
   const int rotor = rotor_of(m, actuator, &a);
   if (rotor < 0) return rotor == FOREIGN ? 0 : NAN;
   return aero_rotor_acceleration(a->rotor + rotor, d->act[m->actuator_actadr[actuator]],
-                                 d->ctrl[m->actuator_ctrladr[actuator]], 0);
+                                 command_of(m, d, actuator), 0);
 }
 
 QUADRL_EXPORT mjtNum quadrl_act_gain(const mjModel* m, const mjData* d, int actuator) {
@@ -111,7 +120,7 @@ static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft*
     const int rotor = rotor_of(m, k, &owner);
     if (rotor < 0 || owner != a) continue;
     speed[rotor][0] = d->act[m->actuator_actadr[k]];
-    command[rotor][0] = d->ctrl[m->actuator_ctrladr[k]];
+    command[rotor][0] = command_of(m, d, k);
     if (m->nuserdata >= AIR) noise[rotor][0] = d->userdata[WIND + rotor];
   }
   for (int k = 0; k < 3; ++k) {
@@ -131,9 +140,38 @@ static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft*
   }
 }
 
-// Writes down the fastest hit of an aircraft on a solid, from the contacts of this moment.
-static void note_hits(const mjModel* m, mjData* d, int body) {
+// Pulls a foot towards the solid that it touches, `way` being the unit vector there, and writes down
+// how the first one touched.
+static void hold(const mjModel* m, mjData* d, const Aircraft* a, int body, mjtNum grip,
+                 const mjtNum way[3], const mjtNum arm[3]) {
+  const int dof = m->body_dofadr[body];
+  const mjtNum *velocity = d->qvel + dof, *rate = velocity + 3, *turn = d->xmat + 9 * body;
+  const mjtNum pull = grip * a->mass[0] * -m->opt.gravity[2] / FEET;
+  mjtNum into = 0, along = 0, spin = 0, cosine = 0;
+  for (int k = 0; k < 3; ++k) {
+    const int next = (k + 1) % 3, last = (k + 2) % 3;
+    d->qfrc_passive[dof + k] += pull * way[k];
+    const mjtNum moment = pull * (arm[next] * way[last] - arm[last] * way[next]);
+    for (int j = 0; j < 3; ++j) d->qfrc_passive[dof + 3 + j] += turn[3 * k + j] * moment;
+    into += velocity[k] * way[k];
+    cosine -= turn[3 * k + 2] * way[k];
+    spin += rate[k] * rate[k];
+  }
+  for (int k = 0; k < 3; ++k) {
+    const mjtNum aside = velocity[k] - into * way[k];
+    along += aside * aside;
+  }
+  mjtNum* held = d->userdata + AIR + HIT;
+  if (held[0] > 0) return;
+  const mjtNum touch[HELD] = {1, into, sqrt(along), cosine, sqrt(spin)};
+  memcpy(held, touch, sizeof touch);
+}
+
+// Writes down the fastest hit of an aircraft on a solid, from the contacts of this moment, and holds
+// its feet where the solid grips them.
+static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) {
   const mjtNum *rate = d->qvel + m->body_dofadr[body] + 3, *turn = d->xmat + 9 * body;
+  const int grips = m->nuser_geom > GRIP && m->nuserdata >= AIR + HIT + HELD;
   mjtNum* hit = d->userdata + AIR;
   for (int c = 0; c < d->ncon; ++c) {
     const mjContact* contact = d->contact + c;
@@ -143,17 +181,21 @@ static void note_hits(const mjModel* m, mjData* d, int body) {
     const int other = own ? first : second;
     const mjtNum* solid = m->geom_user + (size_t)m->nuser_geom * other;
     if ((!own && m->geom_bodyid[first] != body) || !is_same(solid[0], QUADRL_MARK)) continue;
-    mjtNum arm[3], spin[3], velocity[3], speed = 0;
+    mjtNum arm[3], spin[3], velocity[3], way[3], speed = 0;
     for (int k = 0; k < 3; ++k) {
+      // The frame's axis points from the first geom to the second.
+      way[k] = own ? -contact->frame[k] : contact->frame[k];
       arm[k] = contact->pos[k] - d->xpos[3 * body + k];
       spin[k] = turn[3 * k] * rate[0] + turn[3 * k + 1] * rate[1] + turn[3 * k + 2] * rate[2];
     }
     for (int k = 0; k < 3; ++k) {
       const int next = (k + 1) % 3, last = (k + 2) % 3;
       velocity[k] = d->qvel[m->body_dofadr[body] + k] + spin[next] * arm[last] - spin[last] * arm[next];
-      speed += velocity[k] * contact->frame[k];  // which points from the first geom to the second
+      speed += velocity[k] * way[k];
     }
-    speed = own ? -speed : speed;
+    // The feet are the aircraft's only spheres.
+    const int foot = m->geom_type[own ? second : first] == mjGEOM_SPHERE;
+    if (grips && foot && solid[GRIP] > 0) hold(m, d, a, body, solid[GRIP], way, arm);
     if (hit[0] > 0 && !(speed > hit[1])) continue;
     hit[0] = 1 + solid[1];
     hit[1] = speed > 0 ? speed : 0;
@@ -185,7 +227,7 @@ QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
     }
     aero_wrench(a, airspeed, d->qvel + dof + 3, force, moment, 0);
     if (a->effects[0] != STILL_AIR) add_rotor_effects(m, d, a, body, airspeed, force, moment);
-    if (m->nuser_geom >= 2 && m->nuserdata >= AIR + HIT) note_hits(m, d, body);
+    if (m->nuser_geom >= 2 && m->nuserdata >= AIR + HIT) note_hits(m, d, a, body);
     for (int k = 0; k < 3; ++k) {
       d->qfrc_passive[dof + k] += turn[3 * k] * force[0] + turn[3 * k + 1] * force[1] +
                                   turn[3 * k + 2] * force[2] + a->steady_force[k][0];

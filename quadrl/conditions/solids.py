@@ -1,0 +1,142 @@
+"""Solids that a task can declare, and poses that it can give them in each episode."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import Any, cast
+
+import mujoco
+
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array, namespace
+from quadrl.base.validation import number
+
+Vector = tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A geom of a solid."""
+
+    kind: mujoco.mjtGeom
+    size: Vector
+    """As MuJoCo has it: radius; radius and half the height; halves of the edges [m]."""
+    offset: Vector = (0.0, 0.0, 0.0)
+    """Offset of its centre from the solid's, in the solid's frame [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Solid(abc.ABC):
+    """Something that an aircraft can hit."""
+
+    name: str
+    """Name by which the task places it."""
+    position: Vector = dataclasses.field(default=(0.0, 0.0, 0.0), kw_only=True)
+    """Position of its centre where `Task.place` says nothing, task frame [m]."""
+    rgba: tuple[float, float, float, float] = dataclasses.field(
+        default=(0.55, 0.58, 0.62, 1.0), kw_only=True
+    )
+    """Colour and opacity, each between 0 and 1."""
+    grip: float = dataclasses.field(default=0.0, kw_only=True)
+    """With how many times its weight it holds an aircraft whose feet touch it; none by default. The
+    rotors of who is held stop for the rest of the episode."""
+
+    def __post_init__(self) -> None:
+        """Validate the name and the lengths."""
+        if not isinstance(name := cast(Any, self.name), str) or not name.isidentifier():
+            raise QuadrlError(name="solid", value=self.name, allowed="a name such as 'post'")
+        number(f"{self.name} grip", self.grip, 0)
+        for field in dataclasses.fields(self):
+            if field.type == "float" and field.name != "grip":
+                number(f"{self.name} {field.name}", getattr(self, field.name), positive=True)
+
+    @property
+    @abc.abstractmethod
+    def parts(self) -> tuple[Part, ...]:
+        """The geoms that it is made of."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sphere(Solid):
+    """A ball."""
+
+    radius: float = 0.2
+    """[m]"""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """One sphere."""
+        return (Part(mujoco.mjtGeom.mjGEOM_SPHERE, (self.radius, 0.0, 0.0)),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cylinder(Solid):
+    """A post, a tree, or, lower than wide, a pad; upright unless it is turned."""
+
+    radius: float = 0.1
+    """[m]"""
+    height: float = 2.0
+    """[m]"""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """One cylinder."""
+        size = (self.radius, self.height / 2, 0.0)
+        return (Part(mujoco.mjtGeom.mjGEOM_CYLINDER, size),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Box(Solid):
+    """A block, a wall or a floor."""
+
+    length: float = 1.0
+    """Along x [m]."""
+    width: float = 1.0
+    """Along y [m]."""
+    height: float = 1.0
+    """Along z [m]."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """One box."""
+        size = (self.length / 2, self.width / 2, self.height / 2)
+        return (Part(mujoco.mjtGeom.mjGEOM_BOX, size),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gate(Solid):
+    """A square frame to fly through, along its x axis."""
+
+    opening: float = 1.0
+    """Edge of what is free [m]."""
+    frame: float = 0.1
+    """Width and depth of its bars [m]."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Four bars."""
+        half, reach = self.frame / 2, (self.opening + self.frame) / 2
+        box, whole = mujoco.mjtGeom.mjGEOM_BOX, self.opening / 2 + self.frame
+        level, upright = (half, whole, half), (half, half, self.opening / 2)
+        return (
+            Part(box, level, (0.0, 0.0, reach)),
+            Part(box, level, (0.0, 0.0, -reach)),
+            Part(box, upright, (0.0, reach, 0.0)),
+            Part(box, upright, (0.0, -reach, 0.0)),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """Where a solid stands in each episode."""
+
+    position: Array  # (n, 3) [m] of its centre, task frame
+    quaternion: Array = None  # (n, 4) (w, x, y, z); None for upright, its x axis to the east
+
+
+def heading(angle: Array) -> Array:
+    """Quaternions (n, 4) of solids turned by angles (n,) [rad] from the east to the north."""
+    xp = namespace(angle)
+    none = xp.zeros_like(angle)
+    return xp.stack([xp.cos(angle / 2), none, none, xp.sin(angle / 2)], axis=-1)

@@ -1,0 +1,281 @@
+"""Perching: touch a surface of any incline with the feet, gently, and stay on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import operator
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.base.rotation import Array, namespace, norm, stack, to_body
+from quadrl.base.validation import number
+from quadrl.conditions.solids import Box, Pose, Solid
+from quadrl.core import rewards
+from quadrl.core.contact import touches_ground
+from quadrl.core.observation import OBSERVATION, ROTATION, ObservationTerm
+from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
+from quadrl.engines.rng import Rng, hovering
+from quadrl.engines.state import Start
+
+if TYPE_CHECKING:
+    pass
+
+WALL = Box("wall", length=2.0, width=2.0, height=0.1, rgba=(0.62, 0.58, 0.52, 1.0), grip=12.0)
+NEAR = 0.6  # [m], from the goal, where the attitude counts half
+RATE, THRUST, DIVE = (1.5, 3.5), (0.75, 1.1), 0.5  # [rad/s], [weights], [rad]: ways to a touch
+SPREAD = 0.2  # of what is beside a way, as a share of what is beside a start
+OFF = 1.0  # [m], from the middle of the surface
+NORMAL = ObservationTerm(3, "1", "unit vector out of the surface, body frame")
+
+
+@dataclasses.dataclass(frozen=True)
+class Perch(TaskState):
+    """Where to perch, and for how long the aircraft has been held."""
+
+    normal: Array  # (N, 3) unit vector out of the surface
+    rest: Array  # (N,) control steps
+
+
+@dataclasses.dataclass(frozen=True)
+class Perching(Task):
+    """Perch on a surface; its middle is the origin of the task's frame."""
+
+    name = "perching"
+    asks = "touch a surface, from level to a vertical wall, with the feet, and stay on it"
+    starts = "2 to 3 m before it, within 0.5 m of the origin's height, at rest, facing it"
+    ends = (
+        "on the surface for a second (success); a touch that is too hard, aslant or spinning, or "
+        "not of the feet; off the surface again; on the ground; more than 6 m away"
+    )
+    solved = (
+        "a second on the surface after a touch at 0.2 to 1 m/s into it, under 0.5 m/s along it, "
+        "within 20 degrees and under 2 rad/s"
+    )
+    targets = (Target("success_rate", "successful", 0.95, True),)
+    training = {
+        "gamma": 0.98,
+        "steps": 8_192_000,
+        "vehicle_options": {"action_scale": 90.0},  # 35 rad/s cannot brake and turn at once
+        # Most flights begin on the way, or no first one would ever touch as it is asked; and some
+        # inclines lie beyond those that are asked.
+        "training_options": {
+            "approach": 0.7,
+            "least_incline": -0.15,
+            "most_incline": 1.75,
+            "rest_time": 0.3,
+            "time_limit": 3.0,
+        },
+    }
+    keeps_place = False
+    contact = True
+    observation = {
+        **ROTATION,
+        **{name: OBSERVATION[name] for name in ("velocity", "body_rate", "rotor_speed", "goal")},
+        "normal": NORMAL,
+    }
+
+    time_limit: float = 6.0
+    """Time limit of an episode [s]."""
+    least_incline: float = 0.0
+    """Smallest incline of the surface [rad]."""
+    most_incline: float = math.pi / 2
+    """Largest incline of the surface [rad]: a vertical wall."""
+    nearest: float = 2.0
+    """Smallest distance of the start before the surface [m]."""
+    farthest: float = 3.0
+    """Largest distance of the start before the surface [m]."""
+    aside: float = 0.5
+    """Largest distance of the start to the sides, and above and below [m]."""
+    approach: float = 0.0
+    """Share of the episodes that begin on the way, up to the moment of a touch."""
+    attitude_weight: float = 100.0
+    """Reward per unit by which the chord from the body's z axis to the normal falls."""
+    speed_weight: float = 20.0
+    """Reward per m/s by which the speed falls, near the surface."""
+    spin_weight: float = 5.0
+    """Reward per rad/s by which the body rate falls, near the surface."""
+    survival_weight: float = 0.0
+    """Reward per 0.05 s: none, or it would stay in the air."""
+    time_weight: float = 5.0
+    """Cost of each 0.05 s before the touch: without it aircraft learn to wait before a wall."""
+    success_weight: float = 200.0
+    """Reward for staying on the surface."""
+    touch_weight: float = 50.0
+    """Cost of each limit of a touch that it exceeds, in proportion and up to twice."""
+    failure_weight: float = 150.0
+    """Cost of a failure."""
+    least_touch: float = 0.2
+    """Smallest speed of the touch into the surface [m/s]."""
+    most_touch: float = 1.0
+    """Largest speed of the touch into the surface [m/s]."""
+    most_slip: float = 0.5
+    """Largest speed of the touch along the surface [m/s]."""
+    most_slant: float = math.radians(20.0)
+    """Largest angle between the body's z axis and the normal at the touch [rad]."""
+    most_spin: float = 2.0
+    """Largest body rate at the touch [rad/s]."""
+    rest_time: float = 1.0
+    """How long the aircraft has to stay on the surface [s]."""
+    max_distance: float = 6.0
+    """Distance from the goal that ends the episode [m]."""
+
+    def __post_init__(self) -> None:
+        """Validate the ranges."""
+        super().__post_init__()
+        for least, most, limit in (
+            ("least_incline", "most_incline", math.pi),
+            ("nearest", "farthest", self.max_distance),
+            ("least_touch", "most_touch", math.inf),
+        ):
+            number(f"{self.name} {most}", getattr(self, most), getattr(self, least), limit)
+
+    def solids(self) -> Sequence[Solid]:
+        """The surface."""
+        return [WALL]
+
+    def place(self, rng: Rng, start: Start, state: TaskState) -> Mapping[str, Pose]:
+        """Its middle at the origin, facing up and west."""
+        normal = cast(Perch, state).normal
+        incline = np.arctan2(-normal[..., 0], normal[..., 2])
+        none = 0.0 * incline
+        turn = stack(np.cos(incline / 2), none, -np.sin(incline / 2), none)
+        return {"wall": Pose(-WALL.height / 2 * normal, turn)}
+
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Perch]:
+        """At rest before the surface, facing it, or on the way; from above where it is level."""
+        incline = rng.uniform(self.least_incline, self.most_incline)
+        xp, none = namespace(incline), 0.0 * incline
+        normal = stack(-xp.sin(incline), none, xp.cos(incline))
+        goal = -parameters.foot[..., 2:] * normal
+        above = (math.pi / 2 - incline) / 2
+        far = rng.uniform(self.nearest, self.farthest)
+        before = far[..., None] * stack(-xp.cos(above), none, xp.sin(above))
+        away = self.aside * rng.uniform(-1.0, 1.0, 3)
+        away = stack(none, away[..., 1], away[..., 2])
+        comes = (rng.uniform(0.0, 1.0) < self.approach)[..., None]
+        position, velocity, pitch, rate = self._on_the_way(rng, incline)
+        position = xp.where(comes, goal + position + SPREAD * away, before + away)
+        pitch = xp.where(comes[..., 0], pitch, none)
+        start = Start(
+            position=position,
+            quaternion=stack(xp.cos(pitch / 2), none, -xp.sin(pitch / 2), none),
+            velocity=xp.where(comes, velocity, 0.0 * velocity),
+            body_rate=xp.where(comes, stack(none, -rate, none), 0.0 * velocity),
+            rotor_speed=hovering(position, parameters),
+        )
+        return start, Perch(goal=goal, normal=normal, rest=none)
+
+    def _on_the_way(self, rng: Rng, incline: Array) -> tuple[Array, Array, Array, Array]:
+        """States some time before good touches, (N, 3), (N, 3), (N,), (N,).
+
+        They lead there at a constant pitch rate and a constant thrust, so that their motion in the
+        plane of the approach can be integrated backwards by hand.
+
+        Returns:
+            Position from the goal [m], velocity [m/s], pitch, nose up [rad], and its rate [rad/s].
+        """
+        xp, none = namespace(incline), 0.0 * incline
+        rate, thrust = rng.uniform(*RATE), GRAVITY * rng.uniform(*THRUST)
+        into = rng.uniform(self.least_touch, self.most_touch)
+        time = rng.uniform(0.1, 1.0) * (incline + DIVE) / rate
+        pitch = incline - rate * time
+        # Integrals of sine and cosine of the pitch over the time that is left, and over that again.
+        sine = (xp.cos(pitch) - xp.cos(incline)) / rate
+        cosine = (xp.sin(incline) - xp.sin(pitch)) / rate
+        sines = (cosine - time * xp.cos(incline)) / rate
+        cosines = (time * xp.sin(incline) - sine) / rate
+        last_x, last_z = into * xp.sin(incline), -into * xp.cos(incline)
+        fall = GRAVITY * time
+        velocity = stack(last_x + thrust * sine, none, last_z - thrust * cosine + fall)
+        x = -last_x * time - thrust * sines
+        z = -last_z * time + thrust * cosines - fall * time / 2
+        return stack(x, none, z), velocity, pitch, rate
+
+    def update(self, before: Snapshot, now: Snapshot) -> Perch:
+        """Count the control steps on the surface."""
+        task, xp = now.task, namespace(now.task.rest)
+        return dataclasses.replace(task, rest=xp.where(now.held, task.rest + 1, task.rest))
+
+    def measure(self, now: Snapshot) -> Potentials:
+        """The attitude error is the chord from the body's z axis to the normal, at most 2.
+
+        It and the speeds count where the surface is near: who turns to a wall from afar falls, and
+        who is slow never gets there with its feet ahead.
+        """
+        usual, chord = super().measure(now), norm(now.state.rotation[..., :, 2] - now.task.normal)
+        near = 1 / (1 + (usual.distance / NEAR) * (usual.distance / NEAR))
+        return dataclasses.replace(
+            usual,
+            attitude=2 - (2 - chord) * near,
+            speed=near * usual.speed,
+            angular_speed=near * usual.angular_speed,
+        )
+
+    def observe(self, now: Snapshot) -> dict[str, Array]:
+        """The aircraft's motion, and the surface as it sees it."""
+        state = now.state
+        return {
+            "rotation": state.rotation_entries,
+            "velocity": state.body_velocity,
+            "body_rate": state.body_rate,
+            "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
+            "goal": to_body(state.rotation, now.potentials.to_goal),
+            "normal": to_body(state.rotation, now.task.normal),
+        }
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """To the surface and aligned with it; and what the touch is worth."""
+        xp, none = namespace(now.time), 0.0 * now.time
+        touches = now.held & ~before.held
+        excess = functools.reduce(operator.add, (xp.clip(x - 1, 0, 1) for x in self._shares(now)))
+        return {
+            "progress": rewards.progress(self.progress_weight, before, now),
+            "attitude": rewards.attitude(self.attitude_weight, before, now),
+            "speed": rewards.speed(self.speed_weight, before, now),
+            "spin": rewards.spin(self.spin_weight, before, now),
+            "control": rewards.control(self.control_weight, now),
+            "time": xp.where(
+                now.held, none, none - self.time_weight * rewards.time_share(now.parameters)
+            ),
+            "touch": xp.where(touches, -self.touch_weight * excess, none),
+            "success": xp.where(end.succeeded, none + self.success_weight, none),
+            "failure": xp.where(end.failed, none - self.failure_weight, none),
+        }
+
+    def terminated(self, now: Snapshot) -> Array:
+        """On the surface for long enough, or failed."""
+        return self._rested(now) | self._failed(now)
+
+    def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
+        """At rest on the surface for long enough, after a touch as it is asked."""
+        return end.terminated & self._rested(now) & now.state.at_rest & ~self._failed(now)
+
+    def _rested(self, now: Snapshot) -> Array:
+        """Whether the aircraft has been on the surface for long enough, (N,) bool."""
+        steps = now.task.rest + 1
+        return now.held & (steps * now.parameters.control_timestep >= self.rest_time)
+
+    def _failed(self, now: Snapshot) -> Array:
+        """Touched otherwise than asked, off again, on the ground, or away, (N,) bool."""
+        xp = namespace(now.time)
+        most = functools.reduce(xp.maximum, self._shares(now))
+        struck = now.touched[..., 0] & ~now.held
+        off = now.held & (now.potentials.distance > OFF)
+        away = now.potentials.distance > self.max_distance
+        return (now.held & (most > 1)) | struck | off | away | touches_ground(now)
+
+    def _shares(self, now: Snapshot) -> list[Array]:
+        """How the touch was, as shares of what is allowed: each is 1 at its limit, (N,)."""
+        into, along, cosine, rate = (now.touch[..., k] for k in range(4))
+        middle, half = (
+            (self.most_touch + self.least_touch) / 2,
+            (self.most_touch - self.least_touch) / 2,
+        )
+        slant = (1 - cosine) / (1 - math.cos(self.most_slant))
+        return [abs(into - middle) / half, along / self.most_slip, slant, rate / self.most_spin]

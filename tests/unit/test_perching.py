@@ -1,0 +1,121 @@
+"""Perching: what grips holds, what does not lets go, and only a touch as it is asked counts."""
+
+import math
+
+import numpy as np
+import pytest
+
+from quadrl import tasks
+from quadrl.base.errors import QuadrlError
+from quadrl.conditions.solids import Box
+from quadrl.core.environment import Environment
+from quadrl.tasks import perching
+from quadrl.tasks.perching import Perching
+
+INCLINES = [0, 30, 60, 90]
+TWO = np.ones((2, 1))
+
+
+def normal(incline):
+    """Out of a surface (3,), by its incline [deg]."""
+    return np.array([-math.sin(math.radians(incline)), 0.0, math.cos(math.radians(incline))])
+
+
+def touching(incline, engine="mujoco", lean=(0.0, 10.0), into=0.5, along=0.0, rate=0.0, slack=8e-3):
+    """Aircraft just before they touch, whose z axis leans from the normal [deg], and where."""
+    turn = math.radians(incline)
+    task = Perching(least_incline=turn, most_incline=turn)
+    made = Environment(task, num_envs=2, seed=0, engine=engine)
+    out, up = normal(incline), np.array([math.cos(turn), 0.0, math.sin(turn)])
+    half = -(turn - np.radians(lean)) / 2
+    quaternion = np.stack([np.cos(half), 0 * half, np.sin(half), 0 * half], axis=-1)
+    depth = -made.vehicle.foot[2]
+    # The foot ahead is the lower one of an aircraft that leans forward.
+    first = made.vehicle.foot[0] * np.sin(abs(np.radians(lean)))
+    start = {
+        "position": (depth * np.cos(np.radians(lean)) + first + slack)[:, None] * out,
+        "quaternion": quaternion,
+        "velocity": TWO * (along * up - into * out),
+        "body_rate": TWO * np.array([0.0, rate, 0.0]),
+    }
+    made.reset(start=start)
+    return made, depth * out
+
+
+def fly(made, count):
+    """The last transition of some control steps without thrust off hover, or of the episode."""
+    for _ in range(count):
+        done = made.step(np.zeros((2, made.action_size)))
+        if done.terminated.all():
+            break
+    return done
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("incline", INCLINES)
+def test_a_good_touch_holds_an_aircraft_whose_motors_stop(incline, engine):
+    made, place = touching(incline, engine)
+    done = fly(made, 3)
+    assert made.snapshot.held.all() and not done.terminated.any()
+    into, _, cosine, _ = made.snapshot.touch.T
+    assert (abs(into - 0.5) < 0.2).all() and np.allclose(cosine, np.cos(np.radians([0, 10])), 0.02)
+    done = fly(made, 40)
+    assert done.terminated.all() and done.is_success.all()
+    assert (made.snapshot.state.rotor_speed < 5).all()
+    np.testing.assert_allclose(made.snapshot.state.position, TWO * place, rtol=0, atol=0.05)
+    # The feet, and nothing else, are on the surface.
+    np.testing.assert_allclose(
+        made.snapshot.state.rotation[..., 2] @ normal(incline), 1.0, atol=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"into": 1.6}, {"along": 0.8}, {"lean": (25.0, 30.0)}, {"rate": 3.5}, {"into": 0.05}],
+    ids=["too hard", "slips", "aslant", "spins", "too soft"],
+)
+def test_a_touch_that_is_not_as_asked_fails(bad):
+    slack = 1e-4 if bad.get("into") == 0.05 else 2e-3
+    made, _ = touching(0, slack=slack, **{"lean": (0.0, 0.0)} | bad)
+    done = fly(made, 40)
+    assert done.terminated.all() and not done.is_success.any()
+
+
+def test_without_a_grip_a_wall_holds_nobody(monkeypatch):
+    smooth = Box("wall", length=2.0, width=2.0, height=0.1)
+    monkeypatch.setattr(perching, "WALL", smooth)
+    made, _ = touching(90)
+    done = fly(made, 30)
+    assert done.terminated.all() and not (done.is_success | made.snapshot.held).any()
+
+
+def test_a_hold_ends_with_the_episode_and_stays_with_a_saved_state():
+    made, _ = touching(90)
+    fly(made, 5)
+    saved, touch = made.save(), made.snapshot.touch.copy()
+    made.reset()
+    assert not made.snapshot.held.any() and (made.snapshot.touch == 0).all()
+    made.restore(saved)
+    fly(made, 1)
+    assert made.snapshot.held.all()
+    np.testing.assert_array_equal(made.snapshot.touch, touch)
+
+
+def test_episodes_begin_before_the_surface():
+    made = Environment("perching", num_envs=200, seed=3)
+    made.reset()
+    out = made.snapshot.task.normal
+    assert (np.sum(out * made.snapshot.state.position, axis=-1) > 0.5).all()
+    assert (made.snapshot.clearance > 0.3).all()
+    assert out[:, 0].min() < -0.99 and out[:, 2].max() > 0.99
+
+
+@pytest.mark.parametrize("name", ["grip", "length"])
+def test_a_surface_of_a_negative_number_is_refused(name):
+    with pytest.raises(QuadrlError, match=name):
+        Box("wall", **{name: -1.0})
+
+
+def test_inclines_in_the_wrong_order_are_refused():
+    with pytest.raises(QuadrlError, match="most_incline"):
+        tasks.make("perching", least_incline=1.0, most_incline=0.5)
