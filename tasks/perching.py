@@ -30,6 +30,7 @@ WALL = Box("wall", length=2.0, width=2.0, height=0.1, rgba=(0.62, 0.58, 0.52, 1.
 NEAR = 0.6  # [m], from the goal, where the attitude counts half
 RATE, THRUST, DIVE = (1.5, 3.5), (0.75, 1.1), 0.5  # [rad/s], [weights], [rad]: ways to a touch
 SPREAD = 0.2  # of what is beside a way, as a share of what is beside a start
+WORST = 3.0  # times what a limit is exceeded by, or [m/s] of what strikes: more costs no more
 OFF = 1.0  # [m], from the middle of the surface
 NORMAL = ObservationTerm(3, "1", "unit vector out of the surface, body frame")
 
@@ -66,8 +67,8 @@ class Perching(Task):
         # inclines lie beyond those that are asked.
         "training_options": {
             "approach": 0.7,
-            "least_incline": -0.15,
-            "most_incline": 1.75,
+            "least_incline": -0.1,
+            "most_incline": 1.65,
             "rest_time": 0.3,
             "time_limit": 3.0,
         },
@@ -102,13 +103,14 @@ class Perching(Task):
     """Reward per rad/s by which the body rate falls, near the surface."""
     survival_weight: float = 0.0
     """Reward per 0.05 s: none, or it would stay in the air."""
-    time_weight: float = 5.0
+    time_weight: float = 4.0
     """Cost of each 0.05 s before the touch: without it aircraft learn to wait before a wall."""
-    success_weight: float = 200.0
+    success_weight: float = 250.0
     """Reward for staying on the surface."""
     touch_weight: float = 50.0
-    """Cost of each limit of a touch that it exceeds, in proportion and up to twice."""
-    failure_weight: float = 150.0
+    """Cost of each limit of a touch that it exceeds, in proportion; and of each m/s with which
+    rotors or hull strike the surface."""
+    failure_weight: float = 250.0
     """Cost of a failure."""
     least_touch: float = 0.2
     """Smallest speed of the touch into the surface [m/s]."""
@@ -232,8 +234,9 @@ class Perching(Task):
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """To the surface and aligned with it; and what the touch is worth."""
         xp, none = namespace(now.time), 0.0 * now.time
-        touches = now.held & ~before.held
-        excess = functools.reduce(operator.add, (xp.clip(x - 1, 0, 1) for x in self._shares(now)))
+        shares = (xp.clip(share - 1, 0, WORST) for share in self._shares(now))
+        excess = xp.where(now.held & ~before.held, functools.reduce(operator.add, shares), none)
+        excess = xp.where(self._struck(now), xp.clip(now.touch_speed, 0, WORST), excess)
         return {
             "progress": rewards.progress(self.progress_weight, before, now),
             "attitude": rewards.attitude(self.attitude_weight, before, now),
@@ -243,7 +246,7 @@ class Perching(Task):
             "time": xp.where(
                 now.held, none, none - self.time_weight * rewards.time_share(now.parameters)
             ),
-            "touch": xp.where(touches, -self.touch_weight * excess, none),
+            "touch": -self.touch_weight * excess,
             "success": xp.where(end.succeeded, none + self.success_weight, none),
             "failure": xp.where(end.failed, none - self.failure_weight, none),
         }
@@ -265,10 +268,13 @@ class Perching(Task):
         """Touched otherwise than asked, off again, on the ground, or away, (N,) bool."""
         xp = namespace(now.time)
         most = functools.reduce(xp.maximum, self._shares(now))
-        struck = now.touched[..., 0] & ~now.held
         off = now.held & (now.potentials.distance > OFF)
         away = now.potentials.distance > self.max_distance
-        return (now.held & (most > 1)) | struck | off | away | touches_ground(now)
+        return (now.held & (most > 1)) | self._struck(now) | off | away | touches_ground(now)
+
+    def _struck(self, now: Snapshot) -> Array:
+        """Whether anything but the feet touches the surface first, (N,) bool."""
+        return now.touched[..., 0] & ~now.held
 
     def _shares(self, now: Snapshot) -> list[Array]:
         """How the touch was, as shares of what is allowed: each is 1 at its limit, (N,)."""

@@ -229,6 +229,28 @@ def test_a_shipped_policy_neither_turns_nor_circles(file):
     assert [x.metric for x in judged(file) if not x.met(reached)] == []
 
 
+@pytest.mark.parametrize(
+    ("task", "options", "asked"),
+    [
+        *(
+            ("trajectory", {"figure": "lemniscate", "period": period}, ("survival_rate", 0.98))
+            for period in (15.0, 5.5, 3.5)
+        ),
+        *(
+            ("perching", {"least_incline": turn, "most_incline": turn}, ("success_rate", 0.9))
+            for turn in (0.0, 0.5, 1.0, 1.5708)
+        ),
+    ],
+)
+def test_one_policy_flies_every_figure_and_perches_at_every_incline(task, options, asked):
+    """The mean over a task's episodes would hide a figure or an incline that always fails."""
+    given = {"task_options": options, "seed": FRESH_SEED, "engine": "free_flight"}
+    reached = evaluate(task, episodes=FRESH_EPISODES, **given).metrics
+    assert reached[asked[0]] >= asked[1]
+    if task == "trajectory":
+        assert reached["distance_m"] < 0.04
+
+
 # ------------------------------------------------------------------- the command, in a process
 
 TINY = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16", "--episodes", "2"]
