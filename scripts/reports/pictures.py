@@ -5,6 +5,8 @@ The policy that ships for a task, of its own algorithm, flies it, in the aircraf
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -26,7 +28,8 @@ from scripts.reports.report import IMAGES
 SHOWN = (360, 203)  # [pixels]; drawn twice as large, for smooth edges
 SETTLED = 0.05  # of the largest distance from the last position: little happens after that
 LONGEST = 6.0  # [s] of a task's flight that are shown
-RACED = 300  # flights of a race, of which the fastest is shown
+OPTIONS = {"perching": {"least_incline": math.pi / 2}}  # of the task as it is shown: a wall
+FASTEST, RACED = ("race", "perching"), 300  # the fastest of so many flights is shown
 # The training: four policies fly the same start.
 SEED, SHARES = 225, (0.0, 0.12, 0.3, 1.0)  # of the training
 RELEASED = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
@@ -111,7 +114,9 @@ def named(image: Image.Image, name: str) -> Image.Image:
 def flight(name: str) -> Iterator[Image.Image]:
     """Frames of a flight of a task, until little happens."""
     policy, scenario, seed = Policy.pretrained(name), TrainConfig(name).scenario, EVALUATION_SEED
-    if name == "race":
+    shown = scenario.task.replace(**OPTIONS.get(name, {}))
+    scenario = dataclasses.replace(scenario, task=shown)
+    if name in FASTEST:
         raced = fly(policy, scenario, episodes=RACED)
         seed += int(np.where(raced.is_success, raced.length, np.inf).argmin())
     flight, model, _ = flown(policy, scenario, seed)

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from quadrl import tasks
+from quadrl.aircraft import parameters
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.conditions.solids import Box
 from quadrl.core.environment import Environment
@@ -108,6 +111,36 @@ def test_episodes_begin_before_the_surface():
     assert (np.sum(out * made.snapshot.state.position, axis=-1) > 0.5).all()
     assert (made.snapshot.clearance > 0.3).all()
     assert out[:, 0].min() < -0.99 and out[:, 2].max() > 0.99
+
+
+class Middle:
+    """Random numbers that are always in the middle of their range."""
+
+    def uniform(self, low, high, size=None):
+        return np.full((1, size) if size else 1, (low + high) / 2)
+
+
+@pytest.mark.parametrize("incline", INCLINES)
+def test_a_way_ends_in_the_touch_that_it_was_flown_backwards_from(incline):
+    turn = math.radians(incline)
+    task = Perching(least_incline=turn, most_incline=turn, approach=1.0, least_touch=0.5)
+    paper = VEHICLES["paper"]
+    own = parameters.Parameters.of(parameters.rows(paper), paper.control_timestep)
+    start, state = task.begin(Middle(), own)
+    position, velocity = start.position[0].copy(), start.velocity[0].copy()
+    (rate,), thrust, pitch = (
+        -start.body_rate[:, 1],
+        0.925 * GRAVITY,
+        2 * np.arctan2(-start.quaternion[0, 2], start.quaternion[0, 0]),
+    )  # nose up
+    step, count = 1e-4, round((turn - pitch) / rate / 1e-4)
+    for _ in range(count):
+        up = np.array([-math.sin(pitch), 0.0, math.cos(pitch)])
+        position += step * velocity
+        velocity += step * (thrust * up - np.array([0.0, 0.0, GRAVITY]))
+        pitch += step * rate
+    np.testing.assert_allclose(position, state.goal[0], atol=2e-3)
+    np.testing.assert_allclose(velocity, -0.75 * normal(incline), atol=2e-3)
 
 
 @pytest.mark.parametrize("name", ["grip", "length"])
