@@ -127,7 +127,7 @@ def training_defaults(
     kind = tasks.TASKS[choice("task", task, tasks.TASKS)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
     choice("vehicle", vehicle, VEHICLES)
-    own = own_settings(kind, algo)
+    own = _unusual(kind, algo)
     own.pop("algo", None)
     if own.pop("vehicle", "paper") != vehicle:  # the numbers of another aircraft
         own.pop("vehicle_options", None)
@@ -166,7 +166,15 @@ def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
 
 
 def own_settings(task: Task | type[Task], algo: str = "") -> dict[str, Any]:
-    """Settings that have other defaults with a task and an algorithm, by default its own."""
+    """Settings that have other defaults with a task and an algorithm, by default its own.
+
+    They are as `quadrl train` takes them, at the control rate of the aircraft that it trains on.
+    """
+    return at_rate(_unusual(task, algo), task.trained_on)
+
+
+def _unusual(task: Task | type[Task], algo: str) -> dict[str, Any]:
+    """The same at the control rate of the paper's aircraft."""
     chosen = {"vehicle": task.trained_on, "algo": task.trained_by}
     unusual = {name: own for name, own in chosen.items() if own != getattr(TrainSettings, name)}
     return merged(unusual, task.training, task.training_with.get(algo or task.trained_by, {}))
