@@ -132,6 +132,7 @@ def page(name: str) -> str:
         for x in (usual, *known["options"])
     ]
     own = " ".join(f"`{setting}`" for setting in settings(own_settings(task)))
+    other = "vehicle_options" in task.training  # its policy flies no other aircraft
     flies = (SHIPPED / f"{name}_{task.trained_by}.safetensors").exists()
     moving = f"![A flight of a policy that comes with quadrl](images/tasks/{name}.webp)\n\n"
     drawn = (report.IMAGES / "tasks" / f"{name}.webp").exists()
@@ -139,7 +140,7 @@ def page(name: str) -> str:
         name=name,
         camel=camel,
         make=f'policy = quadrl.Policy.pretrained("{name}")\n' if flies else "",
-        given=", **policy.keywords" if flies and task.trained_on != "paper" else "",
+        given=", **policy.keywords" if flies and (other or task.trained_on != "paper") else "",
         fly="policy(observation)" if flies else "env.action_space.sample()",
         asks=line(known["asks"]),
         facts=table(("property", "value"), facts),
