@@ -7,12 +7,13 @@ import functools
 import math
 import operator
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY
+from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, norm, stack, to_body
 from quadrl.base.validation import number
 from quadrl.conditions.solids import Box, Pose, Solid
@@ -22,9 +23,6 @@ from quadrl.core.observation import OBSERVATION, ROTATION, ObservationTerm
 from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
-
-if TYPE_CHECKING:
-    pass
 
 WALL = Box("wall", length=2.0, width=2.0, height=0.1, rgba=(0.62, 0.58, 0.52, 1.0), grip=12.0)
 NEAR = 0.6  # [m], from the goal, where the attitude counts half
@@ -136,6 +134,13 @@ class Perching(Task):
             ("least_touch", "most_touch", math.inf),
         ):
             number(f"{self.name} {most}", getattr(self, most), getattr(self, least), limit)
+        if self.most_touch == self.least_touch:
+            allowed = f"above least_touch, {self.least_touch:g}"
+            raise QuadrlError(
+                name=f"{self.name} most_touch", value=self.most_touch, allowed=allowed
+            )
+        for name in ("most_slip", "most_slant", "most_spin"):
+            number(f"{self.name} {name}", getattr(self, name), positive=True)
 
     def solids(self) -> Sequence[Solid]:
         """The surface."""
@@ -243,6 +248,7 @@ class Perching(Task):
             "speed": rewards.speed(self.speed_weight, before, now),
             "spin": rewards.spin(self.spin_weight, before, now),
             "control": rewards.control(self.control_weight, now),
+            **rewards.smoothness(self.smoothness_weight, before, now),
             "time": xp.where(
                 now.held, none, none - self.time_weight * rewards.time_share(now.parameters)
             ),

@@ -60,8 +60,8 @@ def missions(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
         runs: Run folders; a task has the rows of all of its runs, or of the policy that ships.
     """
     rows: list[Result] = []
+    own = {run: TrainConfig.of_folder(run) for run in runs}
     for name, (task, metric, options, gains) in FLOWN.items():
-        own = {run: TrainConfig.of_folder(run) for run in runs}
         flyers: dict[str, Any] = {
             f"seed {config.seed}": Policy.load(run)
             for run, config in own.items()
@@ -96,5 +96,5 @@ def shown(name: str, value: float | None) -> str:
 
 PARTS: Parts = {
     f"missions-{task}": functools.partial(missions_table, task)
-    for task in ("recovery", "trajectory", "perching")
+    for task in ("trajectory", "perching")
 }

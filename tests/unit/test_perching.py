@@ -149,6 +149,15 @@ def test_a_surface_of_a_negative_number_is_refused(name):
         Box("wall", **{name: -1.0})
 
 
-def test_inclines_in_the_wrong_order_are_refused():
-    with pytest.raises(QuadrlError, match="most_incline"):
-        tasks.make("perching", least_incline=1.0, most_incline=0.5)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("most_incline", {"least_incline": 1.0, "most_incline": 0.5}),
+        ("most_touch", {"most_touch": 0.2}),
+        ("most_slip", {"most_slip": 0.0}),
+        ("most_spin", {"most_spin": 0.0}),
+    ],
+)
+def test_ranges_that_are_none_are_refused(name, options):
+    with pytest.raises(QuadrlError, match=name):
+        tasks.make("perching", **options)
