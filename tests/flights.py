@@ -75,8 +75,8 @@ def by_mj_step(task, seed, mode):
     model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.build)
     data, scene = mujoco.MjData(model), Scene(task.solids())
     solids, row = Solids(model, 1), parameters.rows(vehicle)
-    hits, held = np.split(data.userdata[None, parameters.AIR :], [parameters.HIT], axis=1)
-    world = types.SimpleNamespace(solids=solids, hits=hits, held=held)
+    hits, feet = np.split(data.userdata[None, parameters.AIR :], [parameters.HIT], axis=1)
+    world = types.SimpleNamespace(solids=solids, hits=hits, feet=feet)
     world.clearance = lambda rows: solids.clearance(data.qpos[None], row, vehicle.rotor_count)
     control = modes.make(mode, vehicle)
     own = parameters.Parameters.of(row, vehicle.control_timestep)
@@ -100,6 +100,17 @@ def by_mj_step(task, seed, mode):
         now = Snapshot(state(), remembered, own, action, command, time, around=around)
         return dataclasses.replace(now, potentials=task.measure(now))
 
+    def field(name):
+        return getattr(model, name)[None]
+
+    def move(substep):
+        time = np.array([len(errors) * vehicle.control_timestep])
+        time += (substep + 1) * vehicle.physics_timestep
+        placed = task.move(before.task, time)
+        if placed:
+            poses = scene.poses(placed, 1, origin, solids.poses)
+            solids.move(poses, vehicle.physics_timestep, origin, field)
+
     def begin():
         errors.clear()
         keys = np.array([seed]), np.array([next(episode)])
@@ -107,7 +118,7 @@ def by_mj_step(task, seed, mode):
         mujoco.mj_resetData(model, data)
         if scene.solids:
             poses = scene.poses(task.place(Rng(*keys, SOLIDS), start, remembered), 1, origin)
-            solids.place(np.array([0]), poses, origin, lambda name: getattr(model, name)[None])
+            solids.place(np.array([0]), poses, origin, field)
         data.qpos[:] = np.concatenate([start.position + origin, start.quaternion], axis=-1)[0]
         data.qvel[:] = np.concatenate([start.velocity, start.body_rate], axis=-1)[0]
         data.act[:] = start.rotor_speed[0]
@@ -120,11 +131,13 @@ def by_mj_step(task, seed, mode):
         setpoint = control.setpoint(before.state, action)
         command = np.zeros((1, vehicle.rotor_count))
         hits[:] = 0.0
-        for _ in range(vehicle.substeps):
+        for substep in range(vehicle.substeps):
+            move(substep)
             seen = state() if control.has_loops else before.state
             data.ctrl[:] = control.rotor_command(seen, setpoint)[0]
             command += data.ctrl / vehicle.substeps
             mujoco.mj_step(model, data)
+        solids.arrive(origin, field)
         errors.append(0.0)  # counts the step: `snapshot` tells the time
         now = snapshot(before.task, action, command if control.has_loops else setpoint)
         terminated = task.terminated(now)

@@ -33,10 +33,10 @@ each rotor the noise of its thrust in the vortex ring state, of unit variance.""
 HIT = 2
 """Numbers behind the air, in a world with solids: the number of the solid that was hit fastest in
 this control step, from 1 on (0 for none), and the speed of that hit [m/s]."""
-HELD = 5
-"""Numbers behind those: 1 once a foot has touched a solid that grips, and from the moment of that
-touch the speed into the solid and along it [m/s], the cosine of the angle between the body's z axis
-and the solid's normal, and the body rate [rad/s]."""
+FEET, HELD = 6, 5
+"""Numbers behind those: 1 once a foot has touched a solid, and from the moment of that touch the
+speed into the solid and along it [m/s], the cosine of the angle between the body's z axis and the
+solid's normal, and the body rate [rad/s]; at last (`HELD`) 1 once a solid that grips holds one."""
 MARK = 1903518052.0
 """Tells the actuators and bodies of quadrl from everybody else's: "quad" in ASCII."""
 SETTINGS = (
@@ -176,8 +176,8 @@ def c_structs() -> str:
         return "\n".join(lines)
 
     effects = f"{STILL_AIR=}, {ROTOR_EFFECTS=}, {GROUND_EFFECT=}"
-    sizes = f"MAX_ROTORS = {MAX_ROTORS}, WIND = {WIND}, AIR = {AIR}, HIT = {HIT}, HELD = {HELD}"
-    sizes += f", ROW_SIZE = {ROW_SIZE}"
+    sizes = f"MAX_ROTORS = {MAX_ROTORS}, WIND = {WIND}, AIR = {AIR}, HIT = {HIT}, FEET = {FEET}"
+    sizes += f", HELD = {HELD}, ROW_SIZE = {ROW_SIZE}"
     return (
         "// Written by quadrl/aircraft/parameters.py from Rotor, Vehicle and Aerodynamics.\n"
         f"#define QUADRL_MARK {MARK!r}\n#define MOST_OFFSET {MOST_OFFSET!r}\n"

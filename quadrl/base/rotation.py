@@ -46,6 +46,12 @@ def square_norm(vector: Array) -> Array:
     return total
 
 
+def dot(first: Array, second: Array) -> Array:
+    """Scalar products (...) of vectors (..., 3)."""
+    product = first * second
+    return product[..., 0] + product[..., 1] + product[..., 2]
+
+
 def norm(vector: Array) -> Array:
     """Euclidean norm over the last axis, (..., k) to (...); its gradient at zero is zero."""
     square: Any = square_norm(vector)

@@ -15,13 +15,13 @@ from typing import Any, cast
 import mujoco
 import numpy as np
 
-from quadrl.aircraft.parameters import HELD, MARK
+from quadrl.aircraft.parameters import FEET, HELD, MARK
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.conditions.solids import Pose, Solid, heading
 from quadrl.engines.engine import Engine
-from quadrl.engines.solids import KINDS
+from quadrl.engines.solids import KINDS, MOTION
 
 FAR = 1000.0  # [m]
 HIDDEN = 3
@@ -40,8 +40,9 @@ class Surroundings:
     clearance: Array  # (N,) [m], free at least between the aircraft and the nearest solid
     touched: Array  # (N, K) bool, which one was touched fastest in this control step
     touch_speed: Array  # (N,) [m/s], of that touch towards the solid; 0 without one
-    held: Array  # (N,) bool, whether a foot has touched a solid that grips
+    landed: Array  # (N,) bool, whether a foot has touched a solid
     touch: Array  # (N, 4) of that moment: speed into it and along it [m/s], cosine, rate [rad/s]
+    held: Array  # (N,) bool, whether a foot has touched a solid that grips
 
 
 class Scene:
@@ -70,9 +71,9 @@ class Scene:
                     name=f"{solid.name}_{k}", type=part.kind, size=part.size, pos=position,
                     quat=quaternion, rgba=solid.rgba, contype=1, conaffinity=0, group=HIDDEN,
                 )  # fmt: skip
-                geom.userdata = [MARK, index, *part.offset, solid.grip]
+                geom.userdata = [MARK, index, *part.offset, solid.grip, *np.zeros(12)]
         if self.solids:
-            spec.nuser_geom = 6
+            spec.nuser_geom = MOTION + 12
 
     def check(self, engine: Engine) -> None:
         """Refuse an engine, made already, whose world has other solids.
@@ -84,22 +85,32 @@ class Scene:
             allowed = f"made with the solids of the task: {', '.join(self.names) or 'none'}"
             raise QuadrlError(name="engine", value=engine, allowed=allowed)
 
-    def poses(self, placed: Mapping[str, Pose], count: int, origin: np.ndarray) -> np.ndarray:
+    def poses(
+        self,
+        placed: Mapping[str, Pose],
+        count: int,
+        origin: np.ndarray,
+        last: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Poses (n, K, 7) of the geoms in the world, as engines take them.
 
         Args:
-            placed: Poses of solids by name; the others stand where they are declared.
+            placed: Poses of solids by name.
             count: n.
             origin: (3,) [m], of the task frame in the world frame.
+            last: Poses of the others; by default they stand where they are declared.
 
         Raises:
             QuadrlError: There is no such solid, or an array has the wrong shape.
         """
         if unknown := set(placed) - set(self.names):
             raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(self.names))
-        centres, offsets = self._declared
-        made = np.zeros((count, len(centres), 7))
-        made[..., :3], made[..., 3] = centres + origin + offsets, 1.0
+        if last is None:
+            centres, offsets = self._declared
+            made = np.zeros((count, len(centres), 7))
+            made[..., :3], made[..., 3] = centres + origin + offsets, 1.0
+        else:
+            made = last.copy()
         for solid, first in zip(self.solids, self._first, strict=True):
             if (pose := placed.get(solid.name)) is None:
                 continue
@@ -139,10 +150,21 @@ class Scene:
         position = np.tile([solid.position for solid in self.solids], (count, 1, 1))
         touched = np.zeros((count, len(self.solids)), dtype=bool)
         far = np.full(count, FAR)
-        none = np.zeros((count, HELD))
-        return Surroundings(
-            self.names, position + 0.0, far, touched, 0.0 * far, none[:, 0] > 0, none[:, 1:]
-        )
+        feet = np.zeros((count, FEET))
+        return self._around(position + 0.0, far, touched, 0.0 * far, feet)
+
+    def _around(
+        self,
+        position: np.ndarray,
+        clearance: np.ndarray,
+        touched: np.ndarray,
+        touch_speed: np.ndarray,
+        feet: np.ndarray,
+    ) -> Surroundings:
+        """The surroundings from arrays of their fields, and the rows (n, FEET) of a touch."""
+        measured = position, clearance, touched, touch_speed
+        landed, held = feet[:, 0] > 0, feet[:, HELD] > 0
+        return Surroundings(self.names, *measured, landed, feet[:, 1:HELD], held)
 
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
         """The solids as pictures show them, where they stand in the world of a row."""
@@ -159,17 +181,16 @@ class Scene:
     def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
         """The present surroundings of some aircraft (n,) of an engine, or of all.
 
-        They are copies, but for the positions of all: those are live, since they change with an
-        episode and not with a step.
+        They are copies, but for the positions of all: where nothing moves those are live, since
+        they change with an episode and not with a step.
         """
         chosen = slice(None) if rows is None else rows
         which, speed = engine.hits[chosen].T
         touched = which[:, None] == 1 + np.arange(len(self.solids))
         clear, centres = engine.clearance(rows), engine.solids.centres[chosen]
-        held = engine.held[chosen].copy()
-        return Surroundings(
-            self.names, centres, clear, touched, speed.copy(), held[:, 0] > 0, held[:, 1:]
-        )
+        centres = centres.copy() if engine.solids.moves else centres
+        feet = engine.feet[chosen].copy()
+        return self._around(centres, clear, touched, speed.copy(), feet)
 
 
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -199,7 +199,8 @@ class CompiledStep(Step):
         )
         (before.sensed, before.around), (sensed, around) = given
         for solids in filter(None, (before.around, around)):
-            solids.touched, solids.held = solids.touched != 0.0, solids.held != 0.0
+            for name in ("touched", "landed", "held"):
+                setattr(solids, name, getattr(solids, name) != 0.0)
         seen_from = estimate if self._estimate else None
         inputs = state, action, command, diverged, seen_from, around, sensed
         with symbolic():

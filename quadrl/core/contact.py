@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from quadrl.base.rotation import Array, namespace, norm
+from quadrl.base.rotation import Array, dot, namespace, norm
 from quadrl.core.snapshot import Snapshot
 
 CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing
@@ -29,17 +29,12 @@ def strikes_ground(now: Snapshot) -> Array:
     up = now.state.rotation[..., 2, :]
     depth = norm(up * now.parameters.hull)
     centre = rotor.position + now.parameters.rotor_height[..., None, None] * rotor.axis
-    above = _along(up[..., None, :], centre)  # (N, R) [m], of the discs' centres
+    above = dot(up[..., None, :], centre)  # (N, R) [m], of the discs' centres
     edge = rotor.radius * norm(_across(up[..., None, :], rotor.axis))
     deepest = xp.max(edge - above, axis=-1)
     return now.state.height < xp.maximum(depth, deepest)
 
 
-def _along(first: Array, second: Array) -> Array:
-    product = first * second
-    return product[..., 0] + product[..., 1] + product[..., 2]
-
-
 def _across(up: Array, axis: Array) -> Array:
     """The part of `up` in the plane of a disc with an axis."""
-    return up - _along(up, axis)[..., None] * axis
+    return up - dot(up, axis)[..., None] * axis

@@ -109,8 +109,9 @@ class Environment(saving.Copied):
         self.layout = layout(terms, self.vehicle.rotor_count)
         """Where each named term of the observation stands in the flat vector."""
         self.size = max(part.stop for part in self.layout.values())
-        self.stepwise = self.control_mode.has_loops or self.randomizer.late
-        """Whether the rotors get more than one command in a control step, from `control`."""
+        self._solids_move = type(self.task).move is not Task.move
+        self.stepwise = self.control_mode.has_loops or self.randomizer.late or self._solids_move
+        """Whether a control step is flown in parts, which `control` prepares."""
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
         self._all = np.arange(self.num_envs)
         self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
@@ -314,7 +315,7 @@ class Environment(saving.Copied):
                 self.observer.follow(command, self.vehicle.control_timestep)
 
     def control(self, most: int) -> int:
-        """Command the rotors, where they get more than one command in a control step.
+        """Command the rotors and move solids, where that happens within a control step.
 
         Returns:
             For how many physics steps, of `most` that are left.
@@ -325,9 +326,20 @@ class Environment(saving.Copied):
             self._inputs.command[:] += command / self.vehicle.substeps  # their mean counts
             if self.observer:
                 self.observer.follow(command, self.vehicle.physics_timestep)
+        if self._solids_move:
+            steps = 1
+            self._move_solids()
         self._flown += steps
         self.engine.ctrl[:] = self.randomizer.delayed(command, steps)
         return steps
+
+    def _move_solids(self) -> None:
+        """Move solids to where the next physics step ends."""
+        vehicle, engine = self.vehicle, self.engine
+        flown = (self._flown + 1) * vehicle.physics_timestep
+        time = self.episode.steps * vehicle.control_timestep + flown
+        poses = self.task.move(self.snapshot.task, time), self.num_envs, self.origin
+        engine.move_solids(self.scene.poses(*poses, engine.solids.poses))
 
     def finish(self) -> Transition:
         """Second half of a step, after the engine has advanced."""

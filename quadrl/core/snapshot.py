@@ -66,18 +66,23 @@ class Snapshot:
         return self._surroundings.touch_speed
 
     @property
-    def held(self) -> Array:
-        """Whether a foot has touched a solid that grips, in this episode, (N,) bool."""
-        return self._surroundings.held
+    def landed(self) -> Array:
+        """Whether a foot has touched a solid, in this episode, (N,) bool."""
+        return self._surroundings.landed
 
     @property
     def touch(self) -> Array:
-        """How it did, (N, 4); 0 before.
+        """How the first one did, (N, 4); 0 before.
 
         Speed into the solid and along it [m/s], cosine of the angle between the body's z axis and
         its normal, body rate [rad/s].
         """
         return self._surroundings.touch
+
+    @property
+    def held(self) -> Array:
+        """Whether a foot has touched a solid that grips, in this episode, (N,) bool."""
+        return self._surroundings.held
 
     def solid(self, name: str) -> Array:
         """Centre of a solid, (N, 3) [m], task frame."""

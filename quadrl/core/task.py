@@ -254,12 +254,19 @@ class Task(abc.ABC):
         return ()
 
     def place(self, rng: Rng, start: Start, state: TaskState) -> Mapping[str, Pose]:
-        """Where solids stand in episodes (n,), by name; the others stand where they are declared.
+        """Where solids are at the start of episodes (n,), by name; the others are as declared.
 
         Args:
             rng: Random numbers of their own.
             start: Start of the episodes, as `begin` gives it.
             state: What the task remembers, as `begin` gives it.
+        """
+        return self.move(state, 0.0 * state.goal[..., 0])
+
+    def move(self, state: TaskState, time: Array) -> Mapping[str, Pose]:
+        """Where solids that move are at a time (n,) [s] of episodes, by name.
+
+        An aircraft that touches one is carried along. It is asked at every physics step.
         """
         return {}
 

@@ -49,7 +49,7 @@ def spec(
         whole.geom("ground").contype = 1
         _add_collision(whole.body("aircraft"), vehicle)
     if _has_solids(whole):
-        whole.nuserdata += parameters.HIT + parameters.HELD
+        whole.nuserdata += parameters.HIT + parameters.FEET
         # MuJoCo would look for them where they were compiled.
         whole.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     if not drawn:  # a step without what is only seen takes a sixth less time

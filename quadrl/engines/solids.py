@@ -1,8 +1,9 @@
 """Solids in the world of N aircraft: their poses in each row, clearances and touches.
 
 A solid is one or more geoms of the world that MuJoCo lets aircraft collide with. Their sizes are
-the model's; where they stand is a row's own, and a new one at each reset. `native/solids.h` knows
-how far a point is from one, so that free flight hands over whoever comes near.
+the model's; where they stand is a row's own, and a new one at each reset or, of those that move, at
+each physics step. `native/solids.h` knows how far a point is from one, so that free flight hands
+over whoever comes near.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ KINDS: dict[mujoco.mjtGeom, Shape] = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
 }
 """What a solid can be made of."""
+MOTION = 6
+"""Where velocity and angular velocity of a geom stand in its user data, and their derivatives."""
 SOLID = np.dtype([("kind", "f8"), ("size", "f8", 3), ("position", "f8", 3), ("turn", "f8", 9)])
 """`Solid` in native/solids.h."""
 
@@ -54,6 +57,12 @@ class Solids:
         self.table["kind"] = model.geom_type[self.geoms]
         self.table["size"] = model.geom_size[self.geoms]
         self.table["turn"] = np.eye(3).reshape(-1)
+        self.poses = np.zeros((count, len(self.geoms), 7))
+        """Where they are now, (N, K, 7), as `place` takes it."""
+        self.motion = np.zeros((count, len(self.geoms), 6))
+        """Velocity and angular velocity (N, K, 6) on the way there [m/s], [rad/s], world frame."""
+        self.moves = False
+        """Whether any has moved since it was placed."""
 
     def place(
         self,
@@ -70,6 +79,17 @@ class Solids:
             origin: (3,) of the task frame [m], world frame.
             field: Gives a field of the model with a leading axis N, live.
         """
+        self.poses[rows], self.motion[rows] = poses, 0.0
+        self._stand(rows, poses, origin, field)
+
+    def _stand(
+        self,
+        rows: np.ndarray,
+        poses: np.ndarray,
+        origin: np.ndarray,
+        field: Callable[[str], np.ndarray],
+    ) -> None:
+        """Let engines take the geoms of some rows to be somewhere."""
         position, quaternion = poses[..., :3], poses[..., 3:]
         turn = rotation_matrix(quaternion)
         self.table["position"][rows] = position
@@ -79,10 +99,35 @@ class Solids:
         field("geom_pos")[np.ix_(rows, self.geoms)] = position
         field("geom_quat")[np.ix_(rows, self.geoms)] = quaternion
 
-    def poses(self, field: Callable[[str], np.ndarray]) -> np.ndarray:
-        """Where they stand now, (N, K, 7), as `place` takes it."""
-        parts = (field(name)[:, self.geoms] for name in ("geom_pos", "geom_quat"))
-        return np.ascontiguousarray(np.concatenate(list(parts), axis=-1))
+    def move(
+        self,
+        poses: np.ndarray,
+        timestep: float,
+        origin: np.ndarray,
+        field: Callable[[str], np.ndarray],
+    ) -> None:
+        """Move the solids of all rows to poses (N, K, 7) within a physics step [s].
+
+        During the step they stand half-way, and contacts have the mean velocity of the way and the
+        acceleration since the step before, which MuJoCo knows nothing of.
+        """
+        last, self.moves = self.poses.copy(), True
+        half = (last + poses) / 2
+        half[..., 3:] /= np.linalg.norm(half[..., 3:], axis=-1, keepdims=True)
+        self._stand(np.arange(len(poses)), half, origin, field)
+        self.poses[:] = poses
+        velocity = (poses[..., :3] - last[..., :3]) / timestep
+        motion = np.concatenate([velocity, _turn_rate(last, poses, timestep)], axis=-1)
+        # Of the first step after a start the one before is not known.
+        known = self.motion.any(axis=-1, keepdims=True)
+        faster = np.where(known, (motion - self.motion) / timestep, 0.0)
+        field("geom_user")[:, self.geoms, MOTION:] = np.concatenate([motion, faster], axis=-1)
+        self.motion[:] = motion
+
+    def arrive(self, origin: np.ndarray, field: Callable[[str], np.ndarray]) -> None:
+        """Let them stand where the last step ended."""
+        if self.moves:
+            self._stand(np.arange(len(self.poses)), self.poses, origin, field)
 
     def clearance(
         self, qpos: np.ndarray, parameters: np.ndarray, rotors: int, rows: np.ndarray | None = None
@@ -110,3 +155,12 @@ class Solids:
             )  # fmt: skip
             native.library().quadrl_clearance(where.ctypes.data, len(qpos), out.ctypes.data)
         return out
+
+
+def _turn_rate(last: np.ndarray, poses: np.ndarray, timestep: float) -> np.ndarray:
+    """Angular velocity (N, K, 3) [rad/s], world frame, from poses (N, K, 7) to others."""
+    was, now = last[..., 3:], poses[..., 3:]
+    cross = np.cross(was[..., 1:], now[..., 1:])
+    half = was[..., :1] * now[..., 1:] - now[..., :1] * was[..., 1:] + cross
+    near = (was * now).sum(axis=-1, keepdims=True)  # the cosine of half the angle
+    return 2 * np.where(near < 0, -half, half) / timestep

@@ -74,7 +74,7 @@ def test_clearance_is_the_distance_that_mujoco_measures(solid):
     model = spec.compile()
     data, solids = mujoco.MjData(model), engine.solids.geoms - engine.solids.geoms[0]
     for row in range(count):
-        where = engine.solids.poses(engine._model_field)[row]
+        where = engine.solids.poses[row]
         model.geom_pos[solids], model.geom_quat[solids] = where[:, :3], where[:, 3:]
         data.mocap_pos[0], data.mocap_quat[0] = engine.qpos[row, :3], engine.qpos[row, 3:]
         mujoco.mj_kinematics(model, data)
@@ -256,3 +256,78 @@ def test_a_task_without_solids_says_so_when_one_is_asked_for():
     environment.reset()
     with pytest.raises(QuadrlError, match="declares no solids"):
         environment.snapshot.clearance  # noqa: B018 - it is a property
+
+
+MOVES = {  # a deck's place [m] and heading [rad] at a time [s]
+    "heaves": lambda t: ((0.0, 0.0, 0.6 * np.cos(1.2 * t)), 0.0),
+    "sways": lambda t: ((0.4 * np.sin(1.2 * t), 0.3 * np.cos(1.2 * t), 0.5 * np.sin(0.8 * t)), 0.0),
+    "turns": lambda t: ((0.0, 0.0, 0.0), 0.5 * t),
+}
+DECK = Scene([Box("deck", length=4.0, width=4.0, height=0.2)])
+
+
+def carried(path, count=1, engine="mujoco", place=(0.0, 0.0), drop=0.0, time=6.0, still=False):
+    """Aircraft (T, n, 3) [m] on a deck, rotors off, as seen from it, and the engine at the end.
+
+    Where it stands still, it is the deck's frame: gravity and wind are those in it.
+    """
+    model = compile_model(PAPER, drawn=False, scene=DECK.add_to)
+    made, step = make(engine, PAPER, model, count, altitude=3.0), PAPER.physics_timestep
+
+    def poses(t):
+        place, turn = path(0.0 if still else t)
+        pose = Pose(np.tile(place, (count, 1)), heading(np.full(count, turn)))
+        return DECK.poses({"deck": pose}, count, made.origin)
+
+    def velocity(t):
+        return (np.array(path(t + step)[0]) - path(t)[0]) / step
+
+    rest, height = np.zeros((count, 3)), 0.1 - PAPER.foot[2] + drop
+    start = Start(
+        position=rest + path(0.0)[0] + (*place, height),
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        velocity=rest + (0.0 if still else velocity(0.0)),
+        body_rate=rest,
+        rotor_speed=np.zeros((count, PAPER.rotor_count)),
+    )
+    made.place(np.arange(count), start, solids=poses(0.0))
+    made.ctrl[:], track, gravity = 0.0, [], made.model.opt.gravity.copy()
+    for k in range(round(time / step)):
+        t = k * step
+        if still:
+            made.wind[:] = -velocity(t)
+            made.model.opt.gravity[:] = gravity - (velocity(t) - velocity(t - step)) / step
+        made.move_solids(poses(t + step))
+        made.advance(1)
+        made.read()
+        track.append(made.state.position - path(0.0 if still else t + step)[0])
+    return np.array(track), made
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("name", ["heaves", "sways"])
+def test_a_deck_that_moves_carries_an_aircraft_as_its_own_frame_would(name, engine):
+    frame, _ = carried(MOVES[name], still=True)
+    track, _ = carried(MOVES[name], count=2, engine=engine)
+    # A deck stands still within a physics step, in which it moves by 5 mm.
+    np.testing.assert_allclose(track, np.tile(frame, (1, 2, 1)), rtol=0, atol=2.5e-3)
+    assert abs(track - frame)[..., 2].max() < 7e-4
+
+
+def test_a_deck_that_turns_takes_an_aircraft_around():
+    track, made = carried(MOVES["turns"], place=(0.5, 0.0))
+    radius = np.linalg.norm(track[:, 0, :2], axis=-1)
+    np.testing.assert_allclose(radius, 0.5, atol=0.01)
+    turned = np.arctan2(track[-1, 0, 1], track[-1, 0, 0])
+    assert turned == pytest.approx(3.0, abs=0.03)
+    matrix = rotation_matrix(made.qpos[:, 3:])[0]
+    assert np.arctan2(matrix[1, 0], matrix[0, 0]) == pytest.approx(3.0, abs=0.03)
+
+
+@pytest.mark.parametrize("sink", [-0.5, 0.0, 0.5])
+def test_a_touch_of_what_moves_counts_from_it(sink):
+    """An aircraft falls 2 cm, from the speed of a deck that sinks or rises."""
+    _, made = carried(lambda t: ((0.3 * t, 0.0, -sink * t), 0.0), drop=0.02, time=0.3)
+    landed, into, along, *_ = made.feet[0]
+    assert landed == 1 and into == pytest.approx(np.sqrt(2 * 9.81 * 0.02), abs=0.06)
+    assert along < 0.02

@@ -9,9 +9,11 @@
 //   actuator_gear     along and about the rotor's axis: 1, aero_reaction
 //   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/aircraft/parameters.py says;
 //                     in a world with solids then HIT numbers: 1 + the solid that was hit fastest since
-//                     they were cleared, and how fast [m/s]; and HELD numbers of a touch that holds
+//                     they were cleared, and how fast [m/s]; and FEET numbers of the first touch of a
+//                     foot
 //   geom_user         [0] mark, [1] the number of the solid that a geom is of, [GRIP] with how many
-//                     times its weight it holds an aircraft whose feet touch it
+//                     times its weight it holds an aircraft whose feet touch it, [MOTION] its velocity
+//                     and angular velocity, then their derivatives, world frame
 #include <math.h>
 #include <mujoco/mujoco.h>
 #include <stdint.h>
@@ -21,7 +23,7 @@
 #include "aero.h"
 #include "export.h"
 
-enum { MARK_SLOT = 9, GRIP = 5, FEET = 4 };
+enum { MARK_SLOT = 9, GRIP = 5, MOTION = 6, LEGS = 4 };
 
 // The struct layouts of mjModel and mjData are compiled in: the loader compares these.
 QUADRL_EXPORT int quadrl_mujoco_version(void) { return mjVERSION_HEADER; }
@@ -88,8 +90,8 @@ static int rotor_of(const mjModel* m, int actuator, const Aircraft** owner) {
 
 // What an actuator of ours commands: nothing once something holds the aircraft.
 static mjtNum command_of(const mjModel* m, const mjData* d, int actuator) {
-  const int grips = m->nuser_geom > GRIP && m->nuserdata >= AIR + HIT + HELD;
-  if (grips && d->userdata[AIR + HIT] > 0) return 0;
+  const int grips = m->nuser_geom > GRIP && m->nuserdata >= AIR + HIT + FEET;
+  if (grips && d->userdata[AIR + HIT + HELD] > 0) return 0;
   return d->ctrl[m->actuator_ctrladr[actuator]];
 }
 
@@ -140,38 +142,99 @@ static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft*
   }
 }
 
-// Pulls a foot towards the solid that it touches, `way` being the unit vector there, and writes down
-// how the first one touched.
+// Pulls a foot towards the solid that it touches, `way` being the unit vector there.
 static void hold(const mjModel* m, mjData* d, const Aircraft* a, int body, mjtNum grip,
                  const mjtNum way[3], const mjtNum arm[3]) {
   const int dof = m->body_dofadr[body];
-  const mjtNum *velocity = d->qvel + dof, *rate = velocity + 3, *turn = d->xmat + 9 * body;
-  const mjtNum pull = grip * a->mass[0] * -m->opt.gravity[2] / FEET;
-  mjtNum into = 0, along = 0, spin = 0, cosine = 0;
+  const mjtNum* turn = d->xmat + 9 * body;
+  const mjtNum pull = grip * a->mass[0] * -m->opt.gravity[2] / LEGS;
   for (int k = 0; k < 3; ++k) {
     const int next = (k + 1) % 3, last = (k + 2) % 3;
     d->qfrc_passive[dof + k] += pull * way[k];
     const mjtNum moment = pull * (arm[next] * way[last] - arm[last] * way[next]);
     for (int j = 0; j < 3; ++j) d->qfrc_passive[dof + 3 + j] += turn[3 * k + j] * moment;
-    into += velocity[k] * way[k];
+  }
+  d->userdata[AIR + HIT + HELD] = 1;
+}
+
+// Writes down how the first foot touched a solid that moves with a velocity.
+static void note_touch(const mjModel* m, mjData* d, int body, const mjtNum way[3],
+                       const mjtNum moves[3]) {
+  const mjtNum *velocity = d->qvel + m->body_dofadr[body], *rate = velocity + 3;
+  const mjtNum* turn = d->xmat + 9 * body;
+  mjtNum *feet = d->userdata + AIR + HIT, into = 0, along = 0, spin = 0, cosine = 0;
+  if (feet[0] > 0) return;
+  for (int k = 0; k < 3; ++k) {
+    into += (velocity[k] - moves[k]) * way[k];
     cosine -= turn[3 * k + 2] * way[k];
     spin += rate[k] * rate[k];
   }
   for (int k = 0; k < 3; ++k) {
-    const mjtNum aside = velocity[k] - into * way[k];
+    const mjtNum aside = velocity[k] - moves[k] - into * way[k];
     along += aside * aside;
   }
-  mjtNum* held = d->userdata + AIR + HIT;
-  if (held[0] > 0) return;
   const mjtNum touch[HELD] = {1, into, sqrt(along), cosine, sqrt(spin)};
-  memcpy(held, touch, sizeof touch);
+  memcpy(feet, touch, sizeof touch);
 }
 
-// Writes down the fastest hit of an aircraft on a solid, from the contacts of this moment, and holds
-// its feet where the solid grips them.
+// Adds the vector product of two vectors to a third one.
+static void add_cross(const mjtNum a[3], const mjtNum b[3], mjtNum sum[3]) {
+  for (int k = 0; k < 3; ++k) {
+    const int next = (k + 1) % 3, last = (k + 2) % 3;
+    sum[k] += a[next] * b[last] - a[last] * b[next];
+  }
+}
+
+// Velocity and acceleration of the place of a contact as a point of a solid's geom, world frame.
+static void solid_motion(const mjModel* m, const mjData* d, int geom, const mjtNum place[3],
+                         mjtNum velocity[3], mjtNum acceleration[3]) {
+  for (int k = 0; k < 3; ++k) velocity[k] = acceleration[k] = 0;
+  if (m->nuser_geom < MOTION + 12) return;
+  const mjtNum* motion = m->geom_user + (size_t)m->nuser_geom * geom + MOTION;
+  mjtNum arm[3], swing[3] = {0};
+  for (int k = 0; k < 3; ++k) {
+    arm[k] = place[k] - d->geom_xpos[3 * geom + k];
+    acceleration[k] = motion[6 + k];
+  }
+  add_cross(motion + 3, arm, swing);
+  add_cross(motion + 9, arm, acceleration);
+  add_cross(motion + 3, swing, acceleration);
+  for (int k = 0; k < 3; ++k) velocity[k] = motion[k] + swing[k];
+}
+
+// Makes a contact that of an aircraft with a solid which moves. MuJoCo asks each of its rows for the
+// acceleration -b v - k r, where v is the row's speed of the aircraft alone, since geoms of the world
+// stand still: so much is added to r that speed and acceleration count from the solid.
+static void carry(const mjModel* m, mjData* d, const mjContact* contact, const mjtNum velocity[3],
+                  const mjtNum acceleration[3], int solid_is_first) {
+  const int row = contact->efc_address, pyramid = contact->dim > 1;
+  const int rows = pyramid ? 2 * (contact->dim - 1) : 1;
+  if (row < 0 || row + rows > d->nefc || (pyramid && m->opt.cone != mjCONE_PYRAMIDAL)) return;
+  mjtNum speed[3] = {0}, faster[3] = {0};  // along the normal and the two tangents
+  for (int j = 0; j < 3; ++j) {
+    for (int k = 0; k < 3; ++k) {
+      speed[j] += contact->frame[3 * j + k] * velocity[k];
+      faster[j] += contact->frame[3 * j + k] * acceleration[k];
+    }
+  }
+  for (int k = 0; k < rows; ++k) {
+    const int tangent = 1 + k / 2;  // behind the two there are turns, which are left alone
+    const mjtNum* kbi = d->efc_KBIP + 4 * (row + k);
+    mjtNum asked = kbi[1] * speed[0] + faster[0], stiffness = kbi[0] * kbi[2];
+    if (pyramid && tangent < 3) {
+      const mjtNum aside =
+          contact->friction[tangent - 1] * (kbi[1] * speed[tangent] + faster[tangent]);
+      asked += k % 2 ? -aside : aside;
+    }
+    if (stiffness > 0) d->efc_pos[row + k] += (solid_is_first ? -asked : asked) / stiffness;
+  }
+}
+
+// Writes down the fastest hit of an aircraft on a solid and the first touch of its feet, from the
+// contacts of this moment, and holds its feet where the solid grips them.
 static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) {
   const mjtNum *rate = d->qvel + m->body_dofadr[body] + 3, *turn = d->xmat + 9 * body;
-  const int grips = m->nuser_geom > GRIP && m->nuserdata >= AIR + HIT + HELD;
+  const int notes = m->nuserdata >= AIR + HIT + FEET, grips = notes && m->nuser_geom > GRIP;
   mjtNum* hit = d->userdata + AIR;
   for (int c = 0; c < d->ncon; ++c) {
     const mjContact* contact = d->contact + c;
@@ -181,7 +244,9 @@ static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) 
     const int other = own ? first : second;
     const mjtNum* solid = m->geom_user + (size_t)m->nuser_geom * other;
     if ((!own && m->geom_bodyid[first] != body) || !is_same(solid[0], QUADRL_MARK)) continue;
-    mjtNum arm[3], spin[3], velocity[3], way[3], speed = 0;
+    mjtNum arm[3], spin[3], velocity[3], way[3], moves[3], faster[3], speed = 0;
+    solid_motion(m, d, other, contact->pos, moves, faster);
+    carry(m, d, contact, moves, faster, own);
     for (int k = 0; k < 3; ++k) {
       // The frame's axis points from the first geom to the second.
       way[k] = own ? -contact->frame[k] : contact->frame[k];
@@ -191,10 +256,11 @@ static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) 
     for (int k = 0; k < 3; ++k) {
       const int next = (k + 1) % 3, last = (k + 2) % 3;
       velocity[k] = d->qvel[m->body_dofadr[body] + k] + spin[next] * arm[last] - spin[last] * arm[next];
-      speed += velocity[k] * way[k];
+      speed += (velocity[k] - moves[k]) * way[k];
     }
     // The feet are the aircraft's only spheres.
     const int foot = m->geom_type[own ? second : first] == mjGEOM_SPHERE;
+    if (notes && foot) note_touch(m, d, body, way, moves);
     if (grips && foot && solid[GRIP] > 0) hold(m, d, a, body, solid[GRIP], way, arm);
     if (hit[0] > 0 && !(speed > hit[1])) continue;
     hit[0] = 1 + solid[1];
