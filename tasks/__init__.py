@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from quadrl.core.catalogue import TASKS, make, register
+from quadrl.tasks.deck_landing import DeckLanding
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
 from quadrl.tasks.perching import Perching
@@ -18,6 +19,6 @@ __all__ = ["TASKS", "make", "register"]
 
 for _task in (
     *(Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing),
-    *(Race, Recovery, Trajectory, Perching),
+    *(Race, Recovery, Trajectory, Perching, DeckLanding),
 ):
     register(_task)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, namespace, norm, square_norm, stack
 from quadrl.core import rewards
 from quadrl.core.contact import stands, strikes_ground
@@ -116,7 +117,7 @@ class Landing(Task):
     rest_time: float = 0.25
     """How long the aircraft has to be at rest [s]."""
 
-    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Touchdown]:
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
         """Level and at rest, high over the pad and beside its axis."""
         offset = rng.uniform(0.0, self.start_offset)
         zero = namespace(offset).zeros_like(offset)
@@ -143,7 +144,7 @@ class Landing(Task):
         stood = end.terminated & rested & upright & ~strikes_ground(now)
         return stood & heads_east(now, self.heading_tolerance)
 
-    def update(self, before: Snapshot, now: Snapshot) -> Touchdown:
+    def update(self, before: Snapshot, now: Snapshot) -> TaskState:
         """Remember the touchdown, the speed and how long the aircraft has been at rest."""
         down = now.task.down
         xp = namespace(down)
@@ -191,7 +192,7 @@ class Landing(Task):
         offset = stack(reading.to_goal[..., 0], reading.to_goal[..., 1], zero)
         return offset, stack(zero, zero, -sink)
 
-    def markers(self, now: Snapshot) -> Sequence[Marker]:
+    def markers(self, now: Snapshot) -> Sequence[Marker | Primitive]:
         """The pad."""
         return [Marker("pad", size=self.pad_radius, rgba=(0.95, 0.95, 0.95, 1.0))]
 

@@ -22,6 +22,8 @@ EPISODES = 300
 RATE, SETTLED = "success_rate", "settled_m"
 EIGHT: Any = {"figure": "lemniscate", "time_limit": 30.0}
 EIGHT_GAINS = Gains(1.7125, 1.7125, 1.0, 0.51852, 6.88, 0.66735)
+SEAS = {2: (0.1, 0.5), 3: (0.5, 1.25), 4: (1.25, 2.5), 5: (2.5, 4.0)}
+"""Significant wave heights of the sea states [m], WMO code table 3700."""
 FLOWN: dict[str, tuple[str, str, Any, Gains | None]] = {
     "recovery from 3 m": ("recovery", RATE, {}, Gains(1.4875, 1.4875, 1.0, 0.90741, 7.16, 0.34898)),
     "recovery from 1.5 m": ("recovery", RATE, {"lowest": 1.5, "highest": 1.5}, Gains()),
@@ -41,6 +43,15 @@ FLOWN: dict[str, tuple[str, str, Any, Gains | None]] = {
         )
         for incline in (0, 30, 60, 90)
     },
+    **{
+        f"deck in sea state {state}": (
+            "deck_landing",
+            RATE,
+            {"lowest_waves": lowest, "highest_waves": highest},
+            Gains(),
+        )
+        for state, (lowest, highest) in SEAS.items()
+    },
 }
 """Condition: its task, what counts, its options, and the best of sixteen gains of the controller,
 chosen in 100 flights apart; None where it cannot do what is asked."""
@@ -49,12 +60,17 @@ FIGURES = {
     "survival_rate": "in the air to the end",
     "distance_m": "distance, from rest",
     SETTLED: "distance, settled",
+    "touchdown_speed_median_m_s": "touchdown, median",
+    "touchdown_speed_max_m_s": "hardest",
+    "touchdown_tilt_median_deg": "tilt",
+    "miss_median_m": "off the pad's middle",
+    "landing_time_mean_s": "after",
     "yaw_rate_rad_s": "turning",
 }
 
 
 def missions(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
-    """Fly the policies of finished recoveries, trajectories and perchings.
+    """Fly the policies of finished missions.
 
     Args:
         runs: Run folders; a task has the rows of all of its runs, or of the policy that ships.
@@ -83,8 +99,8 @@ def missions_table(task: str) -> str:
     """Every policy of a task, and the controller, condition by condition."""
     result = report.load("missions")
     own = [row for row in result["rows"] if row["task"] == task]
-    told = {name: text for name, text in FIGURES.items() if any(row[name] for row in own)}
-    rows = [(row["condition"], row["who"], *(shown(n, row[n]) for n in told)) for row in own]
+    told = {name: text for name, text in FIGURES.items() if any(row.get(name) for row in own)}
+    rows = [(row["condition"], row["who"], *(shown(n, row.get(n)) for n in told)) for row in own]
     head = ("flown", "by", *told.values())
     return f"{table(head, rows)}\n\n{result['episodes']} flights a row. {report.source(result)}"
 
@@ -96,5 +112,5 @@ def shown(name: str, value: float | None) -> str:
 
 PARTS: Parts = {
     f"missions-{task}": functools.partial(missions_table, task)
-    for task in ("trajectory", "perching")
+    for task in ("trajectory", "perching", "deck_landing")
 }

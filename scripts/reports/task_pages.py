@@ -38,7 +38,7 @@ print(info["error"], info["reward_terms"])
 
 {action}. Actions outside of [-1, 1] are clipped. With `control_mode=` the same task takes thrust
 and body rates, velocities or positions, and with `vehicle=` another aircraft: see
-[actions](actions.md) and [aircraft](aircraft.md).
+[actions](tasks.md#actions) and [aircraft](aircraft.md).
 
 ## Observation
 

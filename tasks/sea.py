@@ -1,0 +1,135 @@
+"""The sea: waves that the wind has raised, how a boat on it moves, and how it looks."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import operator
+from typing import NamedTuple
+
+import numpy as np
+
+from quadrl.aircraft.rotors import GRAVITY
+from quadrl.base.primitives import Primitive
+from quadrl.base.rotation import Array, namespace, norm, stack
+from quadrl.core.task import TaskState
+from quadrl.engines.rng import FULL_TURN, Rng
+
+WAVES = 12  # that the sea is made of
+RAREST = 1e-6  # of the share of the energy in longer waves: those are endless
+TILES, FARTHEST = 20, math.asinh(50.0)  # of the water that is drawn, along and across
+WATER = np.array([0.10, 0.34, 0.48, 1.0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Waves(TaskState):
+    """The waves that move a boat."""
+
+    amplitude: Array  # (N, WAVES) [m], with which they move it
+    steepness: Array  # (N, WAVES) [rad], with which they tilt it
+    frequency: Array  # (N, WAVES) [rad/s]
+    phase: Array  # (N, WAVES) [rad]
+    course: Array  # (N, 2) unit vector, east and north, of where they run to
+
+
+class Motion(NamedTuple):
+    """The motion of a boat's deck at a moment."""
+
+    position: Array  # (N, 3) [m], of the middle of its surface
+    velocity: Array  # (N, 3) [m/s]
+    normal: Array  # (N, 3) unit vector out of it
+    rate: Array  # (N, 3) [rad/s], angular velocity
+
+
+def draw(rng: Rng, height: Array, size: tuple[float, float]) -> Waves:
+    """Waves of some significant height (N,) [m] under a boat, its length and beam given [m].
+
+    They are those of a sea that the wind has blown on for long: their energy is spread over the
+    frequencies as Pierson and Moskowitz (1964) found, and each has as much of it.
+    """
+    xp = namespace(height)
+    drawn = rng.uniform(0.0, 1.0, WAVES)
+    longer = stack(*((drawn[..., k] + k) / WAVES for k in range(WAVES)))  # share of the energy
+    peak = 0.4 * xp.sqrt(GRAVITY / height)  # [rad/s], of the most energy
+    longer = xp.clip(longer, RAREST, 1 - RAREST)
+    frequency = peak[..., None] * (-1.25 / xp.log(longer)) ** 0.25
+    course = rng.level_direction()[..., :2]
+    # A wave as short as the boat is up here and down there: it moves the boat less.
+    wave_number = frequency * frequency / GRAVITY
+    ahead, aside = (
+        _mean(wave_number * (extent / 2 * course[..., k])[..., None])
+        for k, extent in enumerate(size)
+    )
+    amplitude = (height / 4)[..., None] * math.sqrt(2 / WAVES) * ahead * aside
+    return Waves(
+        goal=stack(*3 * (0.0 * height,)),
+        amplitude=amplitude,
+        steepness=amplitude * wave_number,
+        frequency=frequency,
+        phase=rng.uniform(0.0, FULL_TURN, WAVES),
+        course=course,
+    )
+
+
+def deck(waves: Waves, time: Array) -> Motion:
+    """How the deck moves at a time (N,) [s]: as the water would under the boat.
+
+    Water at the surface of a deep sea goes around in circles, which are tilted as the wave is.
+    """
+    xp, none = namespace(time), 0.0 * time
+    angle = waves.frequency * time[..., None] + waves.phase
+    up, ahead = waves.amplitude * xp.cos(angle), waves.amplitude * xp.sin(angle)
+    slope = waves.steepness * xp.sin(angle)
+    slope_rate = waves.steepness * waves.frequency * xp.cos(angle)
+
+    def along(parts: Array, height: Array) -> Array:
+        way = _sum(parts)
+        return stack(way * waves.course[..., 0], way * waves.course[..., 1], height)
+
+    leans, turns = along(slope, none), along(slope_rate, none)
+    normal = stack(-leans[..., 0], -leans[..., 1], none + 1)
+    normal = normal / norm(normal)[..., None]
+    return Motion(
+        position=along(ahead, _sum(up)),
+        velocity=along(waves.frequency * up, -_sum(waves.frequency * ahead)),
+        normal=normal,
+        rate=stack(turns[..., 1], -turns[..., 0], none),
+    )
+
+
+def upright(normal: Array) -> Array:
+    """Unit quaternions (N, 4) that turn upright to unit vectors (N, 3), the shortest way."""
+    x, y, z = (normal[..., k] for k in range(3))
+    turn = stack(1 + z, -y, x, 0 * x)
+    return turn / norm(turn)[..., None]
+
+
+def water(waves: Waves, time: np.ndarray, level: float) -> list[Primitive]:
+    """Tiles of the water about the boat of one episode (N = 1), mean at a level [m]."""
+    edges = 3 * np.sinh(np.linspace(-FARTHEST, FARTHEST, TILES + 1))  # the nearer, the smaller
+    grids = (edges[1:] + edges[:-1]) / 2, 0.52 * np.diff(edges)
+    place, half = (np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) for grid in grids)
+    lag = (place @ waves.course[0])[:, None] * waves.frequency[0] ** 2 / GRAVITY
+    there = deck(dataclasses.replace(waves, phase=waves.phase - lag), time)
+    height = there.position[:, 2:]
+    colour = WATER + np.clip(0.08 * height, -0.08, 0.2) * (1.0, 1.0, 1.0, 0.0)
+    tiles = (
+        np.concatenate([half, 0 * height + 0.15], axis=-1),
+        np.concatenate([place, height + level], axis=-1),
+        upright(there.normal),
+        colour,
+    )
+    return [Primitive("box", *tile, glow=0.2) for tile in zip(*tiles, strict=True)]
+
+
+def _sum(waves: Array) -> Array:
+    """Over the waves, (N, WAVES) to (N,)."""
+    return functools.reduce(operator.add, (waves[..., k] for k in range(WAVES)))
+
+
+def _mean(half: Array) -> Array:
+    """Share of a wave that is left in the mean over a length, half of it given as a phase [rad]."""
+    xp = namespace(half)
+    angle = xp.where(abs(half) < 1e-4, 0 * half + 1e-4, half)
+    return xp.sin(angle) / angle
