@@ -65,7 +65,12 @@ class DeckLanding(Landing):
     )
     training = {"gamma": 0.98, "steps": 4_096_000}
     training_with = {
-        "ppo": {"training_options": {"attitude_weight": 60.0}, "ppo": {"beta2": 0.99}},
+        "ppo": {
+            # As for landing, it comes down before it has turned; and a deck that sinks draws it
+            # into its own wash.
+            "training_options": {"attitude_weight": 100.0, "max_sink": 1.7},
+            "ppo": {"beta2": 0.99},
+        },
     }
     variants = {}
     observation = {
