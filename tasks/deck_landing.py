@@ -63,7 +63,7 @@ class DeckLanding(Landing):
         Target("success_rate", "successful", 0.95, True),
         Target("touchdown_speed_median_m_s", "touchdown, median", 0.35),
     )
-    training = {"gamma": 0.98, "steps": 4_096_000}
+    training = {"gamma": 0.98, "steps": 8_192_000}
     training_with = {
         "ppo": {
             # As for landing, it comes down before it has turned; and a deck that sinks draws it

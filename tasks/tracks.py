@@ -17,7 +17,7 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, namespace, stack
+from quadrl.base.rotation import Array, dot, namespace, stack
 from quadrl.base.validation import MAX_OPTION, choice, number, numbers
 
 RUN_IN = 5.0
@@ -170,12 +170,6 @@ def crossing(
     share = -was / way
     point = last + share[..., None] * (position - last) - centre
     return forwards, backwards, xp.maximum(abs(dot(point, left)), abs(dot(point, up))), share
-
-
-def dot(first: Array, second: Array) -> Array:
-    """Scalar products (...) of vectors (..., 3)."""
-    product = first * second
-    return product[..., 0] + product[..., 1] + product[..., 2]
 
 
 TRACKS = importlib.resources.files("quadrl") / "assets" / "tracks"

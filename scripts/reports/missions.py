@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,21 +23,48 @@ from scripts.reports.robustness import FRESH
 EPISODES = 300
 RATE, SETTLED = "success_rate", "settled_m"
 EIGHT: Any = {"figure": "lemniscate", "time_limit": 30.0}
-EIGHT_GAINS = Gains(1.7125, 1.7125, 1.0, 0.51852, 6.88, 0.66735)
 SEAS = {2: (0.1, 0.5), 3: (0.5, 1.25), 4: (1.25, 2.5), 5: (2.5, 4.0)}
 """Significant wave heights of the sea states [m], WMO code table 3700."""
-FLOWN: dict[str, tuple[str, str, Any, Gains | None]] = {
-    "recovery from 3 m": ("recovery", RATE, {}, Gains(1.4875, 1.4875, 1.0, 0.90741, 7.16, 0.34898)),
-    "recovery from 1.5 m": ("recovery", RATE, {"lowest": 1.5, "highest": 1.5}, Gains()),
-    "eight of 15 s": ("trajectory", SETTLED, EIGHT | {"period": 15.0}, EIGHT_GAINS),
-    "eight of 5.5 s": ("trajectory", SETTLED, EIGHT | {"period": 5.5}, EIGHT_GAINS),
-    "eight of 3.5 s": ("trajectory", SETTLED, EIGHT | {"period": 3.5}, EIGHT_GAINS),
-    "zigzag": ("trajectory", SETTLED, {"figure": "zigzag"}, EIGHT_GAINS),
-    "pentagram": ("trajectory", SETTLED, {"figure": "pentagram"}, EIGHT_GAINS),
-    "polynomial": ("trajectory", SETTLED, {"figure": "polynomial"}, EIGHT_GAINS),
-    "vertical figure": ("trajectory", SETTLED, {"figure": "vertical"}, EIGHT_GAINS),
+EIGHT_GAINS = Gains(1.7125, 1.7125, 1.0, 0.51852, 6.88, 0.66735)
+DECK_GAINS = Gains(2.0125, 2.0125, 1.0, 0.73333, 4.08, 0.21224)
+
+
+@dataclasses.dataclass(frozen=True)
+class Mission:
+    """A condition that policies are flown in."""
+
+    task: str
+    metric: str
+    options: Mapping[str, Any]
+    gains: Gains | None
+    """The best of sixteen of the controller, chosen in 100 flights apart; None where it cannot do
+    what is asked."""
+    noise: Mapping[str, float] = dataclasses.field(default_factory=dict[str, float])
+    """Of the state estimate."""
+
+
+SEEN = {"position": 0.02, "attitude": 0.005, "velocity": 0.05, "body_rate": 0.01}
+"""Standard deviations [m], [rad], [m/s], [rad/s] with which a deck is seen from an aircraft."""
+FLOWN: dict[str, Mission] = {
+    "recovery from 3 m": Mission(
+        "recovery", RATE, {}, Gains(1.4875, 1.4875, 1.0, 0.90741, 7.16, 0.34898)
+    ),
+    "recovery from 1.5 m": Mission("recovery", RATE, {"lowest": 1.5, "highest": 1.5}, Gains()),
     **{
-        f"perching at {incline:.0f} degrees": (
+        f"eight of {period:g} s": Mission(
+            "trajectory", SETTLED, EIGHT | {"period": period}, EIGHT_GAINS
+        )
+        for period in (15.0, 5.5, 3.5)
+    },
+    **{
+        name: Mission("trajectory", SETTLED, {"figure": figure}, EIGHT_GAINS)
+        for name, figure in {
+            **{same: same for same in ("zigzag", "pentagram", "polynomial")},
+            "vertical figure": "vertical",
+        }.items()
+    },
+    **{
+        f"perching at {incline} degrees": Mission(
             "perching",
             RATE,
             dict.fromkeys(("least_incline", "most_incline"), math.radians(incline)),
@@ -44,17 +73,14 @@ FLOWN: dict[str, tuple[str, str, Any, Gains | None]] = {
         for incline in (0, 30, 60, 90)
     },
     **{
-        f"deck in sea state {state}": (
-            "deck_landing",
-            RATE,
-            {"lowest_waves": lowest, "highest_waves": highest},
-            Gains(),
+        f"sea state {state}{', seen with noise' if noise else ''}": Mission(
+            "deck_landing", RATE, {"lowest_waves": low, "highest_waves": high}, DECK_GAINS, noise
         )
-        for state, (lowest, highest) in SEAS.items()
+        for noise in ({}, SEEN)
+        for state, (low, high) in SEAS.items()
     },
 }
-"""Condition: its task, what counts, its options, and the best of sixteen gains of the controller,
-chosen in 100 flights apart; None where it cannot do what is asked."""
+"""Every condition by its name."""
 FIGURES = {
     RATE: "successful",
     "survival_rate": "in the air to the end",
@@ -77,19 +103,21 @@ def missions(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
     """
     rows: list[Result] = []
     own = {run: TrainConfig.of_folder(run) for run in runs}
-    for name, (task, metric, options, gains) in FLOWN.items():
+    for name, mission in FLOWN.items():
         flyers: dict[str, Any] = {
             f"seed {config.seed}": Policy.load(run)
             for run, config in own.items()
-            if config.task == task
-        } or {"policy that ships": Policy.pretrained(task)}
+            if config.task == mission.task
+        } or {"policy that ships": Policy.pretrained(mission.task)}
         (first, *_) = flyers.values()
-        scenario = scenario_of(first, task_options=options, engine="free_flight")
-        if gains is not None:
-            flyers["controller"] = GeometricController(scenario.aircraft, scenario.task, gains)
+        given: Any = {"task_options": mission.options, "randomization": {"noise": mission.noise}}
+        scenario = scenario_of(first, **given, engine="free_flight")
+        if mission.gains is not None:
+            own_gains = scenario.aircraft, scenario.task, mission.gains
+            flyers["controller"] = GeometricController(*own_gains)
         for who, flyer in flyers.items():
             found = summarize(fly(flyer, scenario, episodes=EPISODES, seed=FRESH))
-            row = {"condition": name, "task": task, "metric": metric, "who": who}
+            row = {"condition": name, "task": mission.task, "metric": mission.metric, "who": who}
             rows.append(row | {figure: found.get(figure) for figure in FIGURES})
             say(rows[-1])
     report.save("missions", {"episodes": EPISODES, "rows": rows})
