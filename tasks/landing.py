@@ -61,7 +61,7 @@ class Landing(Task):
     training = {"gamma": 0.98, "steps": 2_621_440}
     training_with = {
         # With the task's own weight, two of four policies come down before they have turned east.
-        "ppo": {"training_options": {"attitude_weight": 60.0}, "ppo": {"beta2": 0.99}},
+        "ppo": {"training_options": {"attitude_weight": 100.0}, "ppo": {"beta2": 0.99}},
         # With the task's own weights it settles on hanging in the air.
         "trpo": {"training_options": {"attitude_weight": 60.0, "progress_weight": 200.0}},
         # Chosen by a search: docs/paper.md.

@@ -28,8 +28,11 @@ from scripts.reports.report import IMAGES
 SHOWN = (360, 203)  # [pixels]; drawn twice as large, for smooth edges
 SETTLED = 0.05  # of the largest distance from the last position: little happens after that
 LONGEST = 6.0  # [s] of a task's flight that are shown
-OPTIONS = {"perching": {"least_incline": math.pi / 2}}  # of the task as it is shown: a wall
-FASTEST, RACED = ("race", "perching"), 300  # the fastest of so many flights is shown
+OPTIONS: dict[str, dict[str, float]] = {  # of the task as it is shown: a wall, sea state 4
+    "perching": {"least_incline": math.pi / 2},
+    "deck_landing": {"lowest_waves": 1.25, "highest_waves": 2.5},
+}
+FASTEST, RACED = ("deck_landing", "perching", "race"), 300  # the fastest of so many flights is shown
 # The training: four policies fly the same start.
 SEED, SHARES = 225, (0.0, 0.12, 0.3, 1.0)  # of the training
 RELEASED = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
