@@ -125,7 +125,9 @@ def flight(name: str) -> Iterator[Image.Image]:
     flight, model, _ = flown(policy, scenario, seed)
     away = np.linalg.norm(flight.qpos[:, :3] - flight.qpos[-1, :3], axis=1)
     settled = flight.time[np.flatnonzero(away > SETTLED * away.max())[-1]]
-    times = np.arange(0.0, min(settled + LAST, LONGEST), 1.0 / FPS)
+    end = settled + LAST
+    first = max(end - LONGEST, 0.0) if shown.contact else 0.0  # the touch is what counts
+    times = np.arange(first, min(end, first + LONGEST), 1.0 / FPS)
     width, height = (2 * size for size in SHOWN)
     how: Any = {"width": width, "height": height, "overlay": False}
     if name == "race":  # other cameras have gates before the aircraft
