@@ -27,6 +27,7 @@ SEAS = {2: (0.1, 0.5), 3: (0.5, 1.25), 4: (1.25, 2.5), 5: (2.5, 4.0)}
 """Significant wave heights of the sea states [m], WMO code table 3700."""
 EIGHT_GAINS = Gains(1.7125, 1.7125, 1.0, 0.51852, 6.88, 0.66735)
 DECK_GAINS = Gains(2.0125, 2.0125, 1.0, 0.73333, 4.08, 0.21224)
+NOISY_DECK_GAINS = Gains(1.45, 1.45, 1.0, 0.6, 2.4, 0.28571)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,10 +74,13 @@ FLOWN: dict[str, Mission] = {
         for incline in (0, 30, 60, 90)
     },
     **{
-        f"sea state {state}{', seen with noise' if noise else ''}": Mission(
-            "deck_landing", RATE, {"lowest_waves": low, "highest_waves": high}, DECK_GAINS, noise
+        f"sea state {state}{told}": Mission(
+            "deck_landing", RATE, {"lowest_waves": low, "highest_waves": high}, gains, noise
         )
-        for noise in ({}, SEEN)
+        for told, gains, noise in (
+            ("", DECK_GAINS, {}),
+            (", seen with noise", NOISY_DECK_GAINS, SEEN),
+        )
         for state, (low, high) in SEAS.items()
     },
 }

@@ -32,7 +32,10 @@ OPTIONS: dict[str, dict[str, float]] = {  # of the task as it is shown: a wall, 
     "perching": {"least_incline": math.pi / 2},
     "deck_landing": {"lowest_waves": 1.25, "highest_waves": 2.5},
 }
-FASTEST, RACED = ("deck_landing", "perching", "race"), 300  # the fastest of so many flights is shown
+FASTEST, RACED = (
+    ("deck_landing", "perching", "race"),
+    300,
+)  # the fastest of so many flights is shown
 # The training: four policies fly the same start.
 SEED, SHARES = 225, (0.0, 0.12, 0.3, 1.0)  # of the training
 RELEASED = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
