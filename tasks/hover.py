@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.task import (
-    IN_GUSTS,
     STILL,
     EpisodeEnd,
     Snapshot,
@@ -22,6 +22,11 @@ from quadrl.core.task import (
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
+IN_GUSTS: dict[str, Any] = {
+    "steps": 16_384_000,
+    "task_options": {"progress_weight": 300.0, "attitude_weight": 75.0},
+}
+"""Settings of the variant `robust` where a place is kept: in gusts that takes a dearer distance."""
 # An uncertain aircraft in wind is far from the goal and in motion anyway.
 AS_ASKED = {"tilt": 0.2, "spin": 0.3, "radius": 0.5, "speed": 0.3}
 

@@ -8,9 +8,10 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.task import IN_GUSTS, STILL, EpisodeEnd, Snapshot, Target, Task, TaskState
+from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
+from quadrl.tasks.hover import IN_GUSTS
 
 # Practised from rest alone, some policies begin to swing on the way to a far waypoint, with the
 # rotors at their ends, and sink to the ground: in 0 to 28 of 30,000 flights, by the seed.

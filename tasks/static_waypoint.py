@@ -16,7 +16,6 @@ from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.task import (
-    IN_GUSTS,
     STILL,
     EpisodeEnd,
     Snapshot,
@@ -27,6 +26,7 @@ from quadrl.core.task import (
 )
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
+from quadrl.tasks.hover import IN_GUSTS
 
 WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
 

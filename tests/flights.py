@@ -74,13 +74,14 @@ def by_mj_step(task, seed, mode):
     vehicle = VEHICLES["paper"]
     model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.build)
     data, scene = mujoco.MjData(model), Scene(task.solids())
-    solids, row = Solids(model, 1), parameters.rows(vehicle)
+    row = parameters.rows(vehicle)
+    origin = np.array([0.0, 0.0, max(task.altitude, vehicle.ground_clearance)])
+    solids = Solids(model, 1, origin, lambda name: getattr(model, name)[None])
     hits, feet = np.split(data.userdata[None, parameters.AIR :], [parameters.HIT], axis=1)
     world = types.SimpleNamespace(solids=solids, hits=hits, feet=feet)
     world.clearance = lambda rows: solids.clearance(data.qpos[None], row, vehicle.rotor_count)
     control = modes.make(mode, vehicle)
     own = parameters.Parameters.of(row, vehicle.control_timestep)
-    origin = np.array([0.0, 0.0, max(task.altitude, vehicle.ground_clearance)])
     settle = round(min(task.settle_time, task.time_limit) / vehicle.control_timestep)
     errors, episode = [], itertools.count()
 
@@ -100,16 +101,13 @@ def by_mj_step(task, seed, mode):
         now = Snapshot(state(), remembered, own, action, command, time, around=around)
         return dataclasses.replace(now, potentials=task.measure(now))
 
-    def field(name):
-        return getattr(model, name)[None]
-
     def move(substep):
         time = np.array([len(errors) * vehicle.control_timestep])
         time += (substep + 1) * vehicle.physics_timestep
         placed = task.move(before.task, time)
         if placed:
             poses = scene.poses(placed, 1, origin, solids.poses)
-            solids.move(poses, vehicle.physics_timestep, origin, field)
+            solids.move(poses, vehicle.physics_timestep)
 
     def begin():
         errors.clear()
@@ -118,7 +116,7 @@ def by_mj_step(task, seed, mode):
         mujoco.mj_resetData(model, data)
         if scene.solids:
             poses = scene.poses(task.place(Rng(*keys, SOLIDS), start, remembered), 1, origin)
-            solids.place(np.array([0]), poses, origin, field)
+            solids.place(np.array([0]), poses)
         data.qpos[:] = np.concatenate([start.position + origin, start.quaternion], axis=-1)[0]
         data.qvel[:] = np.concatenate([start.velocity, start.body_rate], axis=-1)[0]
         data.act[:] = start.rotor_speed[0]
@@ -137,7 +135,7 @@ def by_mj_step(task, seed, mode):
             data.ctrl[:] = control.rotor_command(seen, setpoint)[0]
             command += data.ctrl / vehicle.substeps
             mujoco.mj_step(model, data)
-        solids.arrive(origin, field)
+        solids.arrive()
         errors.append(0.0)  # counts the step: `snapshot` tells the time
         now = snapshot(before.task, action, command if control.has_loops else setpoint)
         terminated = task.terminated(now)

@@ -339,7 +339,8 @@ class Environment(saving.Copied):
         flown = (self._flown + 1) * vehicle.physics_timestep
         time = self.episode.steps * vehicle.control_timestep + flown
         poses = self.task.move(self.snapshot.task, time), self.num_envs, self.origin
-        engine.move_solids(self.scene.poses(*poses, engine.solids.poses))
+        made = self.scene.poses(*poses, engine.solids.poses)
+        engine.solids.move(made, vehicle.physics_timestep)
 
     def finish(self) -> Transition:
         """Second half of a step, after the engine has advanced."""

@@ -42,13 +42,6 @@ if TYPE_CHECKING:
     from quadrl.core.snapshot import Rollout
 
 
-IN_GUSTS: dict[str, Any] = {
-    "steps": 16_384_000,
-    "task_options": {"progress_weight": 300.0, "attitude_weight": 75.0},
-}
-"""Settings of the variant `robust` where a place is kept: in gusts that takes a dearer distance."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Task(abc.ABC):
     """Base of all tasks: fly to a goal and stay there."""

@@ -63,7 +63,7 @@ class Engine(abc.ABC):
         )
         self.air = fields["userdata"][:, : parameters.AIR]
         self.wind = self.air[:, :3]
-        self.solids = Solids(self.model, self.num_envs)
+        self.solids = Solids(self.model, self.num_envs, self.origin, self._model_field)
         self.hits, self.feet = (
             fields["userdata"][:, parameters.AIR :][:, part]
             for part in (np.s_[: parameters.HIT], np.s_[parameters.HIT :])
@@ -136,11 +136,6 @@ class Engine(abc.ABC):
     def advance(self, steps: int) -> None:
         """Fly some physics steps with the commands in `ctrl`."""
 
-    def move_solids(self, poses: np.ndarray) -> None:
-        """Move the geoms of solids of all rows, (N, K, 7), within the next physics step."""
-        timestep = self.vehicle.physics_timestep
-        self.solids.move(poses, timestep, self.origin, self._model_field)
-
     def leg(self, steps: int) -> Leg:
         """Copy the start and the conditions of the next physics steps, for their derivatives.
 
@@ -168,7 +163,7 @@ class Engine(abc.ABC):
             (`Vehicle.resolved_speed`, `resolved_turn`). Those keep their last good state.
         """
         self.frames.reverse()
-        self.solids.arrive(self.origin, self._model_field)
+        self.solids.arrive()
         if not self._fill(None):
             return None
         table, last = (frame.table for frame in self.frames)
@@ -239,7 +234,7 @@ class Engine(abc.ABC):
         if table is not None:
             self.write_parameters(rows, table)
         if solids is not None:
-            self.solids.place(rows, solids, self.origin, self._model_field)
+            self.solids.place(rows, solids)
         self.clear(rows)
         self._write(rows, start)
         self._fill(rows)
@@ -277,16 +272,13 @@ class Engine(abc.ABC):
         if not np.array_equal(table, self.parameters):
             self.write_parameters(np.arange(len(table)), table)
         if "solids" in saved:
-            poses, motion = np.split(saved["solids"], [7], axis=-1)
-            self.solids.place(np.arange(self.num_envs), poses, self.origin, self._model_field)
-            self.solids.motion[:] = motion
+            self.solids.restore(saved["solids"])
         self._fill(None)
 
     def _saved(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """What `save` gives, with the rows of the simulation."""
         saved = {"rows": rows, "parameters": parameters.numbers(self.parameters).copy()}
-        solids = np.concatenate([self.solids.poses, self.solids.motion], axis=-1)
-        return saved | ({"solids": solids} if self.has_solids else {})
+        return saved | ({"solids": self.solids.save()} if self.has_solids else {})
 
     @property
     def has_solids(self) -> bool:

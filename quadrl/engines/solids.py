@@ -40,14 +40,22 @@ def geoms_of_solids(model: mujoco.MjModel) -> np.ndarray:
 class Solids:
     """K geoms that stand somewhere else in each of N rows."""
 
-    def __init__(self, model: mujoco.MjModel, count: int) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        count: int,
+        origin: np.ndarray,
+        field: Callable[[str], np.ndarray],
+    ) -> None:
         """Take kinds and sizes from the model; all stand at the origin until they are placed.
 
         Args:
             model: With the geoms.
             count: Number of aircraft, N.
+            origin: (3,) of the task frame [m], world frame.
+            field: Gives a field of the model with a leading axis N, live.
         """
-        self.geoms = geoms_of_solids(model)
+        self.geoms, self._origin, self._field = geoms_of_solids(model), origin, field
         _, which, *offset = model.geom_user[self.geoms].T[:5] if len(self.geoms) else [[]] * 5
         self._first = np.unique(which, return_index=True)[1]  # geom of each solid
         self._offsets = np.transpose(offset)[self._first]
@@ -64,48 +72,28 @@ class Solids:
         self.moves = False
         """Whether any has moved since it was placed."""
 
-    def place(
-        self,
-        rows: np.ndarray,
-        poses: np.ndarray,
-        origin: np.ndarray,
-        field: Callable[[str], np.ndarray],
-    ) -> None:
+    def place(self, rows: np.ndarray, poses: np.ndarray) -> None:
         """Put the solids of some rows (n,) somewhere.
 
         Args:
             rows: Which.
             poses: (n, K, 7) position [m], world frame, and quaternion (w, x, y, z).
-            origin: (3,) of the task frame [m], world frame.
-            field: Gives a field of the model with a leading axis N, live.
         """
         self.poses[rows], self.motion[rows] = poses, 0.0
-        self._stand(rows, poses, origin, field)
+        self._stand(rows, poses)
 
-    def _stand(
-        self,
-        rows: np.ndarray,
-        poses: np.ndarray,
-        origin: np.ndarray,
-        field: Callable[[str], np.ndarray],
-    ) -> None:
+    def _stand(self, rows: np.ndarray, poses: np.ndarray) -> None:
         """Let engines take the geoms of some rows to be somewhere."""
         position, quaternion = poses[..., :3], poses[..., 3:]
         turn = rotation_matrix(quaternion)
         self.table["position"][rows] = position
         self.table["turn"][rows] = turn.reshape(*turn.shape[:-2], 9)
         offset = turn[:, self._first] @ self._offsets[..., None]
-        self.centres[rows] = position[:, self._first] - offset[..., 0] - origin
-        field("geom_pos")[np.ix_(rows, self.geoms)] = position
-        field("geom_quat")[np.ix_(rows, self.geoms)] = quaternion
+        self.centres[rows] = position[:, self._first] - offset[..., 0] - self._origin
+        self._field("geom_pos")[np.ix_(rows, self.geoms)] = position
+        self._field("geom_quat")[np.ix_(rows, self.geoms)] = quaternion
 
-    def move(
-        self,
-        poses: np.ndarray,
-        timestep: float,
-        origin: np.ndarray,
-        field: Callable[[str], np.ndarray],
-    ) -> None:
+    def move(self, poses: np.ndarray, timestep: float) -> None:
         """Move the solids of all rows to poses (N, K, 7) within a physics step [s].
 
         During the step they stand half-way, and contacts have the mean velocity of the way and the
@@ -114,20 +102,30 @@ class Solids:
         last, self.moves = self.poses.copy(), True
         half = (last + poses) / 2
         half[..., 3:] /= np.linalg.norm(half[..., 3:], axis=-1, keepdims=True)
-        self._stand(np.arange(len(poses)), half, origin, field)
+        self._stand(np.arange(len(poses)), half)
         self.poses[:] = poses
         velocity = (poses[..., :3] - last[..., :3]) / timestep
         motion = np.concatenate([velocity, _turn_rate(last, poses, timestep)], axis=-1)
         # Of the first step after a start the one before is not known.
         known = self.motion.any(axis=-1, keepdims=True)
         faster = np.where(known, (motion - self.motion) / timestep, 0.0)
-        field("geom_user")[:, self.geoms, MOTION:] = np.concatenate([motion, faster], axis=-1)
+        self._field("geom_user")[:, self.geoms, MOTION:] = np.concatenate([motion, faster], axis=-1)
         self.motion[:] = motion
 
-    def arrive(self, origin: np.ndarray, field: Callable[[str], np.ndarray]) -> None:
+    def arrive(self) -> None:
         """Let them stand where the last step ended."""
         if self.moves:
-            self._stand(np.arange(len(self.poses)), self.poses, origin, field)
+            self._stand(np.arange(len(self.poses)), self.poses)
+
+    def save(self) -> np.ndarray:
+        """Where they are and how they move, (N, K, 13)."""
+        return np.concatenate([self.poses, self.motion], axis=-1)
+
+    def restore(self, saved: np.ndarray) -> None:
+        """Put them where `save` found them."""
+        poses, motion = np.split(saved, [7], axis=-1)
+        self.place(np.arange(len(poses)), poses)
+        self.motion[:] = motion
 
     def clearance(
         self, qpos: np.ndarray, parameters: np.ndarray, rotors: int, rows: np.ndarray | None = None

@@ -12,14 +12,13 @@ from runs import TINY, refused
 
 import quadrl
 from quadrl import tasks
-from quadrl.core.task import IN_GUSTS
 from quadrl.evaluation import evaluate as evaluation
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import OF_VEHICLE, VARIANTS
 from quadrl.learning.environments import make_env
 from quadrl.learning.folder import read_config, write_config
 from quadrl.learning.settings import PPOConfig, VPGConfig
-from quadrl.tasks.hover import Hover
+from quadrl.tasks.hover import IN_GUSTS, Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
 
 

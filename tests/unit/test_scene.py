@@ -297,7 +297,7 @@ def carried(path, count=1, engine="mujoco", place=(0.0, 0.0), drop=0.0, time=6.0
         if still:
             made.wind[:] = -velocity(t)
             made.model.opt.gravity[:] = gravity - (velocity(t) - velocity(t - step)) / step
-        made.move_solids(poses(t + step))
+        made.solids.move(poses(t + step), step)
         made.advance(1)
         made.read()
         track.append(made.state.position - path(0.0 if still else t + step)[0])

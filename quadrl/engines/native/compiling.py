@@ -40,7 +40,7 @@ from quadrl.engines.state import c_rows
 
 SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
            "disturbances.c", "solids.c", "warnings.c")  # fmt: skip
-HEADERS = ("aero.h", "export.h", "philox.h", "runge_kutta.h", "solids.h")
+HEADERS = ("aero.h", "contacts.h", "export.h", "philox.h", "runge_kutta.h", "solids.h")
 # No contraction: a fused multiply-add would round otherwise than NumPy does.
 FLAGS = (
     "-std=c11",
