@@ -28,7 +28,7 @@ IN_GUSTS: dict[str, Any] = {
 }
 """Settings of the variant `robust` where a place is kept: in gusts that takes a dearer distance."""
 # An uncertain aircraft in wind is far from the goal and in motion anyway.
-AS_ASKED = {"tilt": 0.2, "spin": 0.3, "radius": 0.5, "speed": 0.3}
+AS_ASKED = {"tilt": 0.2, "spin": 0.3, "radius": 0.5, "speed": 0.3, "attitude_weight": 75.0}
 
 
 @dataclasses.dataclass(frozen=True)

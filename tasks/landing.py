@@ -74,7 +74,13 @@ class Landing(Task):
     }
     # With the wide action scale of that variant, actions as random as usual end in a crash before
     # anything is learned.
-    variants = {"robust": {"gamma": 0.97, "initial_deviation": 0.4}}
+    variants = {
+        "robust": {
+            "gamma": 0.97,
+            "initial_deviation": 0.4,
+            "training_options": {"attitude_weight": 60.0},
+        }
+    }
     heading_matters = True
     keeps_place = False
     contact = True

@@ -232,9 +232,6 @@ def check_task(
     if not isinstance(given, tuple) or not isinstance(given[0], Start):
         raise QuadrlError(name=f"{task.name} begin", value=begun, allowed="a Start and a TaskState")
     start, task_state = begun
-    scene = Scene(task.solids())
-    scene.poses(task.place(Rng(keys, 0 * keys, SOLIDS), start, task_state), rows, np.zeros(3))
-    around = scene.nothing_near(rows) if scene.solids else None
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "body_rate": 3, "rotor_speed": rotors}
     for name, columns in sizes.items():
         _check_array(task, f"{name} of begin", getattr(start, name), (rows, columns), "f")
@@ -246,6 +243,9 @@ def check_task(
     if not (abs(square_norm(start.quaternion) - 1) < 1e-6).all():
         name = f"{task.name} quaternion of begin"
         raise QuadrlError(name=name, value=start.quaternion, allowed="of norm 1")
+    scene = Scene(task.solids())
+    scene.poses(task.place(Rng(keys, 0 * keys, SOLIDS), start, task_state), rows, np.zeros(3))
+    around = scene.nothing_near(rows) if scene.solids else None
     start_state = {f.name: getattr(start, f.name) for f in dataclasses.fields(start)}
     state = State.of_coordinates(**start_state, origin_height=origin_height)
     now, _ = begin(task, state, task_state, parameters, actions, around)
