@@ -82,17 +82,18 @@ def deck(waves: Waves, time: Array) -> Motion:
     up, ahead = waves.amplitude * xp.cos(angle), waves.amplitude * xp.sin(angle)
     slope = waves.steepness * xp.sin(angle)
     slope_rate = waves.steepness * waves.frequency * xp.cos(angle)
+    faster, sinking = waves.frequency * up, waves.frequency * ahead
+    sums = _sums(ahead, up, faster, sinking, slope, slope_rate)
 
-    def along(parts: Array, height: Array) -> Array:
-        way = _sum(parts)
+    def along(way: Array, height: Array) -> Array:
         return stack(way * waves.course[..., 0], way * waves.course[..., 1], height)
 
-    leans, turns = along(slope, none), along(slope_rate, none)
+    leans, turns = along(sums[4], none), along(sums[5], none)
     normal = stack(-leans[..., 0], -leans[..., 1], none + 1)
     normal = normal / norm(normal)[..., None]
     return Motion(
-        position=along(ahead, _sum(up)),
-        velocity=along(waves.frequency * up, -_sum(waves.frequency * ahead)),
+        position=along(sums[0], sums[1]),
+        velocity=along(sums[2], -sums[3]),
         normal=normal,
         rate=stack(turns[..., 1], -turns[..., 0], none),
     )
@@ -123,9 +124,11 @@ def water(waves: Waves, time: np.ndarray, level: float) -> list[Primitive]:
     return [Primitive("box", *tile, glow=0.2) for tile in zip(*tiles, strict=True)]
 
 
-def _sum(waves: Array) -> Array:
-    """Over the waves, (N, WAVES) to (N,)."""
-    return functools.reduce(operator.add, (waves[..., k] for k in range(WAVES)))
+def _sums(*parts: Array) -> list[Array]:
+    """Of several arrays over the waves, (N, WAVES) to (N,) each; in order, so that C adds alike."""
+    whole = stack(*parts)  # (N, WAVES, number of parts)
+    total = functools.reduce(operator.add, (whole[..., k, :] for k in range(WAVES)))
+    return [total[..., k] for k in range(len(parts))]
 
 
 def _mean(half: Array) -> Array:
