@@ -259,14 +259,13 @@ def test_a_task_without_solids_says_so_when_one_is_asked_for():
 
 
 MOVES = {  # a deck's place [m] and heading [rad] at a time [s]
-    "heaves": lambda t: ((0.0, 0.0, 0.6 * np.cos(1.2 * t)), 0.0),
     "sways": lambda t: ((0.4 * np.sin(1.2 * t), 0.3 * np.cos(1.2 * t), 0.5 * np.sin(0.8 * t)), 0.0),
     "turns": lambda t: ((0.0, 0.0, 0.0), 0.5 * t),
 }
 DECK = Scene([Box("deck", length=4.0, width=4.0, height=0.2)])
 
 
-def carried(path, count=1, engine="mujoco", place=(0.0, 0.0), drop=0.0, time=4.0, still=False):
+def carried(path, count=1, engine="mujoco", place=(0.0, 0.0), drop=0.0, time=3.0, still=False):
     """Aircraft (T, n, 3) [m] on a deck, rotors off, as seen from it, and the engine at the end.
 
     Where it stands still, it is the deck's frame: gravity and wind are those in it.
@@ -305,10 +304,9 @@ def carried(path, count=1, engine="mujoco", place=(0.0, 0.0), drop=0.0, time=4.0
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
-@pytest.mark.parametrize("name", ["heaves", "sways"])
-def test_a_deck_that_moves_carries_an_aircraft_as_its_own_frame_would(name, engine):
-    frame, _ = carried(MOVES[name], still=True)
-    track, _ = carried(MOVES[name], count=2, engine=engine)
+def test_a_deck_that_moves_carries_an_aircraft_as_its_own_frame_would(engine):
+    frame, _ = carried(MOVES["sways"], still=True)
+    track, _ = carried(MOVES["sways"], count=2, engine=engine)
     # A deck stands still within a physics step, in which it moves by 5 mm.
     np.testing.assert_allclose(track, np.tile(frame, (1, 2, 1)), rtol=0, atol=2.5e-3)
     assert abs(track - frame)[..., 2].max() < 7e-4
@@ -319,9 +317,9 @@ def test_a_deck_that_turns_takes_an_aircraft_around():
     radius = np.linalg.norm(track[:, 0, :2], axis=-1)
     np.testing.assert_allclose(radius, 0.5, atol=0.01)
     turned = np.arctan2(track[-1, 0, 1], track[-1, 0, 0])
-    assert turned == pytest.approx(2.0, abs=0.03)
+    assert turned == pytest.approx(1.5, abs=0.03)
     matrix = rotation_matrix(made.qpos[:, 3:])[0]
-    assert np.arctan2(matrix[1, 0], matrix[0, 0]) == pytest.approx(2.0, abs=0.03)
+    assert np.arctan2(matrix[1, 0], matrix[0, 0]) == pytest.approx(1.5, abs=0.03)
 
 
 @pytest.mark.parametrize("sink", [-0.5, 0.0, 0.5])
