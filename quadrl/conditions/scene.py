@@ -186,7 +186,9 @@ class Scene:
         """
         chosen = slice(None) if rows is None else rows
         which, speed = engine.hits[chosen].T
-        touched = which[:, None] == 1 + np.arange(len(self.solids))
+        touched = np.zeros((len(which), len(self.solids)), dtype=bool)
+        hitting = np.flatnonzero(which)
+        touched[hitting, which[hitting].astype(int) - 1] = True
         clear, centres = engine.clearance(rows), engine.solids.centres[chosen]
         centres = centres.copy() if engine.solids.moves else centres
         feet = engine.feet[chosen].copy()

@@ -70,9 +70,8 @@ class Engine(abc.ABC):
         )
         """(N, HIT) of this control step and (N, FEET) of this episode, live; (N, 0) in a world
         without solids."""
-        table = self.solids.table
         flies = name != "mujoco"
-        self._free_flight = FreeFlight(self.model, fields, threads, table) if flies else None
+        self._free_flight = FreeFlight(self.model, fields, threads, self.solids) if flies else None
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
         self._middle: Frame | None = None

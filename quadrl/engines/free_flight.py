@@ -17,7 +17,7 @@ import numpy as np
 from quadrl.aircraft.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 from quadrl.base.errors import QuadrlError
 from quadrl.engines import native
-from quadrl.engines.solids import geoms_of_solids
+from quadrl.engines.solids import Solids, geoms_of_solids
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
 """Those of mjData that free flight reads or writes."""
@@ -33,7 +33,7 @@ class FreeFlight:
     """Advances the rows of a simulation in place."""
 
     def __init__(
-        self, model: mujoco.MjModel, fields: dict[str, np.ndarray], threads: int, solids: np.ndarray
+        self, model: mujoco.MjModel, fields: dict[str, np.ndarray], threads: int, solids: Solids
     ) -> None:
         """Check the model and take the addresses.
 
@@ -41,7 +41,7 @@ class FreeFlight:
             model: A model of `quadrl.engines.mjcf`.
             fields: Live arrays (N, k) of FIELDS, all with one stride between aircraft.
             threads: Threads to fly on.
-            solids: Live table (N, K) of `quadrl.engines.solids`.
+            solids: Those about the aircraft.
 
         Raises:
             QuadrlError: The model holds something that free flight knows nothing of.
@@ -69,8 +69,9 @@ class FreeFlight:
             self.parameters = np.empty((-(-len(table) // LANES), block // LANES, LANES))
             self.parameters[:] = numbers(table[:1])[0, : block // LANES, None]
             self.write(np.arange(len(table)), table)
-        last = (self.parameters, self.world, self._near, self._solids)
-        sizes = (self._stride, block, rotors, self._solids.shape[1])
+        about = (self._solids.table, self._solids.nearby)
+        last = (self.parameters, self.world, self._near, *about)
+        sizes = (self._stride, block, rotors, len(self._solids.geoms))
         # As `Rows` in native/free_flight.c.
         self._rows = np.array([*self._addresses, *(array.ctypes.data for array in last), *sizes])
         self._address = self._rows.ctypes.data

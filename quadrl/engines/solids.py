@@ -28,6 +28,8 @@ MOTION = 6
 """Where velocity and angular velocity of a geom stand in its user data, and their derivatives."""
 SOLID = np.dtype([("kind", "f8"), ("size", "f8", 3), ("position", "f8", 3), ("turn", "f8", 9)])
 """`Solid` in native/solids.h."""
+NEARBY = np.dtype([("place", "f8", 3), ("distance", "f8", 9), ("which", "i4", 8)])
+"""`Nearby` there."""
 
 
 def geoms_of_solids(model: mujoco.MjModel) -> np.ndarray:
@@ -65,6 +67,9 @@ class Solids:
         self.table["kind"] = model.geom_type[self.geoms]
         self.table["size"] = model.geom_size[self.geoms]
         self.table["turn"] = np.eye(3).reshape(-1)
+        self.nearby = np.zeros(count, dtype=NEARBY)
+        self.nearby["place"] = np.nan
+        """Which solids are the nearest to each aircraft; unknown where it is not a number."""
         self.poses = np.zeros((count, len(self.geoms), 7))
         """Where they are now, (N, K, 7), as `place` takes it."""
         self.motion = np.zeros((count, len(self.geoms), 6))
@@ -79,13 +84,15 @@ class Solids:
             rows: Which.
             poses: (n, K, 7) position [m], world frame, and quaternion (w, x, y, z).
         """
-        self.poses[rows], self.motion[rows] = poses, 0.0
-        self._stand(rows, poses)
+        if self.moves or not np.array_equal(self.poses[rows], poses):  # most stand where they stood
+            self.poses[rows], self.motion[rows] = poses, 0.0
+            self._stand(rows, poses)
 
     def _stand(self, rows: np.ndarray, poses: np.ndarray) -> None:
         """Let engines take the geoms of some rows to be somewhere."""
         position, quaternion = poses[..., :3], poses[..., 3:]
         turn = rotation_matrix(quaternion)
+        self.nearby["place"][rows] = np.nan
         self.table["position"][rows] = position
         self.table["turn"][rows] = turn.reshape(*turn.shape[:-2], 9)
         offset = turn[:, self._first] @ self._offsets[..., None]
@@ -138,20 +145,17 @@ class Solids:
             rotors: How many each has.
             rows: Of which aircraft; by default of all.
         """
-        table = self.table
-        if rows is not None:
-            qpos, table = qpos[rows], table[rows]
-            parameters = parameters[rows] if len(parameters) > 1 else parameters
-        out = np.full(len(qpos), np.inf)
+        count, ids = (len(qpos), None) if rows is None else (len(rows), rows.ctypes.data)
+        out = np.full(count, np.inf)
         if len(self.geoms):
             row = parameters.strides[0] // 8 if len(parameters) > 1 else 0
-            arrays = (qpos, parameters, table)
+            arrays = (qpos, parameters, self.table, self.nearby)
             # As `Rows` in native/solids.c.
             where = np.array(
                 [*(array.ctypes.data for array in arrays), qpos.strides[0] // 8, row,
                  len(self.geoms), rotors]
             )  # fmt: skip
-            native.library().quadrl_clearance(where.ctypes.data, len(qpos), out.ctypes.data)
+            native.library().quadrl_clearance(where.ctypes.data, count, ids, out.ctypes.data)
         return out
 
 

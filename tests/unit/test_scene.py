@@ -42,11 +42,13 @@ def flown(scene, poses, velocity, steps=12, engine="mujoco", vehicle=PAPER):
     made.place(np.arange(count), start, solids=solids)
     made.ctrl[:] = hover
     track, hits = [made.state.position.copy()], np.zeros((count, 2))
+    made.clearances = [made.clearance()]
     for _ in range(steps):
         made.hits[:] = 0.0
         made.advance(10)
         made.read()
         track.append(made.state.position.copy())
+        made.clearances.append(made.clearance())
         if scene:
             hits = np.where(made.hits[:, 1:] > hits[:, 1:], made.hits, hits)
     return made, np.array(track), hits
@@ -108,6 +110,39 @@ def test_both_engines_stop_at_a_post_and_say_how_fast_it_was_hit(count):
     # Free flight turns the attitude by a method of fourth order, which shows after a hit.
     np.testing.assert_allclose(tracks[0][:7], tracks[1][:7], rtol=0, atol=1e-4)
     np.testing.assert_allclose(hits[0], hits[1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_among_many_posts_the_nearest_is_known_all_the_way(engine):
+    draw, count, many = np.random.default_rng(2).uniform, 3, 14
+    places = np.stack([draw(-3, 9, (many, count)), draw(0.7, 4, (many, count))], axis=-1)
+    places *= np.sign(draw(-1, 1, (many, count, 1))) * [0, 1] + [1, 0]
+    places[0] = [[8.0, 0.0]] * count  # in the way
+    scene = Scene([Cylinder(f"post_{k}", radius=0.1, height=4.0) for k in range(many)])
+    level = np.concatenate([places, 0 * places[..., :1]], axis=-1)
+    poses = {f"post_{k}": Pose(level[k]) for k in range(many)}
+    velocity = np.array([[5.0, 0, 0], [5.0, 0.02, 0], [4.5, -0.02, 0]])
+    flight, track, hits = flown(scene, poses, velocity, steps=30, engine=engine)
+    assert (hits[:, 0] > 0).all() and (track[:, :, 0].max(axis=0) < 7.75).all()
+    parts = [(np.zeros(3), max(PAPER.hull))]
+    parts += [(np.array(r.position), r.radius) for r in PAPER.rotors]
+    # Level, since nothing has been touched.
+    before = np.maximum.accumulate(track[:, :, 0]) < 7.0
+    free = [
+        np.linalg.norm((track + centre)[:, None, :, :2] - places, axis=-1).min(axis=1) - radius
+        for centre, radius in parts
+    ]
+    clearance = np.array(flight.clearances)
+    np.testing.assert_allclose(clearance[before], np.min(free, axis=0)[before] - 0.1, atol=1e-9)
+    assert before.sum() > 40
+    row = np.array([2])
+    np.testing.assert_array_equal(flight.clearance(row), flight.clearance()[row])
+    # Posts that have come nearer since.
+    aside = {name: Pose(pose.position - [6.0, 0, 0]) for name, pose in poses.items()}
+    flight.solids.place(np.arange(count), scene.poses(aside, count, flight.origin))
+    there = flown(scene, aside, velocity, steps=0)[0]
+    there.qpos[:] = flight.qpos
+    np.testing.assert_array_equal(flight.clearance(), there.clearance())
 
 
 def test_each_row_has_its_own_and_flies_as_it_does_alone():

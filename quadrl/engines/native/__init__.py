@@ -58,7 +58,7 @@ def load(path: Path) -> ctypes.CDLL:
     opened.quadrl_state.argtypes = [_POINTER, integer, _POINTER, _POINTER]
     opened.quadrl_unsound_air.argtypes = [_POINTER, integer]
     opened.quadrl_clearance.restype = None
-    opened.quadrl_clearance.argtypes = [_POINTER, integer, _POINTER]
+    opened.quadrl_clearance.argtypes = [_POINTER, integer, _POINTER, _POINTER]
     opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
     opened.quadrl_uniform.restype = opened.quadrl_weather.restype = None
     opened.quadrl_write_warnings.restype = None

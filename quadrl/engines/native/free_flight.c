@@ -68,15 +68,18 @@ static double lowest(const Lanes* m, double pull, double time, int i) {
 }
 
 // Whether it may touch a solid in that time; everything of it is within `reach` [m].
-static int may_touch(const Solid* solids, int64_t count, double reach, const Lanes* m, double pull,
-                     double time, int i) {
+static int may_touch(const Solid* solids, int64_t count, Nearby* list, double reach, const Lanes* m,
+                     double pull, double time, int i) {
+  if (count == 0) return 0;
   const double p[3] = {m[POSITION][i], m[POSITION + 1][i], m[POSITION + 2][i]};
   const double v[3] = {m[VELOCITY][i], m[VELOCITY + 1][i], m[VELOCITY + 2][i]};
   const double way = (aero_length(v) + pull * time) * time + reach;
-  for (int64_t k = 0; k < count; ++k) {
-    if (!(solid_distance(solids + k, p) > way)) return 1;
+  if (way_since(list, p) + way < list->distance[0]) return 0;
+  if (!(way_since(list, p) + way < list->distance[LISTED])) list_nearest(solids, count, p, list);
+  for (int64_t k = 0; k < count && k < LISTED; ++k) {
+    if (!(solid_distance(solids + list->which[k], p) > way)) return 1;
   }
-  return 0;
+  return !(way_since(list, p) + way < list->distance[LISTED]);
 }
 
 // The kernel of the aircraft that stay above a height each (`low`): the effects that they have, but
@@ -96,7 +99,8 @@ static int effects_of(const Aircraft* a, int rotors, const double low[LANES]) {
 // aircraft i stand at i * stride doubles. parameters: with block = 0 a row for all, an Aircraft of
 // one lane; else those of aircraft i..i+LANES-1 side by side at i / LANES * block doubles, an
 // Aircraft as far as there are rotors. rotors: how many all have, at most MAX_ROTORS. solids: those
-// of aircraft i, `count` of them, at i * count. Filled by quadrl/engines.
+// of aircraft i, `count` of them, at i * count. nearby: what each knows of them. Filled by
+// quadrl/engines.
 typedef struct {
   double *qpos, *qvel, *act;
   const double* ctrl;
@@ -105,6 +109,7 @@ typedef struct {
   const World* world;
   char* near;  // one per aircraft
   const Solid* solids;
+  Nearby* nearby;
   int64_t stride, block, rotors, count;
 } Rows;
 
@@ -155,8 +160,8 @@ QUADRL_EXPORT int64_t quadrl_free_flight(const Rows* rows, int64_t first, int64_
     }
     for (int i = 0; i < filled; ++i) {
       r.near[row + i] = low[i] < world->floor ||
-                        may_touch(r.solids + (row + i) * r.count, r.count, world->reach, m, pull[i],
-                                  time, i);
+                        may_touch(r.solids + (row + i) * r.count, r.count, r.nearby + row + i,
+                                  world->reach, m, pull[i], time, i);
       touching += r.near[row + i];
     }
     marked += touching;

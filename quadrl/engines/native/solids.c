@@ -9,52 +9,84 @@
 #include "solids.h"
 
 // Where the rows of a simulation are: qpos (7) of aircraft i stands at i * stride doubles, its
-// parameters at i * row doubles (0: all the same), its solids, `count` of them, side by side.
+// parameters at i * row doubles (0: all the same), its solids, `count` of them, at i * count, and
+// what it knows of them.
 typedef struct {
   const double *qpos, *parameters;
   const Solid* solids;
+  Nearby* nearby;
   int64_t stride, row, count, rotors;
 } Rows;
 
-// Distance of the nearest solid from the spheres around the hull and around each rotor's disc, for
-// n aircraft: what is free at least [m].
-QUADRL_EXPORT void quadrl_clearance(const Rows* rows, int64_t n, double* out) {
-  for (int64_t i = 0; i < n; ++i) {
+// The spheres around the hull and around each rotor's disc, body frame, and a radius about the
+// centre of mass that holds all of them.
+typedef struct {
+  double centre[MAX_ROTORS + 1][3], radius[MAX_ROTORS + 1], reach;
+} Outline;
+
+static Outline outline_of(const Aircraft* a, int64_t rotors) {
+  Outline o = {0};
+  for (int j = 0; j < 3; ++j) {
+    if (a->hull[j][0] > o.radius[0]) o.radius[0] = a->hull[j][0];
+  }
+  o.reach = o.radius[0];
+  for (int64_t k = 1; k <= rotors; ++k) {
+    const Rotor* rotor = a->rotor + k - 1;
+    double squares = 0;
+    for (int j = 0; j < 3; ++j) {
+      const double at = rotor->position[j][0] + a->rotor_height[0] * rotor->axis[j][0];
+      o.centre[k][j] = at;
+      squares += at * at;
+    }
+    o.radius[k] = rotor->radius[0];
+    if (sqrt(squares) + o.radius[k] > o.reach) o.reach = sqrt(squares) + o.radius[k];
+  }
+  return o;
+}
+
+// Distance of the nearest solid from the spheres of the outline, for n aircraft (ids: which; NULL:
+// the first n): what is free at least [m].
+QUADRL_EXPORT void quadrl_clearance(const Rows* rows, int64_t n, const int64_t* ids, double* out) {
+  Outline own = outline_of((const Aircraft*)rows->parameters, rows->rotors);
+  for (int64_t row = 0; row < n; ++row) {
+    const int64_t i = ids ? ids[row] : row;
     const double* p = rows->qpos + i * rows->stride;
-    const Aircraft* a = (const Aircraft*)(rows->parameters + i * rows->row);
     const double w = p[3], x = p[4], y = p[5], z = p[6];
     const double r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
                          2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                          2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
-    double points[MAX_ROTORS + 1][3], radii[MAX_ROTORS + 1], reach = 0, least = HUGE_VAL;
-    for (int k = -1; k < rows->rotors; ++k) {
-      double centre[3] = {0}, radius = 0, out = 0;
-      if (k < 0) {
-        for (int j = 0; j < 3; ++j) radius = a->hull[j][0] > radius ? a->hull[j][0] : radius;
-      } else {
-        const Rotor* rotor = a->rotor + k;
-        radius = rotor->radius[0];
-        for (int j = 0; j < 3; ++j) {
-          centre[j] = rotor->position[j][0] + a->rotor_height[0] * rotor->axis[j][0];
-        }
-      }
-      for (int j = 0; j < 3; ++j) {
-        points[k + 1][j] =
-            p[j] + r[3 * j] * centre[0] + r[3 * j + 1] * centre[1] + r[3 * j + 2] * centre[2];
-        out += centre[j] * centre[j];
-      }
-      radii[k + 1] = radius;
-      reach = sqrt(out) + radius > reach ? sqrt(out) + radius : reach;
+    if (rows->row) {
+      own = outline_of((const Aircraft*)(rows->parameters + i * rows->row), rows->rotors);
     }
-    for (int64_t s = 0; s < rows->count; ++s) {
-      const Solid* solid = rows->solids + i * rows->count + s;
-      // No part of the aircraft is nearer to it than this, which spares most solids a closer look.
-      if (solid_distance(solid, p) - reach > least) continue;
-      for (int k = 0; k <= rows->rotors; ++k) {
-        const double free = solid_distance(solid, points[k]) - radii[k];
+    double points[MAX_ROTORS + 1][3], least = HUGE_VAL;
+    for (int64_t k = 0; k <= rows->rotors; ++k) {
+      const double* c = own.centre[k];
+      for (int j = 0; j < 3; ++j) {
+        points[k][j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
+      }
+    }
+    const Solid* solids = rows->solids + i * rows->count;
+    Nearby* list = rows->nearby + i;
+    // Whether some part of the aircraft may be nearer to a solid that is not listed.
+    const double *then = list->distance, *next = then + LISTED;
+    double way = way_since(list, p);
+    if (!(then[0] + 2 * way + own.reach < *next)) {
+      list_nearest(solids, rows->count, p, list);
+      way = way_since(list, p);
+    }
+    const int all = !(then[0] + 2 * way + own.reach < *next);
+    const int64_t count = all || rows->count < LISTED ? rows->count : LISTED;
+    for (int64_t s = 0; s < count; ++s) {
+      // No part of the aircraft is nearer to it than this, which spares most solids a closer look:
+      // nor to any of those that were farther when they were listed.
+      if (!all && then[s] - way - own.reach > least) break;
+      const Solid* solid = solids + (all ? s : list->which[s]);
+      if (solid_distance(solid, p) - own.reach > least) continue;
+      for (int64_t k = 0; k <= rows->rotors; ++k) {
+        const double free = solid_distance(solid, points[k]) - own.radius[k];
         least = free < least ? free : least;
       }
     }
-    out[i] = least;
+    out[row] = least;
   }
 }

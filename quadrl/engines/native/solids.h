@@ -1,5 +1,6 @@
-// Solids that stand in the world, and how far a point is from one.
+// Solids that stand in the world, how far a point is from one, and which are the nearest.
 #include <math.h>
+#include <stdint.h>
 
 // What a solid is: MuJoCo's numbers of these geoms (mjtGeom).
 enum { SPHERE = 2, CYLINDER = 5, BOX = 6 };
@@ -34,4 +35,43 @@ static double solid_distance(const Solid* s, const double point[3]) {
     if (past[k] > in) in = past[k];
   }
   return out > 0 ? sqrt(out) : in;
+}
+
+// The solids that were the nearest to a place, in order, and how far they were; the last distance is
+// that of the next one, which is not listed. On the way from there a distance changes by no more
+// than the way is long, so that most steps need no look at all the others. A place that is not a
+// number: they are not known. Written here, and made unknown by quadrl/engines/solids.py whenever a
+// solid is put somewhere else.
+enum { LISTED = 8 };
+#define ROUNDING 1e-9  // [m], more than the error of any distance
+typedef struct {
+  double place[3], distance[LISTED + 1];
+  int32_t which[LISTED];
+} Nearby;
+
+// How far a point is from the place of a list [m].
+static double way_since(const Nearby* list, const double point[3]) {
+  double squares = 0;
+  for (int k = 0; k < 3; ++k) {
+    squares += (point[k] - list->place[k]) * (point[k] - list->place[k]);
+  }
+  return sqrt(squares) + ROUNDING;
+}
+
+// Lists the solids that are the nearest to a point.
+static void list_nearest(const Solid* solids, int64_t count, const double point[3], Nearby* list) {
+  double* sorted = list->distance;
+  int32_t which[LISTED + 1] = {0};
+  for (int k = 0; k <= LISTED; ++k) sorted[k] = HUGE_VAL;
+  for (int64_t s = 0; s < count; ++s) {
+    const double distance = solid_distance(solids + s, point);
+    int k = LISTED;
+    if (distance >= sorted[k]) continue;
+    for (; k > 0 && !(distance >= sorted[k - 1]); --k) {
+      sorted[k] = sorted[k - 1], which[k] = which[k - 1];
+    }
+    sorted[k] = distance, which[k] = (int32_t)s;
+  }
+  for (int k = 0; k < 3; ++k) list->place[k] = point[k];
+  for (int k = 0; k < LISTED; ++k) list->which[k] = which[k];
 }
