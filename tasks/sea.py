@@ -79,9 +79,10 @@ def deck(waves: Waves, time: Array) -> Motion:
     """
     xp, none = namespace(time), 0.0 * time
     angle = waves.frequency * time[..., None] + waves.phase
-    up, ahead = waves.amplitude * xp.cos(angle), waves.amplitude * xp.sin(angle)
-    slope = waves.steepness * xp.sin(angle)
-    slope_rate = waves.steepness * waves.frequency * xp.cos(angle)
+    sine, cosine = xp.sin(angle), xp.cos(angle)
+    up, ahead = waves.amplitude * cosine, waves.amplitude * sine
+    slope = waves.steepness * sine
+    slope_rate = waves.steepness * waves.frequency * cosine
     faster, sinking = waves.frequency * up, waves.frequency * ahead
     sums = _sums(ahead, up, faster, sinking, slope, slope_rate)
 

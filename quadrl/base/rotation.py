@@ -52,6 +52,13 @@ def dot(first: Array, second: Array) -> Array:
     return product[..., 0] + product[..., 1] + product[..., 2]
 
 
+def cross(first: Array, second: Array) -> Array:
+    """Cross product over the last axis (..., 3)."""
+    a, b, c = (first[..., k] for k in range(3))
+    x, y, z = (second[..., k] for k in range(3))
+    return stack(b * z - c * y, c * x - a * z, a * y - b * x)
+
+
 def norm(vector: Array) -> Array:
     """Euclidean norm over the last axis, (..., k) to (...); its gradient at zero is zero."""
     square: Any = square_norm(vector)

@@ -18,7 +18,7 @@ import numpy as np
 from quadrl.aircraft.parameters import FEET, HELD, MARK
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array
+from quadrl.base.rotation import Array, cross
 from quadrl.conditions.solids import Pose, Solid, heading
 from quadrl.engines.engine import Engine
 from quadrl.engines.solids import KINDS, MOTION
@@ -123,7 +123,7 @@ class Scene:
                     raise QuadrlError(name=f"pose of {solid.name}", value=array, allowed=allowed)
             turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
             for k, part in enumerate(solid.parts, first):
-                offset = np.broadcast_to(part.offset, (count, 3)).copy()
+                offset = np.asarray(part.offset, dtype=float)
                 made[:, k, :3] = position + origin + _rotated(turn, offset)
                 made[:, k, 3:] = turn
         return made
@@ -196,7 +196,9 @@ class Scene:
 
 
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Vectors (n, 3) turned by unit quaternions (n, 4)."""
+    """A vector (3,) turned by unit quaternions (n, 4)."""
+    if not vector.any():
+        return vector
     w, axis = quaternion[:, :1], quaternion[:, 1:]
-    twice = 2 * np.cross(axis, vector)
-    return vector + w * twice + np.cross(axis, twice)
+    twice = 2 * cross(axis, vector)
+    return vector + w * twice + cross(axis, twice)

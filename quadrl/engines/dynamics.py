@@ -16,7 +16,16 @@ from typing import Any
 
 from quadrl.aircraft.aerodynamics import GROUND_EFFECT, MOST_OFFSET, STILL_AIR, WINDMILL
 from quadrl.aircraft.parameters import WIND, Parameters
-from quadrl.base.rotation import Array, namespace, norm, rotation_matrix, stack, to_body, to_world
+from quadrl.base.rotation import (
+    Array,
+    cross,
+    namespace,
+    norm,
+    rotation_matrix,
+    stack,
+    to_body,
+    to_world,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,13 +241,6 @@ def derivative(
         body_rate=(moment - cross(rate, spin)) / p.inertia,
         rotor_speed=rotor_acceleration(p, speed, command),
     )
-
-
-def cross(first: Array, second: Array) -> Array:
-    """Cross product over the last axis (..., 3)."""
-    a, b, c = (first[..., k] for k in range(3))
-    x, y, z = (second[..., k] for k in range(3))
-    return stack(b * z - c * y, c * x - a * z, a * y - b * x)
 
 
 def total(array: Array, axis: int = -1) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 
 from quadrl.aircraft.parameters import MARK
 from quadrl.base.primitives import Shape
-from quadrl.base.rotation import rotation_matrix
+from quadrl.base.rotation import cross, rotation_matrix
 from quadrl.engines import native
 
 KINDS: dict[mujoco.mjtGeom, Shape] = {
@@ -162,7 +162,7 @@ class Solids:
 def _turn_rate(last: np.ndarray, poses: np.ndarray, timestep: float) -> np.ndarray:
     """Angular velocity (N, K, 3) [rad/s], world frame, from poses (N, K, 7) to others."""
     was, now = last[..., 3:], poses[..., 3:]
-    cross = np.cross(was[..., 1:], now[..., 1:])
-    half = was[..., :1] * now[..., 1:] - now[..., :1] * was[..., 1:] + cross
+    half = was[..., :1] * now[..., 1:] - now[..., :1] * was[..., 1:]
+    half = half + cross(was[..., 1:], now[..., 1:])
     near = (was * now).sum(axis=-1, keepdims=True)  # the cosine of half the angle
     return 2 * np.where(near < 0, -half, half) / timestep
