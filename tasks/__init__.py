@@ -6,6 +6,7 @@ from quadrl.core.catalogue import TASKS, make, register
 from quadrl.tasks.deck_landing import DeckLanding
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
+from quadrl.tasks.lsy_race import LsyRace
 from quadrl.tasks.perching import Perching
 from quadrl.tasks.race import Race
 from quadrl.tasks.random_waypoint import RandomWaypoint
@@ -19,6 +20,6 @@ __all__ = ["TASKS", "make", "register"]
 
 for _task in (
     *(Hover, StaticWaypoint, RandomWaypoint, StraightAndLevel, Landing, TargetFollowing),
-    *(Race, Recovery, Trajectory, Perching, DeckLanding),
+    *(Race, Recovery, Trajectory, Perching, DeckLanding, LsyRace),
 ):
     register(_task)

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -163,18 +163,18 @@ class Race(Task):
             rotor_speed=hovering(position, parameters),
         )
         none = 0.0 * gate
-        return start, Course(goal, gate, *self._axes(gate), none, none, position, leg)
+        through, left = (look_up(track.axes[:, k], gate) for k in range(2))
+        return start, Course(goal, gate, through, left, none, none, position, leg)
 
     def update(self, before: Snapshot, now: Snapshot) -> Course:
         """Go on to the next gate when this one is passed."""
         task, (passes, _, _, share) = now.task, self._crossed(now)
-        xp, last = namespace(task.gate), float(len(self.course.gates) - 1)
-        following = xp.where(task.gate == last, 0.0 * task.gate, task.gate + 1)
-        gate = xp.where(passes, following, task.gate)
-        goal = look_up(self.course.centre, gate)
-        through, left = self._axes(gate)
+        xp = namespace(task.gate)
+        gate = xp.where(passes, self._following(task.gate), task.gate)
+        goal, through, left = self.gate(task, gate)
         moment = now.time - (1 - share) * now.parameters.control_timestep
-        return Course(
+        return dataclasses.replace(
+            task,
             goal=goal,
             gate=gate,
             through=through,
@@ -187,13 +187,14 @@ class Race(Task):
 
     def observe(self, now: Snapshot) -> dict[str, Array]:
         """The aircraft's motion, and the next two gates as it sees them."""
-        state, track, gate = now.state, self.course, now.task.gate
-        following = look_up(np.roll(track.centre, -1, axis=0), gate)
+        state, gate = now.state, now.task.gate
+        goal, through, _ = self.gate(now.task, gate)
+        next_goal, next_through, _ = self.gate(now.task, self._following(gate))
         seen = {
-            "goal": now.potentials.to_goal,
-            "through": now.task.through,
-            "next_goal": following - state.position,
-            "next_through": look_up(np.roll(track.axes[:, 0], -1, axis=0), gate),
+            "goal": goal - state.position,
+            "through": through,
+            "next_goal": next_goal - state.position,
+            "next_through": next_through,
         }
         return {
             "rotation": state.rotation_entries,
@@ -252,10 +253,16 @@ class Race(Task):
             found["flying_lap_mean_s"] = laps[1:].mean() if done.any() else math.nan
         return {name: float(value) for name, value in found.items()}
 
-    def _axes(self, gate: Array) -> tuple[Array, Array]:
-        """Unit vectors through gates with some numbers (N,), and to their left, (N, 3)."""
-        through, left = self.course.axes[:, 0], self.course.axes[:, 1]
-        return look_up(through, gate), look_up(left, gate)
+    def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
+        """Gates with some numbers (N,): centres [m], and unit vectors through them and left."""
+        track = self.course
+        centre, through, left = track.centre, track.axes[:, 0], track.axes[:, 1]
+        return look_up(centre, number), look_up(through, number), look_up(left, number)
+
+    def _following(self, gate: Array) -> Array:
+        """Numbers (N,) of the gates after some."""
+        last = float(len(self.course.gates) - 1)
+        return namespace(gate).where(gate == last, 0.0 * gate, gate + 1)
 
     def _crossed(self, now: Snapshot) -> tuple[Array, Array, Array, Array]:
         """What becomes of the next gate in this control step, (N,).

@@ -22,7 +22,8 @@ from quadrl.base.validation import MAX_OPTION, choice, number, numbers
 
 RUN_IN = 5.0
 """Distance of the start before the first gate of a track that names no start [m]."""
-THICKNESS = 0.06  # [m], of the frames that are drawn
+DEPTH = 0.03  # of the frames that are drawn, of their outer edge
+POLE = 0.015  # [m], radius of a pole
 NEXT, OTHER = (1.0, 0.55, 0.15, 1.0), (0.25, 0.45, 0.80, 1.0)
 
 
@@ -40,6 +41,8 @@ class Track:
     """Edge of the openings [m]."""
     frame: float
     """Outer edge of the frames [m]."""
+    poles: tuple[tuple[float, ...], ...] = ()
+    """Poles that stand about: x, y and the height of the top [m]."""
 
     def __post_init__(self) -> None:
         """Refuse a track that cannot be flown.
@@ -77,16 +80,16 @@ class Track:
         Raises:
             QuadrlError: The name is unknown, or what is given no track.
         """
-        known = _known(choice("track", name, NAMES))
-        size, rows = (-MAX_OPTION, MAX_OPTION), known.gates
+        listed = known(choice("track", name, NAMES))
+        size, rows = (-MAX_OPTION, MAX_OPTION), listed.gates
         if isinstance(gates, str) or not hasattr(gates, "__len__"):
             raise QuadrlError(name="gates", value=gates, allowed="rows x, y, z, heading, climb")
         if len(gates):
             rows = tuple(numbers(f"gates[{k}]", gate, 5, *size) for k, gate in enumerate(gates))
-            name, known = "own", dataclasses.replace(known, start=_before(rows[0]))
+            name, listed = "own", dataclasses.replace(listed, start=_before(rows[0]))
         if len(numbers("start", start)):
-            known = dataclasses.replace(known, start=numbers("start", start, 3, *size))
-        return cls(name, rows, known.start, opening or known.opening, frame or known.frame)
+            listed = dataclasses.replace(listed, start=numbers("start", start, 3, *size))
+        return cls(name, rows, listed.start, opening or listed.opening, frame or listed.frame)
 
     @functools.cached_property
     def centre(self) -> np.ndarray:
@@ -96,19 +99,22 @@ class Track:
     @functools.cached_property
     def axes(self) -> np.ndarray:
         """Unit vectors through each gate, to its left and up along it, (G, 3, 3)."""
-        heading, climb = np.radians([gate[3:] for gate in self.gates]).T
-        zero = 0 * heading
-        level = np.array([np.cos(heading), np.sin(heading), zero])
-        through = level * np.cos(climb) + np.array([zero, zero, np.sin(climb)])
-        left = np.array([-np.sin(heading), np.cos(heading), zero])
-        return _fixed(np.stack([through.T, left.T, np.cross(through.T, left.T)], axis=1))
+        return _fixed(_axes(self.gates))
 
-    def drawn(self, following: int) -> Iterator[Primitive]:
-        """The frames; that of the gate with a number in another colour."""
-        wide = max(self.frame - self.opening, THICKNESS) / 4
-        for k, (centre, axes) in enumerate(zip(self.centre, self.axes, strict=True)):
+    def drawn(self, following: int, gates: Any = None, poles: Any = None) -> Iterator[Primitive]:
+        """The frames, that of the gate with a number in another colour, and the poles.
+
+        Args:
+            following: The number.
+            gates: Where they stand, as `Track.gates`; by default where they should.
+            poles: The same of the poles.
+        """
+        deep = DEPTH * self.frame / 2
+        wide = max((self.frame - self.opening) / 4, deep / 2)
+        rows = self.gates if gates is None else gates
+        for k, (gate, axes) in enumerate(zip(rows, _axes(rows), strict=True)):
             rgba = NEXT if k == following else OTHER
-            heading, climb = np.radians(self.gates[k][3:]) / 2
+            heading, climb = np.radians(gate[3:]) / 2
             turn = (
                 math.cos(heading) * math.cos(climb),
                 math.sin(heading) * math.sin(climb),
@@ -117,22 +123,35 @@ class Track:
             )
             for across, size in ((1, (wide, self.frame / 2)), (2, (self.opening / 2, wide))):
                 for side in (-1, 1):
-                    place = centre + side * (self.opening / 2 + wide) * axes[across]
-                    yield Primitive("box", (THICKNESS / 2, *size), place, turn, rgba)
+                    place = np.array(gate[:3]) + side * (self.opening / 2 + wide) * axes[across]
+                    yield Primitive("box", (deep, *size), place, turn, rgba)
+        for x, y, top in self.poles if poles is None else poles:
+            yield Primitive("cylinder", (POLE, top / 2, 0.0), (x, y, top / 2), rgba=OTHER)
 
 
 @functools.cache
-def _known(name: str) -> Track:
+def known(name: str) -> Track:
     """A track of assets/tracks."""
     read = json.loads((TRACKS / f"{name}.json").read_text())
     rows = tuple(map(tuple, read["gates"]))
-    return Track(name, rows, tuple(read["start"]), read["opening"], read["frame"])
+    poles = tuple(map(tuple, read.get("poles", ())))
+    return Track(name, rows, tuple(read["start"]), read["opening"], read["frame"], poles)
 
 
 def _before(gate: tuple[float, ...]) -> tuple[float, ...]:
     """A start before a gate (x, y, z, heading, climb), as high [m]."""
     heading = math.radians(gate[3])
     return gate[0] - RUN_IN * math.cos(heading), gate[1] - RUN_IN * math.sin(heading), gate[2]
+
+
+def _axes(gates: Any) -> np.ndarray:
+    """Unit vectors through gates (x, y, z, heading, climb), left and up along them, (G, 3, 3)."""
+    heading, climb = np.radians([gate[3:] for gate in gates]).T
+    zero = 0 * heading
+    level = np.array([np.cos(heading), np.sin(heading), zero])
+    through = level * np.cos(climb) + np.array([zero, zero, np.sin(climb)])
+    left = np.array([-np.sin(heading), np.cos(heading), zero])
+    return np.stack([through.T, left.T, np.cross(through.T, left.T)], axis=1)
 
 
 def _fixed(values: Any) -> np.ndarray:
@@ -173,4 +192,9 @@ def crossing(
 
 
 TRACKS = importlib.resources.files("quadrl") / "assets" / "tracks"
-NAMES = tuple(sorted(file.name.removesuffix(".json") for file in TRACKS.iterdir()))
+NAMES = tuple(
+    name
+    for name in sorted(file.name.removesuffix(".json") for file in TRACKS.iterdir())
+    if not known(name).poles
+)
+"""Tracks that have gates and nothing else."""

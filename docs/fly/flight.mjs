@@ -61,7 +61,7 @@ export class Flight {
     const { rotors } = this.vehicle;
     this.scale[0] = this.vehicle.actionScale;
     this.estimates = false; // whether the rotor speeds that are seen follow from the commands
-    const flown = "qpos qvel act ctrl warm wind parameters world near solids";
+    const flown = "qpos qvel act ctrl warm wind parameters world near solids nearby";
     this.#point("flight_rows", flown, [0, 0, rotors, 0]);
     this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, rotors]);
   }

@@ -71,6 +71,7 @@ PARTS = {
     "episodes": 1,
     "near": 1,  # a byte: as in `Rows` of free_flight.c
     "solids": 1,  # of which there are none
+    "nearby": 1,  # what would be known of them
     "flight_rows": 10,  # that `Rows`, for pointers of 32 bits
     "state_rows": 8,  # `Rows` of state.c
 }

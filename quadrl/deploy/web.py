@@ -55,6 +55,8 @@ KERNELS = {
 """Of quadrl/native, with what they export."""
 MODULES = ("flight", "policy", "episode", "link", "scene", "plot", "main")
 """Of docs/fly, each after those that it imports."""
+FLOWN = tuple(name for name, task in TASKS.items() if not (task.contact or name == "lsy_race"))
+"""Tasks of the page: contact is MuJoCo's, and what is drawn about stays where it is."""
 MEMORY = """// Written by quadrl/deploy/flights.py.
 #include <math.h>
 #include <stdint.h>
@@ -80,8 +82,7 @@ def main() -> None:
 def make_book() -> tuple[dict[str, Any], str]:
     """Collect the data for the JavaScript, as JSON can hold it, and the C of the flights."""
     (slots,) = re.findall(r"export const SLOTS = (\d+)", (SOURCE / "flight.mjs").read_text())
-    # Those that leave the air's laws alone: contact is MuJoCo's.
-    tasks = {name: kind() for name, kind in TASKS.items() if not kind.contact}
+    tasks = {name: TASKS[name]() for name in FLOWN}
     pairs, sources = {}, [MEMORY.format(slots=slots, size=flights.SIZE)]
     for task in tasks.values():
         for vehicle in VEHICLES.values():

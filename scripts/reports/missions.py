@@ -16,7 +16,7 @@ from quadrl.control import Gains, GeometricController
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import fly, scenario_of, summarize
 from quadrl.learning.config import TrainConfig
-from scripts.reports import report
+from scripts.reports import race, report
 from scripts.reports.report import Parts, Result, say, table
 from scripts.reports.robustness import FRESH
 
@@ -40,12 +40,14 @@ class Mission:
     gains: Gains | None
     """The best of sixteen of the controller, chosen in 100 flights apart; None where it cannot do
     what is asked."""
-    noise: Mapping[str, float] = dataclasses.field(default_factory=dict[str, float])
-    """Of the state estimate."""
+    randomization: Mapping[str, Any] = dataclasses.field(default_factory=dict[str, Any])
+    """What of the aircraft is drawn, and the noise of the state estimate."""
 
 
-SEEN = {"position": 0.02, "attitude": 0.005, "velocity": 0.05, "body_rate": 0.01}
+SEEN = {"noise": {"position": 0.02, "attitude": 0.005, "velocity": 0.05, "body_rate": 0.01}}
 """Standard deviations [m], [rad], [m/s], [rad/s] with which a deck is seen from an aircraft."""
+WEIGHED = {"mass": (0.865, 1.135), "inertia": (0.96, 1.04)}
+"""5 g and 1e-6 kg m^2 of the brushless Crazyflie, up and down: of levels 1 and 2."""
 FLOWN: dict[str, Mission] = {
     "recovery from 3 m": Mission(
         "recovery", RATE, {}, Gains(1.4875, 1.4875, 1.0, 0.90741, 7.16, 0.34898)
@@ -75,13 +77,17 @@ FLOWN: dict[str, Mission] = {
     },
     **{
         f"sea state {state}{told}": Mission(
-            "deck_landing", RATE, {"lowest_waves": low, "highest_waves": high}, gains, noise
+            "deck_landing", RATE, {"lowest_waves": low, "highest_waves": high}, gains, drawn
         )
-        for told, gains, noise in (
+        for told, gains, drawn in (
             ("", DECK_GAINS, {}),
             (", seen with noise", NOISY_DECK_GAINS, SEEN),
         )
         for state, (low, high) in SEAS.items()
+    },
+    **{
+        f"level {level}": Mission("lsy_race", RATE, {"level": level}, Gains(), drawn)
+        for level, drawn in enumerate(({}, WEIGHED, WEIGHED))
     },
 }
 """Every condition by its name."""
@@ -95,6 +101,9 @@ FIGURES = {
     "touchdown_tilt_median_deg": "tilt",
     "miss_median_m": "off the pad's middle",
     "landing_time_mean_s": "after",
+    "race_time_mean_s": "time, mean",
+    "race_time_best_s": "time, best",
+    "gates_passed_mean": "gates passed, mean",
     "yaw_rate_rad_s": "turning",
 }
 
@@ -114,7 +123,7 @@ def missions(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
             if config.task == mission.task
         } or {"policy that ships": Policy.pretrained(mission.task)}
         (first, *_) = flyers.values()
-        given: Any = {"task_options": mission.options, "randomization": {"noise": mission.noise}}
+        given: Any = {"task_options": mission.options, "randomization": mission.randomization}
         scenario = scenario_of(first, **given, engine="free_flight")
         if mission.gains is not None:
             own_gains = scenario.aircraft, scenario.task, mission.gains
@@ -139,10 +148,12 @@ def missions_table(task: str) -> str:
 
 def shown(name: str, value: float | None) -> str:
     """A figure; none where no flight got so far."""
+    if value is not None and name.startswith("race_time"):
+        return race.shown(name, value)
     return "none" if value is None else quantity(name, value)
 
 
 PARTS: Parts = {
     f"missions-{task}": functools.partial(missions_table, task)
-    for task in ("trajectory", "perching", "deck_landing")
+    for task in ("trajectory", "perching", "deck_landing", "lsy_race")
 }

@@ -26,8 +26,7 @@ from quadrl.deploy import web
 from quadrl.evaluation.policy import SHIPPED, Policy, shipped
 from quadrl.learning.checkpoint import FORMAT as CHECKPOINT
 
-FLOWN = [name for name, task in tasks.TASKS.items() if not task.contact]
-PAIRS = [(task, vehicle) for task in FLOWN for vehicle in VEHICLES]
+PAIRS = [(task, vehicle) for task in web.FLOWN for vehicle in VEHICLES]
 # Sine and cosine are the C library's, and differ in the last bit between two of them.
 SINES = 1e-14
 TRAINED = "hover_ppo"
@@ -113,7 +112,7 @@ def test_policies_act_as_in_python(node):
     rng, jobs, expected = np.random.default_rng(0), [], []
     policies = {file.stem: Policy.load(file) for file in shipped()}
     for name, policy in policies.items():
-        if policy.task in FLOWN:
+        if policy.task in web.FLOWN:
             scale = rng.uniform(0, 3, (200, 1))  # past where the observations are clipped
             away = scale * policy.deviation * rng.normal(size=(200, policy.size))
             observation = (policy.mean + away).astype(np.float32)
