@@ -7,7 +7,7 @@ from runs import refused
 
 from quadrl import tasks
 from quadrl.core.environment import Environment
-from quadrl.tasks.lsy_race import BALL, LsyRace
+from quadrl.tasks.lsy_race import LsyRace
 
 AT_REST = {"velocity": (0.0, 0.0, 0.0), "quaternion": (1, 0, 0, 0)}
 
@@ -107,8 +107,8 @@ def test_where_they_truly_stand_is_seen_from_near_and_known_from_then_on():
         ((-2.51, 0.75, 0.5), True),
         ((0.0, 1.51, 0.5), True),
         ((0.0, 0.0, 2.05), True),
-        ((0.0, 0.75 + 0.015 + BALL + 0.01, 1.0), False),  # beside a pole
-        ((0.0, 0.75 + 0.015 + BALL - 0.01, 1.0), True),
+        ((0.0, 0.75 + 0.015 + LsyRace.ball + 0.01, 1.0), False),  # beside a pole
+        ((0.0, 0.75 + 0.015 + LsyRace.ball - 0.01, 1.0), True),
         ((0.0, -0.75, 1.2), False),  # in the middle of the last gate
         ((0.0, -0.75 + 0.14, 1.2), True),  # too near to its frame
         ((0.0, -0.75, 0.5), True),  # on its stand
@@ -130,10 +130,40 @@ def test_practice_begins_in_the_middle_of_gates():
     centre, through, _ = task.gate(now.task, now.task.gate - 1)
     np.testing.assert_allclose(now.state.position, centre, atol=1e-12)
     speed = np.linalg.norm(now.state.velocity, axis=1)
-    assert speed.max() > 1.9 and (speed < 2.0).all()
+    assert speed.max() > 0.95 and (speed < 1.0).all()
     np.testing.assert_allclose(now.state.velocity, speed[:, None] * through, atol=1e-12)
 
 
 def test_no_other_levels():
     with refused(name="lsy_race level", value=3):
         tasks.make("lsy_race", level=3)
+
+
+def test_in_practice_the_ball_may_be_smaller():
+    size = begun(300, least_ball=0.02).snapshot.task.ball
+    assert 0.02 <= size.min() < 0.025 and 0.065 < size.max() < 0.07
+    environment = begun(1, (-1.5, 0.75, 0.5), level=0, ball=0.01, least_ball=0.01)
+    environment.engine.qpos[0, :3] = np.add((0.0, -0.75 + 0.18, 1.2), environment.origin)
+    assert not environment.step(np.zeros((1, 4))).terminated[0]  # 2 cm from the last frame
+    with refused(name="lsy_race least_ball", value=0.1):
+        tasks.make("lsy_race", least_ball=0.1)
+
+
+def test_progress_is_paid_up_to_a_speed_and_leads_around_the_second_gate():
+    task = LsyRace(level=0, paid_speed=2.0, progress_weight=10.0)
+    gate, wrong = task.course.centre[1], -task.course.axes[1, 0]
+    state = begun(1, level=0).snapshot.task
+    centre, through, left = task.gate(state, np.array([1.0]))
+    ahead = lambda *place: task._way_left(replaced, np.array([place]))[0]  # noqa: E731
+    replaced = type(state)(**vars(state) | {"goal": centre, "through": through, "left": left})
+    before, behind = gate + wrong, gate - 0.3 * wrong
+    assert ahead(*before) == pytest.approx(1.0)  # straight on, from in front of it
+    assert ahead(*behind) == pytest.approx(0.9)  # from behind by a place 0.3 m before it
+    for speed, paid in ((1.0, 1.0), (5.0, 2.0)):
+        environment = begun(1, (-1.5, 0.75, 0.5), level=0, paid_speed=2.0, progress_weight=10.0)
+        way = task.course.centre[0] - (-1.5, 0.75, 0.5)
+        way /= np.linalg.norm(way)
+        environment.engine.qvel[0, :3] = speed * way
+        done = environment.step(np.zeros((1, 4)))
+        step = environment.vehicle.control_timestep
+        assert done.reward_terms["progress"][0] == pytest.approx(10.0 * paid * step, rel=0.25)
