@@ -27,7 +27,7 @@ FIGURES = ("random", *SINES, "zigzag", "pentagram", "polynomial")
 PIECE = 0.02  # [s], length of a piece of a table
 TRACKS, SEED = 32, 0  # curves of a figure that is drawn once and for all
 LONGEST_GAP, FASTEST = 0.5, 20.0  # [s], [m/s], from one row of a file to the next
-FILE = "a csv file: a line of names, then at least 4 rows of time [s], x, y and z [m]"
+FILE = "a csv file: a line of names, then at least 4 rows of time [s], x, y, z [m], maybe yaw [rad]"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Table:
 
     pieces: np.ndarray  # (tracks * count, 4, AXES) [m/s^k], factors of t^0 to t^3; read-only
     count: int = 1  # pieces of a track; in the last one it stands still
+    turns: np.ndarray | None = None  # (count, 4) [rad/s^k], of a heading other than east
 
     @classmethod
     def of(cls, figure: str, seconds: float, name: str) -> Table:
@@ -59,7 +60,7 @@ class Table:
         Raises:
             QuadrlError: There is no such figure or file, or the file has a gap or a jump.
         """
-        pieces, count = np.zeros((1, 4, AXES)), 1
+        pieces, count, turns = np.zeros((1, 4, AXES)), 1, None
         if figure in ("zigzag", "pentagram"):
             points = _drawn(1.0, 1.5, 0.0, seconds) if figure == "zigzag" else _star(seconds)
             pieces, count = _pieces(*points, 1, seconds)
@@ -68,9 +69,13 @@ class Table:
         elif figure not in FIGURES:
             if not figure.endswith(".csv"):
                 choice(name, figure, [*FIGURES, "the path of a .csv file"])
-            pieces, count = _pieces(*_read(name, figure), 3, seconds)
+            times, rows = _read(name, figure)
+            pieces, count = _pieces(times, rows[..., :AXES], 3, seconds)
+            if rows.shape[-1] > AXES:
+                turns = _pieces(times, np.unwrap(rows[..., AXES:], axis=1), 3, seconds)[0][..., 0]
+                turns.flags.writeable = False
         pieces.flags.writeable = False
-        return cls(pieces, count)
+        return cls(pieces, count, turns)
 
     def at(self, reference: Reference, time: Array, order: int = 0) -> Array:
         """References at times (N,) [s], or derivatives of an order to 3, (N, 3) [m/s^order]."""
@@ -93,6 +98,17 @@ class Table:
             value = value * since + math.perm(k, order) * piece[..., k, :]
         return value
 
+    def heading(self, time: Array) -> Array:
+        """Heading of the reference at times (N,) [rad], from east."""
+        if self.turns is None:
+            return 0 * time
+        xp, last = namespace(time), self.count - 1
+        step = xp.floor(time / PIECE)
+        step = xp.where(step < last, step, 0 * step + last)
+        piece, since = look_up(self.turns, step), time - PIECE * step
+        first, second, third, fourth = (piece[..., k] for k in range(4))
+        return first + since * (second + since * (third + since * fourth))
+
 
 def sines(figure: str, period: float, zero: Array) -> tuple[Array, Array, Array]:
     """Amplitude, frequency and phase of a figure, none for one of a table; for zeros (N,)."""
@@ -107,15 +123,16 @@ def sines(figure: str, period: float, zero: Array) -> tuple[Array, Array, Array]
 def _pieces(
     times: np.ndarray, points: np.ndarray, degree: int, seconds: float
 ) -> tuple[np.ndarray, int]:
-    """Splines of a degree through points (tracks, n, AXES) [m] at times (tracks, n) [s]."""
+    """Splines of a degree through points (tracks, n, k) at times (tracks, n) [s]."""
     from scipy.interpolate import make_interp_spline  # slow to import
 
     count, tracks = math.ceil(seconds / PIECE) + 1, list[np.ndarray]()
-    rest = [(1, np.zeros(AXES)), (2, np.zeros(AXES))]
+    axes = points.shape[-1]
+    rest = [(1, np.zeros(axes)), (2, np.zeros(axes))]
     for when, where in zip(times, points, strict=True):
         ends = (rest, rest) if degree > 3 else None
         curve: Any = make_interp_spline(when, where, degree, bc_type=ends)
-        at, pieces = np.arange(count) * PIECE, np.zeros((count, 4, AXES))
+        at, pieces = np.arange(count) * PIECE, np.zeros((count, 4, axes))
         for k in range(min(degree, 3) + 1):
             slope: Any = curve.derivative(k) if k else curve
             pieces[:, k] = slope(np.minimum(at, when[-1])) / math.factorial(k)
@@ -152,13 +169,13 @@ def _read(name: str, path: str) -> tuple[np.ndarray, np.ndarray]:
     except (OSError, ValueError) as error:
         reason = str(error).partition("\n")[0]
         raise QuadrlError(reason, name=name, value=path, allowed=FILE) from error
-    whole = rows.shape[1] == 4 and len(rows) >= 4 and np.isfinite(rows).all()
+    whole = rows.shape[1] in (4, 5) and len(rows) >= 4 and np.isfinite(rows).all()
     if not whole or rows[0, 0] != 0:
         reason = f"it has {len(rows)} rows of {rows.shape[1]} numbers"
         allowed = f"{FILE}, finite and from time 0 on"
         raise QuadrlError(reason, name=name, value=path, allowed=allowed)
     step = np.diff(rows[:, 0])
-    speed = np.linalg.norm(np.diff(rows[:, 1:], axis=0), axis=1) / np.maximum(step, 1e-9)
+    speed = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1) / np.maximum(step, 1e-9)
     wrong = (step <= 0) | (step > LONGEST_GAP) | (speed > FASTEST)
     for k in np.flatnonzero(wrong)[:1]:
         reason = f"from row {k + 1} to {k + 2} it takes {step[k]:.3g} s at {speed[k]:.3g} m/s"

@@ -75,7 +75,7 @@ class Trajectory(Task):
     """Cost of each metre of distance, for each 0.05 s."""
     figure: str = "random"
     """What to follow: random, lemniscate, vertical, zigzag, pentagram, polynomial, or the path of a
-    csv file with rows of time [s], x, y and z [m]."""
+    csv file with rows of time [s], x, y and z [m], and maybe a heading from east [rad]."""
     period: float = 0.0
     """Period of a lemniscate or a vertical figure [s]; 0 for the usual one, 5.5 or 10 s."""
     acceleration: float = 4.0
@@ -126,6 +126,8 @@ class Trajectory(Task):
         """At rest in the first point, heading east, slightly disturbed."""
         velocity = rng.vector(self.disturbance)
         quaternion = rng.attitude(self.disturbance, heading=0.0)
+        if self.table.turns is not None:
+            quaternion = _headed(quaternion, self.table.heading(0 * velocity[..., 0]))
         body_rate = rng.vector(self.disturbance)
         random = self.figure == "random"
         reference = self._random(rng) if random else self._named(rng, velocity)
@@ -153,14 +155,18 @@ class Trajectory(Task):
 
     def measure(self, now: Snapshot) -> Potentials:
         """Of the attitude only the heading counts, since a curve asks for tilts."""
-        sine, cosine = now.state.sin_attitude[..., 2], now.state.cos_attitude[..., 2]
+        sine, cosine = self._off(now)
         return dataclasses.replace(super().measure(now), attitude=abs(sine) + abs(cosine - 1))
 
     def observe(self, now: Snapshot) -> dict[str, Array]:
         """The reference of the next second, too."""
         later = (self.table.at(now.task, now.time + EVERY * k) for k in range(1, AHEAD + 1))
         seen = [to_body(now.state.rotation, place - now.state.position) for place in later]
-        return super().observe(now) | {"ahead": namespace(seen[0]).concat(seen, axis=-1)}
+        terms = super().observe(now) | {"ahead": namespace(seen[0]).concat(seen, axis=-1)}
+        if self.table.turns is not None:  # as one that heads east sees itself
+            for name, own in zip(("sin_attitude", "cos_attitude"), self._off(now), strict=True):
+                terms[name] = stack(terms[name][..., 0], terms[name][..., 1], own)
+        return terms
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Near the reference and with it, heading east, at little effort, in the air."""
@@ -195,6 +201,15 @@ class Trajectory(Task):
         parts = {"distance_m": rollout.error, "settled_m": settled}
         known = {name: part[np.isfinite(part)] for name, part in parts.items()}
         return {name: float(part.mean()) if part.size else math.nan for name, part in known.items()}
+
+    def _off(self, now: Snapshot) -> tuple[Array, Array]:
+        """Sine and cosine (N,) of the angle from the heading that is asked for to the present."""
+        sine, cosine = now.state.sin_attitude[..., 2], now.state.cos_attitude[..., 2]
+        if self.table.turns is None:
+            return sine, cosine
+        asked, xp = self.table.heading(now.time), namespace(now.time)
+        east, north = xp.cos(asked), xp.sin(asked)
+        return sine * east - cosine * north, cosine * east + sine * north
 
     def _random(self, rng: Rng) -> Reference:
         """Two sines in each coordinate, from slow ones to those of the largest acceleration."""
@@ -231,3 +246,11 @@ class Trajectory(Task):
             one = self._named(Rng(none, none), np.zeros((1, AXES)))
             return self.table.at(one, np.linspace(0.0, self.cycle, 400), order)
         return self.table.pieces[:, order] * math.factorial(order)
+
+
+def _headed(quaternion: Array, heading: Array) -> Array:
+    """Attitudes (N, 4), turned to the left by angles (N,) [rad]."""
+    xp, (w, x, y, z) = namespace(heading), (quaternion[..., k] for k in range(4))
+    cosine, sine = xp.cos(heading / 2), xp.sin(heading / 2)
+    turned = cosine * w - sine * z, cosine * x - sine * y, cosine * y + sine * x
+    return stack(*turned, cosine * z + sine * w)

@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from quadrl import tasks
+from quadrl import Policy, tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import roll_pitch_yaw
 from quadrl.core.environment import Environment
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.rollout import fly, summarize
@@ -107,6 +108,7 @@ STEADY = [(0.1 * k, 0.01 * k, 0, 0) for k in range(9)]
         (STEADY[1:], "from time 0 on"),
         (STEADY[:3], "at least 4 rows"),
         ([row[:3] for row in STEADY], "9 rows of 3 numbers"),
+        ([(*row, 0, 0) for row in STEADY], "9 rows of 6 numbers"),
         ([(t, 50 * x, y, z) for t, x, y, z in STEADY], "within 3 m"),
         ([(t, x, y, -2.9) for t, x, y, _ in STEADY], "0.3 m above the ground"),
     ],
@@ -149,3 +151,24 @@ def test_the_yardstick_flies_the_fast_eight_within_centimetres():
     # It begins at rest where the eight passes at 2.5 m/s, and catches up within a period.
     assert figures["survival_rate"] == 1.0 and figures["settled_m"] < 0.02
     assert figures["distance_m"] > 2 * figures["settled_m"]
+
+
+def test_a_file_may_have_headings_which_a_policy_follows_that_knows_only_east(tmp_path):
+    time = np.linspace(0, 15, 151)
+    heading = 2.0 + 0.5 * time  # past 180 degrees more than once
+    wrapped = np.angle(np.exp(1j * heading))
+    rows = np.stack([time, np.sin(time), np.cos(time), 0.1 * time, wrapped], axis=-1)
+    figure = write(tmp_path / "own.csv", rows)
+    environment, at = flown(figure=figure)
+    np.testing.assert_allclose(environment.task.table.heading(np.array([7.77])), 5.885, atol=1e-6)
+    seen = environment.task.observe(environment.snapshot)
+    assert np.abs(seen["sin_attitude"]).max() < 0.1 and not environment.not_compiled
+    # A heading of 2 rad, of what a controller for the east is 2 rad off.
+    assert environment.snapshot.potentials.attitude == pytest.approx(0.0, abs=0.1)
+    turned = environment.snapshot.state.sin_attitude[:, 2]
+    np.testing.assert_allclose(turned, math.sin(2.0), atol=0.1)
+    policy = Policy.pretrained("trajectory")
+    flight = fly(policy, "trajectory", episodes=4, task_options={"figure": figure})
+    assert summarize(flight)["survival_rate"] == 1.0 and summarize(flight)["settled_m"] < 0.03
+    yaw = np.unwrap(roll_pitch_yaw(flight.quaternion), axis=0)[..., 2]
+    np.testing.assert_allclose(np.diff(yaw[100::100], axis=0), 0.5 * 2.0, atol=0.1)
