@@ -112,11 +112,15 @@ def missions(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
     """Fly the policies of finished missions.
 
     Args:
-        runs: Run folders; a task has the rows of all of its runs, or of the policy that ships.
+        runs: Run folders: what their tasks ask is flown, beside what was measured of the others;
+            without any, all is flown by the policies that ship.
     """
     rows: list[Result] = []
     own = {run: TrainConfig.of_folder(run) for run in runs}
+    wanted = {config.task for config in own.values()}
     for name, mission in FLOWN.items():
+        if own and mission.task not in wanted:
+            continue
         flyers: dict[str, Any] = {
             f"seed {config.seed}": Policy.load(run)
             for run, config in own.items()
@@ -133,7 +137,8 @@ def missions(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
             row = {"condition": name, "task": mission.task, "metric": mission.metric, "who": who}
             rows.append(row | {figure: found.get(figure) for figure in FIGURES})
             say(rows[-1])
-    report.save("missions", {"episodes": EPISODES, "rows": rows})
+    beside = report.beside("missions", {"rows": rows}, wanted)
+    report.save("missions", {"episodes": EPISODES} | beside)
 
 
 def missions_table(task: str) -> str:
@@ -143,7 +148,9 @@ def missions_table(task: str) -> str:
     told = {name: text for name, text in FIGURES.items() if any(row.get(name) for row in own)}
     rows = [(row["condition"], row["who"], *(shown(n, row.get(n)) for n in told)) for row in own]
     head = ("flown", "by", *told.values())
-    return f"{table(head, rows)}\n\n{result['episodes']} flights a row. {report.source(result)}"
+    return (
+        f"{table(head, rows)}\n\n{result['episodes']} flights a row. {report.source(result, own)}"
+    )
 
 
 def shown(name: str, value: float | None) -> str:
