@@ -27,7 +27,7 @@ from quadrl.core.observation import ObservationTerm
 from quadrl.core.task import EpisodeEnd, Snapshot, Target
 from quadrl.engines.rng import FULL_TURN, Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.race import Course, Race
+from quadrl.tasks.race import Course, GateRace
 from quadrl.tasks.tracks import POLE, Track, known
 
 NEAR = 0.7  # [m], from how far on it is seen where a gate or a pole truly stands
@@ -51,12 +51,13 @@ class Arena(Course):
 
 
 @dataclasses.dataclass(frozen=True)
-class LsyRace(Race):
+class LsyRace(GateRace):
     """Fly the course of LSY's drone racing of summer 2026."""
 
     name = "lsy_race"
     asks = "fly through four small gates among poles, which stand elsewhere in each episode"
     starts = "at rest within 0.1 m of the start, level and heading east within 6 degrees"
+    solved = "through every gate"
     ends = (
         "through the last gate (success); within 7 cm of a pole, a frame or a stand; on the "
         "ground; out of the box of 5 m by 3 m by 2 m"
@@ -78,7 +79,7 @@ class LsyRace(Race):
         }
     }
     observation = {
-        **Race.observation,
+        **GateRace.observation,
         "poles": ObservationTerm(12, "m", "to each pole, x, y and z, body frame"),
     }
 

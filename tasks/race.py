@@ -48,36 +48,9 @@ class Course(TaskState):
 
 
 @dataclasses.dataclass(frozen=True)
-class Race(Task):
-    """Fly through all gates of a track, in order and in their direction, for some laps."""
+class GateRace(Task):
+    """Fly through gates in order and in their direction; a task says where they are."""
 
-    name = "race"
-    asks = "fly through the gates of a track in order, as fast as possible"
-    starts = "at rest within 0.1 m of the track's start, any heading, tilted up to 0.3 rad"
-    ends = (
-        "through the last gate (success); through the frame of any gate, on the ground, more than "
-        "5 m farther from the next gate than when the last was passed"
-    )
-    solved = "through every gate of every lap"
-    targets = (
-        Target("success_rate", "successful", 0.95, True),
-        Target("race_time_mean_s", "to the last gate", 6.0),
-    )
-    # With its usual actions no aircraft has the thrust for it.
-    trained_on = "racer"
-    # Gradients through the physics find the way in minutes; PPO does not in millions of steps.
-    trained_by = "apg"
-    training = {"vehicle_options": {"action_scale": 1250.0}}
-    training_with = {
-        "apg": {
-            "steps": 640_000,
-            # What learns with more noise saturates its actions: its mean action alone flies
-            # otherwise, and fails.
-            "initial_deviation": 0.1,
-            # Seen from rest at the start alone, later gates and second laps are learned late.
-            "training_options": {"laps": 3, "flying": 0.5, "margin": 0.2},
-        },
-    }
     keeps_place = False
     observation = {
         **ROTATION,
@@ -104,17 +77,6 @@ class Race(Task):
     """Cost per metre below 0.8 m above the ground, for each 0.05 s."""
     crash_weight: float = 100.0
     """Cost of a failure."""
-    track: str = "split_s"
-    """Name of the track: airsim, alphapilot or split_s."""
-    gates: tuple[tuple[float, ...], ...] = ()
-    """Gates of one's own: x, y, z [m], heading and climb [deg] of the way through each; () for
-    those of the track."""
-    start: tuple[float, ...] = ()
-    """Where a race begins [m]; () for that of the track, or 5 m before the first of own gates."""
-    opening: float = 0.0
-    """Edge of the openings [m]; 0 for that of the track."""
-    frame: float = 0.0
-    """Outer edge of the frames [m]; 0 for that of the track."""
     margin: float = 0.0
     """How far from the edge of an opening the aircraft's centre has to pass [m]."""
     laps: int = 1
@@ -124,12 +86,10 @@ class Race(Task):
     tilt: float = 0.3
     """Largest tilt at the start [rad]."""
     flying: float = 0.0
-    """Share of the episodes that begin on the way to a gate drawn anew."""
-    flying_speed: float = 5.0
-    """Largest speed of those, towards the gate [m/s]."""
+    """Share of the episodes that begin in flight."""
 
     def __post_init__(self) -> None:
-        """Validate the track."""
+        """Validate the race."""
         super().__post_init__()
         number(f"{self.name} margin", self.margin, 0, self.course.opening / 2)
         number(f"{self.name} flying", self.flying, 0, 1)
@@ -137,34 +97,12 @@ class Race(Task):
 
     @functools.cached_property
     def course(self) -> Track:
-        """The track that is flown."""
-        return Track.of(self.track, self.gates, self.start, self.opening, self.frame)
+        """The track that is flown, as it should be."""
+        raise NotImplementedError
 
-    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Course]:
-        """At rest at the start, tilted; or in practice on the way to a gate drawn anew."""
-        track, count = self.course, len(self.course.gates)
-        gate = rng.uniform(0.0, float(count))
-        xp = namespace(gate)
-        gate, flies = xp.floor(gate), rng.uniform(0.0, 1.0) < self.flying
-        rest, away = rng.vector(self.radius), rng.vector(track.opening / 2)
-        gate = xp.where(flies, gate, 0.0 * gate)
-        goal = look_up(track.centre, gate)
-        last = look_up(np.roll(track.centre, 1, axis=0), gate)
-        first = look_up(np.array([track.start]), 0.0 * gate) + rest
-        between = last + rng.uniform(0.0, 1.0)[..., None] * (goal - last) + away
-        position = xp.where(flies[..., None], between, first)
-        leg = norm(goal - position)
-        speed = xp.where(flies, rng.uniform(0.0, self.flying_speed), 0.0 * leg)
-        start = Start(
-            position=position,
-            quaternion=rng.attitude(self.tilt),
-            velocity=(speed / leg)[..., None] * (goal - position),
-            body_rate=0.0 * position,
-            rotor_speed=hovering(position, parameters),
-        )
-        none = 0.0 * gate
-        through, left = (look_up(track.axes[:, k], gate) for k in range(2))
-        return start, Course(goal, gate, through, left, none, none, position, leg)
+    def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
+        """Gates with some numbers (N,): centres [m], and unit vectors through them and left."""
+        raise NotImplementedError
 
     def update(self, before: Snapshot, now: Snapshot) -> Course:
         """Go on to the next gate when this one is passed."""
@@ -232,10 +170,6 @@ class Race(Task):
         way = reading.to_goal / away
         return reading.to_goal + OVERSHOOT * way, CRUISE * way
 
-    def markers(self, now: Snapshot) -> Sequence[Primitive]:
-        """The gates; the next one in another colour."""
-        return [*self.course.drawn(int(now.task.gate[0]))]
-
     def metrics(self, rollout: Rollout) -> dict[str, float]:
         """Times of those that came through, and how many gates all of them passed."""
         passed, time = (rollout.remembered[name] for name in ("passed", "time"))
@@ -252,12 +186,6 @@ class Race(Task):
         if len(laps) > 1:
             found["flying_lap_mean_s"] = laps[1:].mean() if done.any() else math.nan
         return {name: float(value) for name, value in found.items()}
-
-    def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
-        """Gates with some numbers (N,): centres [m], and unit vectors through them and left."""
-        track = self.course
-        centre, through, left = track.centre, track.axes[:, 0], track.axes[:, 1]
-        return look_up(centre, number), look_up(through, number), look_up(left, number)
 
     def _following(self, gate: Array) -> Array:
         """Numbers (N,) of the gates after some."""
@@ -288,3 +216,93 @@ class Race(Task):
         """Whether this control step passes the last gate of the last lap, (N,) bool."""
         last = now.task.passed == self.laps * len(self.course.gates) - 1
         return last & self._crossed(now)[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Race(GateRace):
+    """Fly through all gates of a track, in order and in their direction, for some laps."""
+
+    name = "race"
+    asks = "fly through the gates of a track in order, as fast as possible"
+    starts = "at rest within 0.1 m of the track's start, any heading, tilted up to 0.3 rad"
+    ends = (
+        "through the last gate (success); through the frame of any gate, on the ground, more than "
+        "5 m farther from the next gate than when the last was passed"
+    )
+    solved = "through every gate of every lap"
+    targets = (
+        Target("success_rate", "successful", 0.95, True),
+        Target("race_time_mean_s", "to the last gate", 6.0),
+    )
+    # With its usual actions no aircraft has the thrust for it.
+    trained_on = "racer"
+    # Gradients through the physics find the way in minutes; PPO does not in millions of steps.
+    trained_by = "apg"
+    training = {"vehicle_options": {"action_scale": 1250.0}}
+    training_with = {
+        "apg": {
+            "steps": 640_000,
+            # What learns with more noise saturates its actions: its mean action alone flies
+            # otherwise, and fails.
+            "initial_deviation": 0.1,
+            # Seen from rest at the start alone, later gates and second laps are learned late.
+            "training_options": {"laps": 3, "flying": 0.5, "margin": 0.2},
+        },
+    }
+
+    track: str = "split_s"
+    """Name of the track: airsim, alphapilot or split_s."""
+    gates: tuple[tuple[float, ...], ...] = ()
+    """Gates of one's own: x, y, z [m], heading and climb [deg] of the way through each; () for
+    those of the track."""
+    start: tuple[float, ...] = ()
+    """Where a race begins [m]; () for that of the track, or 5 m before the first of own gates."""
+    opening: float = 0.0
+    """Edge of the openings [m]; 0 for that of the track."""
+    frame: float = 0.0
+    """Outer edge of the frames [m]; 0 for that of the track."""
+    flying: float = 0.0
+    """Share of the episodes that begin on the way to a gate drawn anew."""
+    flying_speed: float = 5.0
+    """Largest speed of those, towards the gate [m/s]."""
+
+    @functools.cached_property
+    def course(self) -> Track:
+        """The track that is flown."""
+        return Track.of(self.track, self.gates, self.start, self.opening, self.frame)
+
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Course]:
+        """At rest at the start, tilted; or in practice on the way to a gate drawn anew."""
+        track, count = self.course, len(self.course.gates)
+        gate = rng.uniform(0.0, float(count))
+        xp = namespace(gate)
+        gate, flies = xp.floor(gate), rng.uniform(0.0, 1.0) < self.flying
+        rest, away = rng.vector(self.radius), rng.vector(track.opening / 2)
+        gate = xp.where(flies, gate, 0.0 * gate)
+        goal = look_up(track.centre, gate)
+        last = look_up(np.roll(track.centre, 1, axis=0), gate)
+        first = look_up(np.array([track.start]), 0.0 * gate) + rest
+        between = last + rng.uniform(0.0, 1.0)[..., None] * (goal - last) + away
+        position = xp.where(flies[..., None], between, first)
+        leg = norm(goal - position)
+        speed = xp.where(flies, rng.uniform(0.0, self.flying_speed), 0.0 * leg)
+        start = Start(
+            position=position,
+            quaternion=rng.attitude(self.tilt),
+            velocity=(speed / leg)[..., None] * (goal - position),
+            body_rate=0.0 * position,
+            rotor_speed=hovering(position, parameters),
+        )
+        none = 0.0 * gate
+        through, left = (look_up(track.axes[:, k], gate) for k in range(2))
+        return start, Course(goal, gate, through, left, none, none, position, leg)
+
+    def markers(self, now: Snapshot) -> Sequence[Primitive]:
+        """The gates; the next one in another colour."""
+        return [*self.course.drawn(int(now.task.gate[0]))]
+
+    def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
+        """Gates with some numbers (N,): centres [m], and unit vectors through them and left."""
+        track = self.course
+        centre, through, left = track.centre, track.axes[:, 0], track.axes[:, 1]
+        return look_up(centre, number), look_up(through, number), look_up(left, number)
