@@ -27,7 +27,7 @@ from quadrl.core.observation import ObservationTerm
 from quadrl.core.task import EpisodeEnd, Snapshot, Target
 from quadrl.engines.rng import FULL_TURN, Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.race import Course, GateRace
+from quadrl.tasks.gates import Course, GateRace
 from quadrl.tasks.tracks import POLE, Track, known
 
 NEAR = 0.7  # [m], from how far on it is seen where a gate or a pole truly stands
