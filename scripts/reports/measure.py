@@ -182,7 +182,9 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     usual = TrainConfig(
         config.task, algo=config.algo, vehicle=config.vehicle, variant=config.variant
     )
-    free = {name: getattr(usual, name) for name in (*FREE, "seed", "engine", "from_run")}
+    named = (*FREE, "seed", "engine", "from_run")
+    named += ("training_options",) if config.from_run else ()  # of a second training
+    free = {name: getattr(usual, name) for name in named}
     if dataclasses.replace(config, **free) != usual:
         return f"left out, {run} has other settings than `quadrl train` gives"
     policy, given = Policy.load(run), {"vehicle": config.scenario.aircraft}
@@ -198,6 +200,9 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     command = f"quadrl train {config.task} --algo {config.algo} --seed {config.seed}"
     command += "" if config.vehicle == TrainConfig.vehicle else f" --vehicle {config.vehicle}"
     command += f" --from {config.from_run.partition('@')[0]}" if config.from_run else ""
+    if config.training_options != usual.training_options:
+        options = (f"{name}={value}" for name, value in config.training_options.items())
+        command += f" --training-options {' '.join(options)}"
     command += "" if config.engine == usual.engine else f" --engine {config.engine}"
     command += "" if config.variant == "ideal" else f" --variant {config.variant}"
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -33,7 +33,7 @@ OPTIONS: dict[str, dict[str, float]] = {  # of the task as it is shown: a wall, 
     "deck_landing": {"lowest_waves": 1.25, "highest_waves": 2.5},
 }
 FASTEST, RACED = (
-    ("deck_landing", "perching", "race"),
+    ("deck_landing", "lsy_race", "perching", "race"),
     300,
 )  # the fastest of so many flights is shown
 # The training: four policies fly the same start.
@@ -134,7 +134,8 @@ def flight(name: str) -> Iterator[Image.Image]:
     width, height = (2 * size for size in SHOWN)
     how: Any = {"width": width, "height": height, "overlay": False}
     if name == "race":  # other cameras have gates before the aircraft
-        how |= {"camera": "chase", "speed_trail": True}
+        how |= {"camera": "chase"}
+    how["speed_trail"] = name in ("lsy_race", "race")
     for frame in render_trajectory(flight, model, fps=FPS, times=times, **how):
         small = Image.fromarray(frame).resize(SHOWN, Image.Resampling.LANCZOS)
         yield named(small, name.replace("_", " "))
