@@ -183,7 +183,8 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
         config.task, algo=config.algo, vehicle=config.vehicle, variant=config.variant
     )
     named = (*FREE, "seed", "engine", "from_run")
-    named += ("training_options",) if config.from_run else ()  # of a second training
+    if config.from_run:  # a second training
+        named += ("randomization", "training_options")
     free = {name: getattr(usual, name) for name in named}
     if dataclasses.replace(config, **free) != usual:
         return f"left out, {run} has other settings than `quadrl train` gives"
@@ -200,6 +201,8 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     command = f"quadrl train {config.task} --algo {config.algo} --seed {config.seed}"
     command += "" if config.vehicle == TrainConfig.vehicle else f" --vehicle {config.vehicle}"
     command += f" --from {config.from_run.partition('@')[0]}" if config.from_run else ""
+    if config.randomization != usual.randomization:
+        command += f" --randomization '{json.dumps(config.randomization)}'"
     if config.training_options != usual.training_options:
         options = (f"{name}={value}" for name, value in config.training_options.items())
         command += f" --training-options {' '.join(options)}"
