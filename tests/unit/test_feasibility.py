@@ -157,7 +157,7 @@ def test_what_ships_can_hover_wherever_it_was_trained(name):
     policy, robust = Policy.pretrained(name), "_robust" in name
     vehicle = policy.scenario.aircraft
     given = policy.conditions.get("randomization")
-    assert ("mass" in (given or {})) == robust
+    assert "mass" in (given or {}) or not robust
     assert unreached(vehicle, AircraftSampler(given, vehicle))[0] == 0
 
 
