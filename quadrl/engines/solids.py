@@ -68,8 +68,8 @@ class Solids:
         self.table["size"] = model.geom_size[self.geoms]
         self.table["turn"] = np.eye(3).reshape(-1)
         self.nearby = np.zeros(count, dtype=NEARBY)
-        self.nearby["place"] = np.nan
         """Which solids are the nearest to each aircraft; unknown where it is not a number."""
+        self.nearby["place"] = np.nan
         self.poses = np.zeros((count, len(self.geoms), 7))
         """Where they are now, (N, K, 7), as `place` takes it."""
         self.motion = np.zeros((count, len(self.geoms), 6))

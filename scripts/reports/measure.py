@@ -20,6 +20,7 @@ import tyro
 
 from quadrl import VEHICLES, tasks
 from quadrl.base.units import digits, length, quantity
+from quadrl.cli.tasks import settings
 from quadrl.core.task import Target
 from quadrl.engines.mujoco import ENGINES
 from quadrl.evaluation.controllers import make_controller
@@ -198,16 +199,19 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
         for old in (file, file.with_suffix(".json")):
             old.unlink(missing_ok=True)
         return f"left out, misses what its task asks: {said} successful{ways}"
-    command = f"quadrl train {config.task} --algo {config.algo} --seed {config.seed}"
-    command += "" if config.vehicle == TrainConfig.vehicle else f" --vehicle {config.vehicle}"
-    command += f" --from {config.from_run.partition('@')[0]}" if config.from_run else ""
-    if config.randomization != usual.randomization:
-        command += f" --randomization '{json.dumps(config.randomization)}'"
-    if config.training_options != usual.training_options:
-        options = (f"{name}={value}" for name, value in config.training_options.items())
-        command += f" --training-options {' '.join(options)}"
-    command += "" if config.engine == usual.engine else f" --engine {config.engine}"
-    command += "" if config.variant == "ideal" else f" --variant {config.variant}"
+    drawn = config.randomization
+    told = {
+        "algo": (config.algo, None),
+        "seed": (config.seed, None),
+        "vehicle": (config.vehicle, TrainConfig.vehicle),
+        "from": (config.from_run.partition("@")[0], ""),
+        "randomization": (f"'{json.dumps(drawn)}'", f"'{json.dumps(usual.randomization)}'"),
+        "training_options": (config.training_options, usual.training_options),
+        "engine": (config.engine, usual.engine),
+        "variant": (config.variant, "ideal"),
+    }
+    words = settings({name: value for name, (value, given) in told.items() if value != given})
+    command = " ".join(("quadrl train", config.task, *words))
     file.parent.mkdir(parents=True, exist_ok=True)
     policy.save(file)
     beside = {"command": command, "evaluation": metrics, "config": config.resolved()}
