@@ -3,12 +3,13 @@
 import tyro
 
 from scripts.reports.learning import curves
-from scripts.reports.measure import goals, ship, speed, training
+from scripts.reports.measure import goals, speed, training
 from scripts.reports.missions import missions
 from scripts.reports.pages import pages
 from scripts.reports.pictures import pictures
 from scripts.reports.race import race
 from scripts.reports.robustness import robust, robustness
+from scripts.reports.shipping import ship
 from scripts.reports.task_pages import shipped
 
 REPORTS = (training, goals, speed, robust, robustness, missions, race, curves, ship, shipped,

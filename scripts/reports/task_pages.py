@@ -15,7 +15,7 @@ from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED
 from quadrl.learning.defaults import own_settings
 from quadrl.learning.description import describe, describe_action
-from scripts.reports import measure, report
+from scripts.reports import measure, report, shipping
 from scripts.reports.code import shown
 from scripts.reports.report import Parts, asked, table
 
@@ -188,9 +188,9 @@ def shipped(episodes: int = 300, only: tuple[str, ...] = ()) -> None:
     rows = []
     files = (file for task in only or [""] for file in SHIPPED.glob(f"{task}*.safetensors"))
     for name in sorted(file.stem for file in files):
-        found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, measure.CALM))
+        found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, shipping.CALM))
         rows.append({"policy": name} | found | {"undisturbed": still})
-        report.say(f"{name}: {[x.words for x in measure.unmet(found['task'], still)]}")
+        report.say(f"{name}: {[x.words for x in shipping.unmet(found['task'], still)]}")
     rows = report.beside("shipped", {"rows": rows}, only)["rows"]
     report.save("shipped", {"rows": sorted(rows, key=lambda row: row["policy"])})
 
@@ -208,7 +208,7 @@ def policies(name: str = "") -> str:
         still = row["undisturbed"]
         missed = (
             f"{x.words}: {quantity(x.metric, still[x.metric])}, asked {asked(x)}"
-            for x in measure.unmet(row["task"], still)
+            for x in shipping.unmet(row["task"], still)
         )
         rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "nothing"))
     if not rows:

@@ -19,7 +19,7 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
-from scripts.reports import learning, measure, pages, report, robustness, task_pages
+from scripts.reports import learning, measure, pages, report, robustness, shipping, task_pages
 
 
 @pytest.fixture(autouse=True)
@@ -213,19 +213,19 @@ def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch, capsys):
     seed = source.metadata["seed"]
     run("a", source, seed + 1)
     run("b", source, seed)
-    monkeypatch.setattr(measure, "SHIPPED_EPISODES", 20)
-    measure.ship((tmp_path / "a", tmp_path / "b", tmp_path / "none"), tmp_path / "out")
+    monkeypatch.setattr(shipping, "EPISODES", 20)
+    shipping.ship((tmp_path / "a", tmp_path / "b", tmp_path / "none"), tmp_path / "out")
     beside = json.loads((tmp_path / "out" / "hover_ppo.json").read_text())
     assert beside["command"] == f"quadrl train hover --algo ppo --seed {seed}"
     assert beside["evaluation"] == summarize(fly(source, "hover", episodes=20))
     run("b", Policy.pretrained("hover", variant="robust"), seed, variant="robust")
-    measure.ship((tmp_path / "b",), tmp_path / "out")
+    shipping.ship((tmp_path / "b",), tmp_path / "out")
     beside = json.loads((tmp_path / "out" / "hover_robust.json").read_text())
     assert beside["command"].endswith(f"--seed {seed} --variant robust")
     capsys.readouterr()
     asked = Target("position_error_m", "error over the last 2 s", 1e-12)
     monkeypatch.setattr(Hover, "targets", (asked,))  # they miss that now, and go
-    measure.ship((tmp_path / "a", tmp_path / "b"), tmp_path / "out")
+    shipping.ship((tmp_path / "a", tmp_path / "b"), tmp_path / "out")
     told = capsys.readouterr().err
     assert told.count(f"misses what its task asks: seed {seed}") == 1
     assert f"successful, {asked.words} " in told
