@@ -11,6 +11,11 @@ export function decoded(text) {
   return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 }
 
+// Which numbers of the observation of a pair of the book are seen beside an aim.
+export function besideAim(pair, aim) {
+  return pair.besideAim[Number(aim.beside_goal ?? false)];
+}
+
 // The compiled C, and where the parts of a flight stand in its memory.
 export class Kernel {
   // bytes: the WebAssembly; book: what quadrl/deploy/web.py exports.
@@ -148,7 +153,7 @@ export class Flight {
     const { observation, pair } = this;
     const { aim } = sensors;
     const felt = disturbance || "disturbance" in sensors;
-    const own = aim ? pair.besideAim.map((k) => observation[k]) : observation.subarray(0, pair.size);
+    const own = aim ? besideAim(pair, aim).map((k) => observation[k]) : observation.subarray(0, pair.size);
     return [...own, ...(felt ? this.felt : []), ...(aim ? this.aim : [])];
   }
 

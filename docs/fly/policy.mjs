@@ -1,5 +1,7 @@
 // A trained policy: reads the file and gives the mean action, as quadrl/evaluation/policy.py does.
 
+import { besideAim } from "./flight.mjs";
+
 const LAYERS = ["weight", "bias"];
 const DAMAGED = "The file is damaged or not a safetensors file.";
 const CHECKPOINT = "This is a checkpoint, from which a training goes on. The policy is policy.safetensors in the same folder.";
@@ -36,7 +38,7 @@ function readArrays({ entries, data }) {
 const KNOWN = { disturbance: false, action_history: 0, observation_history: 0, rotor_speed: "true", sensors: {} };
 
 // Sensors that it knows, with the options that it knows of each.
-const SENSORS = { aim: [], disturbance: ["smoothing"] };
+const SENSORS = { aim: ["beside_goal"], disturbance: ["smoothing"] };
 
 // What of the options of an observation this page does not know, in words; nothing if it knows all.
 function strange(observe) {
@@ -96,7 +98,7 @@ export class Policy {
   unfit(book, taskName, vehicleName) {
     const { rotors, layout } = book.vehicles[vehicleName], { actionSize, metadata, observe } = this;
     const pair = book.pairs[`${taskName}_${vehicleName}`], { aim } = observe.sensors;
-    const single = (aim ? pair.besideAim.length + 3 : pair.size) + 3 * observe.disturbance;
+    const single = (aim ? besideAim(pair, aim).length + 3 : pair.size) + 3 * observe.disturbance;
     const size = single * (1 + observe.observation_history) + rotors * observe.action_history;
     const foreign = strange(observe);
     if (foreign) return `It observes ${foreign}, which this page does not know.`;

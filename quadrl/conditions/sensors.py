@@ -219,17 +219,24 @@ class Aim(Sensor):
     """Longer offsets [m] are ways and are not summed up."""
     most: float = 1.0
     """Largest distance of the place from the goal along each axis of the world [m]."""
+    beside_goal: bool = False
+    """Whether the goal is seen, too: then who learns can answer a gust, whose offset passes, and a
+    lasting force each in its own way."""
 
     def __post_init__(self) -> None:
         """Validate the options."""
         super().__post_init__()
         for name in ("gain", "near", "most"):
             number(f"aim {name}", getattr(self, name), 0, MAX)
+        if not isinstance(self.beside_goal, bool):
+            raise QuadrlError(
+                name="aim beside_goal", value=self.beside_goal, allowed="True or False"
+            )
 
     @property
     def hides(self) -> tuple[str, ...]:
         """What says where the goal is."""
-        return "position", "goal"
+        return ("position",) if self.beside_goal else ("position", "goal")
 
     def begin(self, now: Moment) -> Memory:
         """Nothing is summed up."""

@@ -92,7 +92,7 @@ def make_book() -> tuple[dict[str, Any], str]:
             pairs[f"{task.name}_{vehicle.name}"] = {
                 "drawn": written.drawn,
                 "size": environment.size,
-                "besideAim": beside_aim(environment),
+                "besideAim": [beside_aim(environment, Aim(beside_goal=x)) for x in (False, True)],
                 "origin": environment.origin.tolist(),
                 # JSON knows no infinity, which is where the floor of these tasks is.
                 "world": np.nan_to_num(world(environment.engine.model)).tolist(),
@@ -140,9 +140,9 @@ def surroundings(task: Task) -> dict[str, Any]:
     return shapes([*world, *stands])
 
 
-def beside_aim(environment: Environment) -> list[int]:
+def beside_aim(environment: Environment, aim: Aim) -> list[int]:
     """Which numbers of an observation are seen where there is an aim."""
-    shown = (part for name, part in environment.layout.items() if name not in Aim().hides)
+    shown = (part for name, part in environment.layout.items() if name not in aim.hides)
     return [place for part in shown for place in range(part.start, part.stop)]
 
 

@@ -242,6 +242,7 @@ def test_files_that_cannot_fly_are_refused(node, tmp_path):
                 ({"sensors": {"compass": {}}}, "observes the sensor compass"),
                 ({"sensors": {"aim": {"near": 1.0}}}, "observes aim with its own near"),
                 ({"sensors": {"aim": {}}}, "observes 22 numbers; hover shows 19"),
+                ({"sensors": {"aim": {"beside_goal": True}}}, "^$"),
             )
         ),
         *((part, "hover", "paper", "damaged") for part in (hover[:1000], hover[:-8], b"", b"no")),

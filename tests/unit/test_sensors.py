@@ -173,6 +173,8 @@ def test_the_aim_moves_on_by_short_offsets_and_no_further_than_it_may():
     assert summed[0, 0] == 0.15 and not summed[1].any()  # near, and a long way off
     start = environment.reset(np.array([0]))["aim"]  # a new episode sums up anew
     np.testing.assert_array_equal(start, environment.task.observe(environment.snapshot)["goal"][:1])
+    both = helpers.begun("hover", 2, observe={"sensors": {"aim": {"beside_goal": True}}})
+    assert {"goal", "aim"} <= both.reset().keys() and "position" not in both.observer.terms
 
 
 def test_noise_is_new_in_each_sample_and_a_bias_lasts():
