@@ -82,7 +82,7 @@ WIDE = 90.0
 carry 1.33 times the specified weight at most, too little for one that is 20 % heavier in wind."""
 _SMALL: dict[str, Any] = {
     "weather": {"wind_speed": 2.0},  # in light weather, 7.7 m/s, these do not learn to stay up
-    "randomization": {"lag": (0.5, 2.0), "command_delay": (0.0, 0.04)},
+    "randomization": {"lag": (0.5, 2.0), "command_delay": (0.0, 0.04), "centre_of_mass": 0.0005},
     "observe": {"action_history": 4},  # as many as are on their way at most, at their control rate
     "steps": 3_276_800,
 }
