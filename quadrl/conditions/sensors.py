@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -228,10 +228,9 @@ class Aim(Sensor):
         super().__post_init__()
         for name in ("gain", "near", "most"):
             number(f"aim {name}", getattr(self, name), 0, MAX)
-        if not isinstance(self.beside_goal, bool):
-            raise QuadrlError(
-                name="aim beside_goal", value=self.beside_goal, allowed="True or False"
-            )
+        given: Any = self.beside_goal
+        if not isinstance(given, bool):
+            raise QuadrlError(name="aim beside_goal", value=given, allowed="True or False")
 
     @property
     def hides(self) -> tuple[str, ...]:
