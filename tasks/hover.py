@@ -30,7 +30,7 @@ IN_GUSTS: dict[str, Any] = {
     # Unlike rotors, since nothing else in the practice needs the aim.
     "randomization": {"lag": (0.5, 2.2), "rotors": (0.96, 1.04), "centre_of_mass": 0.002},
     # A gust's offset passes, and is answered otherwise than what lasts.
-    "observe": {"sensors": {"aim": {"beside_goal": True}, "disturbance": {"smoothing": 0.02}}},
+    "observe": {"sensors": {"aim": {"beside_goal": True}}},
     "task_options": {"progress_weight": 300.0, "attitude_weight": 75.0},
 }
 """Settings of the variant `robust` where a place is kept, which a gust moves the aircraft from."""

@@ -181,13 +181,13 @@ def _unusual(task: Task | type[Task], algo: str) -> dict[str, Any]:
 
 
 def merged(*settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings with later ones in place of earlier ones; dicts are added to each other."""
+    """Settings with later ones in place of earlier ones; dicts are added, at every depth."""
     whole: dict[str, Any] = {}
     for given in settings:
         for name, value in given.items():
             old = whole.get(name)
             if isinstance(old, dict) and isinstance(value, dict):
-                value = old | value
+                value = merged(old, value)
             whole[name] = value
     return whole
 
