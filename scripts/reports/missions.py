@@ -18,6 +18,7 @@ from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import fly, scenario_of, summarize
 from quadrl.learning.config import TrainConfig
 from scripts.reports import race, report
+from scripts.reports.pitch_up import PitchUp, Way
 from scripts.reports.report import Parts, Result, say, table
 from scripts.reports.robustness import FRESH
 
@@ -29,6 +30,13 @@ SEAS = {2: (0.1, 0.5), 3: (0.5, 1.25), 4: (1.25, 2.5), 5: (2.5, 4.0)}
 EIGHT_GAINS = Gains(1.7125, 1.7125, 1.0, 0.51852, 6.88, 0.66735)
 DECK_GAINS = Gains(2.0125, 2.0125, 1.0, 0.73333, 4.08, 0.21224)
 NOISY_DECK_GAINS = Gains(1.45, 1.45, 1.0, 0.6, 2.4, 0.28571)
+WAYS = {
+    0: (1.53, Way(0.57, 1.13, 0.53, 0.02, 0.09, 2.29)),
+    30: (1.77, Way(0.75, 1.0, 0.6, 0.22, 0.02, 2.51)),
+    60: (1.56, Way(0.72, 0.89, 0.46, 0.13, 0.09, 2.35)),
+    90: (1.51, Way(0.71, 0.98, 0.34, 0.17, 0.19, 2.12)),
+}
+"""The same for perching, with the plan, by the incline of the surface [degrees]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,11 +46,13 @@ class Mission:
     task: str
     metric: str
     options: Mapping[str, Any]
-    gains: Gains | None
-    """The best of sixteen of the controller, chosen in 100 flights apart; None where it cannot do
-    what is asked."""
+    gains: Gains
+    """The best of sixteen of the controller, chosen in 100 flights apart."""
     randomization: Mapping[str, Any] = dataclasses.field(default_factory=dict[str, Any])
     """What of the aircraft is drawn, and the noise of the state estimate."""
+    way: Way | None = None
+    """The plan that the controller flies along, chosen with the gains; None where the task says
+    where to be."""
 
 
 SEEN = {"noise": {"position": 0.02, "attitude": 0.005, "velocity": 0.05, "body_rate": 0.01}}
@@ -75,9 +85,10 @@ FLOWN: dict[str, Mission] = {
             "perching",
             RATE,
             dict.fromkeys(("least_incline", "most_incline"), math.radians(incline)),
-            None,
+            Gains(level, level, max_speed=4.0, max_tilt=0.5),
+            way=way,
         )
-        for incline in (0, 30, 60, 90)
+        for incline, (level, way) in WAYS.items()
     },
     **{
         f"sea state {state}{told}": Mission(
@@ -133,9 +144,10 @@ def missions(runs: Annotated[tuple[Path, ...], tyro.conf.Positional]) -> None:
         (first, *_) = flyers.values()
         given: Any = {"task_options": mission.options, "randomization": mission.randomization}
         scenario = scenario_of(first, **given, engine="free_flight")
-        if mission.gains is not None:
-            own_gains = scenario.aircraft, scenario.task, mission.gains
-            flyers["controller"] = GeometricController(*own_gains)
+        own_gains: Any = scenario.aircraft, scenario.task, mission.gains
+        flyers["controller"] = (
+            PitchUp(*own_gains, mission.way) if mission.way else GeometricController(*own_gains)
+        )
         for who, flyer in flyers.items():
             found = summarize(fly(flyer, scenario, episodes=EPISODES, seed=FRESH))
             row = {"condition": name, "task": mission.task, "metric": mission.metric, "who": who}

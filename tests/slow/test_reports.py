@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import quadrl
+from quadrl.core.scenario import Scenario
 from quadrl.core.task import Target
 from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
@@ -19,7 +20,17 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
-from scripts.reports import learning, measure, pages, report, robustness, shipping, task_pages
+from scripts.reports import (
+    learning,
+    measure,
+    missions,
+    pages,
+    report,
+    robustness,
+    shipping,
+    task_pages,
+)
+from scripts.reports.pitch_up import PitchUp
 
 
 @pytest.fixture(autouse=True)
@@ -178,6 +189,19 @@ def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass():
     # k_z k_v e = g (mass - 1), of the factor: the aircraft hangs e below the goal.
     assert found[0.0]["position_error_m"] > 0.1 > 5 * found[1.0]["position_error_m"]
     assert found[1.0]["success"] == 1.0
+
+
+@pytest.mark.parametrize("incline", missions.WAYS)
+def test_a_planned_pitch_up_perches_on_every_incline(incline):
+    mission = missions.FLOWN[f"perching at {incline} degrees"]
+    scenario = Scenario.of(
+        "perching",
+        vehicle_options={"action_scale": 90.0},
+        task_options=mission.options,
+        engine="free_flight",
+    )
+    flyer = PitchUp(scenario.aircraft, scenario.task, mission.gains, mission.way)
+    assert summarize(fly(flyer, scenario, episodes=20, seed=7))["success_rate"] >= 0.95
 
 
 def test_policies_that_ship_are_judged_where_nothing_disturbs_them(tmp_path, monkeypatch):
