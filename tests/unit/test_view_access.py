@@ -255,6 +255,23 @@ def test_whatever_a_client_sends_the_flight_goes_on(page):
         check_sound(page)
 
 
+def test_a_browser_that_leaves_is_told_nothing_and_of_it_nobody(page, monkeypatch):
+    def refuse():
+        raise QuadrlError("Nothing flies this.")
+
+    with client(page) as connection:
+        join(connection)
+        until(page.server.get_clients)
+        clients = page.server.get_clients()
+    until(lambda: not page.server.get_clients())
+    monkeypatch.setattr(page.server, "get_clients", lambda: clients)
+    page.controllers["nothing"] = refuse
+    page.flown_by._handle._impl.value = "nothing"
+    page.apart.value += 0.5
+    page.frame(VEHICLE.control_timestep)
+    assert page._viewed[1] == page.apart.value and page.flown_by.value == "geometric"
+
+
 def test_numbers_beyond_a_slider_are_its_ends_and_what_is_no_choice_changes_nothing(page):
     with client(page) as connection:
         ids = join(connection)

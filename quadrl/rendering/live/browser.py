@@ -23,7 +23,7 @@ from quadrl.base.validation import number
 from quadrl.evaluation.rollout import Controller
 from quadrl.rendering.live import access, readout
 from quadrl.rendering.live.flight import KEYS, Flight, Keyboard
-from quadrl.rendering.live.scene import CAMERAS, Scene
+from quadrl.rendering.live.scene import CAMERAS, Scene, telling
 
 FRAME = 1 / 30  # [s]
 READOUT = 0.1  # [s] between two updates of the numbers
@@ -160,8 +160,9 @@ class Page:
             self._flown_by = chosen
         except QuadrlError as error:
             self.flown_by.value = self._flown_by
-            for client in self.server.get_clients().values():
-                client.add_notification(f"{chosen} cannot fly this", str(error))
+            with telling():
+                for client in self.server.get_clients().values():
+                    client.add_notification(f"{chosen} cannot fly this", str(error))
 
     def push(self, direction: str) -> None:
         """Push the aircraft that is looked at: one of PUSHES, as hard as the slider says."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,14 @@ SKY = np.array([(78, 128, 196), (232, 240, 247), (214, 222, 229)])  # above, hor
 GROUND, METRES, TENS = (0.30, 0.37, 0.44), (0.43, 0.51, 0.58), (0.58, 0.66, 0.72)
 FOV = math.radians(42)
 UPRIGHT = np.array([(1.0, 0.0, 0.0, 0.0)])
+
+
+@contextlib.contextmanager
+def telling() -> Iterator[None]:
+    """Say nothing of a browser that leaves while it is told something."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+        yield
 
 
 class Scene:
@@ -65,7 +74,8 @@ class Scene:
         stand = self._home + size * np.array(VIEWS[camera])
         cameras = [client.camera for client in self._server.get_clients().values()]
         for one in (self._server.initial_camera, *cameras):
-            with contextlib.suppress(ValueError):  # a browser may have told of an impossible one
+            # A browser may have told of an impossible one.
+            with telling(), contextlib.suppress(ValueError):
                 one.position, one.look_at, one.fov = stand, self._home, FOV
 
     def draw(self, seconds: float, row: int, camera: str, apart: float) -> None:
