@@ -105,6 +105,5 @@ def c_weather() -> str:
         f"enum {{ {rows}, WEATHER_ROWS }};\n"
         f"enum {{ TURBULENCE = {TURBULENCE}, BLOCKS = {BLOCKS}, LOG_TERMS = {LOG_TERMS}, "
         f"SINE_TERMS = {SINE_TERMS} }};\n"
-        f"#define NORMAL_UNIT {UNIT.hex()}\n"
         f"#define PER_LOWEST {(1 / LOWEST).hex()}\n"
     )

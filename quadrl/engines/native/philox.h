@@ -20,4 +20,21 @@ static inline __attribute__((always_inline)) void philox(uint32_t c[4], uint32_t
   }
 }
 
+// The words of a block of a stream of an episode, for the seed `key`.
+static inline __attribute__((always_inline)) void words(uint32_t w[4], int64_t block,
+                                                        int64_t stream, int64_t episode,
+                                                        int64_t key) {
+  w[0] = (uint32_t)block;
+  w[1] = (uint32_t)stream;
+  w[2] = (uint32_t)episode;
+  w[3] = (uint32_t)(episode >> 32);
+  philox(w, (uint32_t)key, (uint32_t)(key >> 32));
+}
+
+// A number of mean 0 and variance 1 of two words: the sum of four uniform ones of 16 bits.
+static inline __attribute__((always_inline)) double normal(uint32_t one, uint32_t other) {
+  const int32_t halves = (int32_t)((one & 0xFFFF) + (one >> 16) + (other & 0xFFFF) + (other >> 16));
+  return (halves + (2 - 131072)) * 0x1.bb67ae8584caap-16;  // the root of 3 over 2^16
+}
+
 #endif  // QUADRL_PHILOX_H_

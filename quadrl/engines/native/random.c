@@ -14,11 +14,7 @@ QUADRL_EXPORT void quadrl_uniform(int64_t n, const int64_t* keys, const int64_t*
     for (int64_t j = first; j < first + count; ++j) {
       if (j / 4 != at) {
         at = j / 4;
-        block[0] = (uint32_t)at;
-        block[1] = (uint32_t)stream;
-        block[2] = (uint32_t)episodes[i];
-        block[3] = (uint32_t)(episodes[i] >> 32);
-        philox(block, (uint32_t)keys[i], (uint32_t)(keys[i] >> 32));
+        words(block, at, stream, episodes[i], keys[i]);
       }
       out[i * count + j - first] = block[j % 4] * 0x1p-32;
     }

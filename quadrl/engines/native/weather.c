@@ -22,31 +22,25 @@ typedef double Lanes[LANES];
 // i * stride doubles. Filled by quadrl/conditions/weather.py.
 typedef struct {
   double* table;
-  const uint64_t *keys, *episodes;
+  const int64_t *keys, *episodes;
   const double* height;
   double* air;
   int64_t columns, stride, rotors;
   double per_roughness, timestep, per_gust_time;
 } Rows;
 
-// Seeds and episodes, as Philox takes them.
+// Seeds, episodes and control steps.
 typedef struct {
-  uint32_t key[2][LANES], episode[2][LANES], step[LANES];
+  int64_t key[LANES], episode[LANES], step[LANES];
 } Streams;
 
-// The four words of a block of random numbers.
-AERO void words(const Streams* s, uint32_t block, uint32_t w[4][LANES]) {
+// The four words of a block of random numbers, of each aircraft.
+AERO void words_of(const Streams* s, int block, uint32_t w[4][LANES]) {
   for (int i = 0; i < LANES; ++i) {
-    uint32_t c[4] = {s->step[i] * BLOCKS + block, TURBULENCE, s->episode[0][i], s->episode[1][i]};
-    philox(c, s->key[0][i], s->key[1][i]);
+    uint32_t c[4];
+    words(c, s->step[i] * BLOCKS + block, TURBULENCE, s->episode[i], s->key[i]);
     for (int k = 0; k < 4; ++k) w[k][i] = c[k];
   }
-}
-
-// A number of mean 0 and variance 1 of two words: the sum of four uniform ones of 16 bits.
-AERO double normal(uint32_t one, uint32_t other) {
-  const int32_t halves = (int32_t)((one & 0xFFFF) + (one >> 16) + (other & 0xFFFF) + (other >> 16));
-  return (halves + (2 - 131072)) * NORMAL_UNIT;
 }
 
 // ln(max(x, 1)): with the C library's, bits would depend on the machine.
@@ -89,8 +83,8 @@ AERO double half_wave(double share) {
 AERO void filters(Lanes* t, Streams* s, int rotors, int begin) {
   uint32_t w[3][4][LANES];
   for (int i = 0; i < LANES; ++i) t[WEATHER_STEPS][i] = begin ? 0.0 : t[WEATHER_STEPS][i] + 1.0;
-  for (int i = 0; i < LANES; ++i) s->step[i] = (uint32_t)(int32_t)t[WEATHER_STEPS][i];
-  for (int b = 0; b < 3; ++b) words(s, b, w[b]);
+  for (int i = 0; i < LANES; ++i) s->step[i] = (int32_t)t[WEATHER_STEPS][i];
+  for (int b = 0; b < 3; ++b) words_of(s, b, w[b]);
   for (int i = 0; i < LANES; ++i) {
     const double n[5] = {normal(w[0][0][i], w[0][1][i]), normal(w[0][2][i], w[0][3][i]),
                          normal(w[1][0][i], w[1][1][i]), normal(w[1][2][i], w[1][3][i]),
@@ -110,7 +104,7 @@ AERO void filters(Lanes* t, Streams* s, int rotors, int begin) {
     }
   }
   for (int k = 0; k < rotors; ++k) {
-    if (k % 2 == 0) words(s, 3 + k / 2, w[0]);
+    if (k % 2 == 0) words_of(s, 3 + k / 2, w[0]);
     double* noise = t[WEATHER_NOISE_0 + k];
     for (int i = 0; i < LANES; ++i) {
       const double n = normal(w[0][k % 2 * 2][i], w[0][k % 2 * 2 + 1][i]);
@@ -172,11 +166,8 @@ QUADRL_EXPORT void quadrl_weather(const Rows* rows, int64_t n, const int64_t* id
     for (int i = 0; i < LANES; ++i) {
       const int64_t at = first + (i < filled ? i : 0);  // spare lanes: twins
       row[i] = ids ? ids[at] : at;
-      const uint64_t key = r.keys[row[i]], episode = r.episodes[row[i]];
-      s.key[0][i] = (uint32_t)key;
-      s.key[1][i] = (uint32_t)(key >> 32);
-      s.episode[0][i] = (uint32_t)episode;
-      s.episode[1][i] = (uint32_t)(episode >> 32);
+      s.key[i] = r.keys[row[i]];
+      s.episode[i] = r.episodes[row[i]];
       height[i] = r.height[row[i] * r.stride];
     }
     if (!ids && filled == LANES) {
