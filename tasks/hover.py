@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
@@ -22,18 +21,6 @@ from quadrl.core.task import (
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
-IN_GUSTS: dict[str, Any] = {
-    "steps": 16_384_000,
-    # The critic sees the gusts, so that it tells more of an action than many steps of luck.
-    "gae_lambda": 0.9,
-    "ppo": {"learning_rate": 3e-3},
-    # Unlike rotors, since nothing else in the practice needs the aim.
-    "randomization": {"lag": (0.5, 2.2), "rotors": (0.96, 1.04), "centre_of_mass": 0.002},
-    # A gust's offset passes, and is answered otherwise than what lasts.
-    "observe": {"sensors": {"aim": {"beside_goal": True}}},
-    "task_options": {"progress_weight": 300.0, "attitude_weight": 75.0},
-}
-"""Settings of the variant `robust` where a place is kept, which a gust moves the aircraft from."""
 # An uncertain aircraft in wind is far from the goal and in motion anyway.
 AS_ASKED = {"tilt": 0.2, "spin": 0.3, "radius": 0.5, "speed": 0.3, "attitude_weight": 75.0}
 
@@ -93,7 +80,7 @@ class Hover(Task):
             "apg": {"step": 0.4},
         },
     }
-    variants = {"robust": {"training_options": AS_ASKED, **IN_GUSTS}}
+    variants = {"robust": {"training_options": AS_ASKED}}
     heading_matters = True
 
     radius: float = 0.5

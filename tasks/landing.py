@@ -78,6 +78,7 @@ class Landing(Task):
         "robust": {
             "gamma": 0.97,
             "initial_deviation": 0.4,
+            "task_options": {"progress_weight": 200.0, "attitude_weight": 60.0},
             "training_options": {"attitude_weight": 60.0},
         }
     }

@@ -11,7 +11,6 @@ from quadrl.core.contact import touches_ground
 from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.hover import IN_GUSTS
 
 # Practised from rest alone, some policies begin to swing on the way to a far waypoint, with the
 # rotors at their ends, and sink to the ground: in 0 to 28 of 30,000 flights, by the seed.
@@ -41,7 +40,7 @@ class RandomWaypoint(Task):
         "trpo": {"training_options": IN_MOTION},
         "apg": {"steps": 102_400, "holds_goal": False},
     }
-    variants = {"robust": {"training_options": {"farthest": 2.5, **AT_REST}, **IN_GUSTS}}
+    variants = {"robust": {"training_options": {"farthest": 2.5, **AT_REST}}}
 
     nearest: float = 1.0
     """Smallest distance of the waypoint from the start [m]."""

@@ -18,7 +18,7 @@ from quadrl.learning.defaults import OF_VEHICLE, VARIANTS
 from quadrl.learning.environments import make_env
 from quadrl.learning.folder import read_config, write_config
 from quadrl.learning.settings import PPOConfig, VPGConfig
-from quadrl.tasks.hover import IN_GUSTS, Hover
+from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
 
 
@@ -211,9 +211,10 @@ def test_a_run_with_an_old_name_of_a_setting_goes_on(tmp_path):
 def test_a_variant_is_settings_that_go_together():
     config, usual = TrainConfig("hover", variant="robust"), TrainConfig("hover")
     assert (config.weather, usual.weather) == ("light", "calm")
-    assert config.steps == IN_GUSTS["steps"] > VARIANTS["robust"]["steps"] > usual.steps
+    assert config.steps == VARIANTS["robust"]["steps"] > usual.steps
     landing, small = TrainConfig("landing", variant="robust"), "crazyflie_brushless"
-    assert landing.steps == VARIANTS["robust"]["steps"]
+    weights = VARIANTS["robust"]["task_options"] | {"progress_weight": 200.0}
+    assert landing.task_options == weights | {"attitude_weight": 60.0}
     often = config.scenario.aircraft.control_timestep / 0.02
     quick = TrainConfig("hover", variant="robust", vehicle=small)
     assert quick.steps == OF_VEHICLE["robust", small]["steps"] * often
