@@ -68,7 +68,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
         # The critic sees the gusts, so that it tells more of an action than many steps of luck.
         "gae_lambda": 0.9,
         "gamma": 0.95,  # with a shorter horizon heavy aircraft begin to swing, and fall
-        "hidden": (256,),
         "ppo": {"learning_rate": 3e-3, "beta2": 0.999},
         "steps": 16_384_000,
         # A lasting error costs (1 - gamma) of its weight alone: with the tasks' own weights these
