@@ -66,6 +66,8 @@ def settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
             yield from settings(value, f"{word}.")
         elif isinstance(value, bool):
             yield prefix + "no-" * (not value) + word.removeprefix(prefix)
+        elif isinstance(value, tuple | list):
+            yield " ".join((word, *map(str, value)))
         else:
             yield f"{word} {value}"
 
