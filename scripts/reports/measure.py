@@ -1,4 +1,4 @@
-"""Train every task and fly the policies: `training`, `goals`, and `speed`.
+"""Train every task and fly the policies: `training` and `speed`.
 
 Run them on a machine that does nothing else. Interrupted at any moment, they continue at the next
 start.
@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import itertools
 import json
-import statistics
 from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
-
 from quadrl import VEHICLES, tasks
-from quadrl.base.units import digits, length, quantity
+from quadrl.base.units import length, quantity
 from quadrl.engines.mujoco import ENGINES
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.plotting import learning_curves, save
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import EVALUATION_SEED, Controller, flights, fly, summarize
+from quadrl.evaluation.rollout import Controller, fly, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
@@ -32,13 +29,6 @@ from scripts.reports.report import Result, asked, say, table
 HOVER_SEEDS, SEEDS = (225, 226, 227, 228, 229), (385, 386, 387)
 EPISODES, LONGEST = 100, 300.0  # of an evaluation; [s] that a training may take
 AIRBORNE = ("hover", "static_waypoint", "random_waypoint", "straight_and_level", "target_following")
-GOALS = {(task, algo): range(305, 310) for algo in ("ppo", "apg") for task in AIRBORNE}
-GOALS |= {  # their settings were changed after the policies of those seeds had been flown
-    ("hover", "ppo"): range(355, 360),
-    ("hover", "apg"): range(340, 345),
-    ("random_waypoint", "ppo"): range(380, 385),
-}
-FLIGHTS, MANY = 1000, {("random_waypoint", "ppo"): 10_000}  # FLIGHTS of them in a batch
 
 
 def trained(run: PlannedRun) -> Result:
@@ -101,38 +91,6 @@ def flown(controller: Controller, task: str, vehicle: str) -> Result:
     """What a controller, or the mean action of a policy, reaches in MuJoCo."""
     rollout = fly(controller, task, episodes=EPISODES, vehicle=vehicle)
     return {"task": task, "vehicle": vehicle, "metrics": summarize(rollout)}
-
-
-def goals(only: tuple[str, ...] = ()) -> None:
-    """Train tasks with PPO and APG with fresh seeds, and count failures of many flights.
-
-    Args:
-        only: Names of tasks, beside what was measured of the others; by default all.
-    """
-    configs = [
-        TrainConfig(task, algo=algo, seed=seed)
-        for (task, algo), seeds in GOALS.items()
-        if not only or task in only
-        for seed in seeds
-    ]
-    found = [trained(run) | counted(run) for run in runs_of("goals", configs, 1, 20)]
-    report.save("goals", report.beside("goals", {"runs": found}, only))
-
-
-def counted(run: PlannedRun) -> Result:
-    """How often the mean action of a finished training fails in free flight, and its errors."""
-    policy, config = Policy.load(run.folder), run.config
-    total, each = MANY.get((config.task, config.algo), FLIGHTS), []
-    for first in range(0, total, FLIGHTS):
-        count, seed = min(FLIGHTS, total - first), EVALUATION_SEED + first
-        rollout = fly(policy, config.task, episodes=count, seed=seed, engine="free_flight")
-        each.append(flights(rollout))
-    reached: Result = {"flights": total, "failed": sum(int((~x["success"]).sum()) for x in each)}
-    for name in ("position_error_m", "heading_error_deg"):
-        if name in each[0]:
-            reached[name] = float(np.concatenate([x[name] for x in each]).mean())
-    say(f"{run.name}: {reached}")
-    return reached
 
 
 def speed() -> None:
@@ -201,26 +159,6 @@ def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
     return rows, seeds
 
 
-def goals_table() -> str:
-    """Each task and algorithm, its seeds beside each other."""
-    result, rows = report.load("goals"), []
-    for task, algo in GOALS:
-        runs = [run for run in result["runs"] if (run["task"], run["algo"]) == (task, algo)]
-        error = (length(run["position_error_m"]) for run in runs)
-        off = (digits(run["heading_error_deg"]) for run in runs if "heading_error_deg" in run)
-        took = [run["training_s"] for run in runs]
-        failed = ", ".join(str(run["failed"]) for run in runs)
-        time = f"{statistics.median(took):.1f} s ({min(took):.1f} to {max(took):.1f})"
-        first = runs[0]
-        cells = (f"{first['seed']} to {runs[-1]['seed']}", f"{first['steps']:,}", time,
-                 f"{failed} of {first['flights']:,}", ", ".join(error), ", ".join(off))  # fmt: skip
-        rows.append((f"`{task}`", algo, *cells))
-    head = ("task", "algorithm", "seeds", "control steps", "training, median and range",
-            "failed flights, seed by seed", "error", "heading error [deg]")  # fmt: skip
-    note = "Errors are means over all flights, also failed ones."
-    return f"{table(head, rows)}\n\n{note} {report.source(result, result['runs'])}"
-
-
 def speed_table() -> str:
     """Every layer."""
     result = report.load("speed")
@@ -229,4 +167,4 @@ def speed_table() -> str:
 
 
 PARTS: report.Parts = {"training-hover": hover_table, "training-suite": suite_table,
-                       "goals": goals_table, "speed": speed_table}  # fmt: skip
+                       "speed": speed_table}  # fmt: skip

@@ -14,7 +14,7 @@ import quadrl
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Target
 from quadrl.evaluation.policy import SHIPPED, Policy
-from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
+from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import write_config
@@ -124,22 +124,6 @@ def test_trainings_are_evaluated_beside_the_controller_and_drawn(short, monkeypa
     assert seeds == [1, 2] and rows[0] == ("successful", "at least 100 %", "0 %", "0 %", "100 %")
     assert measure.hover_table().count("\n| paper |") == 4
     assert (report.IMAGES / "curves" / "hover.png").stat().st_size > 0
-
-
-def test_goals_are_counted_over_batches_of_flights(short, monkeypatch):
-    both = {(task, "ppo"): (1,) for task in ("hover", "random_waypoint")}
-    monkeypatch.setattr(measure, "GOALS", both)
-    monkeypatch.setattr(measure, "FLIGHTS", 2)
-    monkeypatch.setattr(measure, "MANY", {("hover", "ppo"): 5})
-    measure.goals()
-    hover, waypoint = report.load("goals")["runs"]
-    assert (hover["flights"], hover["failed"]) == (5, 5)  # one batch teaches nothing
-    policy = Policy.load(report.RUNS / "goals" / "hover-paper-free_flight-ppo-1")
-    given = {"episodes": 5, "seed": EVALUATION_SEED, "engine": "free_flight"}
-    whole = summarize(fly(policy, "hover", **given))
-    assert hover["position_error_m"] == pytest.approx(whole["position_error_m"], 1e-4)
-    assert "heading_error_deg" in hover and "heading_error_deg" not in waypoint
-    assert "| 5 of 5 |" in measure.goals_table()
 
 
 def test_policies_for_uncertain_aircraft_fly_beside_the_controller(short):
