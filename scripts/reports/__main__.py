@@ -2,7 +2,6 @@
 
 import tyro
 
-from scripts.reports.learning import curves
 from scripts.reports.measure import speed, training
 from scripts.reports.missions import missions
 from scripts.reports.pages import pages
@@ -12,8 +11,7 @@ from scripts.reports.robustness import robust, robustness
 from scripts.reports.shipping import ship
 from scripts.reports.task_pages import shipped
 
-REPORTS = (training, speed, robust, robustness, missions, race, curves, ship, shipped, pictures,
-           pages)  # fmt: skip
+REPORTS = (training, speed, robust, robustness, missions, race, ship, shipped, pictures, pages)
 
 if __name__ == "__main__":
     commands = {each.__name__: each for each in REPORTS}

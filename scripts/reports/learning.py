@@ -1,23 +1,17 @@
-"""Where learning wins: curves of several algorithms, and policies beside the tuned controller."""
+"""Where learning wins: policies beside the tuned controller."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
 from quadrl.base.units import quantity
-from quadrl.evaluation.plotting import learning_curves, save
 from scripts.reports import report
 from scripts.reports.robustness import UNSURE
 
 RATE, ERROR = "success_rate", "position_error_m"
-CLOCKS, LEVELS = ("steps", "processor"), ("success", "error")
-CURVE = {"steps": "steps", "processor": "seconds", "success": RATE, "error": ERROR}
 ALONE = ("weather light", "weather moderate", "command_delay as in `full`", "lag as in `full`",
          "randomization full", "all together")  # fmt: skip
 WORDS = {RATE: "successful", ERROR: "error, median", "settled_m": "distance, mean",
@@ -28,25 +22,6 @@ GAINS = {
     "missions": "for the row",
     "race": "usual",
 }
-
-
-def curves(file: Annotated[Path, tyro.conf.Positional]) -> None:
-    """Keep and draw learning curves.
-
-    Args:
-        file: What docs/examples/learning_curve.py printed for each training, a line each.
-    """
-    rows, groups = [], {}
-    for told in map(json.loads, file.read_text().splitlines()):
-        columns = {name: [point[key] for point in told["curve"]] for name, key in CURVE.items()}
-        rows.append({"task": told["task"], "algo": told["algo"], "seed": told["seed"]} | columns)
-        algorithms = groups.setdefault(told["task"], {})
-        algorithms.setdefault(told["algo"], []).append({k: np.array(x) for k, x in columns.items()})
-    report.save("curves", {"rows": rows})
-    for task, runs in groups.items():
-        own, *_ = runs.pop("geometric")
-        figure = learning_curves(runs, task, CLOCKS, LEVELS, {n: own[n][0] for n in LEVELS})
-        save(figure, report.IMAGES / "curves" / f"{task}_compared.png")
 
 
 def compared() -> Iterator[tuple[str, str, int, str, dict[str, Any]]]:
