@@ -22,15 +22,18 @@ from quadrl.base.philox import SOLIDS, Seed
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
 from quadrl.conditions.observing import Observing
+from quadrl.conditions.randomization import NONE
+from quadrl.conditions.randomizer import Randomizer
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.scene import Scene
 from quadrl.conditions.weather import WeatherProcess
 from quadrl.control import modes
 from quadrl.control.autopilot import Autopilot
 from quadrl.control.trim import trimmed
-from quadrl.core import compiled, observer, saving, transition
+from quadrl.core import compiled, saving, transition
 from quadrl.core.markers import Marker
 from quadrl.core.observation import layout
+from quadrl.core.observer import Observer
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.step import Inputs, Step
 from quadrl.core.task import Snapshot, Task
@@ -104,8 +107,14 @@ class Environment(saving.Copied):
         self._parameters, seen = (Parameters.of(k, timestep) for k in (self._rows, nominal))
         self.term_names = transition.check_task(self.task, seen, self.action_size, self.origin[2])
         """Names of the reward's terms, in their order."""
-        given = sampler, self.observing, self.task, engine, self.action_size
-        self.randomizer, self.observer, terms = observer.make(*given)
+        senses = self.observing != Observing() or bool(self.task.sensors)
+        active = senses or self.randomization != NONE
+        self.randomizer = Randomizer(sampler, engine, active=active)
+        self.observer: Observer | None = None  # the task then observes the true state
+        if senses or self.randomization.uncertain:
+            given = self.observing, self.task, engine, self.action_size, self.randomizer
+            self.observer = Observer(*given)
+        terms = self.observer.terms if self.observer else self.task.observation
         self.layout = layout(terms, self.vehicle.rotor_count)
         """Where each named term of the observation stands in the flat vector."""
         self.size = max(part.stop for part in self.layout.values())

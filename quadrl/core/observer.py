@@ -12,9 +12,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 from quadrl.conditions.observing import Observing
-from quadrl.conditions.randomization import NONE
 from quadrl.conditions.randomizer import Randomizer
-from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.sensor import Channel, EstimatedState, Moment, Sizes
 from quadrl.core.observation import ObservationTerm, layout
 from quadrl.core.snapshot import Snapshot
@@ -22,25 +20,6 @@ from quadrl.core.task import Task
 from quadrl.core.transition import Transition, observe
 from quadrl.engines.engine import Engine
 from quadrl.engines.state import State
-
-
-def make(
-    sampler: AircraftSampler, options: Observing, task: Task, engine: Engine, actions: int
-) -> tuple[Randomizer, Observer | None, Mapping[str, ObservationTerm]]:
-    """Make the randomizer, the observer and the entries of the observation.
-
-    Args:
-        sampler: Samples what is drawn.
-        options: Options of the observation.
-        task: The task.
-        engine: Flies the aircraft.
-        actions: Numbers in an action.
-    """
-    given, observes = sampler.randomization, options != Observing() or bool(task.sensors)
-    randomizer = Randomizer(sampler, engine, active=observes or given != NONE)
-    observes |= given.uncertain
-    observer = Observer(options, task, engine, actions, randomizer) if observes else None
-    return randomizer, observer, observer.terms if observer else task.observation
 
 
 class Observer:
