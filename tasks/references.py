@@ -31,12 +31,18 @@ FILE = "a csv file: a line of names, then at least 4 rows of time [s], x, y, z [
 
 
 @dataclasses.dataclass(frozen=True)
-class Reference(TaskState):
-    """The reference of an episode; `goal` is the middle of its figure."""
+class Sines(TaskState):
+    """A sum of sines in each coordinate."""
 
     amplitude: Array  # (N, AXES * WAVES) [m]
     frequency: Array  # (N, AXES * WAVES) [rad/s]
     phase: Array  # (N, AXES * WAVES) [rad]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference(Sines):
+    """The reference of an episode; `goal` is the middle of its figure."""
+
     track: Array  # (N,), which curve of the table
 
 
@@ -87,8 +93,7 @@ class Table:
                 size = size * reference.frequency
             waves = size * (xp.cos(angle) if order % 2 else xp.sin(angle))
             waves = -waves if order > 1 else waves
-            axes = range(0, AXES * WAVES, WAVES)
-            value = stack(*(waves[..., k] + waves[..., k + 1] for k in axes))
+            value = by_axis(waves)
             return value if order else reference.goal + value
         step = xp.floor(time / PIECE)
         step = xp.where(step < last, step, 0 * step + last)
@@ -108,6 +113,11 @@ class Table:
         piece, since = look_up(self.turns, step), time - PIECE * step
         first, second, third, fourth = (piece[..., k] for k in range(4))
         return first + since * (second + since * (third + since * fourth))
+
+
+def by_axis(waves: Array) -> Array:
+    """Sum the sines of each axis: (N, AXES * WAVES) to (N, AXES)."""
+    return stack(*(waves[..., k] + waves[..., k + 1] for k in range(0, AXES * WAVES, WAVES)))
 
 
 def sines(figure: str, period: float, zero: Array) -> tuple[Array, Array, Array]:

@@ -10,33 +10,23 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import Array, namespace, norm, stack
+from quadrl.base.rotation import Array, namespace, norm
 from quadrl.base.validation import number
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_MOTION, TARGET_VELOCITY
-from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
+from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task
 from quadrl.engines.rng import FULL_TURN, Rng
 from quadrl.engines.state import Start
+from quadrl.tasks.references import AXES, WAVES, Sines, by_axis
 
 if TYPE_CHECKING:
     from quadrl.control.reading import Reading
     from quadrl.core.snapshot import Rollout
 
-WAVES = 2  # sines in each coordinate of the target's path
-AXES = 3
 SLOWEST = 1e-6  # [rad/s]; the slower, the longer the waves, and the fewer digits are left
 PATH: tuple[float, float, float, float] = (0.95, 0.55, 0.20, 0.35)
-
-
-@dataclasses.dataclass(frozen=True)
-class Path(TaskState):
-    """The target's path: in each coordinate a sum of sines, from the origin of the frame."""
-
-    amplitude: Array  # (N, AXES * WAVES) [m]
-    frequency: Array  # (N, AXES * WAVES) [rad/s]
-    phase: Array  # (N, AXES * WAVES) [rad]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +87,7 @@ class TargetFollowing(Task):
         if self.sees_motion:
             object.__setattr__(self, "observation", self.observation | TARGET_MOTION)
 
-    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Path]:
+    def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Sines]:
         """At rest, beside the target, level, any heading."""
         side = rng.level_direction()
         frequency = rng.uniform(self.slowest, self.fastest, AXES * WAVES)
@@ -113,7 +103,7 @@ class TargetFollowing(Task):
         start = rng.level_start(self.keep * side, parameters)
         phase = rng.uniform(0.0, FULL_TURN, AXES * WAVES)
         goal = xp.zeros_like(side)
-        return start, Path(goal=goal, amplitude=amplitude, frequency=frequency, phase=phase)
+        return start, Sines(goal=goal, amplitude=amplitude, frequency=frequency, phase=phase)
 
     def goal(self, now: Snapshot) -> Array:
         """The target itself."""
@@ -123,7 +113,7 @@ class TargetFollowing(Task):
         """The velocity of the target."""
         path = now.task
         angle = path.frequency * now.time[..., None] + path.phase
-        return _by_axis(path.amplitude * path.frequency * namespace(angle).cos(angle))
+        return by_axis(path.amplitude * path.frequency * namespace(angle).cos(angle))
 
     def target_motion(self, now: Snapshot) -> tuple[Array, Array] | None:
         """The acceleration and the jerk of the target, where they are observed."""
@@ -133,7 +123,7 @@ class TargetFollowing(Task):
         angle = path.frequency * now.time[..., None] + path.phase
         acceleration = -path.amplitude * path.frequency**2
         waves = acceleration * xp.sin(angle), acceleration * path.frequency * xp.cos(angle)
-        return _by_axis(waves[0]), _by_axis(waves[1])
+        return by_axis(waves[0]), by_axis(waves[1])
 
     def measure(self, now: Snapshot) -> Potentials:
         """The distance left is that to the sphere around the target."""
@@ -176,13 +166,8 @@ class TargetFollowing(Task):
         return {"distance_rms_m": float(np.sqrt(np.nanmean(rollout.error**2)))}
 
 
-def _position(path: Path, time: Array) -> Array:
-    """Where the target is at times (N,) [s], (N, 3) [m], task frame."""
+def _position(path: Sines, time: Array) -> Array:
+    """Where the target is at times (N,) [s], (N, 3) [m], task frame; at first in its origin."""
     xp = namespace(path.phase)
     angle = path.frequency * time[..., None] + path.phase
-    return _by_axis(path.amplitude * (xp.sin(angle) - xp.sin(path.phase)))
-
-
-def _by_axis(waves: Array) -> Array:
-    """Sum the sines of each axis: (N, AXES * WAVES) to (N, AXES)."""
-    return stack(*(waves[..., k] + waves[..., k + 1] for k in range(0, AXES * WAVES, WAVES)))
+    return by_axis(path.amplitude * (xp.sin(angle) - xp.sin(path.phase)))

@@ -17,7 +17,7 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, dot, namespace, stack
+from quadrl.base.rotation import Array, cross, dot, namespace
 from quadrl.base.validation import MAX_OPTION, choice, number, numbers
 
 RUN_IN = 5.0
@@ -178,11 +178,7 @@ def crossing(
         two mean nothing where it does not cross it.
     """
     xp = namespace(position)
-    up = stack(
-        through[..., 1] * left[..., 2] - through[..., 2] * left[..., 1],
-        through[..., 2] * left[..., 0] - through[..., 0] * left[..., 2],
-        through[..., 0] * left[..., 1] - through[..., 1] * left[..., 0],
-    )
+    up = cross(through, left)
     was, now = dot(last - centre, through), dot(position - centre, through)
     forwards, backwards = (was < 0) & (now >= 0), (was >= 0) & (now < 0)
     way = xp.where(forwards | backwards, now - was, xp.ones_like(was))
