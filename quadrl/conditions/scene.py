@@ -15,7 +15,7 @@ from typing import Any, cast
 import mujoco
 import numpy as np
 
-from quadrl.aircraft.parameters import FEET, HELD, MARK
+from quadrl.aircraft.parameters import HELD, MARK
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, cross
@@ -149,22 +149,10 @@ class Scene:
         """The surroundings of aircraft (n,) far from everything, before there is an engine."""
         position = np.tile([solid.position for solid in self.solids], (count, 1, 1))
         touched = np.zeros((count, len(self.solids)), dtype=bool)
-        far = np.full(count, FAR)
-        feet = np.zeros((count, FEET))
-        return self._around(position + 0.0, far, touched, 0.0 * far, feet)
-
-    def _around(
-        self,
-        position: np.ndarray,
-        clearance: np.ndarray,
-        touched: np.ndarray,
-        touch_speed: np.ndarray,
-        feet: np.ndarray,
-    ) -> Surroundings:
-        """The surroundings from arrays of their fields, and the rows (n, FEET) of a touch."""
-        measured = position, clearance, touched, touch_speed
-        landed, held = feet[:, 0] > 0, feet[:, HELD] > 0
-        return Surroundings(self.names, *measured, landed, feet[:, 1:HELD], held)
+        far, never = np.full(count, FAR), np.zeros(count, dtype=bool)
+        touch = np.zeros((count, HELD - 1))
+        measured = position + 0.0, far, touched, 0.0 * far, never, touch, never
+        return Surroundings(self.names, *measured)
 
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
         """The solids as pictures show them, where they stand in the world of a row."""
@@ -192,7 +180,9 @@ class Scene:
         clear, centres = engine.clearance(rows), engine.solids.centres[chosen]
         centres = centres.copy() if engine.solids.moves else centres
         feet = engine.feet[chosen].copy()
-        return self._around(centres, clear, touched, speed.copy(), feet)
+        landed, held = feet[:, 0] > 0, feet[:, HELD] > 0
+        measured = centres, clear, touched, speed.copy(), landed, feet[:, 1:HELD], held
+        return Surroundings(self.names, *measured)
 
 
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
