@@ -19,7 +19,7 @@ from quadrl import tasks
 from quadrl.base.progress import Progress
 from quadrl.core.scenario import Scenario
 from quadrl.evaluation.policy import SHIPPED, Policy
-from quadrl.evaluation.rollout import EVALUATION_SEED, fly
+from quadrl.evaluation.rollout import fly
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training
 from quadrl.rendering import render_trajectory
@@ -32,10 +32,8 @@ OPTIONS: dict[str, dict[str, float]] = {  # of the task as it is shown: a wall, 
     "perching": {"least_incline": math.pi / 2},
     "deck_landing": {"lowest_waves": 1.25, "highest_waves": 2.5},
 }
-FASTEST, RACED = (
-    ("deck_landing", "lsy_race", "perching", "race"),
-    300,
-)  # the fastest of so many flights is shown
+FASTEST = ("deck_landing", "lsy_race", "perching", "race")
+RACED = 300  # flights of those, the fastest of which is shown
 # The training: four policies fly the same start.
 SEED, SHARES = 225, (0.0, 0.12, 0.3, 1.0)  # of the training
 RELEASED = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
@@ -68,13 +66,6 @@ def save(frames: Iterable[Image.Image], file: Path) -> None:
     first.save(file, loop=0, quality=QUALITY, method=6, **moving)
 
 
-def flown(flyer: Any, scenario: Scenario, seed: int = EVALUATION_SEED) -> tuple[Any, Any, bool]:
-    """A flight, the model of what is drawn of it, and whether it ended early."""
-    rollout = fly(flyer, scenario, episodes=1, seed=seed)
-    flight = rollout.trajectory(scenario.aircraft)
-    return flight, scenario.compile_model(), bool(rollout.terminated[0])
-
-
 def learning() -> Iterator[Image.Image]:
     """Frames of four policies of one training of hover, from the same start, side by side."""
     config = TrainConfig("hover", seed=SEED)
@@ -102,10 +93,13 @@ def learning() -> Iterator[Image.Image]:
 
 def panel(policy: Policy, name: str) -> list[np.ndarray]:
     """A flight of a policy until its end, with a name in the corner."""
-    flight, model, early = flown(policy, Scenario.of("hover", **RELEASED), 5)
+    scenario = Scenario.of("hover", **RELEASED)
+    rollout = fly(policy, scenario, episodes=1, seed=5)
+    flight, model = rollout.trajectory(scenario.aircraft), scenario.compile_model()
     width, height = PANEL
     drawn = render_trajectory(flight, model, fps=FPS, width=width, height=height, overlay=False)
     frames = [np.asarray(named(Image.fromarray(frame), name)) for frame in drawn]
+    early = rollout.terminated[0]
     return [*frames, (frames[-1] * 0.45).astype(np.uint8)] if early else frames
 
 
