@@ -196,7 +196,11 @@ class Environment(saving.Copied):
             height = begun.position[:, 2] + self.origin[2]
             mean = self.blowing.mean_wind(*place, height, wind_speed)
             begun = trimmed(self.vehicle, begun, mean)
-        state = self.engine.place(rows, begun, table, self._placed(place, begun, task_state))
+        poses = None  # of the solids, where there are any
+        if self.scene.solids:
+            placed = self.task.place(Rng(*place, SOLIDS), begun, task_state)
+            poses = self.scene.poses(placed, len(rows), self.origin)
+        state = self.engine.place(rows, begun, table, poses)
         self.seeds = seeds
         self.randomizer.begin(rows, *place, drawn)
         if self.blowing:
@@ -221,15 +225,6 @@ class Environment(saving.Copied):
         if "position" in given and (start.position[:, 2] < lowest).any():
             allowed = f"above the ground, at z of at least {lowest:g}"
             raise QuadrlError(name="position", value=given["position"], allowed=allowed)
-
-    def _placed(
-        self, place: tuple[Array, Array], start: Start, task_state: Any
-    ) -> np.ndarray | None:
-        """Poses (n, K, 7) of the geoms of solids in episodes; None where there are none."""
-        if not self.scene.solids:
-            return None
-        placed = self.task.place(Rng(*place, SOLIDS), start, task_state)
-        return self.scene.poses(placed, len(place[0]), self.origin)
 
     @property
     def snapshot(self) -> Snapshot:
