@@ -78,6 +78,8 @@ class Landing(Task):
         "robust": {
             "gamma": 0.97,
             "initial_deviation": 0.4,
+            # Else it turns without end on aircraft whose rotors have no inertia to turn against.
+            "randomization": {"rotor_inertia": (0.01, 1.2)},
             "task_options": {"progress_weight": 200.0, "attitude_weight": 60.0},
             "training_options": {"attitude_weight": 60.0},
         }

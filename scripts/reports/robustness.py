@@ -107,19 +107,24 @@ def flown(flyer: Any, task: str, condition: Conditions, episodes: int) -> Result
     return {"success": float(each["success"].mean()), **middle}
 
 
-def robust(only: tuple[str, ...] = (), seeds: int = 5, episodes: int = 1000, jobs: int = 2) -> None:
+def robust(
+    only: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = tuple(SEEDS),
+    episodes: int = 1000,
+    jobs: int = 2,
+) -> None:
     """Train policies for uncertain aircraft in wind, and fly them beside the tuned controller.
 
     Args:
         only: Names of tasks, beside what was measured of the others; by default all.
-        seeds: How many of the seeds.
+        seeds: Of the trainings.
         episodes: Flights of each seed in each condition.
         jobs: Trainings at the same time.
     """
     rows = []
     for task in only or (*AIRBORNE, "landing"):
-        configs = [TrainConfig(task, variant="robust", seed=seed, num_threads=1) for seed in SEEDS]
-        runs = runs_of("robust", configs[:seeds], jobs, 100)
+        configs = [TrainConfig(task, variant="robust", seed=seed, num_threads=1) for seed in seeds]
+        runs = runs_of("robust", configs, jobs, 100)
         flyers: dict[int, Any] = {run.config.seed: Policy.load(run.folder) for run in runs}
         for seed in (*flyers, "controller"):
             for name, condition in UNSURE.items():
