@@ -9,9 +9,10 @@ import math
 
 from quadrl.base.philox import MASK, TURBULENCE, philox
 from quadrl.base.rotation import Array, namespace, stack
-from quadrl.engines.air import BLOCKS, LOG_TERMS, LOWEST, NOISE, SINE_TERMS, UNIT, WALK
+from quadrl.engines.air import BLOCKS, LOG_TERMS, LOWEST, NOISE, SINE_TERMS, WALK
 from quadrl.engines.dynamics import clip
 
+UNIT = math.sqrt(3.0) / 65536.0  # of the sum of four uniform numbers, for a variance of 1
 Columns = dict[str, Array]
 """The rows of a table by name, (n,) each."""
 

@@ -41,7 +41,6 @@ ROWS = (*FIXED, *DRAWN, "steps", *FILTERS)
 """Of the table of a process, a column for each aircraft; `steps` counts the control steps."""
 BLOCKS = 3 + MAX_ROTORS // 2
 """Of four random words, for a step: five numbers of the turbulence, and one for each rotor."""
-UNIT = math.sqrt(3.0) / 65536.0
 LOG_TERMS, SINE_TERMS = 11, 11
 """Of the series, for an error of some 1e-16."""
 

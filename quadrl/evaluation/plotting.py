@@ -44,11 +44,10 @@ PANELS = {
 CLOCKS = {
     "steps": ("control steps [thousands]", 1e-3),
     "seconds": ("wall clock of the training [s]", 1.0),
-    "processor": ("processor time of the training, one core [s]", 1.0),
 }
 """What learning curves are drawn over: column of metrics.csv, label and factor."""
 CURVE_POINTS = 200
-OVER_RUNS = {"return": "return of an episode", "success": "success [share]", "error": "error [m]"}
+OVER_RUNS = {"return": "return of an episode", "success": "success [share]"}
 """What learning curves of several runs show: column and label."""
 PLACE, MOTION = (
     ("x east [m]", "y north [m]", "z up [m]"),
@@ -140,8 +139,6 @@ def learning_curves(
     groups: Mapping[str, Sequence[Metrics]],
     title: str,
     clocks: Sequence[str] = ("steps", "seconds"),
-    panels: Sequence[str] = ("return", "success"),
-    controller: Mapping[str, float] | None = None,
 ) -> Figure:
     """Several trainings in one figure; figures 3 to 5 of the paper.
 
@@ -151,39 +148,31 @@ def learning_curves(
         groups: The metrics of the runs of each algorithm.
         title: Title of the figure.
         clocks: Names of CLOCKS, a row each.
-        panels: Names of OVER_RUNS, a column each.
-        controller: What a controller reaches, by panel. Given that, clocks and errors are
-            logarithmic, since what learns beside it may differ by factors.
 
     Raises:
         QuadrlError: No episode has ended in any of the runs.
     """
-    scale = "linear" if controller is None else "log"
     figure = Figure(figsize=(9.2, 0.6 + 2.6 * len(clocks)), layout="constrained")
-    axes: Any = figure.subplots(len(clocks), len(panels), squeeze=False)
+    axes: Any = figure.subplots(len(clocks), len(OVER_RUNS), squeeze=False)
     spare = itertools.cycle(c for c in COLOURS if c not in ALGORITHM_COLOURS.values())
     for algo, runs in groups.items():
         colour = ALGORITHM_COLOURS.get(algo) or next(spare)
         label = f"{algo.upper()}, {len(runs)} seed{'s' * (len(runs) > 1)}"
-        for (clock, panel), axis in zip(itertools.product(clocks, panels), axes.flat, strict=True):
+        for (clock, panel), axis in zip(
+            itertools.product(clocks, OVER_RUNS), axes.flat, strict=True
+        ):
             axis.set(xlabel=CLOCKS[clock][0], ylabel=OVER_RUNS[panel])
-            if (band := spread(runs, panel, clock, scale)) is None:
+            if (band := spread(runs, panel, clock)) is None:
                 continue
             x, (low, median, high) = band[0] * CLOCKS[clock][1], band[1]
             axis.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
             axis.plot(x, median, color=colour, lw=1.8, label=label)
-    for panel, column in zip(panels, axes.T, strict=True):
+    for panel, column in zip(OVER_RUNS, axes.T, strict=True):
         for axis in column:
             tidy(axis)
-            axis.set_xscale(scale)
-            if controller is None:
-                axis.set_xlim(left=0)
-            else:
-                axis.axhline(controller[panel], color=BLACK, lw=1.2, ls="--", label="controller")
+            axis.set_xlim(left=0)
             if panel == "success":
                 axis.set_ylim(-0.03, 1.03)
-            elif panel == "error":
-                axis.set_yscale(scale)
     if not axes[0, 0].lines:
         raise QuadrlError(f"nothing to plot yet for {title}: no episode has ended")
     axes[0, 0].legend(frameon=False, loc="best")
@@ -191,13 +180,11 @@ def learning_curves(
     return figure
 
 
-def spread(
-    runs: Sequence[Metrics], name: str, clock: str, scale: str = "linear"
-) -> tuple[np.ndarray, np.ndarray] | None:
+def spread(runs: Sequence[Metrics], name: str, clock: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Worst, median and best (3, n) of a column over runs, and where (n,); None without any.
 
-    The points lie where every run has been, evenly on a linear or a log scale; between the batches
-    in which episodes ended a run is interpolated.
+    The points lie evenly where every run has been; between the batches in which episodes ended a
+    run is interpolated.
     """
     curves = []
     for run in runs:
@@ -209,8 +196,7 @@ def spread(
     low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
     if high < low:  # one was stopped before another's first episode ended
         return None
-    evenly = np.linspace if scale == "linear" else np.geomspace
-    points = evenly(low, high, CURVE_POINTS)
+    points = np.linspace(low, high, CURVE_POINTS)
     values = np.array([np.interp(points, x, y) for x, y in curves])
     return points, np.quantile(values, (0.0, 0.5, 1.0), axis=0)
 

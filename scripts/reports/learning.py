@@ -22,6 +22,7 @@ GAINS = {
     "missions": "for the row",
     "race": "usual",
 }
+FINISHED = {"race": " at 6fa4e93"}  # where the program of a finished report is
 
 
 def compared() -> Iterator[tuple[str, str, int, str, dict[str, Any]]]:
@@ -74,8 +75,8 @@ def wins_table() -> str:
         told = (", ".join(quantity(metric, side[k]) for side in sides.values()) for k in (0, 1))
         who = [f"{who}: {', '.join(each)}" for who, each in groups.items() if each]
         first = f"{name} ({', '.join(sides)})" if len(sides) == 1 else name
-        given = (GAINS[source], "; ".join(who), f"`scripts/report {source}`")
-        rows.append((first, WORDS[metric], *told, *given))
+        command = f"`scripts/report {source}`" + FINISHED.get(source, "")
+        rows.append((first, WORDS[metric], *told, GAINS[source], "; ".join(who), command))
     head = ("flown in", "figure", "policy", "controller", "its gains", "ahead", "measured by")
     return report.table(head, rows)
 
