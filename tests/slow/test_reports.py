@@ -274,5 +274,5 @@ def test_who_is_ahead_is_said_where_it_is_no_chance():
     race = "| one lap (race) | successful | 80 % | 100 % | usual | controller: race |"
     given = "distance, mean | 1.5 cm | 3.0 cm | for the row | policy: trajectory"
     eight = f"| eight (trajectory) | {given} |"
-    rows = {hover: "robust", race: "race", eight: "missions"}
-    assert {f"{row} `scripts/report {name}` |" for row, name in rows.items()} < set(lines)
+    rows = {hover: "robust` |", race: "race` at 6fa4e93 |", eight: "missions` |"}
+    assert {f"{row} `scripts/report {rest}" for row, rest in rows.items()} < set(lines)
