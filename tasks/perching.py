@@ -212,8 +212,8 @@ class Perching(Task):
     def measure(self, now: Snapshot) -> Potentials:
         """The attitude error is the chord from the body's z axis to the normal, at most 2.
 
-        It and the speeds count where the surface is near: who turns to a wall from afar falls, and
-        who is slow never gets there with its feet ahead.
+        It and the speeds count where the surface is near: an aircraft that turns to a wall from
+        afar falls, and a slow one never gets there with its feet ahead.
         """
         usual, chord = super().measure(now), norm(now.state.rotation[..., :, 2] - now.task.normal)
         near = 1 / (1 + (usual.distance / NEAR) * (usual.distance / NEAR))
@@ -283,7 +283,7 @@ class Perching(Task):
         return now.touched[..., 0] & ~now.held
 
     def _shares(self, now: Snapshot) -> list[Array]:
-        """How the touch was, as shares of what is allowed: each is 1 at its limit, (N,)."""
+        """Rate the touch as shares of what is allowed: each is 1 at its limit, (N,)."""
         into, along, cosine, rate = (now.touch[..., k] for k in range(4))
         middle, half = (
             (self.most_touch + self.least_touch) / 2,

@@ -14,13 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from rich.console import Console
-from tyro.conf import (
-    CascadeSubcommandArgs,
-    Positional,
-    UseAppendAction,
-    arg,
-    subcommand,
-)
+from tyro.conf import CascadeSubcommandArgs, Positional, UseAppendAction, arg
 
 from quadrl import __version__
 from quadrl.base.errors import QuadrlError, QuadrlWarning
@@ -57,21 +51,20 @@ class Completion:
 
 
 Command = (
-    Annotated[Tasks, subcommand("tasks")]
-    | Annotated[Train, subcommand("train")]
-    | Annotated[Study, subcommand("study")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Robustness, subcommand("robustness")]
-    | Annotated[Render, subcommand("render")]
-    | Annotated[View, subcommand("view")]
-    | Annotated[Plot, subcommand("plot")]
-    | Annotated[Check, subcommand("check")]
-    | Annotated[Export, subcommand("export")]
-    | Annotated[Benchmark, subcommand("benchmark")]
-    | Annotated[Completion, subcommand("completion")]
+    Tasks
+    | Train
+    | Study
+    | Evaluate
+    | Robustness
+    | Render
+    | View
+    | Plot
+    | Check
+    | Export
+    | Benchmark
+    | Completion
 )
-
-COMMANDS = tuple(kind.__metadata__[0].name for kind in typing.get_args(Command))
+COMMANDS = {kind.__name__.lower(): kind for kind in typing.get_args(Command)}
 
 
 @choices.command

@@ -27,8 +27,6 @@ from scripts.reports.report import Parts, table
 
 FIRST_SOURCE = "gym-aero"
 """What the docstrings of a Vehicle name in brackets, for the numbers of the paper's aircraft."""
-COMMANDS = {each.__metadata__[0].name: typing.get_args(each)[0]
-            for each in typing.get_args(cli.Command)}  # fmt: skip
 
 
 def shown(value: Any) -> str:
@@ -133,7 +131,7 @@ def written_sources(name: str) -> dict[str, str]:
 
 def command(name: str) -> str:
     """What a command does, and its options."""
-    kind, rows, meanings = COMMANDS[name], [], docstrings(COMMANDS[name])
+    kind, rows, meanings = cli.COMMANDS[name], [], docstrings(cli.COMMANDS[name])
     for field in dataclasses.fields(kind):
         if not (meaning := meanings.get(field.name)):
             continue
@@ -212,7 +210,7 @@ PARTS: Parts = {
     "reward": lambda: every_task(reward_rows, *REWARD),
     "vehicles": vehicles,
     **{f"aircraft-{name}": functools.partial(aircraft, name) for name in VEHICLES},
-    **{f"command-{name}": functools.partial(command, name) for name in COMMANDS},
+    **{f"command-{name}": functools.partial(command, name) for name in cli.COMMANDS},
     **{f"fields-{name}": functools.partial(fields, kind) for name, kind in RECORDS.items()},
     "conditions": conditions,
     "randomization": randomization,
