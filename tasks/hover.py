@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
@@ -21,6 +22,13 @@ from quadrl.core.task import (
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
+IN_GUSTS: dict[str, Any] = {
+    "hidden": (256,),
+    "steps": 24_576_000,
+    "task_options": {"spin_weight": 5.0},
+}
+"""Settings of the variant `robust` where a place is kept, which gusts move the aircraft from: what
+it takes to answer them quickly enough, and no more than commands that are late allow."""
 # An uncertain aircraft in wind is far from the goal and in motion anyway.
 AS_ASKED = {"tilt": 0.2, "spin": 0.3, "radius": 0.5, "speed": 0.3, "attitude_weight": 75.0}
 
@@ -80,7 +88,7 @@ class Hover(Task):
             "apg": {"step": 0.4},
         },
     }
-    variants = {"robust": {"training_options": AS_ASKED}}
+    variants = {"robust": {"training_options": AS_ASKED, **IN_GUSTS}}
     heading_matters = True
 
     radius: float = 0.5

@@ -211,7 +211,8 @@ def test_a_run_with_an_old_name_of_a_setting_goes_on(tmp_path):
 def test_a_variant_is_settings_that_go_together():
     config, usual = TrainConfig("hover", variant="robust"), TrainConfig("hover")
     assert (config.weather, usual.weather) == ("light", "calm")
-    assert config.steps == VARIANTS["robust"]["steps"] > usual.steps
+    following = TrainConfig("target_following", variant="robust")
+    assert config.steps > following.steps == VARIANTS["robust"]["steps"] > usual.steps
     landing, small = TrainConfig("landing", variant="robust"), "crazyflie_brushless"
     weights = VARIANTS["robust"]["task_options"] | {"progress_weight": 200.0}
     assert landing.task_options == weights | {"attitude_weight": 60.0}

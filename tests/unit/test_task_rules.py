@@ -12,6 +12,7 @@ from quadrl.aircraft.parameters import Parameters, rows
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.core import transition
+from quadrl.core.environment import Environment
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start, State
 from quadrl.evaluation import rollout
@@ -185,6 +186,13 @@ def test_flights_to_random_waypoints_may_begin_in_motion(tilt, speed, spin):
     moving = (np.linalg.norm(part, axis=-1) for part in (start.velocity, start.body_rate))
     for found, largest in zip((leaning, *moving), (tilt, speed, spin), strict=True):
         assert 0.98 * largest <= found.max() <= largest + 1e-12
+
+
+@pytest.mark.parametrize(("asked", "error"), [(False, 0.0), (True, np.sin(1) + 1 - np.cos(1))])
+def test_a_random_waypoint_is_flown_to_with_any_heading_unless_east_is_asked(asked, error):
+    environment = Environment(tasks.make("random_waypoint", faces_east=asked))
+    environment.reset(start={"quaternion": (np.cos(0.5), 0, 0, np.sin(0.5))})  # 1 rad
+    assert environment.snapshot.potentials.attitude[0] == pytest.approx(error)
 
 
 def test_a_route_is_flown_in_order():
