@@ -25,7 +25,7 @@ from quadrl.engines.state import Start
 IN_GUSTS: dict[str, Any] = {
     "hidden": (256,),
     "steps": 24_576_000,
-    "task_options": {"spin_weight": 5.0},
+    "task_options": {"spin_weight": 7.0},
 }
 """Settings of the variant `robust` where a place is kept, which gusts move the aircraft from: what
 it takes to answer them quickly enough, and no more than commands that are late allow."""

@@ -26,7 +26,6 @@ from quadrl.core.task import (
 )
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.hover import IN_GUSTS
 
 WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
 
@@ -61,7 +60,6 @@ class StaticWaypoint(Task):
     )
     training = {"gamma": 0.9, "holds_goal": True, "ppo": {"learning_rate": 8e-3}}
     training_with = {"apg": {"steps": 153_600, "holds_goal": False}}
-    variants = {"robust": IN_GUSTS}
     heading_matters = True
 
     waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)
