@@ -27,8 +27,9 @@ IN_GUSTS: dict[str, Any] = {
     "steps": 24_576_000,
     "task_options": {"spin_weight": 7.0},
 }
-"""Settings of the variant `robust` where a place is kept, which gusts move the aircraft from: what
-it takes to answer them quickly enough, and no more than commands that are late allow."""
+"""Settings of the variant `robust` of this task and of random_waypoint, whose place gusts move the
+aircraft from: enough neurons and steps to learn how to answer them. static_waypoint gains nothing
+by these: docs/robustness.md."""
 # An uncertain aircraft in wind is far from the goal and in motion anyway.
 AS_ASKED = {"tilt": 0.2, "spin": 0.3, "radius": 0.5, "speed": 0.3, "attitude_weight": 75.0}
 
