@@ -34,12 +34,3 @@ def cheap_pictures():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mjcf, "compile_model", cheaper)
         yield
-
-
-@pytest.fixture(scope="module")
-def cheap_figures():
-    """Whatever is plotted has few pixels and panels that overlap, and takes half of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("quadrl.evaluation.plotting.DPI", 40)
-        patch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: None)
-        yield

@@ -38,7 +38,6 @@ FILES = {
     "learning_curve.png",
     "trajectory.png",
 }
-pytestmark = pytest.mark.usefixtures("cheap_pictures", "cheap_figures")
 METRICS = {"success_rate", "survival_rate", "position_error_m", "return_mean", "return_std"}
 
 
@@ -58,7 +57,7 @@ def command(*arguments: object) -> int:
 
 
 @pytest.fixture(scope="module")
-def run(cheap_pictures, cheap_figures, tmp_path_factory):
+def run(cheap_pictures, tmp_path_factory):
     """A run with everything in it; not to be written to."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     assert command("train", "hover", *TINY, "--out", folder) == 0

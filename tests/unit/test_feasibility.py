@@ -32,7 +32,6 @@ from quadrl.evaluation.robustness import DISTURBANCES
 from quadrl.evaluation.rollout import BEHAVIOUR
 from quadrl.learning.defaults import VARIANTS
 
-pytestmark = pytest.mark.usefixtures("cheap_figures")
 PAPER = Vehicle()
 # Action 1 commands 225.68 + 35 = 260.68 rad/s, which carry (260.68 / 225.68)^2 times the weight;
 # action -1 commands 190.68 rad/s.
