@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -14,6 +13,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import (
     Array,
+    cross,
     dot,
     namespace,
     norm,
@@ -28,10 +28,12 @@ from quadrl.core.task import EpisodeEnd, Snapshot, Target
 from quadrl.engines.rng import FULL_TURN, Rng, hovering
 from quadrl.engines.state import Start
 from quadrl.tasks.gates import Course, GateRace
-from quadrl.tasks.tracks import POLE, Track, known
+from quadrl.tasks.tracks import POLE, Track, attitude, known
 
 NEAR = 0.7  # [m], from how far on it is seen where a gate or a pole truly stands
-ASIDE, ABOVE, TURNED = 0.15, 0.1, 0.2  # [m], [m], [rad], by how much they may be elsewhere
+ASIDE = 0.15, 0.15, 0.1  # [m], by how much gates may be elsewhere along x, y and z
+ASIDE_POLE = 0.15, 0.15, 0.05  # [m], the same of poles, whose tops are higher or lower
+LEANING = 0.05, 0.1, 0.2  # [rad], by how much gates roll, pitch and turn at most
 BOX = (-2.5, 2.5), (-1.5, 1.5), (0.0, 2.0)  # [m], along x, y and z, which ends a race
 STAND, DEPTH = 0.05, 0.01  # [m], of stands and frames, half their width
 STRAIGHT, LEAD = 0.05, 0.3  # [m]: who is farther aside of a gate than this flies by a place so far
@@ -44,7 +46,7 @@ ROOM = 0.15  # [m], about the ball, in which a flight costs more
 class Arena(Course):
     """The race, and where things truly stand."""
 
-    gates: Array  # (N, 5 G) centre [m], cosine and sine of the heading of each gate
+    gates: Array  # (N, 9 G) centre [m], unit vectors through each gate and to its left
     poles: Array  # (N, 3 P) x, y and height of the top [m] of each pole
     ball: Array  # (N,) [m], radius of the ball that the aircraft is taken for
     seen: Array  # (N, G + P) 1 for gates and poles that have been near, 0 for others
@@ -103,8 +105,8 @@ class LsyRace(GateRace):
     least_ball: float = 0.07
     """Radius of the smallest; each episode has another."""
     level: int = 2
-    """Level of the competition: at 2 gates and poles stand up to 0.15 m elsewhere, and where is
-    seen within 0.7 m of them; at 0 and 1 they stand where they should."""
+    """Level of the competition: at 2 gates and poles stand up to 0.15 m elsewhere, gates lean by
+    up to 0.1 rad, and where is seen within 0.7 m of them; at 0 and 1 they stand as they should."""
     radius: float = 0.1
     """Largest distance from the start [m], along x and y."""
     tilt: float = 0.1
@@ -128,8 +130,9 @@ class LsyRace(GateRace):
 
     @functools.cached_property
     def nominal(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Where gates and poles should be, rows as `Arena` has them, (5 G,) and (3 P,)."""
-        gates = np.concatenate([self.course.centre, self.course.axes[:, 0, :2]], axis=1)
+        """Where gates and poles should be, rows as `Arena` has them, (9 G,) and (3 P,)."""
+        axes = self.course.axes
+        gates = np.concatenate([self.course.centre, axes[:, 0], axes[:, 1]], axis=1)
         return tuple(gates.ravel().tolist()), tuple(sum(self.course.poles, ()))
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Arena]:
@@ -163,18 +166,15 @@ class LsyRace(GateRace):
         """An arena with everything where it stands in this episode, before the start."""
         count, size = len(self.course.gates), 1.0 if self.level == 2 else 0.0
         gates, poles = self.nominal
-        shift = rng.uniform(-size, size, 4 * count + len(poles))
+        shift = rng.uniform(-size, size, 6 * count + len(poles))
         ball = rng.uniform(self.least_ball, self.ball)
         rows: list[Array] = []
         for k in range(count):
-            x, y, z, cosine, sine = gates[5 * k : 5 * k + 5]
-            turn = TURNED * shift[..., 4 * k + 3]
-            c, s = namespace(turn).cos(turn), namespace(turn).sin(turn)
-            rows += [x + ASIDE * shift[..., 4 * k], y + ASIDE * shift[..., 4 * k + 1]]
-            rows += [z + ABOVE * shift[..., 4 * k + 2]]
-            rows += [cosine * c - sine * s, sine * c + cosine * s]
-        aside = (ASIDE, ASIDE, 0.05) * (len(poles) // 3)
-        stand = [poles[k] + aside[k] * shift[..., 4 * count + k] for k in range(len(poles))]
+            x, y, z, east, north = gates[9 * k : 9 * k + 5]
+            off = [most * shift[..., 6 * k + i] for i, most in enumerate((*ASIDE, *LEANING))]
+            rows += [x + off[0], y + off[1], z + off[2], *_leaning(east, north, *off[3:])]
+        aside = ASIDE_POLE * (len(poles) // 3)
+        stand = [poles[k] + aside[k] * shift[..., 6 * count + k] for k in range(len(poles))]
         one = 0.0 * shift[..., 0]
         three, seen = stack(one, one, one), 0.0 * shift[..., : count + len(poles) // 3]
         course = Course(three, one, three, three, one, one, three, one)
@@ -184,7 +184,7 @@ class LsyRace(GateRace):
         """Go on to the next gate when this one is passed, and remember what has been near."""
         course = cast(Arena, super().update(before, now))
         place, xp, seen = now.state.position, namespace(now.time), list[Array]()
-        gates = [self._row(course, k)[:2] for k in range(len(self.course.gates))]
+        gates = [(centre[..., 0], centre[..., 1]) for centre, *_ in self._gates(course)]
         poles = [pole[:2] for pole in self._poles(course)]
         for k, (x, y) in enumerate([*gates, *poles]):
             near = _length(place[..., 0] - x, place[..., 1] - y) < NEAR
@@ -196,7 +196,7 @@ class LsyRace(GateRace):
         task, xp, state = now.task, namespace(now.time), now.state
         count, (gates, poles) = len(self.course.gates), self.nominal
         near = [task.seen[..., k] > 0 for k in range(count + len(poles) // 3)]
-        places = [xp.where(near[k // 5], task.gates[..., k], gates[k]) for k in range(len(gates))]
+        places = [xp.where(near[k // 9], task.gates[..., k], gates[k]) for k in range(len(gates))]
         stand = [
             xp.where(near[count + k // 3], task.poles[..., k], poles[k]) for k in range(len(poles))
         ]
@@ -220,27 +220,30 @@ class LsyRace(GateRace):
 
     def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
         """Gates with some numbers (N,), where they stand in the episode."""
-        x, y, z, cosine, sine = self._row(task, 0)
-        for k in range(1, len(self.course.gates)):
-            this, xp = number == k, namespace(number)
-            x, y, z, cosine, sine = (
-                xp.where(this, own, other)
-                for own, other in zip(self._row(task, k), (x, y, z, cosine, sine), strict=True)
+        first, *others = self._gates(task)
+        centre, through, left = first
+        for k, other in enumerate(others, 1):
+            this, xp = (number == k)[..., None], namespace(number)
+            centre, through, left = (
+                xp.where(this, own, before)
+                for own, before in zip(other, (centre, through, left), strict=True)
             )
-        return stack(x, y, z), stack(cosine, sine, 0 * z), stack(-sine, cosine, 0 * z)
+        return centre, through, left
 
     def markers(self, now: Snapshot) -> Sequence[Primitive]:
         """The gates with their stands and the poles, where they stand."""
         task, number = now.task, int(now.task.gate[0])
-        rows = [[float(x[0]) for x in self._row(task, k)] for k in range(len(self.course.gates))]
-        gates = tuple((*row[:3], math.degrees(math.atan2(row[4], row[3])), 0.0) for row in rows)
+        gates = [[vector[0] for vector in gate] for gate in self._gates(task)]
+        axes = [(through, left, np.cross(through, left)) for _, through, left in gates]
         poles = [[float(x[0]) for x in pole] for pole in self._poles(task)]
-        stands = [
-            Primitive("box", (STAND, STAND, high / 2), (*row[:2], high / 2), rgba=WOOD, glow=0.2)
-            for row in rows
-            if (high := row[2] - self.course.frame / 2)
-        ]
-        return [*self.course.drawn(number, gates, poles), *stands]
+        stands: list[Primitive] = []
+        for (centre, *_), turned in zip(gates, axes, strict=True):
+            frame = self.course.frame / 2
+            high = centre[2] - frame
+            place = centre - (frame + high / 2) * turned[2]
+            size = STAND, STAND, high / 2
+            stands.append(Primitive("box", size, place, attitude(turned), WOOD, glow=0.2))
+        return [*self.course.drawn(number, [gate[0] for gate in gates], axes, poles), *stands]
 
     def _failed(self, now: Snapshot) -> Array:
         """Against something, on the ground, or out of the box, (N,) bool."""
@@ -261,10 +264,10 @@ class LsyRace(GateRace):
         for x, y, top in self._poles(now.task):
             beside = _length(place[..., 0] - x, place[..., 1] - y)
             rooms.append(_length(past(beside, POLE), past(place[..., 2], top)))
-        for k in range(len(self.course.gates)):
-            x, y, z, cosine, sine = self._row(now.task, k)
-            east, north, up = place[..., 0] - x, place[..., 1] - y, place[..., 2] - z
-            along, aside = abs(cosine * east + sine * north), abs(cosine * north - sine * east)
+        for centre, through, left in self._gates(now.task):
+            off = place - centre
+            along, aside = abs(dot(off, through)), abs(dot(off, left))
+            up = dot(off, cross(through, left))
             within = past(-xp.maximum(aside, abs(up)), -inner)
             out = past(aside, outer), past(abs(up), outer)
             rooms.append(_length(past(along, DEPTH), within, *out))
@@ -279,9 +282,10 @@ class LsyRace(GateRace):
         lead = xp.clip(aside + 2 * xp.clip(along, 0.0, None) - STRAIGHT, 0.0, LEAD)
         return norm(off + lead[..., None] * task.through) + lead
 
-    def _row(self, task: Any, number: int) -> tuple[Array, ...]:
-        """Centre, and cosine and sine of the heading, of a gate, (N,) each."""
-        return tuple(task.gates[..., 5 * number + k] for k in range(5))
+    def _gates(self, task: Any) -> list[tuple[Array, Array, Array]]:
+        """Centre, and unit vectors through it and to its left, of each gate, (N, 3) each."""
+        rows = [task.gates[..., 9 * k : 9 * k + 9] for k in range(len(self.course.gates))]
+        return [(row[..., :3], row[..., 3:6], row[..., 6:]) for row in rows]
 
     def _poles(self, task: Any) -> list[tuple[Array, ...]]:
         """East, north and height of the top of each pole, (N,) each."""
@@ -289,6 +293,24 @@ class LsyRace(GateRace):
             tuple(task.poles[..., 3 * pole + k] for k in range(3))
             for pole in range(len(self.course.poles))
         ]
+
+
+def _leaning(east: float, north: float, roll: Array, pitch: Array, turn: Array) -> list[Array]:
+    """Unit vectors through a gate and to its left, (N,) each component.
+
+    Args:
+        east: Of the way through it as it should be, which is level.
+        north: The same.
+        roll: About that way [rad], (N,).
+        pitch: Down, about what is to its left [rad], (N,).
+        turn: Counter-clockwise from above [rad], (N,).
+    """
+    xp = namespace(turn)
+    (a, b), (c, d), (e, f) = ((xp.cos(x), xp.sin(x)) for x in (turn, pitch, roll))
+    cosine, sine = east * a - north * b, north * a + east * b
+    across = d * f
+    through = [cosine * c, sine * c, -d]
+    return [*through, cosine * across - sine * e, sine * across + cosine * e, c * f]
 
 
 def _length(*parts: Array) -> Array:

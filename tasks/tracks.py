@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from quadrl.base.errors import QuadrlError
@@ -101,29 +102,28 @@ class Track:
         """Unit vectors through each gate, to its left and up along it, (G, 3, 3)."""
         return _fixed(_axes(self.gates))
 
-    def drawn(self, following: int, gates: Any = None, poles: Any = None) -> Iterator[Primitive]:
+    def drawn(
+        self, following: int, centre: Any = None, axes: Any = None, poles: Any = None
+    ) -> Iterator[Primitive]:
         """The frames, that of the gate with a number in another colour, and the poles.
 
         Args:
             following: The number.
-            gates: Where they stand, as `Track.gates`; by default where they should.
+            centre: Where gates stand, as `Track.centre`; by default where they should.
+            axes: The same of `Track.axes`.
             poles: The same of the poles.
         """
         deep = DEPTH * self.frame / 2
         wide = max((self.frame - self.opening) / 4, deep / 2)
-        rows = self.gates if gates is None else gates
-        for k, (gate, axes) in enumerate(zip(rows, _axes(rows), strict=True)):
-            rgba = NEXT if k == following else OTHER
-            heading, climb = np.radians(gate[3:]) / 2
-            turn = (
-                math.cos(heading) * math.cos(climb),
-                math.sin(heading) * math.sin(climb),
-                -math.cos(heading) * math.sin(climb),
-                math.sin(heading) * math.cos(climb),
-            )
+        centre, axes = (
+            self.centre if centre is None else centre,
+            self.axes if axes is None else axes,
+        )
+        for k, (middle, turned) in enumerate(zip(centre, axes, strict=True)):
+            rgba, turn = NEXT if k == following else OTHER, attitude(turned)
             for across, size in ((1, (wide, self.frame / 2)), (2, (self.opening / 2, wide))):
                 for side in (-1, 1):
-                    place = np.array(gate[:3]) + side * (self.opening / 2 + wide) * axes[across]
+                    place = middle + side * (self.opening / 2 + wide) * turned[across]
                     yield Primitive("box", (deep, *size), place, turn, rgba)
         for x, y, top in self.poles if poles is None else poles:
             yield Primitive("cylinder", (POLE, top / 2, 0.0), (x, y, top / 2), rgba=OTHER)
@@ -136,6 +136,13 @@ def known(name: str) -> Track:
     rows = tuple(map(tuple, read["gates"]))
     poles = tuple(map(tuple, read.get("poles", ())))
     return Track(name, rows, tuple(read["start"]), read["opening"], read["frame"], poles)
+
+
+def attitude(axes: Any) -> tuple[float, ...]:
+    """The quaternion w, x, y, z of what has its x, y and z axis along unit vectors (3, 3)."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.transpose(axes).ravel())
+    return tuple(quaternion.tolist())
 
 
 def _before(gate: tuple[float, ...]) -> tuple[float, ...]:

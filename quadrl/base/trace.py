@@ -74,7 +74,7 @@ REVERSE: dict[str, Callable[..., tuple[Any, ...]]] = {
     "look_up": lambda by, result, index: (None,),
 }
 """From the derivative of a number by a result, and the result and its operands, those by them."""
-MAX_OPERATIONS = 2000  # more would take the C compiler longer than they save
+MAX_OPERATIONS = 2500  # more would take the C compiler longer than they save
 MAX_TABLES = 1_000_000
 """Numbers of the tables that a function looks up in."""
 

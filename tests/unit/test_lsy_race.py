@@ -29,9 +29,11 @@ def world(task, row):
     """MuJoCo's model of the solids of a row, and a point that moves about as a tiny ball."""
     spec = mujoco.MjSpec()
     box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
-    for x, y, z, cosine, sine in task.gates[row].reshape(-1, 5):
-        quat = [np.cos(np.arctan2(sine, cosine) / 2), 0, 0, np.sin(np.arctan2(sine, cosine) / 2)]
-        body = spec.worldbody.add_body(pos=[x, y, z], quat=quat)
+    for centre, through, left in task.gates[row].reshape(-1, 3, 3):
+        quat = np.zeros(4)
+        axes = np.array([through, left, np.cross(through, left)])
+        mujoco.mju_mat2Quat(quat, axes.T.ravel())
+        body = spec.worldbody.add_body(pos=centre, quat=quat)
         for side in (-1, 1):
             body.add_geom(type=box, pos=[0, 0, 0.28 * side], size=[0.01, 0.36, 0.08])
             body.add_geom(type=box, pos=[0, 0.28 * side, 0], size=[0.01, 0.08, 0.36])
@@ -63,13 +65,21 @@ def test_gates_and_poles_stand_elsewhere_in_each_episode_of_level_two_alone():
     gates, poles = (np.array(rows) for rows in LsyRace().nominal)
     for level in (0, 1, 2):
         task = begun(200, level=level).snapshot.task
-        moved = abs(task.gates - gates).reshape(200, -1, 5)
+        moved = abs(task.gates - gates).reshape(200, -1, 3, 3)[..., 0, :]
         fallen = abs(task.poles - poles).reshape(200, -1, 3)
-        turned = np.arccos(
-            np.clip((task.gates * gates).reshape(200, -1, 5)[..., 3:].sum(-1), -1, 1)
-        )
-        most = *moved[..., :3].max(axis=(0, 1)), turned.max(), *fallen.max(axis=(0, 1))
-        bounds = np.array([0.15, 0.15, 0.1, 0.2, 0.15, 0.15, 0.05])
+        should = gates.reshape(-1, 3, 3)[:, 1]
+        axes = task.gates.reshape(200, -1, 3, 3)[:, :, 1:]
+        up = np.cross(axes[:, :, 0], axes[:, :, 1])
+        np.testing.assert_allclose(np.linalg.norm(axes, axis=-1), 1.0, rtol=1e-12)
+        np.testing.assert_allclose((axes[:, :, 0] * axes[:, :, 1]).sum(-1), 0.0, atol=1e-12)
+        # Roll, pitch and yaw, one after the other about axes of the world.
+        roll = np.arctan2(axes[..., 1, 2], up[..., 2])
+        pitch = -np.arcsin(axes[..., 0, 2])
+        yaw = np.arctan2(axes[..., 0, 1], axes[..., 0, 0])
+        turned = (yaw - np.arctan2(should[:, 1], should[:, 0]) + np.pi) % (2 * np.pi) - np.pi
+        angles = [abs(angle).max() for angle in (roll, pitch, turned)]
+        most = *moved.max(axis=(0, 1)), *angles, *fallen.max(axis=(0, 1))
+        bounds = np.array([0.15, 0.15, 0.1, 0.05, 0.1, 0.2, 0.15, 0.15, 0.05])
         if level == 2:
             assert (most < bounds).all() and (most > 0.95 * bounds).all()
         else:
