@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
 import fcntl
 import hashlib
+import io
 import itertools
 import json
 import os
 import re
 import tomllib
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -45,6 +47,18 @@ def write_whole(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):
             scratch.unlink()
         raise
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write what JSON can hold, whole or not at all."""
+    write_whole(path, json.dumps(content, indent=2).encode())
+
+
+def write_csv(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write rows under the names of their columns, whole or not at all."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([head, *rows])
+    write_whole(path, text.getvalue().encode())
 
 
 def put(written: Path, path: Path) -> None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import html
-import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Unpack, cast
 
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import write_whole
+from quadrl.base.files import write_csv
 from quadrl.base.units import length, percent, quantity
 from quadrl.base.validation import number
 from quadrl.control import CONTROLLERS
@@ -84,17 +82,15 @@ class Evaluation:
     def save_csv(self, path: str | Path) -> Path:
         """Write one row per flight: its seed and what `quadrl.evaluation.rollout.flights` gives."""
         columns = flights(self.rollout)
-        text = io.StringIO(newline="")
-        writer = csv.writer(text)
-        writer.writerow(["episode", "seed", *columns])
+        rows = []
         for i, row in enumerate(
             zip(*(column.tolist() for column in columns.values()), strict=True)
         ):
             cells = (f"{x:.6g}" if isinstance(x, float) else int(x) for x in row)
-            writer.writerow([i, self.seed + i, *cells])
+            rows.append((i, self.seed + i, *cells))
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, text.getvalue().encode())
+        write_csv(path, ("episode", "seed", *columns), rows)
         return path
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadrl.base.files import write_whole
+from quadrl.base.files import write_csv
 from quadrl.base.progress import Progress
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.learning.folder import EVALUATIONS, read_metrics
@@ -38,22 +37,18 @@ def evaluating(training: Training, show: Callable[[Progress], None]) -> Callable
     config, file = training.config, training.folder / EVALUATIONS
     times = range(1, config.evaluations + 1)
     due = {max(1, round(time * config.iterations / config.evaluations)) for time in times}
-    rows: list[dict[str, Any]] = []
+    rows: list[Sequence[Any]] = []
     if file.exists():  # a row after the checkpoint is made again
         with open(file, newline="") as opened:
-            rows = [row for row in csv.DictReader(opened) if int(row["steps"]) <= training.steps]
+            rows += [row for row in [*csv.reader(opened)][1:] if int(row[0]) <= training.steps]
 
     def after(progress: Progress) -> None:
         if progress.iteration in due:
             policy = training.policy()
             found = evaluate(policy, config.scenario, episodes=EPISODES, engine="free_flight")
-            row = {"steps": progress.steps, "seconds": round(progress.seconds, 3)}
-            rows.append(row | {name: found.metrics[of] for name, of in COLUMNS.items()})
-            text = io.StringIO(newline="")
-            table = csv.DictWriter(text, ["steps", "seconds", *COLUMNS])
-            table.writeheader()
-            table.writerows(rows)
-            write_whole(file, text.getvalue().encode())
+            reached = (found.metrics[of] for of in COLUMNS.values())
+            rows.append([progress.steps, round(progress.seconds, 3), *reached])
+            write_csv(file, ("steps", "seconds", *COLUMNS), rows)
         show(progress)
 
     return after

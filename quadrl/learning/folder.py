@@ -6,7 +6,6 @@ import contextlib
 import csv
 import functools
 import hashlib
-import io
 import json
 import os
 import socket
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
-from quadrl.base.files import NO_LOCKS, lock, read_sealed_json, write_sealed_json, write_whole
+from quadrl.base.files import NO_LOCKS, lock, read_sealed_json, write_csv, write_sealed_json
 from quadrl.base.machine import processor_kind
 from quadrl.evaluation.policy_file import RUN as CONFIG
 from quadrl.evaluation.policy_file import RUN_FORMAT
@@ -147,11 +146,6 @@ def _owner() -> str:
     return f"{socket.gethostname()} {os.getpid()}\n"
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write a file whole or not at all."""
-    write_whole(path, json.dumps(content, indent=2).encode())
-
-
 def run_of(config: Mapping[str, Any]) -> str:
     """The identity of a run and its policies: a digest of all that its result depends on."""
     free = (*CHANGEABLE, "run", "processors")
@@ -228,9 +222,7 @@ class Log:
             with open(path, newline="") as file:
                 rows = list(csv.reader(file))[1:]
             kept = [row for row in rows if len(row) == len(self.COLUMNS)][:iteration]
-        whole = io.StringIO(newline="")
-        csv.writer(whole).writerows([list(self.COLUMNS), *kept])
-        write_whole(path, whole.getvalue().encode())
+        write_csv(path, self.COLUMNS, kept)
         self._file = open(path, "a", newline="")  # noqa: SIM115 - closed by close
         self._writer = csv.writer(self._file)
         self._events = SummaryWriter(str(folder / EVENTS), purge_step=iteration + 1)

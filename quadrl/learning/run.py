@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+from quadrl.base.files import write_json
 from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.validation import number
 from quadrl.control.feasibility import warn_of_unreached
@@ -17,7 +18,7 @@ from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.evaluations import evaluating
-from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO, write_json
+from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training
 from quadrl.rendering import write_video

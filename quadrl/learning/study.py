@@ -6,9 +6,7 @@ A study goes on where it was stopped, since each of its trainings does: see `exe
 from __future__ import annotations
 
 import contextlib
-import csv
 import dataclasses
-import io
 import itertools
 import json
 import math
@@ -18,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import write_whole
+from quadrl.base.files import write_csv, write_json
 from quadrl.base.units import quantity
 from quadrl.base.validation import number
 from quadrl.core.scenario import as_saved
@@ -27,7 +25,7 @@ from quadrl.learning.cluster import on_ray
 from quadrl.learning.comparison import LEVEL, Comparison, arm, compare
 from quadrl.learning.evaluations import along
 from quadrl.learning.executor import Local, complaint, train_all
-from quadrl.learning.folder import EVALUATION, write_json
+from quadrl.learning.folder import EVALUATION
 from quadrl.learning.plan import Plan, read_plan
 from quadrl.learning.show import curves
 
@@ -101,11 +99,8 @@ class StudyResult:
         Args:
             on_line: Called with a line about each run or task of which there is no curve.
         """
-        text = io.StringIO(newline="")
-        table = csv.DictWriter(text, [*GROUP, "seeds", *itertools.chain(*map(_columns, FIGURES))])
-        table.writeheader()
-        table.writerows(self.rows)
-        write_whole(self.folder / TABLE, text.getvalue().encode())
+        head = [*GROUP, "seeds", *itertools.chain(*map(_columns, FIGURES))]
+        write_csv(self.folder / TABLE, head, ([row[name] for name in head] for row in self.rows))
         write_json(self.folder / STUDY, self.content)
         return [self.folder / TABLE, self.folder / STUDY, *self._draw(on_line)]
 
@@ -113,10 +108,7 @@ class StudyResult:
         """A picture for each task, with a curve for each algorithm and variant."""
         from quadrl.evaluation.plotting import save
 
-        labels = {
-            self.folder / run["name"]: f"{run['algo']} {run['variant']}".strip()
-            for run in self.runs
-        }
+        labels = {self.folder / run["name"]: arm(run) for run in self.runs}
         # In the shortest trainings no episode ends: there is no curve to draw.
         figures = curves(labels, on_missing=lambda error: on_line(f"left out: {error}"))
         return [

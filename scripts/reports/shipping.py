@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from quadrl import tasks
+from quadrl.base.files import write_json
 from quadrl.base.units import quantity
 from quadrl.cli.tasks import settings
 from quadrl.core.task import Target
@@ -18,7 +19,7 @@ from quadrl.evaluation.policy import SHIPPED, SHIPPED_AS, Policy
 from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import FREE, write_json
+from quadrl.learning.folder import FREE
 from scripts.reports.report import Result, say
 
 EPISODES = 2000

@@ -7,11 +7,12 @@ import pytest
 
 import quadrl
 from quadrl.base.errors import QuadrlError
+from quadrl.base.files import write_json
 from quadrl.base.validation import seeds
 from quadrl.learning import executor
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import End, PlannedRun, train_all
-from quadrl.learning.folder import EVALUATION, write_config, write_json
+from quadrl.learning.folder import EVALUATION, write_config
 from quadrl.learning.plan import read_plan
 from quadrl.learning.study import interval
 
