@@ -77,10 +77,13 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def free_name(path: Path) -> Path:
-    """The path, or the first of NAME-2, NAME-3 and so on that is not there yet."""
+def free_name(path: Path, holding: str = "") -> Path:
+    """The path, or the first of NAME-2, NAME-3 and so on that is not there yet.
+
+    A folder counts as there with a file of the name `holding` in it.
+    """
     names = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(2))
-    return next(name for name in itertools.chain([path], names) if not name.exists())
+    return next(x for x in itertools.chain([path], names) if not (x / holding).exists())
 
 
 def lock(folder: Path) -> int:

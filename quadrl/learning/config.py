@@ -16,6 +16,7 @@ from typing import Any
 from quadrl import __version__
 from quadrl.aircraft.aerodynamics import FULL
 from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.files import free_name
 from quadrl.base.validation import choice, keys, number, tuples
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.observing import resolve as resolve_observing
@@ -28,7 +29,7 @@ from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning.defaults import CHOSEN, PAIRS, flat, training_defaults
-from quadrl.learning.folder import CHANGEABLE, CONFIG, free_folder, read_config
+from quadrl.learning.folder import CHANGEABLE, CONFIG, read_config
 from quadrl.learning.origin import Origin, with_networks
 from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
 from quadrl.tasks import TASKS
@@ -257,7 +258,7 @@ def prepare(
     else:
         config = TrainConfig(task or "hover", **settings)
     named = Path("runs") / f"{config.task}-{config.algo}-{config.seed}"
-    return config, free_folder(named) if out is None else Path(out)
+    return config, free_name(named, CONFIG) if out is None else Path(out)
 
 
 def renamed(settings: dict[str, Any]) -> dict[str, Any]:

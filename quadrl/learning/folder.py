@@ -44,15 +44,6 @@ DRAWN = {"steps", "seconds", "return", "success", "error", "survival"}
 """Columns of the metrics that a plot needs."""
 
 
-def free_folder(wanted: Path) -> Path:
-    """The folder for a new run: the one that is wanted, numbered if it holds a run already."""
-    number, path = 1, wanted
-    while (path / CONFIG).exists():
-        number += 1
-        path = wanted.with_name(f"{wanted.name}-{number}")
-    return path
-
-
 def new_folder(path: Path) -> None:
     """Make the folder of a new run.
 

@@ -15,11 +15,11 @@ from runs import TINY, refused
 
 import quadrl
 from quadrl.base.errors import QuadrlError
+from quadrl.base.files import free_name
 from quadrl.base.progress import ProgressBar
 from quadrl.cli import main
 from quadrl.evaluation.controllers import make_controller
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import free_folder
 
 SETTINGS = dict(
     num_envs=8, rollout=4, steps=192, hidden=(16,), task_options={"time_limit": 0.5}, episodes=2
@@ -59,7 +59,7 @@ def test_train_goes_on_further(run, tmp_path):
 
 def test_the_folder_of_a_run_is_a_new_one(tmp_path):
     for name in ("a", "a-2", "a-3"):
-        assert free_folder(tmp_path / "a") == tmp_path / name
+        assert free_name(tmp_path / "a", "config.json") == tmp_path / name
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").touch()
 
