@@ -28,7 +28,7 @@ from quadrl.core.scenario import KEYWORDS, Scenario
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
-from quadrl.learning.defaults import CHOSEN, PAIRS, flat, training_defaults
+from quadrl.learning.defaults import PAIRS, flat, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, read_config
 from quadrl.learning.origin import Origin, with_networks
 from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
@@ -68,7 +68,7 @@ class TrainConfig(TrainSettings):
         vehicle = settings.setdefault("vehicle", _of(task).trained_on)
         variant = settings.get("variant", TrainConfig.variant)
         chosen = task, algo, vehicle, variant, settings.get("memory")
-        values, _ = training_defaults(_fields(), *chosen)
+        values, _ = training_defaults(*chosen)
         for name, kind in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
             if isinstance(given, dict):
@@ -91,7 +91,7 @@ class TrainConfig(TrainSettings):
         for name in PAIRS:
             if isinstance(settings.get(name), dict):
                 settings[name] = values[name] | settings[name]
-        for name, value in (values | settings | {"algo": algo}).items():
+        for name, value in (values | settings | {"task": task, "algo": algo}).items():
             object.__setattr__(self, name, tuples(value))
         object.__setattr__(self, "aerodynamics", self.aerodynamics or self._wind_brings())
         self._check()
@@ -104,7 +104,7 @@ class TrainConfig(TrainSettings):
 
     def _defaults(self) -> tuple[dict[str, Any], dict[str, str]]:
         chosen = self.task, self.algo, self.vehicle, self.variant, self.memory
-        values, sources = training_defaults(_fields(), *chosen)
+        values, sources = training_defaults(*chosen)
         if not values["aerodynamics"] and (brought := self._wind_brings()):
             values["aerodynamics"], sources["aerodynamics"] = brought, "in wind"
         if self.from_run:
@@ -125,11 +125,6 @@ class TrainConfig(TrainSettings):
         what the layers say.
         """
         usual, layers = self._defaults()
-        usual |= {name: getattr(TrainConfig, name) for name in CHOSEN}
-        task = _of(self.task)
-        for name, own in (("vehicle", task.trained_on), ("algo", task.trained_by)):
-            if own != usual[name]:
-                usual[name], layers[name] = own, f"{self.task} x {self.algo}"
         others = {*ALGORITHMS} - {self.algo}
         values = dict(flat(usual | {name: dataclasses.asdict(usual[name]) for name in ALGORITHMS}))
         for name, value in flat(dataclasses.asdict(self)):
@@ -276,13 +271,6 @@ def as_saved(settings: dict[str, Any]) -> dict[str, Any]:
         settings["control_mode"] = modes.as_saved(settings["control_mode"])
     old = settings.get("aerodynamics") == "" and not Weather.of(settings.get("weather")).calm
     return settings | ({"aerodynamics": "none"} if old else {})
-
-
-def _fields() -> dict[str, Any]:
-    """The defaults of the fields, as a layer of the defaults."""
-    names = [field.name for field in dataclasses.fields(TrainConfig)]
-    own = {name: dataclasses.asdict(kind()) for name, kind in ALGORITHM_CONFIGS.items()}
-    return {name: getattr(TrainConfig, name, {}) for name in names} | own
 
 
 def _of(task: str) -> type[Task]:

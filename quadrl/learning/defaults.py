@@ -108,17 +108,11 @@ WITH_MEMORY: dict[str, Any] = {
 
 
 def training_defaults(
-    fields: dict[str, Any],
-    task: str,
-    algo: str,
-    vehicle: str,
-    variant: str,
-    memory: str | None = None,
+    task: str, algo: str, vehicle: str, variant: str, memory: str | None = None
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The fields of `TrainConfig` where nothing is given, and the layer that each comes from.
 
     Args:
-        fields: The fields' own defaults.
         task: Name of the task.
         algo: Name of the algorithm.
         vehicle: Name of the aircraft.
@@ -135,9 +129,10 @@ def training_defaults(
     kind = tasks.TASKS[choice("task", task, tasks.TASKS)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
     choice("vehicle", vehicle, VEHICLES)
-    own = _unusual(kind, algo)
-    own.pop("algo", None)
-    if own.pop("vehicle", "paper") != vehicle:  # the numbers of another aircraft
+    fields, own = _fields(), _unusual(kind, algo)
+    stated = merged(kind.training, *kind.training_with.values(), *kind.variants.values())
+    keys(f"training default of {task}", stated, [name for name in fields if name not in CHOSEN])
+    if own.get("vehicle", "paper") != vehicle:  # the numbers of another aircraft
         own.pop("vehicle_options", None)
     varied = (shared, kind.variants.get(variant, {}), OF_VEHICLE.get((variant, vehicle), {}))
     layers = {
@@ -150,18 +145,21 @@ def training_defaults(
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for label, layer in layers.items():
-        if values:
-            known = [name for name in fields if name not in CHOSEN]
-            keys(f"training default of {task}", layer, known)
         read = at_rate(layer, vehicle)
         values = merged(values, read)
         sources |= {
             name: label if layer.get(name) == read.get(name) else f"{label}, at its control rate"
             for name, _ in flat(read)
         }
-    values |= {"task": task, "algo": algo}
     values |= {name: config(**values[name]) for name, config in ALGORITHM_CONFIGS.items()}
     return values, sources
+
+
+def _fields() -> dict[str, Any]:
+    """The first layer but for what the algorithm changes of it."""
+    names = [field.name for field in dataclasses.fields(TrainSettings)]
+    own = {name: dataclasses.asdict(kind()) for name, kind in ALGORITHM_CONFIGS.items()}
+    return {name: getattr(TrainSettings, name, {}) for name in names} | own
 
 
 def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
