@@ -16,6 +16,7 @@ from torch import nn
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import read_safetensors, write_safetensors
+from quadrl.learning.defaults import flat
 from quadrl.learning.folder import CHANGEABLE
 from quadrl.learning.folder import CHECKPOINT as CHECKPOINT
 from quadrl.learning.settings import ALGORITHM_CONFIGS
@@ -78,26 +79,22 @@ def begin_with(path: Path, actor: nn.Module, critic: nn.Module) -> None:
             raise QuadrlError(reason, name="from", value=folder, allowed=allowed) from error
 
 
-def check_same(
-    path: Path, saved: dict[str, Any], present: dict[str, Any], prefix: str = ""
-) -> None:
+def check_same(path: Path, saved: dict[str, Any], present: dict[str, Any]) -> None:
     """Refuse a checkpoint whose settings would end in another policy than the present ones.
 
     Args:
         path: The checkpoint.
         saved: Its resolved configuration.
         present: The one that it is to be continued with.
-        prefix: Prefix of the names: these are settings within a setting.
 
     Raises:
         QuadrlError: A setting differs.
     """
-    for name in saved | present:
-        if name not in saved and prefix.rstrip(".") in ALGORITHM_CONFIGS:
+    was, now = dict(flat(saved)), dict(flat(present))
+    for name in was | now:
+        if name not in was and name.partition(".")[0] in ALGORITHM_CONFIGS:
             continue  # a setting of an algorithm that is new since then
-        was, now = saved.get(name), present.get(name)
-        if isinstance(was, dict) and isinstance(now, dict):
-            check_same(path, was, now, f"{prefix}{name}.")
-        elif was != now and name not in CHANGEABLE:
+        if was.get(name) != now.get(name) and name not in CHANGEABLE:
             reason = f"{path} was trained with it; restore that setting or start a new run"
-            raise QuadrlError(reason, name=f"{prefix}{name}", value=now, allowed=repr(was))
+            value = now.get(name, present.get(name))
+            raise QuadrlError(reason, name=name, value=value, allowed=repr(was.get(name)))

@@ -62,7 +62,7 @@ class TrainConfig(TrainSettings):
         """
         settings = _given(renamed(settings))
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
-        settings, _ = with_networks(settings)
+        settings = with_networks(settings)
         algo = settings.get("algo", _of(task).trained_by)
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
         vehicle = settings.setdefault("vehicle", _of(task).trained_on)

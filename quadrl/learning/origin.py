@@ -66,15 +66,15 @@ class Origin(NamedTuple):
         return self.folder / CHECKPOINT
 
 
-def with_networks(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Settings of a training with its origin as text, and what follows from that.
+def with_networks(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a training with its origin as text, and with the networks of that.
 
     Raises:
         QuadrlError: The folder holds no run, or other networks are asked for.
     """
     given = settings.get("from_run", "")
     if not given or (WRITTEN.fullmatch(str(given)) and not {*NETWORKS} - settings.keys()):
-        return {**settings}, {}
+        return {**settings}
     origin = Origin.of(given)
     networks = origin.networks()
     for name in networks.keys() & settings.keys():
@@ -84,7 +84,7 @@ def with_networks(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str
         if own != theirs:
             reason = f"the networks of {origin.folder} are others"
             raise QuadrlError(reason, name=name, value=own, allowed=repr(theirs))
-    return {**networks, **settings, "from_run": str(origin)}, networks
+    return {**networks, **settings, "from_run": str(origin)}
 
 
 def _digest(folder: Path) -> str:
