@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from quadrl.base.files import write_json
+from quadrl.base.files import write_csv, write_json
 from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.validation import number
 from quadrl.control.feasibility import warn_of_unreached
@@ -17,13 +18,21 @@ from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning.config import TrainConfig, prepare
-from quadrl.learning.evaluations import evaluating
-from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO
+from quadrl.learning.folder import EVALUATION, EVALUATIONS, LEARNING_CURVE, TRAJECTORY, VIDEO
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training
 from quadrl.rendering import write_video
 from quadrl.rendering.scenarios import comment
 
+EPISODES = 50
+"""Of each of the evaluations along a training."""
+COLUMNS = {
+    "success": "success_rate",
+    "survival": "survival_rate",
+    "error": "position_error_m",
+    "return": "return_mean",
+}
+"""Of evaluations.csv beside steps and seconds, as metrics.csv has them, and figures of each."""
 DEAD_TIMES = (0.01, 0.02)
 """With which the policy of an aircraft that has a dead time flies, beside its own [s]: those of
 Crazyflies, and what a radio adds."""
@@ -131,7 +140,7 @@ def train_in(
     warn_of_unreached(scenario.aircraft, *asked)
     training = Training(config, folder, resume=resume)
     with heed(training):
-        policy = training.run(evaluating(training, show) if config.evaluations else show)
+        policy = training.run(_evaluating(training, show) if config.evaluations else show)
     found = evaluate(policy, scenario, episodes=episodes)
     seconds = round(training.seconds, 2)
     record = {"training_s": seconds, "scenario": scenario.to_json()}
@@ -144,3 +153,29 @@ def train_in(
         record["success_rate_by_dead_time"] = {f"{s:g}": share for s, share in late.items()}
     write_json(folder / EVALUATION, found.metrics | record)
     return Run(folder, config, policy, found, seconds, late)
+
+
+def _evaluating(training: Training, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
+    """Evaluate the policy of the moment as often as the settings say; then `show` the progress.
+
+    A success is that of the mean action in episodes of their own. metrics.csv has that of sampled
+    actions in episodes that began up to two time limits of every aircraft ago.
+    """
+    config, file = training.config, training.folder / EVALUATIONS
+    times = range(1, config.evaluations + 1)
+    due = {max(1, round(time * config.iterations / config.evaluations)) for time in times}
+    rows: list[Sequence[Any]] = []
+    if file.exists():  # a row after the checkpoint is made again
+        with open(file, newline="") as opened:
+            rows += [row for row in [*csv.reader(opened)][1:] if int(row[0]) <= training.steps]
+
+    def after(progress: Progress) -> None:
+        if progress.iteration in due:
+            policy = training.policy()
+            found = evaluate(policy, config.scenario, episodes=EPISODES, engine="free_flight")
+            reached = (found.metrics[of] for of in COLUMNS.values())
+            rows.append([progress.steps, round(progress.seconds, 3), *reached])
+            write_csv(file, ("steps", "seconds", *COLUMNS), rows)
+        show(progress)
+
+    return after

@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_csv, write_json
 from quadrl.base.units import quantity
@@ -23,9 +25,8 @@ from quadrl.core.scenario import as_saved
 from quadrl.evaluation.evaluate import html_table
 from quadrl.learning.cluster import on_ray
 from quadrl.learning.comparison import LEVEL, Comparison, arm, compare
-from quadrl.learning.evaluations import along
 from quadrl.learning.executor import Local, complaint, train_all
-from quadrl.learning.folder import EVALUATION
+from quadrl.learning.folder import EVALUATION, EVALUATIONS, read_metrics
 from quadrl.learning.plan import Plan, read_plan
 from quadrl.learning.show import curves
 
@@ -41,6 +42,8 @@ FIGURES = {
 TABLE, STUDY = "table.csv", "study.json"
 GROUP = ("task", "algo", "variant")
 CONFIDENCE = 0.95
+SOLVED = 0.95
+"""The success of a policy from which on its figure `solved_after_steps` counts."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -188,6 +191,26 @@ def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
             row |= dict(zip(_columns(name), interval(values, 0.0, most), strict=True))
         rows.append(row)
     return StudyResult(plan.folder, tuple(runs), tuple(rows), failed)
+
+
+def along(folder: Path) -> dict[str, float | None]:
+    """Figures without a ceiling of a run that was evaluated along the way; none of another.
+
+    Returns:
+        solved_after_steps: control steps after which its success stays at 95 % or above, None
+        where it ends below; success_area: its mean over the training; success_lost: the largest
+        of it less the last.
+    """
+    if not (folder / EVALUATIONS).exists():
+        return {}
+    curve = read_metrics(folder / EVALUATIONS)
+    success, (below,) = curve["success"], np.nonzero(curve["success"] < SOLVED)
+    after = curve["steps"][below[-1] + 1 if len(below) else 0 :]
+    return {
+        "solved_after_steps": float(after[0]) if len(after) else None,
+        "success_area": float(success.mean()),
+        "success_lost": float(success.max() - success[-1]),
+    }
 
 
 def interval(

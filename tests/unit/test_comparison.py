@@ -11,8 +11,7 @@ from quadrl import cli
 from quadrl.base.errors import QuadrlError
 from quadrl.learning import study
 from quadrl.learning.comparison import VERDICTS, compare, power, sums
-from quadrl.learning.evaluations import along
-from quadrl.learning.study import StudyResult
+from quadrl.learning.study import StudyResult, along
 
 NONE = math.inf
 
