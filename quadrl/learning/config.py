@@ -25,6 +25,7 @@ from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control import modes
 from quadrl.core.scenario import KEYWORDS, Scenario
+from quadrl.core.scenario import as_saved as conditions_as_saved
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
@@ -264,13 +265,10 @@ def renamed(settings: dict[str, Any]) -> dict[str, Any]:
 def as_saved(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings from the file of a run, some of which may be of an earlier version.
 
-    Those of wind without effects of the air are of a version in which it acted by drag alone.
+    What an empty `aerodynamics` means in wind is for `quadrl.core.scenario.as_saved` to say.
     """
-    settings = renamed(settings)
-    if "control_mode" in settings:
-        settings["control_mode"] = modes.as_saved(settings["control_mode"])
-    old = settings.get("aerodynamics") == "" and not Weather.of(settings.get("weather")).calm
-    return settings | ({"aerodynamics": "none"} if old else {})
+    given = {k: v for k, v in renamed(settings).items() if (k, v) != ("aerodynamics", "")}
+    return {"aerodynamics": ""} | conditions_as_saved(given)
 
 
 def _of(task: str) -> type[Task]:
