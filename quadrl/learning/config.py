@@ -35,7 +35,7 @@ from quadrl.learning.origin import Origin, with_networks
 from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
 from quadrl.tasks import TASKS
 
-ALGORITHMS = ("ppo", "trpo", "vpg", "apg")
+ALGORITHMS = tuple(ALGORITHM_CONFIGS)
 ALIASES = {"gae": "vpg"}
 """The paper names the plain policy gradient after its advantages."""
 MAX_BATCH = 1 << 24
@@ -68,13 +68,12 @@ class TrainConfig(TrainSettings):
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
         vehicle = settings.setdefault("vehicle", _of(task).trained_on)
         variant = settings.get("variant", TrainConfig.variant)
-        chosen = task, algo, vehicle, variant, settings.get("memory")
-        values, _ = training_defaults(*chosen)
+        values, _ = training_defaults(task, algo, vehicle, variant, settings.get("memory"))
         for name, kind in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
             if isinstance(given, dict):
                 keys(f"setting of {name}", given, [f.name for f in dataclasses.fields(kind)])
-                given = dataclasses.replace(values[name], **_given(given))
+                given = kind(**values[name] | _given(given))
             elif not isinstance(given, kind):
                 raise QuadrlError(name=name, value=given, allowed=f"a {kind.__name__} or a dict")
             settings[name] = given
@@ -98,14 +97,15 @@ class TrainConfig(TrainSettings):
         self._check()
 
     def __repr__(self) -> str:
-        usual, _ = self._defaults()
-        own = {k: v for k, v in vars(self).items() if v != usual.get(k) or k in ("algo", "seed")}
-        given = ", ".join(f"{name}={value!r}" for name, value in own.items() if name != "task")
+        usual, values = tuples(self._defaults()[0]), dataclasses.asdict(self)
+        own = [name for name in values if name in ("algo", "seed") or values[name] != usual[name]]
+        given = ", ".join(f"{name}={getattr(self, name)!r}" for name in own if name != "task")
         return f"TrainConfig({self.task!r}, {given})"
 
     def _defaults(self) -> tuple[dict[str, Any], dict[str, str]]:
-        chosen = self.task, self.algo, self.vehicle, self.variant, self.memory
-        values, sources = training_defaults(*chosen)
+        values, sources = training_defaults(
+            self.task, self.algo, self.vehicle, self.variant, self.memory
+        )
         if not values["aerodynamics"] and (brought := self._wind_brings()):
             values["aerodynamics"], sources["aerodynamics"] = brought, "in wind"
         if self.from_run:
@@ -127,7 +127,7 @@ class TrainConfig(TrainSettings):
         """
         usual, layers = self._defaults()
         others = {*ALGORITHMS} - {self.algo}
-        values = dict(flat(usual | {name: dataclasses.asdict(usual[name]) for name in ALGORITHMS}))
+        values = dict(flat(usual))
         for name, value in flat(dataclasses.asdict(self)):
             if name.partition(".")[0] not in others:
                 same = name in values and tuples(values[name]) == value

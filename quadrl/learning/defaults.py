@@ -120,7 +120,8 @@ def training_defaults(
         memory: Memory of the policy; None for that of the layers.
 
     Returns:
-        The values; and a label of the layer by the name of the setting, as in `flat`.
+        The values, those of an algorithm as a dict; and a label of the layer by the name of the
+        setting, as in `flat`.
 
     Raises:
         QuadrlError: The task, the vehicle, the variant or a setting in `Task.training`,
@@ -151,7 +152,6 @@ def training_defaults(
             name: label if layer.get(name) == read.get(name) else f"{label}, at its control rate"
             for name, _ in flat(read)
         }
-    values |= {name: config(**values[name]) for name, config in ALGORITHM_CONFIGS.items()}
     return values, sources
 
 
