@@ -133,29 +133,27 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
     vehicle, size, free = Vehicle(), f"{num_envs:,}", f"{FREE_FLIGHT_ENVS:,}"
     air = in_real_air(vehicle)
     model = Scenario.of(task, vehicle=vehicle).compile_model(drawn=False)
-    pool = stack.enter_context(ThreadPoolExecutor(cores()))
     alone, loaded = gym.make(gymnasium_id), suite.make(task, random=0)
     vectors: Any = gym.make_vec(gymnasium_id, num_envs=num_envs)
     for env in (alone, loaded, vectors):
         stack.callback(env.close)
     batch = _batched_mj_step(vehicle, model, num_envs)
-    flying = partial(_environment, task, num_envs=FREE_FLIGHT_ENVS, engine="free_flight")
+    flying = partial(_environment, num_envs=FREE_FLIGHT_ENVS, engine="free_flight")
     layers = [
         Layer("mj_step, a loop on each core", ALL_CORES,
-              _mj_step(vehicle, model, pool, cores()), None, ALL_CORES),
+              _mj_step(vehicle, model, cores()), None, ALL_CORES),
         Layer(f"mj_step, mujoco.batch of {size}", ALL_CORES, batch, None, ALL_CORES),
         Layer("the same with mujoco's own stage clock", ALL_CORES, _with_clock(batch)),
         Layer(f"Environment of {size}", ALL_CORES, _environment(task, num_envs=num_envs), 0.90),
-        Layer(f"Environment of {free}, {FREE_FLIGHT}", ALL_CORES, flying(), 20.0, FREE_FLIGHT),
+        Layer(f"Environment of {free}, {FREE_FLIGHT}", ALL_CORES, flying(task), 20.0, FREE_FLIGHT),
         Layer("the same in real air and wind", FREE_FLIGHT,
-              flying(vehicle=air, weather="light"), 1 / 3),
-        Layer("the same, different aircraft", FREE_FLIGHT, flying(randomization=DIFFERENT), 0.90),
-        Layer("the same, all that is drawn", FREE_FLIGHT, flying(randomization=FULL)),
+              flying(task, vehicle=air, weather="light"), 1 / 3),
+        Layer("the same, different aircraft", FREE_FLIGHT,
+              flying(task, randomization=DIFFERENT), 0.90),
+        Layer("the same, all that is drawn", FREE_FLIGHT, flying(task, randomization=FULL)),
         Layer("the same by velocities, flown by loops", FREE_FLIGHT,
-              flying(control_mode="velocity"), 1 / 3),
-        Layer(f"the same among {POSTS} posts", FREE_FLIGHT,
-              _environment(_among_posts(task), num_envs=FREE_FLIGHT_ENVS, engine="free_flight"),
-              0.80),
+              flying(task, control_mode="velocity"), 1 / 3),
+        Layer(f"the same among {POSTS} posts", FREE_FLIGHT, flying(_among_posts(task)), 0.80),
         Layer(f"Gymnasium make_vec of {size}", ALL_CORES, _vectors(vectors)),
     ]  # fmt: skip
     if importlib.util.find_spec("torchrl"):
@@ -164,7 +162,7 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
     return [
         *layers,
         Layer("mj_step, a loop on one core", ONE_CORE,
-              _mj_step(vehicle, model, pool, 1), None, ONE_CORE),
+              _mj_step(vehicle, model, 1), None, ONE_CORE),
         Layer("Gymnasium make, one aircraft", ONE_CORE,
               _single(alone, model.nu, lambda step: step[2] or step[3]), 0.35),
         Layer("dm_control load, one aircraft", ONE_CORE,
@@ -189,7 +187,7 @@ def _commands(vehicle: Vehicle, *shape: int) -> Iterator[np.ndarray]:
     return itertools.cycle(vehicle.rotor_command(np.random.default_rng(0).uniform(-1, 1, shape)))
 
 
-def _mj_step(vehicle: Vehicle, model: mujoco.MjModel, pool: ThreadPoolExecutor, cores: int) -> Work:
+def _mj_step(vehicle: Vehicle, model: mujoco.MjModel, cores: int) -> Work:
     """As `mj_step` can be at its best: an aircraft per core, and a command per flight."""
     aircraft, commands = [mujoco.MjData(model) for _ in range(cores)], _commands(vehicle)
 
@@ -200,9 +198,10 @@ def _mj_step(vehicle: Vehicle, model: mujoco.MjModel, pool: ThreadPoolExecutor, 
             data.ctrl[:] = next(commands)
             mujoco.mj_step(model, data, FLIGHT * vehicle.substeps)
 
-    while True:
-        list(pool.map(fly, aircraft))
-        yield 8 * FLIGHT * cores
+    with ThreadPoolExecutor(cores) as pool:
+        while True:
+            list(pool.map(fly, aircraft))
+            yield 8 * FLIGHT * cores
 
 
 def _batched_mj_step(vehicle: Vehicle, model: mujoco.MjModel, num_envs: int) -> Work:
@@ -295,9 +294,8 @@ def _single(env: Any, size: int, over: Callable[[Any], bool]) -> Work:
 
 def _collector(task: Task, num_envs: int, stack: contextlib.ExitStack) -> Work:
     """The collector and the policy as a training has them."""
-    import torch
-
     from quadrl.envs.torchrl import QuadrotorEnv
+    from quadrl.learning.algorithm import one_thread
     from quadrl.learning.config import TrainConfig
     from quadrl.learning.environments import make_collector
     from quadrl.learning.networks import make_actor_critic
@@ -307,9 +305,8 @@ def _collector(task: Task, num_envs: int, stack: contextlib.ExitStack) -> Work:
     actor, _, _ = make_actor_critic(env.environment.size, env.environment.action_size, config)
     collector = make_collector(env, actor, frames := num_envs * config.rollout)
     stack.callback(collector.shutdown)
-    stack.callback(torch.set_num_threads, torch.get_num_threads())
     batches = iter(collector)
     while True:
-        torch.set_num_threads(1)  # as in a training
-        next(batches)
+        with one_thread():  # as in a training
+            next(batches)
         yield frames
