@@ -90,7 +90,7 @@ def on_ray(address: str, local: Local) -> Generator[Nodes]:
     Raises:
         QuadrlError: Ray is not installed, or there is no cluster at the address.
     """
-    os.environ.update({name: os.environ.get(name, value) for name, value in QUIET.items()})
+    os.environ.update(QUIET | os.environ)
     try:
         import ray
     except ImportError as error:
@@ -112,18 +112,18 @@ def _connect(ray: Any, address: str, jobs: int | None) -> None:
     given: dict[str, Any] = {"address": address}
     if address == "local":
         given |= {"num_cpus": jobs or cores(), "include_dashboard": False}
-    nobody = (
-        f"there is no Ray cluster at {address}: start one with ray start --head, join machines to "
-        "it with ray start --address, and give the address that it prints"
-    )
-    host, colon, port = address.rpartition(":")
+    host, _, port = address.rpartition(":")
     if address not in ("local", "auto"):
-        if not colon or not host or "/" in host or not port.isdecimal():
+        if not host or "/" in host or not port.isdecimal():
             allowed = "HOST:PORT such as 10.0.0.1:6379, auto, or local"
             raise QuadrlError(name="ray", value=address, allowed=allowed)
     try:
-        if colon:  # Ray itself waits for minutes
+        if host:  # Ray itself waits for minutes
             socket.create_connection((host, int(port)), REACH_SECONDS).close()
         ray.init(**given, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, OSError, OverflowError, RuntimeError, ValueError) as error:
-        raise QuadrlError(f"{nobody} ({str(error).splitlines()[0]})") from error
+        raise QuadrlError(
+            f"there is no Ray cluster at {address}: start one with ray start --head, join machines "
+            "to it with ray start --address, and give the address that it prints "
+            f"({str(error).splitlines()[0]})"
+        ) from error

@@ -157,8 +157,6 @@ def study(
     plan = read_plan(what, None if out is None else Path(out))
     if jobs is not None:
         number("jobs", jobs, 1, MAX_JOBS, whole=True)
-    for run in plan.runs:
-        _ = run.done  # refuses other settings before anything starts
     here = Local(plan.episodes, jobs, own)
     with on_ray(ray, here) if ray else contextlib.nullcontext(here) as executor:
         failed = train_all(plan.runs, executor, on_line)
