@@ -69,13 +69,14 @@ class Nodes(Local):
         """How many at the same time: one per CPU of the cluster as it is now."""
         return self.jobs or max(1, int(self.ray.cluster_resources().get("CPU", 1)))
 
-    def begin(self, run: PlannedRun, log: Path) -> Task:
+    def begin(self, run: PlannedRun) -> Task:
         """Begin a training, or continue it, on a node with a CPU to spare."""
-        for folder in (run.folder, log.parent):
+        for folder in (run.folder, run.log.parent):
             folder.mkdir(parents=True, exist_ok=True)
         needs = {"num_cpus": 1, "num_gpus": int(run.config.device.startswith("cuda"))}
         remote = self.ray.remote(max_retries=-1, **needs)(carry_out_here)
-        return Task(self.ray, remote.remote(order(run, self.episodes, self.own), log.absolute()))
+        what, log = order(run, self.episodes, self.own), run.log.absolute()
+        return Task(self.ray, remote.remote(what, log))
 
 
 @contextlib.contextmanager

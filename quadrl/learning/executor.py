@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,18 @@ class PlannedRun:
                 "choose another folder (--out), or move that run away"
             )
         return EVALUATION in files
+
+    @property
+    def share(self) -> float:
+        """How much of it is done, by the rows that it has written."""
+        file = self.folder / METRICS
+        rows = file.read_bytes().count(b"\n") - 1 if file.exists() else 0
+        return max(0, rows) / self.config.iterations
+
+    @property
+    def log(self) -> Path:
+        """Where its process writes."""
+        return self.folder.parent / "logs" / f"{self.name}.txt"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,30 +164,9 @@ class Local:
         """How many at the same time."""
         return self.jobs or cores()
 
-    def begin(self, run: PlannedRun, log: Path) -> Any:
+    def begin(self, run: PlannedRun) -> Any:
         """Begin a training, or continue it; returns what can `poll` and `stop` it."""
-        return Process(order(run, self.episodes, self.own), log)
-
-
-@dataclasses.dataclass(eq=False)
-class _Job:
-    """A training that waits or is at work."""
-
-    run: PlannedRun
-    worker: Any = None
-    attempt: int = 0
-
-    @property
-    def log(self) -> Path:
-        """Where its process writes."""
-        return self.run.folder.parent / "logs" / f"{self.run.name}.txt"
-
-    @property
-    def share(self) -> float:
-        """How much of it is done, by the rows that it has written."""
-        file = self.run.folder / METRICS
-        rows = file.read_bytes().count(b"\n") - 1 if file.exists() else 0
-        return max(0, rows) / self.run.config.iterations
+        return Process(order(run, self.episodes, self.own), run.log)
 
 
 def train_all(
@@ -183,7 +175,7 @@ def train_all(
     """Train and evaluate the runs that are not done, and continue those that are half done.
 
     Args:
-        runs: The runs.
+        runs: The runs, each with a name of its own.
         executor: Where they are carried out.
         say: Called with a line about each event.
 
@@ -193,48 +185,48 @@ def train_all(
     Raises:
         QuadrlError: A folder holds a run with other settings; nothing was begun.
     """
-    given = list(runs)
-    waiting = [_Job(run) for run in given if not run.done]
-    going: list[_Job] = []
+    given = {run.name: run for run in runs}
+    waiting = [name for name, run in given.items() if not run.done]
+    going: dict[str, Any] = {}
+    attempts: Counter[str] = Counter()
     failed: dict[str, str] = {}
     clock, news, done = TimeLeft(), time.monotonic(), len(given) - len(waiting)
-    clock.left(done + sum(job.share for job in waiting), len(given))
+    clock.left(done + sum(given[name].share for name in waiting), len(given))
     if done:
         say(f"{done} of {len(given)} trainings are done already")
     try:
         while waiting or going:
             while waiting and len(going) < executor.slots():
-                job = waiting.pop(0)
-                job.attempt += 1
-                job.worker = executor.begin(job.run, job.log)
-                going.append(job)
-                again = f" (attempt {job.attempt} of {ATTEMPTS})" if job.attempt > 1 else ""
-                say(f"{job.run.name}: begun{again}, {len(waiting)} waiting")
-            for job in list(going):
-                if (end := job.worker.poll()) is None:
+                name = waiting.pop(0)
+                going[name] = executor.begin(given[name])
+                attempts[name] += 1
+                again = f" (attempt {attempts[name]} of {ATTEMPTS})" if attempts[name] > 1 else ""
+                say(f"{name}: begun{again}, {len(waiting)} waiting")
+            for name, worker in list(going.items()):
+                if (end := worker.poll()) is None:
                     continue
-                going.remove(job)
-                name, why = job.run.name, end.message or "it left no result"
-                if not end.message and job.run.done:
+                del going[name]
+                why = end.message or "it left no result"
+                if not end.message and given[name].done:
                     done += 1
                     say(f"{name}: done, {done} of {len(given)}")
-                elif end.lost and job.attempt < ATTEMPTS:
-                    waiting.insert(0, job)
+                elif end.lost and attempts[name] < ATTEMPTS:
+                    waiting.insert(0, name)
                     say(f"{name}: {why}; it goes on from its last checkpoint")
                 else:
-                    failed[name] = f"{why} (see {job.log})"
+                    failed[name] = f"{why} (see {given[name].log})"
                     say(f"{name}: failed: {failed[name]}")
             if time.monotonic() - news > NEWS_SECONDS:
                 news = time.monotonic()
-                at = ", ".join(f"{job.run.name} {100 * job.share:.0f} %" for job in going)
-                parts = sum(job.share for job in (*going, *waiting))
+                at = ", ".join(f"{name} {100 * given[name].share:.0f} %" for name in going)
+                parts = sum(given[name].share for name in (*going, *waiting))
                 say(f"{done} of {len(given)} done; {at}{clock.left(done + parts, len(given))}")
             time.sleep(POLL_SECONDS)
     finally:
-        for job in going:  # after a Ctrl-C: each run can be continued
-            job.worker.ask()
-        for job in going:
-            job.worker.stop()
+        for worker in going.values():  # after a Ctrl-C: each run can be continued
+            worker.ask()
+        for worker in going.values():
+            worker.stop()
     return failed
 
 

@@ -156,7 +156,7 @@ class Pretended:
     def slots(self):
         return 1
 
-    def begin(self, run, log):
+    def begin(self, run):
         self.begun.append(run.name)
         self.run = run
         return self
