@@ -153,8 +153,6 @@ class TrainConfig(TrainSettings):
         for name, kind in (widths | dict.fromkeys(PAIRS, dict)).items():
             if not isinstance(value := getattr(self, name), kind):
                 raise QuadrlError(name=name, value=value, allowed=f"a {kind.__name__}")
-            if kind is dict and not all(isinstance(key, str) for key in value):
-                raise QuadrlError(name=name, value=value, allowed="names and their values")
         for width in (*self.hidden, *self.critic_hidden):
             number("width of a hidden layer", width, 1, MAX_WIDTH, whole=True)
         batch = self.num_envs * self.rollout  # the advantage of a single one has no deviation

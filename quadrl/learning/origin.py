@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from quadrl.base.errors import QuadrlError
+from quadrl.base.validation import tuples
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.folder import CHECKPOINT, read_config
 
@@ -43,7 +44,7 @@ class Origin(NamedTuple):
     def networks(self) -> dict[str, Any]:
         """What its networks are made of."""
         config = read_config(self.folder)
-        return {name: config[name] for name in NETWORKS if name in config}
+        return {name: tuples(config[name]) for name in NETWORKS if name in config}
 
     def checkpoint(self, size: int, actions: int) -> Path:
         """Its checkpoint, for a training with observations of a size and some actions.
@@ -78,12 +79,9 @@ def with_networks(settings: Mapping[str, Any]) -> dict[str, Any]:
     origin = Origin.of(given)
     networks = origin.networks()
     for name in networks.keys() & settings.keys():
-        own, theirs = (
-            tuple(x) if isinstance(x, list) else x for x in (settings[name], networks[name])
-        )
-        if own != theirs:
+        if (own := tuples(settings[name])) != networks[name]:
             reason = f"the networks of {origin.folder} are others"
-            raise QuadrlError(reason, name=name, value=own, allowed=repr(theirs))
+            raise QuadrlError(reason, name=name, value=own, allowed=repr(networks[name]))
     return {**networks, **settings, "from_run": str(origin)}
 
 
