@@ -130,7 +130,7 @@ def training_defaults(
     kind = tasks.TASKS[choice("task", task, tasks.TASKS)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
     choice("vehicle", vehicle, VEHICLES)
-    fields, own = _fields(), _unusual(kind, algo)
+    fields, own = dataclasses.asdict(TrainSettings()), _unusual(kind, algo)
     stated = merged(kind.training, *kind.training_with.values(), *kind.variants.values())
     keys(f"training default of {task}", stated, [name for name in fields if name not in CHOSEN])
     if own.get("vehicle", "paper") != vehicle:  # the numbers of another aircraft
@@ -155,13 +155,6 @@ def training_defaults(
     return values, sources
 
 
-def _fields() -> dict[str, Any]:
-    """The first layer but for what the algorithm changes of it."""
-    names = [field.name for field in dataclasses.fields(TrainSettings)]
-    own = {name: dataclasses.asdict(kind()) for name, kind in ALGORITHM_CONFIGS.items()}
-    return {name: getattr(TrainSettings, name, {}) for name in names} | own
-
-
 def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
     """A layer's settings as they are for an aircraft: the same in seconds."""
     timestep = VEHICLES["paper"].control_timestep
@@ -171,19 +164,19 @@ def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
     return layer | {name: PER_STEP[name](layer[name], often) for name in PER_STEP if name in layer}
 
 
-def own_settings(task: Task | type[Task], algo: str = "") -> dict[str, Any]:
-    """Settings that have other defaults with a task and an algorithm, by default its own.
+def own_settings(task: Task | type[Task]) -> dict[str, Any]:
+    """Settings that have other defaults with a task and its own algorithm.
 
     They are as `quadrl train` takes them, at the control rate of the aircraft that it trains on.
     """
-    return at_rate(_unusual(task, algo), task.trained_on)
+    return at_rate(_unusual(task, task.trained_by), task.trained_on)
 
 
 def _unusual(task: Task | type[Task], algo: str) -> dict[str, Any]:
-    """The same at the control rate of the paper's aircraft."""
+    """The same with any algorithm, at the control rate of the paper's aircraft."""
     chosen = {"vehicle": task.trained_on, "algo": task.trained_by}
     unusual = {name: own for name, own in chosen.items() if own != getattr(TrainSettings, name)}
-    return merged(unusual, task.training, task.training_with.get(algo or task.trained_by, {}))
+    return merged(unusual, task.training, task.training_with.get(algo, {}))
 
 
 def merged(*settings: dict[str, Any]) -> dict[str, Any]:
