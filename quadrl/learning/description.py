@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.aircraft.presets import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
 from quadrl.core.environment import Environment
@@ -15,12 +14,8 @@ from quadrl.core.task import Task
 from quadrl.learning.defaults import own_settings
 
 
-def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]:
-    """Describe a task before it is flown, as JSON can hold it.
-
-    Args:
-        task: The task.
-        vehicle: The aircraft; None for the paper's.
+def describe(task: Task) -> dict[str, Any]:
+    """Describe a task before it is flown with the paper's aircraft, as JSON can hold it.
 
     Returns:
         name, asks, starts, ends, solved (texts); time_limit [s]; training: settings that have other
@@ -28,15 +23,14 @@ def describe(task: Task, vehicle: Vehicle | str | None = None) -> dict[str, Any]
         term of the flat vector; action (text); reward: name, weight (None without an option of that
         name) and meaning of each term; options: name, value and meaning of the others.
     """
-    vehicle, texts = resolve(vehicle), docstrings(type(task))
-    environment = Environment(task, vehicle=vehicle, seed=0)
+    environment, texts = Environment(task, seed=0), docstrings(type(task))
     values = dataclasses.asdict(task)
     return {
         **{name: getattr(task, name) for name in ("name", "asks", "starts", "ends", "solved")},
         "time_limit": task.time_limit,
         "training": own_settings(task),
         "observation": describe_observation(environment),
-        "action": describe_action(vehicle),
+        "action": describe_action(environment.vehicle),
         "reward": [
             {"name": term, "weight": values.get(f"{term}_weight"),
              "meaning": texts.get(f"{term}_weight", "")}

@@ -11,10 +11,9 @@ import pytest
 
 import quadrl
 from quadrl import tasks
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
 from quadrl.core.environment import Environment
-from quadrl.learning.description import describe
+from quadrl.learning.description import describe, describe_action, describe_observation
 from quadrl.tasks.hover import Hover
 
 
@@ -54,9 +53,9 @@ def test_terms_and_weights_are_those_of_a_flight(name):
 
 
 def test_a_task_of_ones_own_is_described():
-    described = describe(Tidy(time_limit=3.0), Vehicle(action_scale=20.0))
+    described = describe(Tidy(time_limit=3.0))
     assert described["time_limit"] == 3.0
-    assert "20 rad/s at 1" in described["action"]
+    assert "35 rad/s at 1" in described["action"]
     option = {"name": "margin", "value": 0.5, "meaning": "Something in two lines [m]"}
     assert option in described["options"]
     assert described["reward"][-1] == {"name": "tidy", "weight": None, "meaning": ""}
@@ -64,10 +63,10 @@ def test_a_task_of_ones_own_is_described():
 
 
 def test_the_layout_is_that_of_the_aircraft():
-    described = describe(Hover(), "hexa")
-    speeds = next(t for t in described["observation"] if t["name"] == "rotor_speed")
+    environment = Environment(Hover(), vehicle="hexa", seed=0)
+    speeds = next(t for t in describe_observation(environment) if t["name"] == "rotor_speed")
     assert (speeds["first"], speeds["last"]) == (15, 20)
-    assert described["action"].startswith("6 numbers")
+    assert describe_action(environment.vehicle).startswith("6 numbers")
 
 
 def test_modules_that_have_moved_are_found_under_their_old_names():
