@@ -152,57 +152,42 @@ def flights(rollout: Rollout) -> dict[str, np.ndarray]:
 
     Returns:
         success, survived and diverged (bool); position_error_m: mean error over the last 2 s [m];
-        where the heading matters heading_error_deg: mean of |yaw| over the same time; the
-        `behaviour`; return; length_s.
+        where the heading matters heading_error_deg: mean of |yaw| over the same time;
+        yaw_rate_rad_s: mean of the body rate about z, without its sign, over it [rad/s]; where the
+        task asks to keep a place circling_m_s: mean speed relative to the goal over it [m/s]; and
+        over the whole flight command_change_rate: mean change of a rotor's command from one control
+        step to the next, as a share of its largest speed; saturated_rate: share of the entries of
+        the actions that are -1 or 1; least_height_m: of the aircraft's centre above the ground [m];
+        return; length_s.
     """
     steps = max(1, round(FINAL_STRETCH / rollout.control_timestep))
     index = np.arange(len(rollout.error))[:, None]
-    last = (index >= rollout.length - steps) & (index < rollout.length)
+    flown = index < rollout.length
+    last = flown & (index >= rollout.length - steps)
     yaw = np.degrees(roll_pitch_yaw(rollout.quaternion)[..., 2])
     heading = {"heading_error_deg": _means(np.abs(yaw), last)}
+    relative = np.linalg.norm(rollout.velocity - rollout.target_velocity, axis=-1)
+    circling = {"circling_m_s": _means(relative, last)}
+    change = np.abs(np.diff(rollout.rotor_command, axis=0)).mean(-1)
+    height = rollout.position[..., 2] + rollout.origin[2]
     return {
         "success": rollout.is_success,
         "survived": ~(rollout.terminated & ~rollout.is_success),
         "diverged": rollout.diverged,
         "position_error_m": _means(rollout.error, last),
         **(heading if rollout.task.heading_matters else {}),
-        **behaviour(rollout, last),
+        "yaw_rate_rad_s": _means(np.abs(rollout.body_rate[..., 2]), last),
+        **(circling if rollout.task.keeps_place else {}),
+        "command_change_rate": _means(change, flown[1:]),
+        "saturated_rate": _means((np.abs(rollout.action) >= 1.0).mean(-1), flown),
+        "least_height_m": np.where(flown, height, np.inf).min(0),
         "return": np.nansum(rollout.reward, 0),
         "length_s": rollout.length * rollout.control_timestep,
     }
 
 
-def behaviour(rollout: Rollout, last: np.ndarray) -> dict[str, np.ndarray]:
-    """How each aircraft flies, beside where: arrays (N,).
-
-    Args:
-        rollout: The flights.
-        last: Whether a step is in the last 2 s of a flight, (T, N) bool.
-
-    Returns:
-        yaw_rate_rad_s: mean of the body rate about z, without its sign, over the last 2 s [rad/s];
-        where the task asks to keep a place circling_m_s: mean speed relative to the goal over the
-        same time [m/s]; and over the whole flight command_change_rate: mean change of a rotor's
-        command from one control step to the next, as a share of its largest speed;
-        saturated_rate: share of the entries of the actions that are -1 or 1; least_height_m: of
-        the aircraft's centre above the ground [m].
-    """
-    height = rollout.position[..., 2] + rollout.origin[2]
-    flown = np.arange(len(height))[:, None] < rollout.length
-    relative = np.linalg.norm(rollout.velocity - rollout.target_velocity, axis=-1)
-    change = np.abs(np.diff(rollout.rotor_command, axis=0)).mean(-1)
-    circling = {"circling_m_s": _means(relative, last)} if rollout.task.keeps_place else {}
-    return {
-        "yaw_rate_rad_s": _means(np.abs(rollout.body_rate[..., 2]), last),
-        **circling,
-        "command_change_rate": _means(change, flown[1:]),
-        "saturated_rate": _means((np.abs(rollout.action) >= 1.0).mean(-1), flown),
-        "least_height_m": np.where(flown, height, np.inf).min(0),
-    }
-
-
 def means_of_behaviour(flown: dict[str, np.ndarray]) -> dict[str, float]:
-    """Means of the `behaviour` in what `flights` gives, and the least of the heights.
+    """Means of BEHAVIOUR in what `flights` gives, and the least of the heights.
 
     Over the flights that did not fail (who tumbles does not spin), over all if none is left.
     """
