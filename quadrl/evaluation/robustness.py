@@ -12,7 +12,6 @@ import numpy as np
 
 from quadrl.aircraft.aerodynamics import NONE
 from quadrl.aircraft.presets import resolve
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.progress import ProgressBar
 from quadrl.base.validation import choice, number
@@ -162,20 +161,28 @@ def robustness(
     first = next(iter(flown.values()))[1]
     levels = sum(len(one.levels) - 1 for one in chosen) + 1
     total = len(flown) * (levels + recovery * len(MAPS))
-    found: dict[str, Any] = {"task": first.task.name, "vehicle": first.vehicle.name, "seed": seed}
-    found |= {"episodes": episodes, "engine": first.engine, "flown": [*flown]}
-    found["scenarios"] = {name: scenario.to_json() for name, (_, scenario) in flown.items()}
-    found |= {"axes": {one.name: _described(one) for one in chosen}, "recovery": {}}
-    worlds = {
-        (name, one.name): [disturbed(scenario, one.at(level)) for level in one.levels]
-        for one in chosen
-        for name, (_, scenario) in flown.items()
+    found: dict[str, Any] = {
+        "task": first.task.name,
+        "vehicle": first.vehicle.name,
+        "seed": seed,
+        "episodes": episodes,
+        "engine": first.engine,
+        "flown": [*flown],
+        "scenarios": {name: scenario.to_json() for name, (_, scenario) in flown.items()},
+        "axes": {},
+        "recovery": {},
     }
+    worlds: dict[tuple[str, str], list[Scenario]] = {}
     for one in chosen:
-        reach = {name: _reach(one, scenario.aircraft) for name, (_, scenario) in flown.items()}
-        found["axes"][one.name]["reach"] = reach
+        axis = {name: getattr(one, name) for name in ("label", "unit", "levels", "usual")}
+        axis = found["axes"][one.name] = {**axis, "flown": {}, "reach": {}}
+        ends = one.levels[0], one.levels[-1]
+        for name, (_, scenario) in flown.items():
+            reach = [limit(one.at, one.usual, end, scenario.aircraft) for end in ends]
+            axis["reach"][name] = reach
+            worlds[name, one.name] = [disturbed(scenario, one.at(level)) for level in one.levels]
     done, kept = 0, ResultCache(None if keep is None else Path(keep))
-    fresh: Any = {"seed": EVALUATION_SEED + seed}
+    fresh: Any = {"episodes": episodes, "seed": EVALUATION_SEED + seed}
 
     with ProgressBar() as bar:
 
@@ -187,14 +194,14 @@ def robustness(
 
         for name, (flies, scenario) in flown.items():
             count(f"{name}, undisturbed")
-            undisturbed = kept(measured, flies, scenario, episodes=episodes, **fresh)
+            undisturbed = kept(measured, flies, scenario, **fresh)
             for one in chosen:
                 at = [undisturbed] * len(one.levels)
                 for k, level in enumerate(one.levels):
                     if level != one.usual:
                         count(f"{name}, {one.label}")
                         there = worlds[name, one.name][k]
-                        at[k] = kept(measured, flies, there, episodes=episodes, **fresh)
+                        at[k] = kept(measured, flies, there, **fresh)
                 found["axes"][one.name]["flown"][name] = _summary(one, at)
         for chart in MAPS.values() if recovery else ():
             sides = {side: vars(getattr(chart, side)) for side in "xy"}
@@ -243,16 +250,6 @@ def _summary(one: Disturbance, at: list[dict[str, Any] | None]) -> dict[str, Any
     below = half_level(one.levels[start::-1], shares[start::-1])
     above = half_level(one.levels[start:], shares[start:])
     return {**columns, "half": [below, above]}
-
-
-def _reach(one: Disturbance, vehicle: Vehicle) -> list[float | None]:
-    """The levels under and over the usual one from which on no policy can hover."""
-    return [limit(one.at, one.usual, end, vehicle) for end in (one.levels[0], one.levels[-1])]
-
-
-def _described(one: Disturbance) -> dict[str, Any]:
-    names = ("label", "unit", "levels", "usual")
-    return {name: getattr(one, name) for name in names} | {"flown": {}}
 
 
 def _flown(
