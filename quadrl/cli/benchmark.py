@@ -36,7 +36,6 @@ class Benchmark:
         if self.json:
             print_json(measured)
             return
-        head, *layers = rows(measured)
-        console.print(make_table(head, layers, numbers=5))
+        console.print(make_table(rows(measured), numbers=5))
         say("\nsteps/s: control steps a second, the fastest of the repetitions")
         say(f"\n{in_a_line(measured['machine'])}")

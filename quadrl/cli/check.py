@@ -26,5 +26,4 @@ class Check(Conditioned):
             rows = [dataclasses.asdict(row) for row in found.rows]
             print_json({"vehicle": found.vehicle.name, "rows": rows})
             return
-        head, *rows = found.table
-        console.print(make_table(head, rows))
+        console.print(make_table(found.table))

@@ -7,7 +7,7 @@ import json
 import shlex
 import signal
 import sys
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,18 +33,18 @@ def print_json(data: Any) -> None:
     print(json.dumps(data))
 
 
-def make_table(head: Sequence[str], rows: Iterable[Sequence[str]] = (), numbers: int = 0) -> Table:
+def make_table(rows: Sequence[Sequence[str]], numbers: int = 0) -> Table:
     """A table without lines, whose texts are no markup; the last columns hold `numbers`.
 
-    Where the terminal is narrow, cells are broken between words and never within one.
+    The first row is its head. Where the terminal is narrow, cells are broken between words and
+    never within one.
     """
-    cells = [head, *rows]
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for k, column in enumerate(head):
-        right = k >= len(head) - numbers
-        longest = max(len(word) for row in cells for word in ("", *row[k].split()))
+    for k, column in enumerate(rows[0]):
+        right = k >= len(rows[0]) - numbers
+        longest = max(len(word) for row in rows for word in ("", *row[k].split()))
         table.add_column(column, min_width=longest, justify="right" if right else "left")
-    for row in cells[1:]:
+    for row in rows[1:]:
         table.add_row(*(escape(cell) for cell in row))
     return table
 

@@ -46,6 +46,6 @@ class Evaluate(Flown):
         rows = [
             (name, *(quantity(name, column[name]) for column in columns.values())) for name in first
         ]
-        console.print(make_table(("", *columns), rows, numbers=len(columns)))
+        console.print(make_table([("", *columns), *rows], numbers=len(columns)))
         if self.csv is not None:
             say(f"wrote {self.csv}")

@@ -70,8 +70,7 @@ class Robustness(Conditioned):
         if self.json:
             print_json(card.found)
             return
-        head, *rows = card.table
-        console.print(make_table(head, rows, numbers=len(head) - 1))
+        console.print(make_table(card.table, numbers=len(card.found["flown"])))
         if card.reach:
             say(card.reach)
         for path in paths:

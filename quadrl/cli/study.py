@@ -57,12 +57,11 @@ def carry_out(
     if json:
         print_json(found.content | {"compared": [dataclasses.asdict(one) for one in compared]})
     else:
-        head, *rows = found.table
-        console.print("", make_table(head, rows, numbers=4))
+        console.print("", make_table(found.table, numbers=4))
         say("\nmeans over the seeds, with their 95 % intervals in brackets")
         if compared:
             head = ("the one", "the other", f"smaller {compare}", "verdict", "power")
-            console.print("", make_table(head, [_row(one) for one in compared], numbers=3))
+            console.print("", make_table([head, *map(_row, compared)], numbers=3))
             say(f"\nchance that a seed of the one has the smaller {compare}, within a task;")
             say("power to show a chance of three in four, and to show no difference")
         say(f"in {found.folder}: table.csv, study.json, learning_curves_TASK.png, the runs")

@@ -32,15 +32,15 @@ class Tasks:
             whole = {task["name"]: task for task in described}
             print_json(whole[self.task] if self.task else whole)
             return
-        console.print(make_table(("task", "", ""), _texts(described)))
+        console.print(make_table([("task", "", ""), *_texts(described)]))
         head = ("observation", "numbers", "unit", "meaning and frame")
-        console.print(make_table(head, observation_rows(described)))
+        console.print(make_table([head, *observation_rows(described)]))
         console.print(f"\n[bold]action[/bold]  {escape(described[0]['action'])}\n", highlight=False)
         head = ("reward", "meaning", "weight", "" if self.task else "where it differs")
-        console.print(make_table(head, reward_rows(described)))
+        console.print(make_table([head, *reward_rows(described)]))
         if self.task:
             rows = [(o["name"], _text(o["value"]), o["meaning"]) for o in described[0]["options"]]
-            console.print("", make_table(("option", "default", "meaning"), rows))
+            console.print("", make_table([("option", "default", "meaning"), *rows]))
         else:
             say("\nquadrl tasks NAME shows the options of a task")
 

@@ -96,7 +96,7 @@ class Train:
         if self.dry_run:
             config, _ = prepare(task, self.out, self.resume, settings)
             rows = ((name, str(value), origin) for name, value, origin in config.sources())
-            console.print(make_table(("setting", "value", "from"), rows))
+            console.print(make_table([("setting", "value", "from"), *rows]))
             return
         if self.seeds:
             self._study(task, settings)
