@@ -45,26 +45,19 @@ def words(known: Iterable[str], *others: str) -> PrimitiveConstructorSpec[str]:
 
 
 TaskName = Annotated[str, words(TASKS)]
-VariantName = Annotated[str, words(VARIANTS)]
-VehicleName = Annotated[str, words(VEHICLES)]
 Algorithm = Annotated[str, words((*ALGORITHMS, *ALIASES))]
 ControllerName = Annotated[str, words(CONTROLLERS)]
-ControlModeName = Annotated[str, words(CONTROL_MODES)]
-EngineName = Annotated[str, words(ENGINES)]
-MemoryName = Annotated[str, words(MEMORIES)]
-RandomizationName = Annotated[str, words(RANDOMIZATIONS, "JSON")]
-WeatherName = Annotated[str, words(WEATHERS, "JSON")]
 Camera = Annotated[str, words(("follow", "track", "chase", "onboard", "fixed"))]
 SETTINGS = {
     "task": TaskName,
-    "variant": VariantName,
-    "vehicle": VehicleName,
+    "variant": Annotated[str, words(VARIANTS)],
+    "vehicle": Annotated[str, words(VEHICLES)],
     "algo": Algorithm,
-    "control_mode": ControlModeName,
-    "engine": EngineName,
-    "weather": WeatherName,
-    "randomization": RandomizationName,
-    "memory": MemoryName,
+    "control_mode": Annotated[str, words(CONTROL_MODES)],
+    "engine": Annotated[str, words(ENGINES)],
+    "weather": Annotated[str, words(WEATHERS, "JSON")],
+    "randomization": Annotated[str, words(RANDOMIZATIONS, "JSON")],
+    "memory": Annotated[str, words(MEMORIES)],
     "aerodynamics": str,
 }
 """Of settings and conditions, by name."""
