@@ -100,16 +100,11 @@ def main(arguments: list[str] | None = None) -> None:
             for path in chosen.own:
                 import_own(path)
             chosen.command.run()
-    except (QuadrlError, OSError) as error:
-        if os.environ.get("QUADRL_TRACEBACK"):
+    except (QuadrlError, OSError, MemoryError, RuntimeError) as error:
+        said = console.reason(error)
+        if os.environ.get("QUADRL_TRACEBACK") or said is None:
             raise
-        said = console.reason(error) if isinstance(error, OSError) else error
         stderr.print(f"quadrl: {said}")
-        sys.exit(2)
-    except (MemoryError, RuntimeError) as error:
-        if os.environ.get("QUADRL_TRACEBACK") or not console.is_of_memory(error):
-            raise
-        stderr.print(f"quadrl: there is not enough memory: {console.in_a_line(error)}")
         sys.exit(2)
     except KeyboardInterrupt as stop:
         stderr.print(f"quadrl: {stop.args[0] if stop.args else 'stopped'}")

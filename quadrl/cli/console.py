@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from quadrl.base.errors import QuadrlError
 from quadrl.base.signals import Stopped, handling
 from quadrl.evaluation.controllers import comes_with_quadrl
 
@@ -73,21 +74,21 @@ def going_on() -> Generator[None]:
         raise
 
 
-def reason(error: OSError) -> str:
-    """The message of a system error, in a shell's words."""
-    path = error.filename2 or error.filename
-    return f"cannot read or write {path}: {error.strerror}" if path else str(error)
+def reason(error: Exception) -> str | None:
+    """What an error that the user can mend says, in a line; None where it is another.
 
-
-def is_of_memory(error: BaseException) -> bool:
-    """Whether an error says that there is no memory left, in Python, NumPy, MuJoCo or torch."""
-    said = str(error).lower()
-    return isinstance(error, MemoryError) or any(words in said for words in OUT_OF_MEMORY)
-
-
-def in_a_line(error: BaseException) -> str:
-    """The message of an error in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    That is one of quadrl, one of the system, in a shell's words, or one of Python, NumPy, MuJoCo
+    or torch that says that there is no memory left.
+    """
+    if isinstance(error, OSError):
+        path = error.filename2 or error.filename
+        return f"cannot read or write {path}: {error.strerror}" if path else str(error)
+    if isinstance(error, QuadrlError):
+        return str(error)
+    said = " ".join(str(error).split())
+    if isinstance(error, MemoryError) or any(words in said.lower() for words in OUT_OF_MEMORY):
+        return f"there is not enough memory: {said or type(error).__name__}"
+    return None
 
 
 OUT_OF_MEMORY = ("allocate memory", "out of memory", "bad_alloc", "could not allocate")
