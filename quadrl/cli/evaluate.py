@@ -9,7 +9,7 @@ from typing import Any
 from quadrl.base.units import quantity
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, print_json, say
-from quadrl.cli.flown import Flown
+from quadrl.cli.flown import Flown, flies
 from quadrl.conditions.observing import Observing
 from quadrl.evaluation.evaluate import evaluate
 
@@ -31,9 +31,8 @@ class Evaluate(Flown):
         """Print the metrics, beside those of the geometric controller."""
         flight: dict[str, Any] = {"episodes": self.episodes, "seed": self.seed}
         name = self.controller or "policy"
-        flown = evaluate(
-            self.flies(), self.task or None, sampled=self.sampled, **flight, **self.conditions()
-        )
+        who, given = flies(self.policy, self.controller, self.algo), self.conditions()
+        flown = evaluate(who, self.task or None, sampled=self.sampled, **flight, **given)
         first, columns = flown.metrics, {name: flown.metrics}
         if self.controller != "geometric" and not self.json:  # it has rotor commands, and sees all
             other = dataclasses.replace(flown.scenario, control_mode="rotor", observe=Observing())

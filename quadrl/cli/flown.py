@@ -19,7 +19,6 @@ from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import Conditions
 from quadrl.evaluation.controllers import comes_with_quadrl
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.policy_file import FILE
 from quadrl.learning.defaults import PAIRS
 
 HELP = {
@@ -51,14 +50,15 @@ class Conditioned(ConditionOptions):
 
 
 def parsed(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a command line as the functions of Python take them, without what is not given.
+    """Options of a command line as Python takes them, at any depth, without what is not given.
 
     Raises:
         QuadrlError: One begins like JSON and is none, or has no equals sign.
     """
+    whole = {k: parsed(v) if isinstance(v, dict) else v for k, v in given.items()}
     return {
         name: parse_options(value) if name in PAIRS else parse_named(name, value)
-        for name, value in given.items()
+        for name, value in whole.items()
         if value not in (None, "", {}) and (value or name not in PAIRS)
     }
 
@@ -80,33 +80,26 @@ class Flown(Conditioned):
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
 
-    @property
-    def label(self) -> str:
-        """The name of a flight in a comparison."""
-        path = Path(self.controller or self.policy)
-        return path.parent.name if path.name == FILE and path.parent.name else path.name
 
-    def flies(self) -> str | Path | Policy:
-        """The policy or controller, as the Python functions take it.
+def flies(policy: str, controller: str, algo: str) -> str | Path | Policy:
+    """A policy or a controller, as the Python functions take it, from the words of the options.
 
-        Raises:
-            QuadrlError: It is unknown, or the choice is ambiguous.
-        """
-        if bool(self.policy) == bool(self.controller):
-            raise QuadrlError(
-                "give either a policy (a run folder, a .safetensors file, or the name of a task) "
-                f"or --controller {' or '.join(CONTROLLERS)}"
-            )
-        if self.algo and self.policy not in tasks.TASKS:
-            raise QuadrlError(
-                "--algo chooses among the policies that come with quadrl: give the name of a task, "
-                "or leave it out"
-            )
-        if self.controller:
-            return choice("controller", self.controller, CONTROLLERS)
-        if self.algo:
-            return Policy.pretrained(self.policy, self.algo)
-        return policy_named(self.policy)
+    Raises:
+        QuadrlError: It is unknown, or the choice is ambiguous.
+    """
+    if bool(policy) == bool(controller):
+        raise QuadrlError(
+            "give either a policy (a run folder, a .safetensors file, or the name of a task) "
+            f"or --controller {' or '.join(CONTROLLERS)}"
+        )
+    if algo and policy not in tasks.TASKS:
+        raise QuadrlError(
+            "--algo chooses among the policies that come with quadrl: give the name of a task, "
+            "or leave it out"
+        )
+    if controller:
+        return choice("controller", controller, CONTROLLERS)
+    return Policy.pretrained(policy, algo) if algo else policy_named(policy)
 
 
 def policy_named(word: str) -> str | Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +10,8 @@ from tyro.conf import Positional, arg
 from quadrl.base.files import free_name
 from quadrl.cli import choices
 from quadrl.cli.console import console, say
-from quadrl.cli.flown import Flown
+from quadrl.cli.flown import Flown, flies
+from quadrl.evaluation.policy_file import FILE
 from quadrl.learning.show import render
 from quadrl.rendering.sheet import SHEETS
 from quadrl.rendering.video import VIDEOS, checked
@@ -45,16 +45,13 @@ class Render(Flown):
 
     def run(self) -> None:
         """Fly an episode of each and draw them."""
-        alone: dict[str, Any] = {"policy": "", "controller": ""}
-        chosen = [alone | {"policy": name} for name in self.policy]
-        chosen += [alone | {"controller": name, "algo": ""} for name in self.controller]
-        names = [field.name for field in dataclasses.fields(Flown)]
-        shared = {name: getattr(self, name) for name in names}
-        flown = [Flown(**(shared | one)) for one in chosen or [alone]]
+        chosen = [(policy, "", self.algo) for policy in self.policy]
+        chosen += [("", controller, "") for controller in self.controller]
         controllers: dict[str, Any] = {}
-        for one in flown:
-            again = f" ({len(controllers) + 1})" if one.label in controllers else ""
-            controllers[one.label + again] = one.flies()
+        for policy, controller, algo in chosen or [("", "", self.algo)]:
+            name = label(controller or policy)
+            again = f" ({len(controllers) + 1})" if name in controllers else ""
+            controllers[name + again] = flies(policy, controller, algo)
         out, kind = checked(self.out or free_name(Path("flight.mp4")), (*VIDEOS, *SHEETS))
         out.parent.mkdir(parents=True, exist_ok=True)  # refused before the flight, not after
         media = render(
@@ -71,3 +68,9 @@ class Render(Flown):
             **self.conditions(),
         )
         say(f"wrote {media.save(out)}")
+
+
+def label(flown: str) -> str:
+    """The name of a flight in a comparison."""
+    path = Path(flown)
+    return path.parent.name if path.name == FILE and path.parent.name else path.name

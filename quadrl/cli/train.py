@@ -91,7 +91,7 @@ class Train:
 
     def run(self) -> None:
         """Train, sum up, draw."""
-        settings = parsed(given(dataclasses.asdict(self.settings)))
+        settings = parsed(dataclasses.asdict(self.settings))
         task = settings.pop("task", None)
         if self.dry_run:
             config, _ = prepare(task, self.out, self.resume, settings)
@@ -153,12 +153,6 @@ class Train:
         if config.num_envs < FEW:
             say("Many aircraft train faster than few, with shorter rollouts: see --num-envs.\n")
         return run
-
-
-def given(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings that are given, at any depth."""
-    kept = {k: given(v) if isinstance(v, dict) else v for k, v in settings.items()}
-    return {name: value for name, value in kept.items() if value not in (None, "", {})}
 
 
 def _draw(run: Run, *, video: bool) -> None:

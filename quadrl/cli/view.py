@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from quadrl.cli import choices
 from quadrl.cli.console import say
-from quadrl.cli.flown import Flown
+from quadrl.cli.flown import Flown, flies
 from quadrl.rendering.live.view import view
 from quadrl.tasks import TASKS
 
@@ -27,7 +27,7 @@ class View(Flown):
         name = self.controller or self.policy
         try:
             view(
-                self.flies(),
+                flies(self.policy, self.controller, self.algo),
                 self.task or None,
                 label=f"{name}_{self.algo or TASKS[name].trained_by}" if name in TASKS else name,
                 num_envs=self.num_envs,

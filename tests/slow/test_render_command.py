@@ -63,4 +63,4 @@ def test_side_by_side_they_fly_the_task_of_the_first_in_one_world():
     + [("x/best.safetensors", "best.safetensors"), ("policy.safetensors", "policy.safetensors")],
 )
 def test_flights_are_named_after_their_runs(policy, label):
-    assert cli.flown.Flown(policy=policy).label == label
+    assert cli.render.label(policy) == label
