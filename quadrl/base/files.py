@@ -56,9 +56,14 @@ def write_json(path: Path, content: Any) -> None:
 
 def write_csv(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write rows under the names of their columns, whole or not at all."""
+    write_whole(path, csv_content([head, *rows]))
+
+
+def csv_content(rows: Iterable[Sequence[Any]]) -> bytes:
+    """The content of a .csv file, its head first."""
     text = io.StringIO(newline="")
-    csv.writer(text).writerows([head, *rows])
-    write_whole(path, text.getvalue().encode())
+    csv.writer(text).writerows(rows)
+    return text.getvalue().encode()
 
 
 def put(written: Path, path: Path) -> None:

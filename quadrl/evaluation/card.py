@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import html
-import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import write_whole
+from quadrl.base.files import csv_content, write_whole
 from quadrl.base.media import Media
 from quadrl.base.units import quantity
 from quadrl.core.scenario import as_saved
@@ -144,7 +142,7 @@ class Card:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"format": FORMAT, **self.found}, indent=1, allow_nan=False) + "\n"
-        contents = {f"{FILE}.json": text.encode(), f"{FILE}.csv": self._csv().encode()}
+        contents = {f"{FILE}.json": text.encode(), f"{FILE}.csv": csv_content(self._rows())}
         for name in [FILE, *[RECOVERY] * bool(self.found["recovery"])]:
             for kind, picture in zip(KINDS, self._drawn(name, *KINDS), strict=True):
                 contents[f"{name}.{kind}"] = picture
@@ -185,21 +183,18 @@ class Card:
         figure = draw(self.found)
         return [plotting.content(figure, kind) for kind in kinds]
 
-    def _csv(self) -> str:
-        text = io.StringIO(newline="")
-        writer = csv.writer(text)
+    def _rows(self) -> Iterator[Sequence[Any]]:
+        """The numbers as a table: a row for each level that each flew."""
         quartiles = [f"error_{round(100 * q)}_m" for q in QUARTILES]
         shares, rest = ("success", "low", "high"), BEHAVIOUR
-        head = ("disturbance", "unit", "flown", "level", *shares, *quartiles, *rest)
-        writer.writerow(head)
+        yield ("disturbance", "unit", "flown", "level", *shares, *quartiles, *rest)
         for name, axis in self.found["axes"].items():
             for flown, reached in axis["flown"].items():
                 for k, level in enumerate(axis["levels"]):
                     errors = reached["error_m"][k] or ["", "", ""]
                     known = (reached[which][k] for which in shares)
                     ways = (reached[which][k] if which in reached else None for which in rest)
-                    writer.writerow([name, axis["unit"], flown, level, *known, *errors, *ways])
-        return text.getvalue()
+                    yield [name, axis["unit"], flown, level, *known, *errors, *ways]
 
 
 def half_words(axis: Mapping[str, Any], half: Sequence[float | None]) -> str:
