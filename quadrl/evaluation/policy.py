@@ -258,9 +258,7 @@ class Policy:
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
-        arrays = {"mean": self.mean, "deviation": self.deviation}
-        header = {"task": self.task, "metadata": self.metadata}
-        policy_file.write(Path(path), self.weights, self.biases, self.memory, header, **arrays)
+        policy_file.write(Path(path), self)
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:

@@ -31,30 +31,16 @@ LARGEST = 1e30
 PARTS = ("weight", "bias")
 
 
-def write(
-    path: Path,
-    weights: tuple[np.ndarray, ...],
-    biases: tuple[np.ndarray, ...],
-    memory: GRU | None,
-    header: dict[str, Any],
-    **arrays: np.ndarray,
-) -> None:
-    """Write the file of a policy, whole or not at all.
-
-    Args:
-        path: The file.
-        weights: Weights of each layer.
-        biases: Biases of each layer.
-        memory: What it remembers with.
-        header: Its task and its metadata.
-        **arrays: Its other arrays by name.
-    """
-    for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+def write(path: Path, policy: Any) -> None:
+    """Write the file of a policy, whole or not at all."""
+    arrays = {"mean": policy.mean, "deviation": policy.deviation}
+    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
-    arrays |= memory.arrays() if memory else {}
+    arrays |= policy.memory.arrays() if policy.memory else {}
     arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
-    written = RECURRENT_FORMAT if memory else FORMAT
-    write_safetensors(path, arrays, {"format": written, **header}, to_bytes)
+    header = {"format": RECURRENT_FORMAT if policy.memory else FORMAT}
+    header |= {"task": policy.task, "metadata": policy.metadata}
+    write_safetensors(path, arrays, header, to_bytes)
 
 
 def read(path: Path) -> dict[str, Any]:
