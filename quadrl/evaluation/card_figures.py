@@ -83,10 +83,8 @@ def _panels(upper: Any, lower: Any, axis: Mapping[str, Any], flown: list[str]) -
         for half in (level for level in reached["half"] if level is not None):
             ring = {"marker": "o", "ms": 8, "mfc": "none", "mew": 1.6, "color": colour}
             upper.plot([half], [50], ls="none", zorder=5, **ring)
-        if not known.all():
-            for panel in (upper, lower):
-                for start, end in _unknown(levels, known):
-                    panel.axvspan(start, end, color=GREY, alpha=0.18, lw=0)
+        for panel, span in itertools.product((upper, lower), _unknown(levels, known)):
+            panel.axvspan(*span, color=GREY, alpha=0.18, lw=0)
     _hatch((upper, lower), axis, flown)
     upper.axhline(50, color=GREY, lw=0.7, zorder=0)
     upper.set(ylim=(-4, 104), yticks=(0, 25, 50, 75, 100))
@@ -162,14 +160,13 @@ def maps(found: Mapping[str, Any]) -> Figure:
     bar = figure.colorbar(shown, ax=grid, shrink=min(1.0, 1.2 / len(flown) + 0.3), pad=0.015)
     bar.set_label("flights that recover [%]; white line: half")
     bar.outline.set_visible(False)
-    words = f"Recovery on {found['task']}, aircraft {found['vehicle']}"
-    head(figure, words)
+    head(figure, f"Recovery on {found['task']}, aircraft {found['vehicle']}")
     return figure
 
 
 def _head(figure: Figure, words: str, hatched: bool, handles: list[Any], names: list[str]) -> None:
     """The title, and what each line is, above the panels."""
-    figure.suptitle(words, x=0.01, ha="left", fontweight="bold", fontsize=11)
+    head(figure, words)
     ring = Line2D([], [], color=GREY, marker="o", ms=8, mfc="none", ls="none")
     entries: list[tuple[Any, str]] = [(ring, "half of the flights fail")]
     if hatched:
