@@ -202,14 +202,14 @@ def spread(runs: Sequence[Metrics], name: str, clock: str) -> tuple[np.ndarray, 
 
 
 @styled
-def trajectory(rollout: Rollout, title: str, episodes: int = len(COLOURS)) -> Figure:
+def trajectory(rollout: Rollout, title: str) -> Figure:
     """Flights in space and over time; figure 6 of the paper, and what led to it.
 
     Each flight has a colour. Goals are dashed: black where all flights have the same one that
     stays, else each in the colour of its flight. Flights in wind show it, and the airspeed. At most
-    `episodes` flights are drawn.
+    as many flights are drawn as there are COLOURS.
     """
-    shown = min(episodes, rollout.position.shape[1])
+    shown = min(len(COLOURS), rollout.position.shape[1])
     goals = rollout.goal[:, :shown]
     shared = bool(np.all(np.isnan(goals) | (np.abs(goals - goals[:1, :1]) < 1e-9)))
     figure = Figure(figsize=(14.0, 9.6), layout="constrained")
@@ -254,14 +254,14 @@ def _quantities(rollout: Rollout, shown: int) -> tuple[dict[str, np.ndarray], ..
 def _flights(axis: Any, rollout: Rollout, values: np.ndarray, **style: Any) -> None:
     """Draw values (T, n) over time, a colour each."""
     time = np.arange(1, len(values) + 1) * rollout.control_timestep
-    for value, colour in zip(values.T, itertools.cycle(COLOURS), strict=False):
+    for value, colour in zip(values.T, COLOURS, strict=False):
         axis.plot(time, value, **({"color": colour, "lw": 1.2, "alpha": 0.85} | style))
     tidy(axis)
 
 
 def _space(space: Any, rollout: Rollout, goals: np.ndarray, shared: bool) -> None:
     """Draw the paths of flights and their goals (T, n, 3) in space."""
-    for i, colour in zip(range(goals.shape[1]), itertools.cycle(COLOURS), strict=False):
+    for i, colour in zip(range(goals.shape[1]), COLOURS, strict=False):
         flown, goal = (path[: rollout.length[i], i] for path in (rollout.position, goals))
         ended = "successful" if rollout.is_success[i] else "not successful"
         space.plot(*flown.T, color=colour, lw=1.4, alpha=0.9, label=f"flight {i + 1}, {ended}")
