@@ -35,24 +35,17 @@ def card(found: Mapping[str, Any]) -> Figure:
     rows = math.ceil(len(axes) / columns)
     size = max(columns * PANEL[0], 2 * PANEL[0]), rows * PANEL[1] + GAP
     figure = Figure(figsize=size, layout="constrained")
-    grid: Any = figure.subplots(2 * rows, columns, squeeze=False, height_ratios=[1.25, 1] * rows)
+    shared: Any = {"sharey": "row", "squeeze": False, "height_ratios": [1.25, 1] * rows}
+    grid: Any = figure.subplots(2 * rows, columns, **shared)
     for k, axis in enumerate(axes.values()):
         row, column = divmod(k, columns)
         upper, lower = grid[2 * row, column], grid[2 * row + 1, column]
         _panels(upper, lower, axis, flown)
-        for panel, label in ((upper, "success [%]"), (lower, "error [m]")):
-            if column == 0:
-                panel.set_ylabel(label)
-            else:
-                panel.tick_params(labelleft=False)
+        if column == 0:
+            upper.set_ylabel("success [%]")
+            lower.set_ylabel("error [m]")
     for panel in grid.flat:
         panel.set_visible(panel.has_data())
-    for row in range(rows):
-        bottom = [panel for panel in grid[2 * row + 1] if panel.get_visible()]
-        low = min(panel.get_ylim()[0] for panel in bottom)
-        high = max(panel.get_ylim()[1] for panel in bottom)
-        for panel in bottom:
-            panel.set_ylim(low, high)
     words = f"{found['task']}, aircraft {found['vehicle']}, {found['episodes']} flights a level"
     hatched = any(_beyond(axis, name) for axis in axes.values() for name in flown)
     _head(figure, words, hatched, *grid[0, 0].get_legend_handles_labels())
@@ -168,12 +161,9 @@ def _head(figure: Figure, words: str, hatched: bool, handles: list[Any], names: 
     """The title, and what each line is, above the panels."""
     head(figure, words)
     ring = Line2D([], [], color=GREY, marker="o", ms=8, mfc="none", ls="none")
-    entries: list[tuple[Any, str]] = [(ring, "half of the flights fail")]
+    marks: dict[str, Any] = {"half of the flights fail": ring}
     if hatched:
-        entries.append(
-            (Patch(**HATCHED, ec=GREY), "beyond the reach of the actions (no level hover)")
-        )
-    marks, texts = zip(*entries, strict=True)
+        marks["beyond the reach of the actions (no level hover)"] = Patch(**HATCHED, ec=GREY)
     columns = max(1, min(4, round(figure.get_figwidth() / PANEL[0]) - 1))
     legend: dict[str, Any] = {"loc": "outside lower left", "ncols": columns, "frameon": False}
-    figure.legend([*handles, *marks], [*names, *texts], **legend)
+    figure.legend([*handles, *marks.values()], [*names, *marks], **legend)
