@@ -55,7 +55,7 @@ def parsed(given: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         QuadrlError: One begins like JSON and is none, or has no equals sign.
     """
-    whole = {k: parsed(v) if isinstance(v, dict) else v for k, v in given.items()}
+    whole: dict[str, Any] = {k: parsed(v) if isinstance(v, dict) else v for k, v in given.items()}
     return {
         name: parse_options(value) if name in PAIRS else parse_named(name, value)
         for name, value in whole.items()
