@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import typing
 from collections.abc import Callable, Generator, Iterable, Mapping
-from typing import Annotated, Any, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
 
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
@@ -78,42 +78,36 @@ def enforced() -> Generator[None]:
 
 
 def optional(
-    hints: Mapping[str, Any],
-    texts: Mapping[str, str],
-    default: Callable[[str], str],
-    within: str = "",
+    kind: Any, default: Callable[[str], str], texts: Mapping[str, str] = {}, within: str = ""
 ) -> Any:
     """A dataclass of options that are empty by default: "not given".
 
     Args:
-        hints: The type of each option; a dataclass is a group of options.
-        texts: What help says of each.
+        kind: A dataclass or a TypedDict with a field for each option; a field that is a dataclass
+            is a group of options.
         default: What help says is used where an option is not given, from its whole name.
+        texts: What help says of some, in place of their docstrings.
         within: The group that they are in, with a dot.
     """
+    said = {**docstrings(kind), **texts}
     fields: list[tuple[str, Any, Any]] = []
-    for name, hint in hints.items():
+    for name, hint in typing.get_type_hints(kind).items():
+        if typing.get_origin(hint) is ClassVar:
+            continue
         show = functools.partial(lambda whole, _: default(whole), within + name)
-        told = arg(name=FLAGS.get(name), help=texts[name], help_behavior_hint=show)
+        told = arg(name=FLAGS.get(name), help=said[name], help_behavior_hint=show)
         if name in PAIRS:
             fields.append((name, Annotated[tuple[str, ...], told], ()))
         elif name in SETTINGS:
             word = Positional[SETTINGS[name]] if name == "task" else SETTINGS[name]
             fields.append((name, Annotated[word, told], ""))
         elif dataclasses.is_dataclass(hint):
-            words_of = docstrings(typing.cast(type, hint))
-            group = optional(types_of(hint), words_of, default, f"{within}{name}.")
+            group = optional(hint, default, within=f"{within}{name}.")
             made = dataclasses.field(default_factory=group)
-            fields.append((name, Annotated[group, arg(help=texts[name])], made))
+            fields.append((name, Annotated[group, arg(help=said[name])], made))
         else:
             fields.append((name, Annotated[hint | None, told], None))
     return dataclasses.make_dataclass("Options", fields, frozen=True)
-
-
-def types_of(kind: Any) -> dict[str, Any]:
-    """The types of the fields of a dataclass."""
-    hints = typing.get_type_hints(kind)
-    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
 
 @dataclass_transform(frozen_default=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +10,6 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from quadrl import tasks
-from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, tuples
 from quadrl.cli import choices
@@ -33,8 +31,7 @@ HELP = {
     "engine": "The engine: mujoco, or free_flight (MuJoCo only near what can be touched)",
 }
 """Of conditions that Python takes in more forms than a command line."""
-TEXTS = docstrings(Conditions) | HELP
-ConditionOptions: Any = choices.optional(typing.get_type_hints(Conditions), TEXTS, lambda name: "")
+ConditionOptions: Any = choices.optional(Conditions, lambda name: "", HELP)
 
 
 class Conditioned(ConditionOptions):

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.progress import ProgressBar
 from quadrl.base.signals import heeded
@@ -60,7 +59,7 @@ def _default(name: str) -> str:
     return "" if text in ("", "{}") else f"(default: {text})"
 
 
-Settings: Any = choices.optional(choices.types_of(TrainConfig), docstrings(TrainConfig), _default)
+Settings: Any = choices.optional(TrainConfig, _default)
 """Only after everything is parsed does `TrainConfig` fill in the defaults of the task."""
 
 
