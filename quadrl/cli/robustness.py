@@ -52,11 +52,11 @@ class Robustness(Conditioned):
                 "give policies (run folders, .safetensors files, or names of tasks), or "
                 f"--controller {' or '.join(CONTROLLERS)}"
             )
-        for name in self.controller:
-            choice("controller", name, CONTROLLERS)
+        flown = [policy_named(name) for name in self.policies]
+        flown += [choice("controller", name, CONTROLLERS) for name in self.controller]
         with going_on():
             card = robustness(
-                [*map(policy_named, self.policies), *map(str, self.controller)],
+                flown,
                 self.task or None,
                 episodes=self.episodes,
                 seed=self.seed,

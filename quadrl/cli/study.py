@@ -11,8 +11,7 @@ from tyro.conf import Positional
 
 from quadrl.base.errors import QuadrlError
 from quadrl.cli import choices
-from quadrl.cli import console as shared
-from quadrl.cli.console import console, going_on, make_table, print_json, say
+from quadrl.cli.console import console, going_on, make_table, own_files, print_json, say
 
 
 @choices.command
@@ -47,12 +46,9 @@ def carry_out(
     """Carry out a study, as `quadrl.study` takes it, and print what it reached."""
     from quadrl.learning.study import complaint, study
 
-    def on_line(line: str) -> None:
-        if not json:
-            say(line)
-
+    on_line = (lambda line: None) if json else say
     with going_on():
-        found = study(what, own=tuple(shared.own_files), on_line=on_line, **given)
+        found = study(what, own=tuple(own_files), on_line=on_line, **given)
     compared = found.compare(compare) if compare else []
     if json:
         print_json(found.content | {"compared": [dataclasses.asdict(one) for one in compared]})
