@@ -130,16 +130,11 @@ class _Memory:
 
     def kept(self, *like: Any) -> list[Any]:
         """Records of the same shapes as those before, read from `kept` one after the other."""
-        first = 0
-
-        def place(array: Array) -> Array:
-            nonlocal first
-            numbers = first + np.arange(array.size).reshape(1, *array.shape[1:])
-            first += array.size
-            return self.read("kept", numbers)
-
-        found = [records.mapped(place, record) for record in like]
-        return [*found, self.read("kept", np.array([first]))]
+        columns = records.Columns(0, [array for one in like for array in records.leaves(one)])
+        places = iter(columns.views(np.arange(columns.end)[:, None]))
+        placed = [records.filled(record, places) for record in like]
+        found = [records.mapped(lambda numbers: self.read("kept", numbers), one) for one in placed]
+        return [*found, self.read("kept", np.array([columns.end]))]
 
 
 class _Draws(Rng):
@@ -157,30 +152,23 @@ class _Draws(Rng):
         return low + (high - low) * (drawn[..., 0] if size is None else drawn)
 
 
-@dataclasses.dataclass(frozen=True)
-class Written:
-    """The functions of a task with an aircraft."""
+def write(environment: Environment) -> tuple[str, int]:
+    """Trace the functions for the task and the aircraft of an environment.
 
-    source: str
-    """C."""
-    drawn: int
-    """Random numbers that a start takes."""
-
-
-def write(environment: Environment) -> Written:
-    """Trace the functions for the task and the aircraft of an environment."""
+    Returns:
+        The C, and how many random numbers a start takes.
+    """
     task, vehicle, origin = environment.task, environment.vehicle, environment.origin
     timestep, rotors = vehicle.control_timestep, vehicle.rotor_count
-    settle = max(1, round(task.settle_time / timestep))
-    clock = Clock(timestep, environment.time_limit_steps, settle)
+    clock = Clock.of(task, timestep)
     functions: list[str] = []
 
     def emit(name: str, memory: _Memory, **parts: Any) -> None:
-        outputs = {
-            f"m[{LAYOUT[part] + k}]": value
-            for part, values in parts.items()
-            for k, value in enumerate(_fitting(part, values))
-        }
+        outputs = {}
+        for part, values in parts.items():
+            numbers = _flat(values)
+            assert len(numbers) <= PARTS[part], part
+            outputs |= {f"m[{LAYOUT[part] + k}]": value for k, value in enumerate(numbers)}
         body, name = memory.trace.body(outputs), f"{task.name}_{vehicle.name}_{name}"
         # Writing the body may add constants.
         constants = ", ".join(repr(float(number)) for number in (*memory.trace.constants, 0.0))
@@ -252,14 +240,7 @@ def write(environment: Environment) -> Written:
             disturbance = felt(disturbance, last, motion, timestep, share)
         seen = to_body(state.rotation, disturbance)
         emit(name, memory, moving=motion, disturbance=disturbance, felt=seen)
-    return Written("\n".join(functions), draws.used)
-
-
-def _fitting(part: str, values: Array | Iterable[Any]) -> list[Any]:
-    """The numbers of a part, of which there is room for."""
-    numbers = _flat(values)
-    assert len(numbers) <= PARTS[part], part
-    return numbers
+    return "\n".join(functions), draws.used
 
 
 def _row(record: Any) -> list[Any]:

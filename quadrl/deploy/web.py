@@ -87,10 +87,10 @@ def make_book() -> tuple[dict[str, Any], str]:
     for task in tasks.values():
         for vehicle in VEHICLES.values():
             environment = Environment(task, vehicle=vehicle, seed=0)
-            written = flights.write(environment)
-            sources.append(written.source)
+            source, drawn = flights.write(environment)
+            sources.append(source)
             pairs[f"{task.name}_{vehicle.name}"] = {
-                "drawn": written.drawn,
+                "drawn": drawn,
                 "size": environment.size,
                 "besideAim": [beside_aim(environment, Aim(beside_goal=x)) for x in (False, True)],
                 "origin": environment.origin.tolist(),

@@ -21,11 +21,8 @@ class Memory:
 
     def __init__(self, environment):
         self.numbers = np.zeros(sum(flights.PARTS.values()))
-        written = flights.write(environment)
-        self.drawn = written.drawn
-        self._library = compiling.compile_generated(
-            "#include <math.h>\n" + exported(written.source)
-        )
+        source, self.drawn = flights.write(environment)
+        self._library = compiling.compile_generated("#include <math.h>\n" + exported(source))
         self._prefix = f"{environment.task.name}_{environment.vehicle.name}"
 
     def __getitem__(self, part):
