@@ -14,6 +14,7 @@ from quadrl.aircraft.presets import VEHICLES, in_real_air
 from quadrl.aircraft.rotors import ring
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.conditions.randomization import Randomization
+from quadrl.conditions.weather import Weather
 from quadrl.core.environment import Environment
 from quadrl.engines.mjcf import compile_model
 from quadrl.engines.mujoco import BatchEngine
@@ -192,6 +193,16 @@ def begun(task="hover", num_envs=1, seed=0, **settings):
     """An environment that is reset."""
     environment = Environment(task, num_envs=num_envs, seed=seed, **settings)
     environment.reset()
+    return environment
+
+
+def in_flight(time, pose, rotor_speed=0.0, wind=None):
+    """An environment with the paper's aircraft at a moment, its goal there, as pictures see it."""
+    environment = begun(weather=None if wind is None else Weather(wind_speed=1.0))
+    now, engine = environment.snapshot, environment.engine
+    now.time[:], now.state.rotor_speed[:], engine.qpos[:] = time, rotor_speed, pose
+    engine.wind[:] = 0.0 if wind is None else wind
+    environment.goals = lambda: pose[None, :3]
     return environment
 
 

@@ -25,7 +25,8 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import Seed
 from quadrl.core.environment import Environment, Transition
 from quadrl.core.task import Task
-from quadrl.envs.common import PICTURE, Named, Pictures, episode_info, make
+from quadrl.envs.common import PICTURE, Named, episode_info, make
+from quadrl.rendering.pictures import Pictures
 
 Array = np.ndarray
 Info = dict[str, Any]

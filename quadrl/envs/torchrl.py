@@ -12,7 +12,8 @@ from torchrl.envs import EnvBase
 
 from quadrl.core.task import Task
 from quadrl.core.transition import Transition
-from quadrl.envs.common import PICTURE, Pictures, make
+from quadrl.envs.common import PICTURE, make
+from quadrl.rendering.pictures import Pictures
 
 DONE = ("done", "terminated", "truncated")
 

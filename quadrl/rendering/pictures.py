@@ -1,19 +1,91 @@
-"""Pictures of a flight in progress, one at a time."""
+"""Pictures of flights in progress, one at a time."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array
-from quadrl.core.markers import Marker
+from quadrl.base.errors import RenderingUnavailable
+from quadrl.base.rotation import Array, norm
+from quadrl.base.validation import number
+from quadrl.core.environment import Environment
+from quadrl.core.trajectory import outcome
+from quadrl.engines import mjcf
 from quadrl.rendering.camera import MOVING, eased, keeping, moving_camera, moving_views
 from quadrl.rendering.drawing import TRAIL_SECONDS, streaks
+from quadrl.rendering.overlay import Panel, flight_lines, task_title
 from quadrl.rendering.scene import Renderer
+
+
+class Pictures:
+    """Draws the aircraft of an environment; opens the renderer at the first picture.
+
+    The camera is eased from one picture of an episode to the next. A panel with time, error, speed,
+    reward, wind, horizon, rotor speeds and, at its end, the outcome of the episode is laid over
+    pictures that are large enough (from about 370 x 280 pixels on), where Pillow is installed.
+    """
+
+    def __init__(self, environment: Environment, camera: str, width: int, height: int) -> None:
+        """Note what to draw, on pictures of width x height pixels."""
+        self._environment, self._camera = environment, camera
+        self._width = number("width", width, 1, whole=True)
+        self._height = number("height", height, 1, whole=True)
+        self._renderer: Renderer | None = None
+        self._panel: Panel | None = None
+        self._flights: dict[int, LiveFlight] = {}  # by row
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle and deepcopy: a copy opens a renderer of its own."""
+        return self.__dict__ | {"_renderer": None, "_panel": None}
+
+    def frame(self, row: int = 0) -> np.ndarray:
+        """The picture (height, width, 3) uint8 of one aircraft.
+
+        Raises:
+            RenderingUnavailable: This machine has no graphics library.
+            QuadrlError: There is no such camera.
+        """
+        self._renderer = renderer = self._renderer or self._open()
+        flight = self._flights.setdefault(row, LiveFlight(self._camera))
+        picture = flight.picture(renderer, self._environment, row)
+        if self._panel is not None:
+            self._panel.draw(picture, *self._values(row))
+        return picture
+
+    def _open(self) -> Renderer:
+        vehicle, task = self._environment.vehicle, self._environment.task
+        model = self._environment.scenario.compile_model()
+        renderer = Renderer(model, self._width, self._height)
+        with contextlib.suppress(RenderingUnavailable):  # without Pillow
+            colours = [mjcf.rotor_colour(rotor.position) for rotor in vehicle.rotors]
+            windy = not self._environment.weather.calm
+            panel = Panel(self._height, task_title(task.name), colours, windy)
+            self._panel = panel if panel.fits(self._width, self._height) else None
+        return renderer
+
+    def _values(self, row: int) -> tuple[Any, ...]:
+        """What the panel shows of a row: values, rotor speeds, attitude, outcome."""
+        environment = self._environment
+        now, done, reward, end = environment.snapshot, environment.transition, 0.0, ""
+        time, error = float(now.time[row]), environment.task.error(now)[row]
+        if done is not None and time > 0:  # it is of this episode
+            error, reward = done.error[row], done.reward[row]
+            end = outcome(done.terminated[row], done.truncated[row], done.is_success[row])
+        calm = environment.weather.calm
+        wind = None if calm else float(norm(environment.engine.wind[row]))
+        moment = time, float(error), float(now.state.speed[row]), float(reward)
+        values = flight_lines(*moment, wind)
+        shares = now.state.rotor_speed[row] / environment.vehicle.max_speed
+        return [*values.values()], shares, environment.engine.qpos[row][3:7], end
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = self._panel = None
 
 
 class LiveFlight:
@@ -28,33 +100,17 @@ class LiveFlight:
         self._drift = np.zeros(3)
         self._trail: list[tuple[float, Array]] = []
 
-    def picture(
-        self,
-        renderer: Renderer,
-        time: float,
-        qpos: Array,
-        rotor_speed: Array,
-        goal: Array,
-        markers: Sequence[Marker | Primitive],
-        wind: Array | None = None,
-    ) -> Array:
-        """Draw the flight as it is now.
+    def picture(self, renderer: Renderer, environment: Environment, row: int) -> Array:
+        """Draw a row of an environment as it is now, (height, width, 3) colours.
 
-        Args:
-            renderer: What draws.
-            time: Since the episode began [s]; if it goes back or is 0, this is another flight.
-            qpos: (7,) position [m] and attitude (w, x, y, z), world frame.
-            rotor_speed: (R,) [rad/s].
-            goal: (3,) [m], world frame.
-            markers: World frame.
-            wind: (3,) [m/s], world frame, since the last picture; None for calm air.
-
-        Returns:
-            (height, width, 3) colours.
+        If the time since its episode began goes back or is 0, this is another flight.
         """
+        time, qpos = float(environment.snapshot.time[row]), environment.engine.qpos[row]
+        goal, markers = environment.goals()[row], environment.markers(row)
         position, camera = np.array(qpos[:3]), self._camera
         seconds = time - self._time
         begins = seconds < 0 or time == 0  # an episode may end before its second picture
+        rotor_speed = environment.snapshot.state.rotor_speed[row]
         if begins:
             self._trail, self._angles = [], np.zeros(len(rotor_speed))
             self._drift = np.zeros(3)
@@ -70,7 +126,8 @@ class LiveFlight:
             self._view = view if begins else eased(view, self._view, seconds)
             size = renderer.scale, renderer.aspect
             shown = moving_camera(keeping(self._view[None], position[None], *size)[0])
-        if wind is not None:
+        if not environment.weather.calm:
+            wind = environment.engine.wind[row]  # since the last picture
             self._drift = self._drift + wind * max(seconds, 0.0)
             markers = (*markers, *streaks(position, wind, self._drift, renderer.scale))
         self._time = time

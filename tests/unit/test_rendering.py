@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import get_args
 
 import gymnasium as gym
+import helpers
 import imageio_ffmpeg
 import mujoco
 import numpy as np
@@ -30,7 +31,6 @@ from quadrl.core.markers import Kind, Marker
 from quadrl.core.scenario import Scenario
 from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER, outcome
 from quadrl.engines import mjcf
-from quadrl.envs.common import Pictures
 from quadrl.rendering import (
     Renderer,
     drawing,
@@ -52,7 +52,7 @@ from quadrl.rendering.camera import (
 )
 from quadrl.rendering.horizon import horizon
 from quadrl.rendering.overlay import Panel
-from quadrl.rendering.pictures import LiveFlight
+from quadrl.rendering.pictures import LiveFlight, Pictures
 
 SIZE = 200  # [pixels], of square pictures
 PER_METRE = SIZE / 2 / math.tan(math.radians(21)) / 4  # [pixels] 4 m away, the field of view 42 deg
@@ -551,10 +551,11 @@ def test_gymnasium_shows_the_panel_and_the_outcome():
     assert changed(late[119:144, 13:100], end[119:144, 13:100]).mean() > 0.5  # the outcome
     environment = Environment("hover", seed=0)
     environment.reset()
-    for size, shown in (((160, 96), True), ((400, 300), False)):
-        with contextlib.closing(Pictures(environment, "follow", *size, overlay=shown)) as drawing:
-            plain = drawing.frame()
-        assert plain[:12].mean() > 150  # sky in the corner
+    with contextlib.closing(Pictures(environment, "follow", 160, 96)) as drawing:
+        small = drawing.frame()
+    with Renderer(environment.scenario.compile_model(), 400, 300) as opened:
+        plain = LiveFlight("follow").picture(opened, environment, 0)
+    assert small[:12].mean() > 150 and plain[:12].mean() > 150  # sky in the corner
     assert begin[13:112, 13:270].mean() < 0.8 * plain[13:112, 13:270].mean()
     assert changed(begin[150:], plain[150:]).sum() < 5
 
@@ -566,7 +567,7 @@ def test_a_picture_of_a_flight_in_progress_shows_where_it_came_from(renderer):
 
     def see(time, x):
         pose = POSE + np.array([x, 0, 0, 0, 0, 0, 0])
-        return flying.picture(recorder, time, pose, np.full(4, 10.0), pose[:3], ())
+        return flying.picture(recorder, helpers.in_flight(time, pose, rotor_speed=10.0), 0)
 
     assert len(see(0.0, 0)["trail"]) == 1 and len(see(0.0, 0)["trail"]) == 1
     later = see(0.1, 1.0)

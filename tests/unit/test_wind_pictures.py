@@ -8,11 +8,10 @@ import pytest
 
 from quadrl.conditions.weather import Weather
 from quadrl.engines import mjcf
-from quadrl.envs.common import Pictures
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.rendering import Renderer, overlay, render_trajectory
 from quadrl.rendering.drawing import STREAKS, streaks
-from quadrl.rendering.pictures import LiveFlight
+from quadrl.rendering.pictures import LiveFlight, Pictures
 
 WEST = Weather(wind_speed=12.0, direction=np.pi)
 HIGH = np.array([0.0, 0.0, 30.0])
@@ -87,9 +86,7 @@ def test_a_flight_is_drawn_in_its_wind(flown, monkeypatch, cheap_pictures):
 def test_pictures_of_an_environment_show_its_wind(monkeypatch, cheap_pictures):
     asked = []
     large = np.full((300, 400, 3), 128, np.uint8)
-    monkeypatch.setattr(
-        LiveFlight, "picture", lambda self, *given: asked.append(given) or large.copy()
-    )
+    monkeypatch.setattr(Renderer, "frame", lambda self, *_, **o: asked.append(o) or large.copy())
     for weather in (WEST, None):
         environment = helpers.begun("hover", 2, weather=weather)
         pictures = Pictures(environment, "follow", 400, 300)
@@ -98,10 +95,12 @@ def test_pictures_of_an_environment_show_its_wind(monkeypatch, cheap_pictures):
         assert (picture[:200] != 128).any()  # the panel
         rows = np.flatnonzero((picture != 128).any(axis=(1, 2)))
         assert rows.max() == pytest.approx(0.72 * (18 + 138 + 21 * bool(weather)), abs=2)
-        wind = asked[-1][-1]
-        assert (wind is None) == (weather is None)
+        shown = asked[-1]["markers"]
+        assert bool(shown) == bool(weather)
         if weather:
-            np.testing.assert_array_equal(wind, environment.engine.wind[1])
+            ends, begins = heads(shown)
+            way = 0.05 * environment.engine.wind[1]
+            np.testing.assert_allclose(ends - begins, np.tile(way, (len(ends), 1)))
 
 
 def test_a_flight_in_progress_hands_on_how_far_the_air_has_come():
@@ -109,8 +108,8 @@ def test_a_flight_in_progress_hands_on_how_far_the_air_has_come():
     recorder.frame = lambda qpos, **options: next(heads(options["markers"]))
     flying, pose = LiveFlight("track"), np.array([*HIGH, 1.0, 0, 0, 0])
     wind = np.array([4.0, 0, 0])
-    times, still = (0.0, 0.01, 0.0), np.zeros(4)
-    seen = [flying.picture(recorder, t, pose, still, HIGH, (), wind) for t in times]
+    moments = (helpers.in_flight(time, pose, wind=wind) for time in (0.0, 0.01, 0.0))
+    seen = [flying.picture(recorder, moment, 0) for moment in moments]
     assert_moved(seen[0], seen[1], 0.01 * wind)
     np.testing.assert_array_equal(seen[2], seen[0])  # another flight begins anew
 
