@@ -74,15 +74,12 @@ class Physics(mujoco.Physics):
         """Advance by physics steps; a NativeError if the rotor callbacks were removed."""
         while nstep:
             steps = self.inner_loop(nstep) if self.inner_loop else nstep
-            self._advance(steps)
+            if self.engine is not None and self.engine.fly(steps):
+                self.forward()  # what is drawn and measured belongs to the new state
+            else:
+                native.check_installed()
+                super().step(steps)
             nstep -= steps
-
-    def _advance(self, steps: int) -> None:
-        if self.engine is not None and self.engine.fly(steps):
-            self.forward()  # what is drawn and measured belongs to the new state
-            return
-        native.check_installed()
-        super().step(steps)
 
     @contextlib.contextmanager
     def check_invalid_state(self) -> Generator[None]:
