@@ -64,6 +64,7 @@ class Flight:
     Where it is `endless`, only flying into the ground ends one.
     """
 
+    environment: Environment  # where it flies; another one after a change of the control mode
     wind: Array  # (3,) [m/s], world frame
     pose: Array  # (N, 7 + R) position, quaternion, angles of the blades [rad]; as after a step
     trail: Array  # (T, N, 3) [m], world frame, oldest first; NaN before an episode's begin
@@ -93,14 +94,7 @@ class Flight:
         self.wind = np.zeros(3)
         self._rows: Any = {"num_envs": num_envs, "seed": seed}
         self._spins = np.sign([rotor.spin for rotor in self.vehicle.rotors])
-        self._environment: Environment | None = None
         self.fly_with(controller)
-
-    @property
-    def environment(self) -> Environment:
-        """Where it flies; another one after a change of the control mode."""
-        assert self._environment is not None
-        return self._environment
 
     def fly_with(self, controller: Controller) -> None:
         """Hand over to another controller.
@@ -113,12 +107,12 @@ class Flight:
         mode = getattr(controller, "control_mode", "rotor")
         seen = resolve(getattr(controller, "conditions", {}).get("observe"))
         scenario = dataclasses.replace(self.scenario, control_mode=mode, observe=seen)
-        if (environment := self._environment) is None or environment.scenario != scenario:
+        before = environment = getattr(self, "environment", None)  # at first there is none
+        if environment is None or environment.scenario != scenario:
             environment = Environment(scenario, **self._rows)
-        self._act = begun(controller, environment)
-        self.controller = controller
-        if environment is not self._environment:
-            self._environment = environment
+        self._act, self.controller = begun(controller, environment), controller
+        if environment is not before:
+            self.environment = environment
             self.reset()
 
     def reset(self) -> None:
