@@ -176,9 +176,9 @@ def bearing(attitude: ArrayLike) -> float:
     return round(90.0 - math.degrees(yaw)) % 360
 
 
-def grid(pictures: Sequence[Array]) -> Array:
-    """Pictures of one size side by side, in as many rows as columns or one less."""
-    columns = math.ceil(math.sqrt(len(pictures)))
+def grid(pictures: Sequence[Array], columns: int = 0) -> Array:
+    """Pictures of one size side by side; by default in as many rows as columns or one less."""
+    columns = columns or math.ceil(math.sqrt(len(pictures)))
     blank = np.zeros_like(pictures[0])
     filled = [*pictures, *[blank] * (-len(pictures) % columns)]
     return np.vstack([np.hstack(filled[k : k + columns]) for k in range(0, len(filled), columns)])

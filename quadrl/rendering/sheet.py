@@ -12,7 +12,7 @@ import numpy as np
 
 from quadrl.base.files import write_whole
 from quadrl.core.trajectory import Trajectory
-from quadrl.rendering.overlay import Panel, require
+from quadrl.rendering.overlay import Panel, grid, require
 from quadrl.rendering.scenarios import COMMENT, comment
 from quadrl.rendering.video import OneOrMore, OnFrame, checked, listed, render_trajectory
 
@@ -53,35 +53,30 @@ def write_contact_sheet(
         RenderingUnavailable: There is no graphics library, or no Pillow.
         QuadrlError: The path, the size or the camera does not suit a picture.
     """
-    path, _ = checked(path, SHEETS)
+    path, kind = checked(path, SHEETS)
     flights = listed(trajectory)
     labels, models = listed(label, len(flights)), listed(model, len(flights))
     count = PICTURES if len(flights) == 1 else COLUMNS
     options = {"fine": True} | options | {"width": width, "height": height, "overlay": False}
-    rows, total = [], count * len(flights)
+    tiles, total = [], count * len(flights)
     for flight, of, text in zip(flights, models, labels, strict=True):
         times = np.linspace(flight.time[0], flight.time[-1], count)
-        panel, tiles = Panel(height, "", []), []
+        panel = Panel(height, "", [])
         for k, drawn in enumerate(render_trajectory(flight, of, times=times, **options)):
-            tile, words = drawn.copy(), [text] if text and not k else []
-            words += [
-                f"{times[k]:.2f} s",
-                *[flight.outcome] * bool(flight.outcome and k == count - 1),
-            ]
-            panel.write(tile, ", ".join(words), 14, 14)
+            tile = drawn.copy()
+            words = text * (k == 0), f"{times[k]:.2f} s", flight.outcome * (k == count - 1)
+            panel.write(tile, ", ".join(filter(None, words)), 14, 14)
             tiles.append(np.pad(tile, ((1, 1), (1, 1), (0, 0)), constant_values=255))
-            on_frame(COLUMNS * len(rows) + k + 1, total)
-        for k in range(0, count, COLUMNS):
-            rows.append(np.hstack(tiles[k : k + COLUMNS]))
-    sheet, image = io.BytesIO(), require("PIL.Image", "Pillow").fromarray(np.vstack(rows))
-    kind = "png" if path.suffix.lower() == ".png" else "jpeg"
+            on_frame(len(tiles), total)
+    sheet = io.BytesIO()
+    image = require("PIL.Image", "Pillow").fromarray(grid(tiles, COLUMNS))
     carried = comment(flight.scenario for flight in flights)
     if kind == "png":
         text = require("PIL.PngImagePlugin", "Pillow").PngInfo()
         text.add_text(COMMENT, carried)
-        image.save(sheet, format=kind, pnginfo=text)
+        image.save(sheet, format="png", pnginfo=text)
     else:
-        image.save(sheet, format=kind, quality=90, comment=carried)
+        image.save(sheet, format="jpeg", quality=90, comment=carried)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, sheet.getvalue())
     return path
