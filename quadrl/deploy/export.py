@@ -101,15 +101,15 @@ def described(policy: Policy) -> dict[str, str]:
     environment = Environment(policy.scenario, seed=0)
     policy.check_fits(environment)
     mode = environment.control_mode
-    arrays = (mode.centre, mode.scale, -mode.scale_down)
-    reach = [
-        dict(zip(("at_0", "change", "change_down"), map(float, numbers), strict=True))
-        for numbers in zip(*arrays, strict=True)
+    reach = (numbers.tolist() for numbers in (mode.centre, mode.scale, -mode.scale_down))
+    action = [
+        {**dataclasses.asdict(term), "at_0": at_0, "change": up, "change_down": down}
+        for term, at_0, up, down in zip(mode.terms, *reach, strict=True)
     ]
     whole = {
         "scenario": policy.scenario.to_json(),
         "observation": describe_observation(environment),
-        "action": [dataclasses.asdict(n) | r for n, r in zip(mode.terms, reach, strict=True)],
+        "action": action,
         "control_timestep": environment.vehicle.control_timestep,
         "quadrl": __version__,
     }

@@ -163,7 +163,6 @@ def describe(vehicle: Vehicle) -> dict[str, Any]:
         "size": vehicle.size,
         "wide": max(vehicle.scale, SMALLEST),
         "mass": vehicle.mass,
-        "hoverSpeed": vehicle.hover_speed.tolist(),
         "actionScale": vehicle.action_scale,
         "maxSpeed": vehicle.max_speed.tolist(),
         "spin": [rotor.spin for rotor in vehicle.rotors],

@@ -81,10 +81,8 @@ class Scene:
     def draw(self, seconds: float, row: int, camera: str, apart: float) -> None:
         """Send the poses of this moment; the camera belongs to the aircraft of a row."""
         pose, offsets = self._flight.drawn(), self.offsets(apart)
-        places, attitude = (
-            pose[:, :3] + offsets,
-            Rotation.from_quat(pose[:, 3:7], scalar_first=True),
-        )
+        places = pose[:, :3] + offsets
+        attitude = Rotation.from_quat(pose[:, 3:7], scalar_first=True)
         for node in (self._airframe, *self._clear):
             node.batched_positions, node.batched_wxyzs = places, pose[:, 3:7]
         for (node, hub, frame), angle in zip(self._rotors, pose[:, 7:].T, strict=True):
