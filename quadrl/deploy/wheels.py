@@ -7,7 +7,6 @@ hold (`quadrl.engines.native.compiling`), under the same names and with the same
 from __future__ import annotations
 
 import itertools
-import platform
 import re
 import sys
 import warnings
@@ -22,6 +21,7 @@ from quadrl.control.modes import CONTROL_MODES
 from quadrl.core.environment import Environment
 from quadrl.engines import adjoint
 from quadrl.engines.native import compiling
+from quadrl.engines.native.compiling import HERE, Target
 from quadrl.tasks import TASKS
 
 GLIBC = 28
@@ -71,19 +71,11 @@ def steps(tasks: Iterable[str]) -> list[str]:
         return list(dict.fromkeys(found))
 
 
-def fill(
-    folder: Path,
-    machine: str,
-    compiler: str = "",
-    tasks: Iterable[str] = TASKS,
-    airs: Iterable[int] = AIRS,
-) -> None:
+def fill(target: Target, tasks: Iterable[str] = TASKS, airs: Iterable[int] = AIRS) -> None:
     """Compile what a wheel brings, for the mujoco that is installed.
 
     Args:
-        folder: Where to; what it holds already is not compiled again.
-        machine: The kind of machine that it is for, as `platform.machine` names it there.
-        compiler: The command that compiles for it; empty for the one of this machine.
+        target: What it is for; what its folder holds already is not compiled again.
         tasks: Those whose steps it brings.
         airs: Kinds of air whose derivatives it brings, as `Aerodynamics.effects`.
 
@@ -91,8 +83,6 @@ def fill(
         NativeError: A library would not run on all systems that the wheel is for.
     """
     sources = steps(tasks)  # first, since flights need libraries of this machine
-    folder.mkdir(parents=True, exist_ok=True)
-    target = compiling.Target(machine, compiler, folder)
     paths = [compiling.build(target=target)]
     paths += [compiling.build_generated(source, target) for source in sources]
     paths += [adjoint.build(*each, target) for each in itertools.product(airs, ROTORS)]
@@ -104,7 +94,7 @@ def fill(
 
 if __name__ == "__main__":
     chosen, *other = sys.argv[1:]
-    machine, compiler = other or (platform.machine(), "")
+    machine, compiler = other or (HERE.machine, HERE.compiler)
     folder = Path(chosen) / tag(machine)
-    fill(folder, machine, compiler)
+    fill(Target(machine, compiler, folder))
     sys.stdout.write(f"{folder}\n")

@@ -18,6 +18,7 @@ from PIL import Image
 
 from quadrl.aircraft.aerodynamics import STILL_AIR
 from quadrl.deploy import wheels
+from quadrl.engines.native.compiling import Target
 
 REPOSITORY = Path(__file__).parents[2]
 FOLDERS = ("quadrl", "quadrl/assets", "quadrl/tasks")  # links are not followed
@@ -181,7 +182,7 @@ def without_compiler(tmp_path_factory):
     """Runs a program of an environment that has the wheel for this machine, and no compiler."""
     root, machine = tmp_path_factory.mktemp("machine"), platform.machine()
     libraries = root / wheels.tag(machine)
-    wheels.fill(libraries, machine, tasks=["hover"], airs=[STILL_AIR])
+    wheels.fill(Target(machine, folder=libraries), tasks=["hover"], airs=[STILL_AIR])
     (root / "dist").mkdir()
     wheel = build("--wheel", REPOSITORY, root / "dist", QUADRL_LIBRARIES=str(libraries))
     assert wheel.name.endswith(f"-py3-none-{libraries.name}.whl")
