@@ -12,7 +12,6 @@ import io
 import ipaddress
 import socket
 import urllib.parse
-from collections.abc import Callable
 from typing import Annotated, Any, cast
 
 import msgspec
@@ -115,7 +114,12 @@ def serve(host: str, port: int) -> viser.ViserServer:
     def checked(handler: Any, *where: Any, process_request: Any = None, **options: Any) -> Any:
         guarded.append(handler)
         options |= {"max_size": LARGEST_MESSAGE, "create_connection": Connection}
-        check = _checked(process_request, host)
+
+        def check(connection: server.ServerConnection, request: Request) -> Any:
+            if reason := refusal(request.headers, host):
+                return connection.respond(403, f"{reason}\n")
+            return process_request(connection, request) if process_request else None
+
         return unchecked(handler, *where, process_request=check, **options)
 
     with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
@@ -131,18 +135,6 @@ def serve(host: str, port: int) -> viser.ViserServer:
                 "install an earlier one"
             )
     return started
-
-
-def _checked(answer: Callable[..., Any] | None, host: str) -> Callable[..., Any]:
-    """The answer to a request, which is 403 and a line unless it comes from the page."""
-
-    def check(connection: server.ServerConnection, request: Request) -> Any:
-        reason = refusal(request.headers, host)
-        if reason:
-            return connection.respond(403, f"{reason}\n")
-        return answer(connection, request) if answer else None
-
-    return check
 
 
 def _names_this_machine(reached: str, names: list[str]) -> bool:
