@@ -105,11 +105,6 @@ ensure_web() {
     say "not here: ${missing[*]}; the page is built, and its tests are skipped"
 }
 
-# fingerprint: changes with anything that the environment is made from.
-fingerprint() {
-    (cd "$REPOSITORY" && { pwd && cat pyproject.toml constraints.txt; } | cksum)
-}
-
 make_venv() {
     local python
     python="$(find_python)"
@@ -137,7 +132,8 @@ ensure_environment() {
             *) installed="${installed:+$installed }$extra" ;;
         esac
     done
-    wanted="$(fingerprint; echo "$installed")"
+    # A fingerprint, which changes with anything that the environment is made from, and the extras.
+    wanted="$(cd "$REPOSITORY" && { pwd && cat pyproject.toml constraints.txt; } | cksum; echo "$installed")"
     if [ "$(cat "$STAMP" 2>/dev/null)" != "$wanted" ]; then
         installed="${installed:+[${installed// /,}]}"
         may_install "quadrl$installed into $ENVIRONMENT: at first minutes and, with torch, gigabytes" ||
