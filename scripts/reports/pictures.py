@@ -23,6 +23,7 @@ from quadrl.evaluation.rollout import fly
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training
 from quadrl.rendering import render_trajectory
+from quadrl.rendering.overlay import grid
 from scripts.reports.report import IMAGES
 
 SHOWN = (360, 203)  # [pixels]; drawn twice as large, for smooth edges
@@ -84,11 +85,7 @@ def learning() -> Iterator[Image.Image]:
     panels = [panel(*each) for each in zip(policies, names, strict=True)]
     count = max(map(len, panels)) + round(LAST * FPS)
     for k in range(count):
-        top, bottom = (
-            np.hstack([frames[min(k, len(frames) - 1)] for frames in panels[i : i + 2]])
-            for i in (0, 2)
-        )
-        yield Image.fromarray(np.vstack([top, bottom]))
+        yield Image.fromarray(grid([frames[min(k, len(frames) - 1)] for frames in panels]))
 
 
 def panel(policy: Policy, name: str) -> list[np.ndarray]:
