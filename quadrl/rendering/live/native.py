@@ -41,13 +41,12 @@ def run(flight: Flight) -> None:
     What the mouse pulls (double click, then Ctrl and the right button) is pulled in the flight.
 
     Raises:
-        RenderingUnavailable: There is no screen, or MuJoCo cannot open a window on it.
+        RenderingUnavailable: MuJoCo cannot open a window on the screen.
         QuadrlError: There is more than one aircraft.
     """
     engine = flight.environment.engine
     if not isinstance(engine, DataEngine):
         raise QuadrlError(name="num_envs", value=engine.num_envs, allowed="1 with --native")
-    check_screen()
     from mujoco import viewer
 
     model = flight.scenario.compile_model()
