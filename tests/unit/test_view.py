@@ -60,7 +60,7 @@ def test_time_passes_as_fast_as_it_is_told_to():
 
 def test_between_two_steps_the_aircraft_is_drawn_between_their_poses():
     flight = hover(2)
-    flight.push(np.array([1.0, 0.0, 0.0]))
+    flight.push(np.array([1.0, 0.0, 0.0]), 0)
     flight.advance(0.0)
     before = flight.pose.copy()
     flight.advance(1.25 * STEP)

@@ -174,9 +174,9 @@ class Flight:
         self.step()
         self._due = self.vehicle.control_timestep
 
-    def push(self, velocity: Array, row: int | None = None) -> None:
-        """Change the velocity of an aircraft, or of all, at once by (3,) [m/s], world frame."""
-        self.environment.engine.qvel[slice(None) if row is None else row, :3] += velocity
+    def push(self, velocity: Array, row: int) -> None:
+        """Change the velocity of an aircraft at once by (3,) [m/s], world frame."""
+        self.environment.engine.qvel[row, :3] += velocity
 
     def drawn(self) -> Array:
         """Poses (N, 7 + R) at this moment, between the last two control steps."""
