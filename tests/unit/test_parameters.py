@@ -77,39 +77,6 @@ def test_a_row_flies_as_the_aircraft_that_is_built_with_its_numbers(task, name, 
     assert touched == (task is LOW)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_each_parameter_is_felt(engine):
-    # From the same start, with the same commands, in still air: each range changes the flight.
-    commands = helpers.random_commands(PAPER, 1, 3, rotor=0.3)[:, 0]
-
-    def end(vehicle=PAPER, **randomization):
-        environment = flying(count=1, vehicle=vehicle, randomization=randomization, engine=engine)
-        helpers.put(environment.engine, helpers.random_motion(PAPER, 1, speed=5.0, turn=5.0))
-        for command in commands:
-            environment.engine.ctrl[:] = command
-            environment.engine.advance(5)
-        return helpers.coordinates(environment.engine)
-
-    paper = end()
-    # A range of one number is that number.
-    np.testing.assert_array_equal(end(mass=(1.0, 1.0)), paper)
-    for name in ("mass", "inertia", "thrust", "torque", "lag", "drag", "rotors"):
-        assert (end(**{name: (0.9, 1.1)}) != paper).any(), name
-    assert (end(centre_of_mass=0.01) != paper).any()
-    airy, real = end(vehicle=REAL), end(vehicle=REAL, inflow=(0.9, 1.1))
-    assert (airy != real).any()
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_rotor_is_never_faster_than_its_own_largest_speed(engine):
-    # Full action commands 225.7 + 35 = 260.7 rad/s, the row's rotors 319 times 0.72 to 0.75.
-    environment = flying(randomization={"max_speed": (0.72, 0.75)}, engine=engine)
-    for _ in range(40):
-        environment.step(np.ones((4, 4)))
-    largest = environment.engine.parameters["rotor"]["max_speed"][:, :4]
-    np.testing.assert_allclose(environment.engine.act, largest, rtol=1e-3)
-
-
 @pytest.mark.parametrize(("column", "resolved"), [(5, "resolved_turn"), (0, "resolved_speed")])
 def test_a_row_diverges_past_its_own_limit(column, resolved):
     # J / (2 k_M dt) from 417 rad/s down, but 50 at most; m / (2 k_D dt) from 3611 m/s down.

@@ -145,18 +145,6 @@ def test_among_many_posts_the_nearest_is_known_all_the_way(engine):
     np.testing.assert_array_equal(flight.clearance(), there.clearance())
 
 
-def test_each_row_has_its_own_and_flies_as_it_does_alone():
-    velocity = np.array([[3.0, 0, 0], [0, 3.0, 0], [0, 0, 0.5]])
-    places = np.array([[1.0, 0, 0], [0, 1.2, 0], [0, 5.0, 0]])
-    scene = Scene([Sphere("ball", radius=0.3)])
-    for engine in ("mujoco", "free_flight"):
-        _, together, _ = flown(scene, {"ball": Pose(places)}, velocity, engine=engine)
-        for row in range(3):
-            pose = {"ball": Pose(places[row : row + 1])}
-            _, alone, _ = flown(scene, pose, velocity[row : row + 1], engine=engine)
-            np.testing.assert_array_equal(together[:, row], alone[:, 0])
-
-
 def test_far_from_every_solid_an_aircraft_flies_bit_for_bit_as_without():
     velocity = np.array([[3.0, 1.0, 0.5], [0.0, -2.0, 0.0]])
     far = {solid.name: Pose(np.full((2, 3), 20.0)) for solid in EVERY.solids}
