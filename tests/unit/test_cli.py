@@ -214,12 +214,19 @@ def test_a_run_has_a_folder_of_its_own_unless_one_is_given(monkeypatch):
     assert resolved(monkeypatch, "--out", "somewhere")[1] == Path("somewhere")
 
 
-def test_train_says_where_to_go_on(tmp_path, capsys):
+def test_the_result_comes_before_the_pictures_and_where_to_go_on_without_them(
+    tmp_path, capsys, monkeypatch
+):
+    def skip(*_, **__):
+        said = capsys.readouterr().out
+        assert "100 %        192 steps" in said and "successful" in said
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("quadrl.learning.run.curve", skip)
     folder = tmp_path / "a folder" / "run"
-    assert command("train", "hover", *TINY, "--no-video", "--out", folder) == 0
-    assert {p.name for p in folder.iterdir()} == FILES
+    assert command("train", "hover", *TINY, "--out", folder) == 0
+    assert not {"learning_curve.png", "flight.mp4"} & {*os.listdir(folder)}
     said = capsys.readouterr().out
-    assert "100 %        192 steps" in said
     for words in (f"quadrl render '{folder}'", f"quadrl evaluate '{folder}'"):
         assert words in said  # on one line, however long
 
@@ -230,6 +237,7 @@ def test_train_says_what_dead_time_does(tmp_path, capsys):
     words = (*SIZE, *long, "--episodes", "2", "--no-video", "--out", tmp_path / "run")
     assert command("train", "hover", "--vehicle", "crazyflie", *words) == 0
     assert "dead time: 10 ms 100 %, 20 ms 100 %" in capsys.readouterr().out
+    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES
     recorded = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert recorded["success_rate_by_dead_time"] == {"0.01": 1.0, "0.02": 1.0}
 
@@ -406,18 +414,6 @@ def test_an_interrupted_run_can_be_flown(tmp_path, capsys, monkeypatch):
     assert f"quadrl train --resume {folder}" in capsys.readouterr().err
     assert quadrl.Policy.load(folder).metadata["steps"] == 64
     assert command("evaluate", folder, "--episodes", "2") == 0
-
-
-def test_the_result_comes_before_the_pictures_and_these_can_be_skipped(
-    tmp_path, capsys, monkeypatch
-):
-    def skip(*_, **__):
-        assert "successful" in capsys.readouterr().out
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("quadrl.learning.show.curve", skip)
-    assert command("train", "hover", *TINY, "--out", tmp_path / "run") == 0
-    assert f"quadrl render {tmp_path / 'run'}" in capsys.readouterr().out
 
 
 def test_version(capsys):
