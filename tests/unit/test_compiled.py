@@ -66,18 +66,21 @@ def same_flights(one, other, steps=STEPS, seed=0):
     return ended
 
 
-@pytest.mark.parametrize(
-    ("count", "settings"),
-    [
-        (1, {}),
-        (21, {"vehicle": "racer", "engine": "free_flight"}),
-        (3, {"vehicle": "hexa", "control_mode": "velocity"}),
-        (4, {"randomization": "full", "observe": SEEN}),
-    ],
-    ids=["one", "batch", "loops", "randomized"],
-)
-@pytest.mark.parametrize("task", tasks.TASKS)
-def test_the_same_bits_as_the_functions_of_the_task(task, count, settings):
+SETTINGS = {
+    "one": (1, {}),
+    "batch": (21, {"vehicle": "racer", "engine": "free_flight"}),
+    "loops": (3, {"vehicle": "hexa", "control_mode": "velocity"}),
+    "randomized": (4, {"randomization": "full", "observe": SEEN}),
+}
+# A batch of each task; the rest concerns a task's step alike, whatever it computes. The contract
+# flies one aircraft of each.
+FEW = ("hover", "landing", "race")
+FLOWN = [(task, name) for name in SETTINGS for task in (tasks.TASKS if name == "batch" else FEW)]
+
+
+@pytest.mark.parametrize(("task", "name"), FLOWN)
+def test_the_same_bits_as_the_functions_of_the_task(task, name):
+    count, settings = SETTINGS[name]
     options = {"time_limit": 0.5, "settle_time": 0.2}
     one, other = pair(tasks.TASKS[task], options, num_envs=count, **settings)
     assert not one.not_compiled
@@ -250,28 +253,20 @@ def test_a_fault_of_the_task_is_raised_as_if_it_was_not_compiled():
 
 def test_options_change_the_numbers_and_not_the_code(monkeypatch):
     # Also where two numbers happen to be equal: a wheel brings each task's code, for all options.
+    # Without a compiler the task is run as it is written.
     sources = set()
 
     def note(source):
         sources.add(source)
-        raise NativeError("noted")
+        raise NativeError("there is no C compiler\nof any name")
 
     monkeypatch.setattr(compiling, "compile_generated", note)
     weights = {name: 1.0 for name in vars(Hover()) if name.endswith("_weight")} | {"altitude": 1.0}
     weights["smoothness_weight"] = 0.0
     for options in ({}, weights, {"time_limit": 1.0, "max_distance": 1.0}):
-        with pytest.warns(QuadrlWarning, match="not compiled: noted"):
-            helpers.begun(variant(options=options))
+        with pytest.warns(QuadrlWarning, match="not compiled: there is no C compiler;"):
+            helpers.idle(helpers.begun(variant(options=options)))
     assert len(sources) == 1
-
-
-def test_without_a_compiler_a_task_is_run_as_it_is_written(monkeypatch):
-    def fail(source):
-        raise NativeError("there is no C compiler\nof any name")
-
-    monkeypatch.setattr(compiling, "compile_generated", fail)
-    with pytest.warns(QuadrlWarning, match="not compiled: there is no C compiler;"):
-        helpers.idle(helpers.begun(variant()))
 
 
 # --------------------------------------------------------------------- what may change elsewhere
@@ -351,15 +346,6 @@ def test_what_cannot_change_is_compiled():
         return now.potentials.distance * FIXED * np.pi * self.radius * PAIR[0]
 
     assert not helpers.begun(variant(error=error), 2).not_compiled
-
-
-def test_options_share_the_compiled_code(monkeypatch, tmp_path):
-    monkeypatch.setenv("QUADRL_CACHE", str(tmp_path))
-    compiling.opened_generated.cache_clear()
-    for limit, weight in ((5.0, 17.0), (7.0, 19.0)):
-        task = tasks.make("hover", time_limit=limit, progress_weight=weight)
-        assert not helpers.begun(task, 1).not_compiled
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize("compiled", [True, False])
