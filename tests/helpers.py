@@ -94,11 +94,6 @@ def matrices(quaternion):
     return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
-def quaternions(matrix):
-    """Quaternions wxyz (n, 4) of rotation matrices (n, 3, 3), by SciPy."""
-    return Rotation.from_matrix(matrix).as_quat(scalar_first=True)
-
-
 def random_quaternions(rng, count):
     """(n, 4) wxyz, any attitude."""
     quaternion = rng.normal(size=(count, 4))
@@ -209,12 +204,6 @@ def in_flight(time, pose, rotor_speed=0.0, wind=None):
 def idle(environment):
     """A step with the action 0."""
     return environment.step(np.zeros((environment.num_envs, environment.action_size)))
-
-
-def observed(environment):
-    """What is seen at the present moment, by name; copies."""
-    seen = environment.task.observe(environment.snapshot)
-    return {name: np.array(value) for name, value in seen.items()}
 
 
 FLAGS = ("terminated", "truncated", "is_success", "diverged")

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import LAYOUTS, quaternions
+from helpers import LAYOUTS
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
@@ -273,7 +273,7 @@ def test_rows_are_flown_as_each_alone_and_no_attitude_breaks_it(name, vehicle):
     """Bit for bit: straight up, straight down, on its back; far away, and on the goal."""
     task, rng = tasks.make("hover"), np.random.default_rng(0)
     turns = [angle * axis for angle in np.linspace(-math.pi, math.pi, 17) for axis in np.eye(3)]
-    quaternion, count = quaternions(Rotation.from_rotvec(turns).as_matrix()), len(turns)
+    quaternion, count = Rotation.from_rotvec(turns).as_quat(scalar_first=True), len(turns)
     goal = rng.choice([0.0, 0.1, 1e3, -1e3], (count, 3))
     speed = vehicle.hover_speed * rng.uniform(0.5, 1.1, (count, vehicle.rotor_count))
     motion = dict(quaternion=quaternion, velocity=rng.normal(size=(count, 3)), rotor_speed=speed)
@@ -298,7 +298,8 @@ def test_the_linear_model_is_the_derivative_of_the_engine(vehicle):
     sizes = np.repeat([1e-4, 1e-4, 1e-5, 1e-5, 1e-3, 1e-4], [3, 3, 3, 3, count, count])
     x = np.concatenate([np.diag(sizes), -np.diag(sizes)])
     part = {name: x[:, : 12 + count][:, where] for name, where in lqr.STATES.items()}
-    part["quaternion"] = quaternions(Rotation.from_rotvec(part.pop("attitude")).as_matrix())
+    turn = Rotation.from_rotvec(part.pop("attitude"))
+    part["quaternion"] = turn.as_quat(scalar_first=True)
     part["rotor_speed"] = part["rotor_speed"] + vehicle.hover_speed
     flyer = Flyer("rotor", vehicle, np.zeros(len(x)), **part)
     flyer.fly(x[:, 12 + count :])

@@ -52,8 +52,11 @@ def blown(weather, steps, **settings):
 # ------------------------------------------------------------------------------ the definition
 
 
-@pytest.mark.parametrize("as_array", [np.asarray, torch.as_tensor], ids=["numpy", "torch"])
-@pytest.mark.parametrize(("count", "noise_time"), [(1, 0.0), (21, 0.5)])
+@pytest.mark.parametrize(
+    ("count", "noise_time", "as_array"),
+    [(1, 0.0, np.asarray), (21, 0.5, np.asarray), (21, 0.5, torch.as_tensor)],
+    ids=["one", "batch", "tensors"],
+)
 def test_c_is_the_definition_bit_for_bit(count, noise_time, as_array):
     made, engine = process(GUSTY, count, noise_time)
     numbers = np.arange(count)
