@@ -11,8 +11,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # At the end: an installed package comes first.
 sys.path.append(str(Path(__file__).parents[1]))
 
-import quadrl  # noqa: E402, F401 - before any test imports mujoco: it chooses the renderer
+import quadrl  # noqa: E402 - before any test imports mujoco: it chooses the renderer
 from quadrl.engines import mjcf  # noqa: E402
+
+# Processes that tests start have the same package.
+SEARCHED = [str(Path(quadrl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, SEARCHED))
 
 
 @pytest.fixture(autouse=True)

@@ -1,9 +1,6 @@
 """Clients that take their time: they learn, they film, they fly in other processes."""
 
 import functools
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,6 +9,7 @@ import pytest
 import torch
 from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
+from processes import python
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import (
@@ -44,9 +42,7 @@ from quadrl.testing import varied_actions
 
 HOVER = "quadrl/Hover-v0"
 PICTURE = {"render_mode": "rgb_array", "width": 64, "height": 48}
-REPOSITORY = Path(quadrl.__file__).parents[1]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-EXAMPLES = REPOSITORY / "docs" / "examples"
+EXAMPLES = Path(quadrl.__file__).parents[1] / "docs" / "examples"
 
 
 # ------------------------------------------------------------------------------------ learning
@@ -135,10 +131,8 @@ def test_torchrl_learns_as_in_its_tutorial(make):
 
 @pytest.mark.parametrize("example", ["sb3_ppo", "cleanrl_ppo", "torchrl_ppo", "learning_curve"])
 def test_an_example_trains(example):
-    command = [sys.executable, EXAMPLES / f"{example}.py", "--total-steps", "4096"]
-    command += ["--algo", "sac"] if example == "learning_curve" else []
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    options = ["--algo", "sac"] if example == "learning_curve" else []
+    done = python(EXAMPLES / f"{example}.py", "--total-steps", "4096", *options)
     assert '"successful"' in done.stdout or '"success' in done.stdout
 
 
@@ -273,10 +267,7 @@ IPython.display.display = shown.append
 mediapy.show_video(np.zeros((3, 48, 64, 3), np.uint8), fps=10)
 assert "video/mp4" in shown[0].data
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    python("-c", code)
 
 
 # ------------------------------------------------------------------------------ other processes

@@ -1,33 +1,19 @@
 """dm_control in processes of its own: its own suite test, and what draws its pictures."""
 
-import os
+import functools
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import python
 
 from quadrl.tasks import TASKS
 
-TESTS = Path(__file__).parents[1]
-
-
-def run(*arguments):
-    """Output of a Python process that finds this repository's package, without a MUJOCO_GL."""
-    own = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
-    done = subprocess.run(
-        [sys.executable, "-W", "error", *arguments],
-        env=own | {"PYTHONPATH": str(TESTS.parent)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout + done.stderr
+run = functools.partial(python, "-W", "error", without=("MUJOCO_GL",))
 
 
 def test_dm_controls_own_suite_test_passes():
-    output = run(TESTS / "dm_control_conformance.py")
+    output = run(Path(__file__).parents[1] / "dm_control_conformance.py").stderr
     assert output.rstrip().endswith("OK"), output  # nothing skipped either
     # One test of the constants, and nine of every task.
     assert int(re.search(r"Ran (\d+) tests", output)[1]) == 1 + 9 * len(TASKS)

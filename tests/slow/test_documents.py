@@ -17,6 +17,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from processes import python, run
 
 from quadrl import tasks
 from quadrl.learning.plan import read_plan
@@ -35,7 +36,6 @@ SHORTER = {
     "robustness": ("--episodes", "2", "--no-recovery"),
     "benchmark": ("--num-envs", "8", "--seconds", "0.01", "--repeats", "1"),
 }
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(REPOSITORY)}
 STUDIES = sorted((REPOSITORY / "docs" / "studies").glob("*.toml"))
 RUN = "runs/hover"  # what the pages call their run
 
@@ -66,13 +66,6 @@ QUADRL = list(dict.fromkeys(command for command in COMMANDS if command.startswit
 VIEWS = [command for command in QUADRL if command.startswith("quadrl view ")]
 
 
-def run(command, folder):
-    done = subprocess.run(
-        command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=550
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A folder in which scripts/quickstart has made the README's run, shortly.
@@ -90,7 +83,7 @@ def trained(tmp_path_factory):
     program = programs / "quadrl"
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m quadrl "$@"\n')
     program.chmod(0o755)
-    run((scripts / "quickstart", *SHORT_TRAINING), folder)
+    run(scripts / "quickstart", *SHORT_TRAINING, cwd=folder)
     return folder
 
 
@@ -106,7 +99,7 @@ def test_python_snippets_run(page, folder):
     names = [f"snippet_{k}.py" for k in range(len(PYTHON[page]))]
     for name, snippet in zip(names, PYTHON[page], strict=True):
         (folder / name).write_text(snippet)
-    run((sys.executable, "-c", RUNNER, *names), folder)
+    python("-c", RUNNER, *names, cwd=folder)
 
 
 @pytest.mark.parametrize("command", [command for command in QUADRL if command not in VIEWS])
@@ -119,7 +112,7 @@ def test_quadrl_command_runs(command, folder):
         if option.startswith("--") and option in arguments:
             at = arguments.index(option)
             del arguments[at : at + (1 if option.startswith("--no-") else 2)]
-    run((sys.executable, "-m", "quadrl", *arguments, *shorter), folder)
+    python("-m", "quadrl", *arguments, *shorter, cwd=folder)
 
 
 @pytest.mark.parametrize("command", VIEWS)
@@ -127,7 +120,7 @@ def test_quadrl_view_flies_until_it_is_interrupted(command, folder):
     _, *arguments = shlex.split(command, comments=True)
     program = (sys.executable, "-m", "quadrl", *arguments, "--port", "0")
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen(program, cwd=folder, env=ENVIRONMENT, **pipes) as viewer:
+    with subprocess.Popen(program, cwd=folder, **pipes) as viewer:
         assert "http://localhost:" in viewer.stdout.readline()
         time.sleep(2.0)
         viewer.send_signal(signal.SIGINT)
@@ -144,7 +137,7 @@ def test_every_command_is_checked():
         assert command in (*QUADRL, *SCRIPTS, *PIP), command
     for script in SCRIPTS:
         assert os.access(REPOSITORY / script, os.X_OK)
-        subprocess.run(("bash", "-n", REPOSITORY / script), check=True)
+        run("bash", "-n", REPOSITORY / script)
 
 
 @pytest.mark.parametrize("command", sorted(set(PIP)))

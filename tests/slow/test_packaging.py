@@ -1,10 +1,8 @@
 """The packages: what a user gets from pip, away from this repository."""
 
 import json
-import os
 import platform
 import shutil
-import subprocess
 import sys
 import sysconfig
 import tarfile
@@ -13,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+import processes
 import pytest
 from PIL import Image
 
@@ -88,13 +87,10 @@ def run(*command, cwd):
     return finished(*command, cwd=cwd).stdout
 
 
-def finished(*command, cwd, **variables):
-    """The same with its errors, and with further variables; one that is None is not there."""
-    variables = os.environ | {"PYTHONPATH": None, "PYTHONHOME": None} | variables
-    environment = {name: value for name, value in variables.items() if value is not None}
-    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-    return done
+def finished(*command, cwd, without=(), **variables):
+    """The same with its errors, and with further variables, or without some."""
+    without = ("PYTHONPATH", "PYTHONHOME", *without)
+    return processes.run(*command, cwd=cwd, without=without, **variables)
 
 
 def build(kind, source, folder, **variables):
@@ -190,8 +186,8 @@ def without_compiler(tmp_path_factory):
     assert not any(shutil.which(name, path=programs) for name in ("cc", "gcc", "clang"))
 
     def program(name, *arguments, cwd):
-        variables = {"PATH": str(programs), "CC": None, "QUADRL_CACHE": str(cache)}
-        done = finished(programs / name, *arguments, cwd=cwd, **variables)
+        variables = {"PATH": str(programs), "QUADRL_CACHE": str(cache)}
+        done = finished(programs / name, *arguments, cwd=cwd, without=("CC",), **variables)
         assert not cache.exists() or not [*cache.iterdir()]
         return done
 

@@ -4,35 +4,27 @@ import multiprocessing
 import os
 import pickle
 import shutil
-import subprocess
-import sys
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from apis import APIS
+from processes import command, python
 
-import quadrl
 from quadrl.engines import native
 from quadrl.engines.native import compiling
 from quadrl.testing import varied_actions
 
-REPOSITORY = Path(quadrl.__file__).parents[1]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-
 
 def test_processes_that_build_at_once_do_not_disturb_each_other(tmp_path):
     settings = {"QUADRL_CACHE": str(tmp_path / "cache"), "QUADRL_CFLAGS": "-O0"}
-    environment = ENVIRONMENT | settings
     code = "from quadrl.engines.native import build, load; print(build()); load(build())"
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    command = [sys.executable, "-c", code]
-    running = [subprocess.Popen(command, env=environment, **pipes) for _ in range(4)]
-    outcomes = [process.communicate(timeout=300) for process in running]
-    assert [process.returncode for process in running] == [0] * 4, outcomes
-    (path,) = {out.strip() for out, _ in outcomes}
+    with ThreadPoolExecutor(4) as pool:
+        running = [pool.submit(python, "-c", code, **settings) for _ in range(4)]
+    (path,) = {one.result().stdout.strip() for one in running}
     assert os.listdir(tmp_path / "cache") == [Path(path).name]  # and no scratch left
 
 
@@ -103,23 +95,10 @@ KEEP = "import os; os.environ['QUADRL_KEEP_CLOCK'] = '1'"
 )
 def test_the_clock_stands_still_unless_somebody_wants_it(before, after, moves):
     # In a process of its own: the clock is stopped once in a process.
-    script = FLY.format(before=before, after=after)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, f"1 {moves}\n"), done.stderr
+    assert python("-c", FLY.format(before=before, after=after)).stdout == f"1 {moves}\n"
 
 
 # ------------------------------------------------------------------- machines that lack something
-
-
-def quadrl_line(*arguments, **environment):
-    """The one line of a command that fails."""
-    command = [sys.executable, "-W", "ignore", "-m", "quadrl", *arguments]
-    variables = ENVIRONMENT | environment
-    done = subprocess.run(command, env=variables, capture_output=True, text=True)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("quadrl: ")
-    return line
 
 
 @pytest.mark.parametrize(
@@ -134,7 +113,8 @@ def quadrl_line(*arguments, **environment):
     ],
 )
 def test_what_is_missing_is_said_with_what_to_install(tmp_path, words, missing, said):
-    assert said in quadrl_line(*words, **missing)
+    (line,) = command(*words, code=2, **missing).stderr.splitlines()
+    assert line.startswith("quadrl: ") and said in line
     assert not list(tmp_path.glob("*.mp4"))
 
 
@@ -143,9 +123,7 @@ def test_the_contract_needs_neither_pytest_nor_torch():
         "import sys; sys.modules.update(pytest=None, torch=None, torchrl=None, tensordict=None);"
         "import quadrl; quadrl.testing.check_task('hover')"
     )
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python("-c", code)
 
 
 LIMITED = """
@@ -169,10 +147,9 @@ cli.main(sys.argv[2:])
     ],
 )
 def test_under_a_limit_of_the_shell_the_command_ends_in_one_line(words, tmp_path):
-    command = [sys.executable, "-c", LIMITED, str(300 << 20), *words]
-    ended = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=ENVIRONMENT)
+    ended = python("-c", LIMITED, 300 << 20, *words, code=2, cwd=tmp_path)
     (line,) = ended.stderr.splitlines()
-    assert ended.returncode == 2 and "memory" in line, ended.stderr
+    assert "memory" in line
 
 
 FORKED = """
@@ -232,5 +209,4 @@ FORKED = """
 
 
 def test_batches_that_have_flown_fly_on_in_a_forked_process_bit_for_bit():
-    code = textwrap.dedent(FORKED)
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    python("-c", textwrap.dedent(FORKED))

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from policies import make_remembering
+from processes import python
 from rich.console import Console
 from runs import TINY, refused
 
@@ -159,10 +159,8 @@ def test_a_program_of_torch_loads_where_quadrl_is_not(policy, tmp_path):
     path = quadrl.export(policy, "torch", tmp_path / "policy.pt2")
     rows = np.random.default_rng(0).normal(policy.mean, policy.deviation, (5, policy.size))
     rows = rows.astype(np.float32)
-    sizes = [str(policy.state_size)] * bool(policy.memory)
-    command = [sys.executable, "-W", "error", "-c", LOADED, str(path), json.dumps(rows.tolist())]
-    done = subprocess.run([*command, *sizes], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    sizes = [policy.state_size] * bool(policy.memory)
+    done = python("-W", "error", "-c", LOADED, path, json.dumps(rows.tolist()), *sizes)
     expected = policy.step(rows, np.full((5, policy.state_size), 0.5))
     for found, array in zip(json.loads(done.stdout), expected, strict=False):
         np.testing.assert_allclose(found, array, rtol=0, atol=1e-6)

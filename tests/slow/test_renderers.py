@@ -1,14 +1,10 @@
 """Pictures by several renderers in one process, without a screen; each case is a process."""
 
 import importlib.util
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-
-import quadrl
+from processes import python
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux draws without a screen")
 
@@ -63,12 +59,8 @@ def run(code, before="", **variables):
     Some of it may come before `import quadrl`.
     """
     names = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")
-    kept = {name: value for name, value in os.environ.items() if name not in names}
-    places = [str(Path(quadrl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
-    environment = kept | {"PYTHONPATH": os.pathsep.join(filter(None, places))} | variables
-    command = [sys.executable, "-W", "error", "-c", before + PREAMBLE + code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stderr, done.stdout) == (0, "", "")
+    done = python("-W", "error", "-c", before + PREAMBLE + code, without=names, **variables)
+    assert (done.stderr, done.stdout) == ("", "")
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,11 @@
 """The documentation site: it builds strictly, its links lead somewhere, and it loads nothing."""
 
 import html.parser
-import subprocess
-import sys
 from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
+from processes import python
 
 from quadrl import tasks
 
@@ -35,9 +34,7 @@ class Parsed(html.parser.HTMLParser):
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     config = REPOSITORY / "scripts" / "site" / "mkdocs.yml"
-    command = (sys.executable, "-m", "mkdocs", "build", "--strict", "--config-file", config)
-    done = subprocess.run((*command, "--site-dir", folder), capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    python("-m", "mkdocs", "build", "--strict", "--config-file", config, "--site-dir", folder)
     return folder
 
 

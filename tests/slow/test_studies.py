@@ -5,7 +5,6 @@ import csv
 import functools
 import hashlib
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import python
 
 import quadrl
 from quadrl import cli
@@ -163,16 +163,12 @@ def test_ctrl_c_leaves_a_study_that_the_same_command_ends(alone, tmp_path):
     given = {"cwd": tmp_path, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     # A shell that runs the tests in the background lets all that they start ignore Ctrl-C.
     given["preexec_fn"] = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    first = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": search()}, **given)
+    first = subprocess.Popen(command, **given)
     with once_begun(tmp_path / "runs/two/hover-ppo-0", lambda: first.send_signal(signal.SIGINT)):
         said, _ = first.communicate(timeout=PATIENCE)
     assert first.returncode == 130 and "the same command goes on" in said
     cli.main(["study", str(file), "--jobs", "1", "--out", str(tmp_path / "runs/two")])
     assert [digest(tmp_path / f"runs/two/hover-ppo-{seed}") for seed in (0, 1)] == alone
-
-
-def search() -> str:
-    return os.pathsep.join(path or os.getcwd() for path in sys.path)
 
 
 def test_a_failed_training_is_told_at_the_end_and_stops_no_other(tmp_path, monkeypatch):
@@ -222,7 +218,6 @@ def cluster(monkeypatch):
     ray = pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("PYTHONPATH", search())
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     monkeypatch.setenv("RAY_worker_register_timeout_seconds", str(int(PATIENCE)))
     small = {"object_store_memory": 80 << 20, "include_dashboard": False}
@@ -309,9 +304,7 @@ def test_the_example_with_collectors_on_two_nodes_repeats_itself(tmp_path, clust
     options = ["--num-envs", "8", "--steps", "1024", "--episodes", "2", "--address", made.address]
     runs = []
     for seed in (0, 0, 1):
-        command = [sys.executable, str(script), *options, "--seed", str(seed)]
-        said = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-        assert said.returncode == 0, said.stderr
+        said = python(script, *options, "--seed", seed)
         runs.append(json.loads(said.stdout.splitlines()[-1]) | {"seconds": 0})
     assert runs[0] == runs[1] and runs[0]["steps"] == 1024
     assert runs[0]["sum_of_weights"] != runs[2]["sum_of_weights"]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import command
 from runs import assert_same_run, changed, metrics, train
 from scipy import stats
 
@@ -22,8 +23,6 @@ from quadrl.evaluation.policy import SHIPPED_AS, Policy, shipped
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
 from quadrl.learning import checkpoint
 from quadrl.learning.config import TrainConfig
-
-REPOSITORY = Path(quadrl.__file__).parents[1]
 
 
 def test_several_seeds_are_a_study(tmp_path, monkeypatch, capsys):
@@ -94,8 +93,8 @@ def processes():
     They are forked from one that has computed nothing: it has no threads that a fork would lose.
     """
     patch = pytest.MonkeyPatch()
-    paths = (REPOSITORY, REPOSITORY / "tests", Path(__file__).parent)
-    patch.setenv("PYTHONPATH", os.pathsep.join(map(str, paths)))
+    own = (Path(__file__).parents[1], Path(__file__).parent)
+    patch.setenv("PYTHONPATH", os.pathsep.join(map(str, (os.environ["PYTHONPATH"], *own))))
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([Path(__file__).stem])
     yield context
@@ -272,7 +271,6 @@ def stopped(words, folder, signal_number, awaited):
     """Exit code and errors of a command that gets a signal as soon as a file is in its folder."""
     process = subprocess.Popen(
         [sys.executable, "-m", "quadrl", *words, "--out", str(folder)],
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -322,12 +320,6 @@ def test_terminated_while_it_draws_it_leaves_nothing_half_written(tmp_path):
 
 def test_without_graphics_it_trains_and_says_that_there_is_no_video(tmp_path):
     folder = tmp_path / "run"
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-m", "quadrl", "train", "hover", *TINY, "--out", folder],
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY), "MUJOCO_GL": "disabled"},
-        capture_output=True,
-        text=True,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "no video: " in done.stdout
+    done = command("train", "hover", *TINY, "--out", folder, MUJOCO_GL="disabled")
+    assert done.stderr == "" and "no video: " in done.stdout
     assert (folder / "trajectory.png").exists() and not (folder / "flight.mp4").exists()

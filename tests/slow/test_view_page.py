@@ -5,12 +5,9 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import chromium
 import pytest
-
-import quadrl
 
 SHOWN = "/rotor speeds/.test(document.body?.innerText ?? '')"
 KNOCK = """
@@ -29,8 +26,7 @@ def address():
         reason = "chromium is not installed: run scripts/web"
         pytest.fail(reason) if os.environ.get("QUADRL_REQUIRE_WEB") == "1" else pytest.skip(reason)
     words = [sys.executable, "-m", "quadrl", "view", "hover", "--port", "0"]
-    environment = os.environ | {"PYTHONPATH": str(Path(quadrl.__file__).parents[1])}
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment) as serving:
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as serving:
         try:
             (said,) = (line for line in [serving.stdout.readline()] if "open http://" in line)
             yield said.partition("open ")[2].split()[0]

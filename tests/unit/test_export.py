@@ -2,7 +2,6 @@
 
 import functools
 import json
-import subprocess
 import sys
 
 import helpers
@@ -13,6 +12,7 @@ import onnxruntime
 import pytest
 import torch
 from policies import linear, make_remembering
+from processes import python
 from runs import refused
 
 import quadrl
@@ -70,10 +70,7 @@ def test_it_hovers_where_quadrl_is_not(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     path = export("crazyflie", "mjcf", tmp_path / "there" / "small.xml")
     assert path.stat().st_size < 20_000 and [*path.parent.iterdir()] == [path]
-    command = (sys.executable, "-c", ALONE, str(path))
-    done = subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert float(done.stdout) < 1e-3
+    assert float(python("-c", ALONE, path, cwd=tmp_path / "elsewhere").stdout) < 1e-3
 
 
 @LAYOUTS
@@ -340,5 +337,4 @@ def test_a_missing_library_is_named(monkeypatch):
 def test_an_aircraft_needs_neither_torch_nor_onnx():
     code = "import sys, quadrl; quadrl.export('paper', 'mjcf'); "
     code += "print({'torch', 'onnx'} & {*sys.modules})"
-    done = subprocess.run((sys.executable, "-c", code), capture_output=True, text=True)
-    assert done.stdout == "set()\n", done.stderr
+    assert python("-c", code).stdout == "set()\n"
