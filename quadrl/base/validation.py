@@ -142,7 +142,7 @@ def keys(what: str, given: Iterable[str], choices: Iterable[str]) -> None:
             raise UnknownKeyword(reason, name=what, value=name, allowed=error.allowed) from None
 
 
-def record(name: str, value: Any, kind: type) -> Any:
+def record(name: str, value: Any, kind: type, word: str = "field") -> Any:
     """What is given, or the dataclass of a kind that it has some fields of, as JSON has them.
 
     Raises:
@@ -151,8 +151,26 @@ def record(name: str, value: Any, kind: type) -> Any:
     if not isinstance(value, Mapping):
         return value
     given = cast(Mapping[str, Any], value)
-    keys(f"field of {name}", given, [field.name for field in dataclasses.fields(kind)])
+    keys(f"{word} of {name}", given, [field.name for field in dataclasses.fields(kind)])
     return kind(**given)
+
+
+def resolved(
+    name: str, value: Any, kind: type, known: Mapping[str, Any] | None = None, word: str = "field"
+) -> Any:
+    """A dataclass of a kind: as it is given, by a known name, or from some of its fields.
+
+    Raises:
+        QuadrlError: It is something else, or there is no such name or field.
+    """
+    if known and isinstance(value, str):
+        return known[choice(name, value, known)]
+    made = record(name, value, kind, word)
+    if not isinstance(made, kind):
+        names = f", or a name of {', '.join(known)}" if known else ""
+        allowed = f"of the kind {kind.__name__}, or a mapping of its {word}s{names}"
+        raise QuadrlError(name=name, value=value, allowed=allowed)
+    return made
 
 
 def tuples(value: Any) -> Any:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice, keys, number
+from quadrl.base.validation import choice, number, resolved
 from quadrl.conditions import sensors
 from quadrl.conditions.sensors import LONGEST_HISTORY, Sensor
 
@@ -112,10 +112,4 @@ def resolve(given: Observed) -> Observing:
     Raises:
         QuadrlError: It is something else, or an option is unknown or out of range.
     """
-    if given is None or isinstance(given, Observing):
-        return given or Observing()
-    some: Any = given
-    if not isinstance(some, Mapping):
-        raise QuadrlError(name="observe", value=given, allowed="an Observing, or a mapping")
-    keys("option of observe", given, [field.name for field in dataclasses.fields(Observing)])
-    return Observing(**given)
+    return resolved("observe", {} if given is None else given, Observing, word="option")

@@ -14,7 +14,7 @@ import numpy as np
 
 from quadrl.aircraft.rotors import MAX
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice, number, numbers, record
+from quadrl.base.validation import number, numbers, resolved
 
 Range = tuple[float, float]
 LEAST, MOST = 0.01, 100.0  # of a factor
@@ -85,19 +85,6 @@ class Pushes:
         """Validate the numbers."""
         for name, value in vars(self).items():
             object.__setattr__(self, name, number(f"pushes {name}", value, 0, MAX))
-
-
-def _record(name: str, given: Any, kind: type, also: str = "") -> Any:
-    """Make a record of a kind from a mapping of some of its fields, or take one that is given.
-
-    Raises:
-        QuadrlError: It is neither, nor what `also` names, or a field is unknown.
-    """
-    made = record(name, given, kind)
-    if not isinstance(made, kind):
-        allowed = f"a {kind.__name__}, or a mapping of its fields{also}"
-        raise QuadrlError(name=name, value=given, allowed=allowed)
-    return made
 
 
 def _pair(name: str, given: Any, low: float, high: float) -> Range:
@@ -176,7 +163,7 @@ class Randomization:
             if name in ("centre_of_mass", "corners", "force", "moment"):
                 value: Any = number(name, given, 0, 1)  # [m], shares
             elif name in ("noise", "bias", "pushes"):
-                value = _record(name, given, Pushes if name == "pushes" else Errors)
+                value = resolved(name, given, Pushes if name == "pushes" else Errors)
             elif name in DELAYS:
                 value = _pair(name, given, 0, LONGEST_DELAY)
             else:
@@ -265,9 +252,5 @@ def resolve(given: Randomized) -> Randomization:
     Raises:
         QuadrlError: It is something else, a name or field is unknown, or a value out of range.
     """
-    if given is None or isinstance(given, Randomization):
-        return given or NONE
-    if isinstance(given, str):
-        return RANDOMIZATIONS[choice("randomization", given, RANDOMIZATIONS)]
-    names = f", or a name of {', '.join(RANDOMIZATIONS)}"
-    return _record("randomization", given, Randomization, names)
+    given = "none" if given is None else given
+    return resolved("randomization", given, Randomization, RANDOMIZATIONS)

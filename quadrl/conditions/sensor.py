@@ -16,7 +16,7 @@ from quadrl.aircraft.rotors import MAX
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SENSORS as STREAMS
 from quadrl.base.rotation import Array
-from quadrl.base.validation import choice, keys, number, whole_steps
+from quadrl.base.validation import choice, number, record, whole_steps
 from quadrl.conditions.randomization import LONGEST_DELAY
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.engines import native
@@ -157,9 +157,7 @@ def make(name: str, options: Any) -> Sensor:
     kind = SENSORS[choice("sensor", name, SENSORS)]
     if not isinstance(options, Mapping):
         raise QuadrlError(name=f"sensor {name}", value=options, allowed="a mapping of its options")
-    given = cast(Mapping[str, Any], options)
-    keys(f"option of {name}", given, [field.name for field in dataclasses.fields(kind)])
-    return kind(**given)
+    return record(name, options, kind, "option")
 
 
 class Channel:

@@ -27,7 +27,7 @@ from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import WEATHER
 from quadrl.base.rotation import Array, stack
-from quadrl.base.validation import choice, keys, number
+from quadrl.base.validation import number, resolved
 from quadrl.engines import native
 from quadrl.engines.air import FIXED, ROWS, fixed_of, mean_wind
 from quadrl.engines.rng import FULL_TURN, Rng
@@ -72,12 +72,7 @@ class Weather:
         Raises:
             QuadrlError: There is no such weather, or it has no such field.
         """
-        if isinstance(weather, Weather):
-            return weather
-        if isinstance(weather, Mapping):
-            keys("weather", weather, [field.name for field in dataclasses.fields(cls)])
-            return cls(**weather)
-        return WEATHERS["calm" if weather is None else choice("weather", weather, WEATHERS)]
+        return resolved("weather", "calm" if weather is None else weather, cls, WEATHERS)
 
     @property
     def calm(self) -> bool:
