@@ -143,7 +143,7 @@ class WeatherProcess:
         self._table = self._whole[:, :count]
         self._streams = np.zeros((2, count), dtype=np.int64)
         self._varied = False
-        self._write(slice(None), weather.wind_speed)
+        self._write(slice(None), fixed_of(weather.wind_speed, *self._setting))
         self._engine = engine  # its buffers stay where they are
         arrays = (self._whole, *self._streams, engine.qpos[:, 2], engine.air)
         pointers = [array.ctypes.data for array in arrays]
@@ -180,19 +180,18 @@ class WeatherProcess:
         """
         self._streams[:, rows] = keys, episodes
         if wind_speed is not None:
-            self._write(rows, wind_speed)
+            self._write(rows, fixed_of(wind_speed, *self._setting))
             self._varied = True
         gust = self.weather.gust_speed
         bearing, gust_bearing, begins = self._drawn(keys, episodes)
-        values = {
+        drawn = {
             "east": np.cos(bearing),
             "north": np.sin(bearing),
             "gust_start": self._latest * begins,
             "gust_east": gust * np.cos(gust_bearing),
             "gust_north": gust * np.sin(gust_bearing),
         }
-        for name, value in values.items():
-            self._table[ROWS.index(name), rows] = value
+        self._write(rows, drawn)
         self._kernel(self._address, len(rows), rows.ctypes.data, True)
 
     def mean_wind(
@@ -219,14 +218,13 @@ class WeatherProcess:
         """Advance the weather of all aircraft by a control step, and write their air."""
         self._kernel(self._address, self._table.shape[1], None, False)
 
-    def _write(self, rows: Any, wind_speed: Any) -> None:
-        fixed = fixed_of(wind_speed, *self._setting)
-        for name, value in fixed.items():
+    def _write(self, rows: Any, values: Mapping[str, Any]) -> None:
+        for name, value in values.items():
             self._table[ROWS.index(name), rows] = value
 
     def save(self) -> dict[str, np.ndarray]:
         """Everything that the next steps depend on, as arrays."""
-        return {"weather.table": self._table.copy(), "weather.streams": self._streams.copy()}
+        return {"table": self._table.copy(), "streams": self._streams.copy()}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
         """Refuse what was saved in another weather, or is not finite.
@@ -243,4 +241,4 @@ class WeatherProcess:
 
     def restore(self, saved: Mapping[str, np.ndarray]) -> None:
         """Restore what `save` returned; the engine restores its air itself."""
-        self._table[:], self._streams[:] = saved["weather.table"], saved["weather.streams"]
+        self._table[:], self._streams[:] = saved["table"], saved["streams"]

@@ -84,12 +84,10 @@ class Memory:
 
     def _parts(self) -> dict[str, Any]:
         """What saves arrays of its own, by the name that these begin with."""
-        parts: dict[str, Any] = {"engine": self.engine}
-        if self.randomizer.active:
-            parts["randomizer"] = self.randomizer
-        if self.observer is not None:
-            parts["observer"] = self.observer
-        return parts
+        drawn = self.randomizer if self.randomizer.active else None
+        parts = {"engine": self.engine, "randomizer": drawn}
+        parts |= {"observer": self.observer, "weather": self.weather}
+        return {name: part for name, part in parts.items() if part is not None}
 
     def save(self) -> dict[str, np.ndarray]:
         """Copies of all arrays by name."""
@@ -99,7 +97,7 @@ class Memory:
         saved |= {name: np.array(getattr(self.snapshot, name)) for name in MOMENT}
         for name, part in self._parts().items():
             saved |= {f"{name}.{k}": value for k, value in part.save().items()}
-        return saved | (self.weather.save() if self.weather else {})
+        return saved
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
         """Refuse what was saved of another environment, or what none can be in.
@@ -154,8 +152,6 @@ class Memory:
         Returns:
             The snapshot of that moment, without its potentials, and how far its episodes are.
         """
-        if self.weather:
-            self.weather.restore(saved)
         for name, part in self._parts().items():
             own = [key for key in saved if key.startswith(f"{name}.")]
             part.restore({key.removeprefix(f"{name}."): saved[key] for key in own})

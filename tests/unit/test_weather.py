@@ -36,7 +36,7 @@ def process(weather, count=1, noise_time=0.0, time_limit=10.0, seed=0, altitude=
 
 
 def column(made, name):
-    return made.save()["weather.table"][air.ROWS.index(name)]
+    return made.save()["table"][air.ROWS.index(name)]
 
 
 def blown(weather, steps, **settings):
@@ -63,8 +63,8 @@ def test_c_is_the_definition_bit_for_bit(count, noise_time, as_array):
     made.begin(numbers, 2**40 + numbers, 2**33 + 7 * numbers)
     engine.qpos[:, 2] = np.geomspace(0.01, 500.0, count)
     height, rotors = as_array(engine.qpos[:, 2].copy()), 4 if noise_time else 0
-    streams = tuple(map(as_array, made.save()["weather.streams"]))
-    kept = dict(zip(air.ROWS, map(as_array, made.save()["weather.table"]), strict=True))
+    streams = tuple(map(as_array, made.save()["streams"]))
+    kept = dict(zip(air.ROWS, map(as_array, made.save()["table"]), strict=True))
     now = definition.begun(kept, streams, rotors)
     for step in range(220):  # past the gust
         for name, values in now.items():
@@ -110,7 +110,7 @@ def test_no_step_draws_the_numbers_of_another():
 )
 def test_mean_wind_follows_the_profile(height, share):
     made, _ = process(dataclasses.replace(LIGHT, direction=0.7))
-    still = dict(zip(air.ROWS, made.save()["weather.table"], strict=True))
+    still = dict(zip(air.ROWS, made.save()["table"], strict=True))
     still |= {name: np.zeros(1) for name in air.FILTERS}
     wind = definition.blowing(still, np.array([height]), 1 / LIGHT.roughness, STEP, 1.0)
     expected = share * 7.72 * np.array([[math.cos(0.7), math.sin(0.7), 0.0]])
