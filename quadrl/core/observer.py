@@ -62,15 +62,14 @@ class Observer:
         sizes = dataclasses.replace(sizes, observed=observed)
         # In the order in which they sense.
         self._channels = {k: Channel(s, sizes, randomizer, timestep) for k, s in sensors.items()}
-        self._entries = self._channels["state"]
-        others = [channel for name, channel in self._channels.items() if name != "state"]
-        shown = [channel for channel in others if channel.sensor.shown]
-        self._early = [channel for channel in others if not channel.sensor.last]
-        late = [channel for channel in others if channel.sensor.last]
-        # What is measured is told to the others.
+        channels = self._channels.values()
+        others = [c for c in channels if c.sensor.shown and c.sensor.name != "state"]
+        self._early = [channel for channel in channels if not channel.sensor.last]
+        late = [channel for channel in channels if channel.sensor.last]
+        # The task's entries come first; what is measured is told to the others.
         self._last = sorted(late, key=lambda channel: not channel.sensor.measured)
-        self._measured = [self._entries, *(c for c in shown if c.sensor.measured)]
-        self._known = [channel for channel in shown if not channel.sensor.measured]
+        self._measured = [self._channels["state"], *(c for c in others if c.sensor.measured)]
+        self._known = [channel for channel in others if not channel.sensor.measured]
         for channel in (*self._measured[1:], *self._known):
             sensor = channel.sensor
             if sensor.name in task.observation:
@@ -144,7 +143,6 @@ class Observer:
         """Let those sensors begin or step that look at the task's entries."""
         now.entries = np.concatenate([entries[name] for name in self._own], axis=-1)
         now.estimated, now.truth = entries, truth
-        act(self._entries, now)
         for channel in self._last:
             if not channel.sensor.measured and now.observed is None:
                 observed = self._observed()
