@@ -69,12 +69,8 @@ class Conditions(TypedDict, total=False, extra_items=Any):
     """Time limit of an episode in control steps, in place of the task's option time_limit."""
 
 
-def _one_of(name: str, choices: Iterable[str]) -> Callable[[Any], Any]:
-    return lambda given: validation.choice(name, given, choices)
-
-
-def _effects(given: Any) -> Any:
-    return validation.record("aerodynamics", given, Aerodynamics)
+_effects = functools.partial(validation.record, "aerodynamics", kind=Aerodynamics)
+_engine = functools.partial(validation.choice, "engine", choices=ENGINES)
 
 
 def _condition(default: Any, parse: Callable[[Any], Any]) -> Any:
@@ -104,7 +100,7 @@ class Scenario:
     """Options of the observation."""
     control_mode: str = _condition("rotor", modes.named)
     """What actions mean."""
-    engine: EngineName = _condition("mujoco", _one_of("engine", ENGINES))
+    engine: EngineName = _condition("mujoco", _engine)
     """What flies it."""
 
     def __post_init__(self) -> None:
