@@ -30,11 +30,7 @@ def strikes_ground(now: Snapshot) -> Array:
     depth = norm(up * now.parameters.hull)
     centre = rotor.position + now.parameters.rotor_height[..., None, None] * rotor.axis
     above = dot(up[..., None, :], centre)  # (N, R) [m], of the discs' centres
-    edge = rotor.radius * norm(_across(up[..., None, :], rotor.axis))
+    across = up[..., None, :] - dot(up[..., None, :], rotor.axis)[..., None] * rotor.axis
+    edge = rotor.radius * norm(across)  # of what is in the plane of a disc
     deepest = xp.max(edge - above, axis=-1)
     return now.state.height < xp.maximum(depth, deepest)
-
-
-def _across(up: Array, axis: Array) -> Array:
-    """The part of `up` in the plane of a disc with an axis."""
-    return up - dot(up, axis)[..., None] * axis

@@ -126,8 +126,8 @@ class Environment(saving.Copied):
         self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
         """Which episode each row flies."""
         self._step: Step | None = None  # from the first reset on
-        rotors = self.vehicle.rotor_count
-        self._inputs = Inputs.zeros(self.num_envs, self.action_size, rotors)
+        taken = np.zeros((self.num_envs, self.action_size))
+        self._inputs = Inputs(taken, np.zeros(engine.ctrl.shape), np.zeros(self.num_envs, bool))
         self.transition: Transition | None = None  # what the last step gave
         loops, given = self.control_mode.has_loops, (self.control_mode, engine, self._inputs.action)
         self.autopilot = Autopilot(*given) if loops else None

@@ -29,12 +29,6 @@ class Inputs:
     command: np.ndarray  # (N, R) [rad/s], mean over the control step
     diverged: np.ndarray  # (N,) bool
 
-    @classmethod
-    def zeros(cls, count: int, action_size: int, rotors: int) -> Inputs:
-        """Buffers for some rows."""
-        action, command = np.zeros((count, action_size)), np.zeros((count, rotors))
-        return cls(action, command, np.zeros(count, dtype=bool))
-
 
 class Step(abc.ABC):
     """The control step of a task for N rows."""
