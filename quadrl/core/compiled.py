@@ -40,21 +40,20 @@ _REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
 """Tasks of which was said that they are not compiled."""
 
 
-def make(now: Snapshot, episode: Episode, parameters: np.ndarray, *parts: Any) -> Step:
+def compiled(step: WrittenStep, now: Snapshot, episode: Episode, parameters: np.ndarray) -> Step:
     """The step of a task, compiled if it can be; a task that cannot is reported once.
 
     Args:
+        step: The step as it is written.
         now: Any snapshot of the task.
         episode: Any of its episodes.
         parameters: Rows that the task sees, (N,) or (1,), read live.
-        *parts: As `Step` takes them.
     """
-    step = WrittenStep(*parts)
     if not step.task.compiled:
         step.not_compiled = "the task has `compiled = False`"
         return step
     try:
-        return CompiledStep(step, now, episode, parameters, *parts)
+        return CompiledStep(step, now, episode, parameters)
     except NotCompilable as error:
         return _reported(step, str(error))
 
@@ -99,12 +98,7 @@ class CompiledStep(Step):
     """
 
     def __init__(
-        self,
-        written: WrittenStep,
-        now: Snapshot,
-        episode: Episode,
-        parameters: np.ndarray,
-        *parts: Any,
+        self, written: WrittenStep, now: Snapshot, episode: Episode, parameters: np.ndarray
     ) -> None:
         """Trace and compile.
 
@@ -113,15 +107,15 @@ class CompiledStep(Step):
             now: Any snapshot of the task, with those parameters.
             episode: Any of its episodes.
             parameters: Rows that the task sees, (N,) or (1,), read live.
-            *parts: As `Step` takes them.
 
         Raises:
             NotCompilable: The functions of the task do more than arithmetic, or there is no
                 compiler.
         """
-        super().__init__(*parts)
+        world = written.engine, written.inputs, written.estimate, written.scene
+        super().__init__(written.task, written.clock, *world)
         self._written, self._parameters = written, now.parameters
-        self.count, self.columns = self._engine.num_envs, padded(self._engine.num_envs)
+        self.count, self.columns = self.engine.num_envs, padded(self.engine.num_envs)
         # These have tables of their own.
         like = dataclasses.replace(now, state=None, parameters=None, around=None)
         kept = [*records.leaves(like), *records.leaves(episode)]
@@ -151,10 +145,10 @@ class CompiledStep(Step):
             for numbers in self.sensed.views(np.arange(self.sensed.end)[:, None])
             for places in [numbers.ravel().tolist()]
         ]
-        inputs = (getattr(self._inputs, f.name) for f in dataclasses.fields(self._inputs))
+        inputs = (getattr(self.inputs, f.name) for f in dataclasses.fields(self.inputs))
         self._arguments = Rows(
             *(array.ctypes.data for array in (self._constants, parameters, *inputs)),
-            estimate=self._estimate.address if self._estimate else None,
+            estimate=self.estimate.address if self.estimate else None,
             stride=parameters.strides[0] // 8 if len(parameters) > 1 else 0,
             columns=self.columns,
         )
@@ -172,10 +166,10 @@ class CompiledStep(Step):
         # Arrays whose numbers say where they stand, made by what makes the views of real ones.
         own = Parameters.of(
             np.arange(float(ROW_SIZE)).view(AIRCRAFT),
-            self._clock.control_timestep,
-            self._inputs.command.shape[1],
+            self.clock.control_timestep,
+            self.inputs.command.shape[1],
         )
-        states = State.of_table(np.arange(len(self._engine.frames[0].table))[:, None])
+        states = State.of_table(np.arange(len(self.engine.frames[0].table))[:, None])
         state, last_state, estimate = (
             records.mapped(read(f"{name}[{{}} * columns + i]"), states)
             for name in ("state", "last_state", "estimate")
@@ -190,7 +184,7 @@ class CompiledStep(Step):
         action, command = (
             read(f"{name}[i * {size} + {{}}]")(np.arange(size)[None])
             for name in ("action", "command")
-            for size in [getattr(self._inputs, name).shape[1]]
+            for size in [getattr(self.inputs, name).shape[1]]
         )
         diverged = trace.inputs(np.array(["diverged[i]"], object), is_flag=True)
         given = (
@@ -201,10 +195,10 @@ class CompiledStep(Step):
         for solids in filter(None, (before.around, around)):
             for name in ("touched", "landed", "held"):
                 setattr(solids, name, getattr(solids, name) != 0.0)
-        seen_from = estimate if self._estimate else None
+        seen_from = estimate if self.estimate else None
         inputs = state, action, command, diverged, seen_from, around, sensed
         with symbolic():
-            after, ended, done = finish(self.task, self._clock, begun, before, *inputs)
+            after, ended, done = finish(self.task, self.clock, begun, before, *inputs)
             after.state = after.parameters = after.around = None  # type: ignore[assignment]
             kept = [*records.leaves(after), *records.leaves(ended)]
             return trace, trace.body(self._outputs(kept, done))
@@ -218,7 +212,7 @@ class CompiledStep(Step):
     def _outputs(self, kept: list[Array], done: Transition) -> dict[str, Any]:
         """What is computed, by where it is written to."""
         self.observed, self._rewarded = list(done.observation), list(done.reward_terms)
-        seen = [*done.observation.values(), *(done.truth.values() if self._estimate else ())]
+        seen = [*done.observation.values(), *(done.truth.values() if self.estimate else ())]
         rest = [*done.reward_terms.values(), done.reward, done.error]
         self.seen = records.Columns(self.kept.end, seen)
         self.flags, outputs = len(rest), dict[str, Any]()
@@ -246,9 +240,9 @@ class CompiledStep(Step):
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
         last, page = self._pages
         self._pages = page, last
-        rows, (now, before) = self._arguments, self._engine.frames
+        rows, (now, before) = self._arguments, self.engine.frames
         rows.state, rows.last_state = now.address, before.address
-        around = self.scene.surroundings(self._engine) if self.scene.solids else None
+        around = self.scene.surroundings(self.engine) if self.scene.solids else None
         # A reset since the last step has given its rows what the sensors show then.
         self._take(self.snapshot.sensed, self.snapshot.around, last)
         self._take(sensed, around, page)
@@ -283,7 +277,7 @@ class CompiledStep(Step):
     ) -> None:
         """Make a table the present one."""
         page.now.sensed, page.now.around = sensed, around
-        page.now.state, page.now.parameters = self._engine.state, self._parameters
+        page.now.state, page.now.parameters = self.engine.state, self._parameters
         self.snapshot, self.episode = page.now, page.episode
 
     def renewed(self) -> Step:

@@ -30,12 +30,13 @@ from quadrl.conditions.weather import WeatherProcess
 from quadrl.control import modes
 from quadrl.control.autopilot import Autopilot
 from quadrl.control.trim import trimmed
-from quadrl.core import compiled, saving, transition
+from quadrl.core import saving, transition
+from quadrl.core.compiled import compiled
 from quadrl.core.markers import Marker
 from quadrl.core.observation import layout
 from quadrl.core.observer import Observer
 from quadrl.core.scenario import Conditions, Scenario
-from quadrl.core.step import Inputs, Step
+from quadrl.core.step import Inputs, Step, WrittenStep
 from quadrl.core.task import Snapshot, Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
 from quadrl.engines import mujoco
@@ -259,8 +260,9 @@ class Environment(saving.Copied):
         now.sensed = self.sensed
         if self._step is None:
             estimate = self.observer.frame if self.observer else None
-            parts = self.task, self._clock, self.engine, self._inputs, estimate, self.scene
-            self._step = compiled.make(now, episode, self._rows, *parts)
+            world = self.engine, self._inputs, estimate, self.scene
+            written = WrittenStep(self.task, self._clock, *world)
+            self._step = compiled(written, now, episode, self._rows)
         self._step.begin(now, episode)
 
     def step(self, action: Array) -> Transition:

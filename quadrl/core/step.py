@@ -30,37 +30,22 @@ class Inputs:
     diverged: np.ndarray  # (N,) bool
 
 
+@dataclasses.dataclass(eq=False, repr=False)
 class Step(abc.ABC):
     """The control step of a task for N rows."""
 
-    snapshot: Snapshot
+    task: Task
+    clock: Clock  # of its episodes
+    engine: Engine  # of the aircraft
+    inputs: Inputs  # read live
+    estimate: Frame | None  # table of the state that is observed, read live; None for the true one
+    scene: Scene  # the solids in the world
+    snapshot: Snapshot = dataclasses.field(init=False)
     """What tasks see now: live, valid until the next step."""
-    episode: Episode
+    episode: Episode = dataclasses.field(init=False)
     """How far the episodes are: as live as the snapshot."""
-    not_compiled = ""
+    not_compiled: str = dataclasses.field(default="", init=False)
     """Why it is not compiled; empty where it is."""
-
-    def __init__(
-        self,
-        task: Task,
-        clock: Clock,
-        engine: Engine,
-        inputs: Inputs,
-        estimate: Frame | None,
-        scene: Scene,
-    ) -> None:
-        """Note where everything is.
-
-        Args:
-            task: The task.
-            clock: Clock of its episodes.
-            engine: Engine of the aircraft.
-            inputs: Read live.
-            estimate: Table of the state that is observed, read live; None for the true one.
-            scene: The solids in the world.
-        """
-        self.task, self._clock, self._engine = task, clock, engine
-        self._inputs, self._estimate, self.scene = inputs, estimate, scene
 
     @abc.abstractmethod
     def begin(self, now: Snapshot, episode: Episode) -> None:
@@ -92,12 +77,12 @@ class WrittenStep(Step):
 
     def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
-        inputs, estimate = records.copied(self._inputs), self._estimate
+        inputs, estimate = records.copied(self.inputs), self.estimate
         self.snapshot, self.episode, done = transition.finish(
-            *(self.task, self._clock, self.episode, self.snapshot, self._engine.state),
+            *(self.task, self.clock, self.episode, self.snapshot, self.engine.state),
             *(inputs.action, inputs.command, inputs.diverged),
             estimate.state if estimate else None,
-            self.scene.surroundings(self._engine) if self.scene.solids else None,
+            self.scene.surroundings(self.engine) if self.scene.solids else None,
             sensed,
         )
         # What a task remembers must not be a view of buffers that the next steps write.
