@@ -173,6 +173,23 @@ def resolved(
     return made
 
 
+def registered(what: str, kind: Any, base: type, registry: Mapping[str, Any]) -> str:
+    """The name under which a class enters a registry.
+
+    Raises:
+        QuadrlError: It is not a subclass of the base with a name, or another class has the name.
+    """
+    name = getattr(kind, "name", None)
+    is_kind = isinstance(kind, type) and issubclass(kind, base)
+    if not (is_kind and isinstance(name, str) and name.isidentifier()):
+        allowed = f"a {base.__name__} subclass with a string `name` such as 'my_{what}'"
+        raise QuadrlError(name=what, value=kind, allowed=allowed)
+    if registry.get(name, kind) is not kind:
+        allowed = f"a name that no other {what} has"
+        raise QuadrlError(name=f"{what} name", value=name, allowed=allowed)
+    return name
+
+
 def tuples(value: Any) -> Any:
     """Lists as JSON has them to tuples, at any depth."""
     if isinstance(value, dict):

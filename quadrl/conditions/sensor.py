@@ -16,7 +16,7 @@ from quadrl.aircraft.rotors import MAX
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SENSORS as STREAMS
 from quadrl.base.rotation import Array
-from quadrl.base.validation import choice, number, record, whole_steps
+from quadrl.base.validation import choice, number, record, registered, whole_steps
 from quadrl.conditions.randomization import LONGEST_DELAY
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.engines import native
@@ -137,14 +137,8 @@ def register_sensor(kind: Kind) -> Kind:
     Raises:
         QuadrlError: It is not a Sensor subclass with a name, or another sensor has the name.
     """
-    given, name = cast(Any, kind), getattr(kind, "name", None)
-    named = isinstance(given, type) and issubclass(given, Sensor) and isinstance(name, str)
-    if not named or not name.isidentifier():  # type: ignore[union-attr]
-        allowed = "a Sensor subclass with a string `name` such as 'my_sensor'"
-        raise QuadrlError(name="sensor", value=kind, allowed=allowed)
-    if SENSORS.get(name, kind) is not kind:  # type: ignore[arg-type]
-        raise QuadrlError(name="sensor name", value=name, allowed="one that no other sensor has")
-    SENSORS[name] = kind = dataclasses.dataclass(frozen=True)(given)  # type: ignore[index]
+    given, name = cast(Any, kind), registered("sensor", kind, Sensor, SENSORS)
+    SENSORS[name] = dataclasses.dataclass(frozen=True)(given)
     return kind
 
 

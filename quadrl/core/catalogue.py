@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
-from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice
+from quadrl.base.validation import choice, registered
 from quadrl.core.task import Task
 
 TASKS: dict[str, type[Task]] = {}
@@ -18,15 +17,7 @@ def register(task: type[Task]) -> type[Task]:
     Raises:
         QuadrlError: It is not a Task subclass with a name, or another task has the name.
     """
-    given, name = cast(Any, task), getattr(task, "name", None)
-    named = isinstance(given, type) and issubclass(given, Task) and isinstance(name, str)
-    if not named or not task.name.isidentifier():
-        allowed = "a Task subclass with a string `name` such as 'my_task'"
-        raise QuadrlError(name="task", value=task, allowed=allowed)
-    if TASKS.get(task.name, task) is not task:
-        allowed = "a name that no other task has"
-        raise QuadrlError(name="task name", value=task.name, allowed=allowed)
-    TASKS[task.name] = task
+    TASKS[registered("task", task, Task, TASKS)] = task
     return task
 
 
