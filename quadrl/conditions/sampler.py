@@ -201,15 +201,8 @@ class AircraftSampler:
         for heavy, inertia, drag in itertools.product((0, 1), repeat=3):
             # Its mass at one end, what its rotors give at the other.
             weak = 1 - heavy
-            ends = {
-                "mass": heavy,
-                "inertia": inertia,
-                "drag": drag,
-                "inflow": 1,
-                "lag": 0,
-                "rotor_inertia": 1,
-            }
-            ends |= {"thrust": weak, "torque": weak, "max_speed": weak}
+            ends = {"mass": heavy, "inertia": inertia, "drag": drag, "inflow": 1, "lag": 0}
+            ends |= {"rotor_inertia": 1, "thrust": weak, "torque": weak, "max_speed": weak}
             both = self.low, self._high
             columns: Any = {k: both[end][self.names.index(k)] for k, end in ends.items()}
             columns |= {f"{name}_1": [given.rotors[ends[name]]] * count for name in EACH_ROTOR}

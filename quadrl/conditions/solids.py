@@ -32,13 +32,12 @@ class Solid(abc.ABC):
 
     name: str
     """Name by which the task places it."""
-    position: Vector = dataclasses.field(default=(0.0, 0.0, 0.0), kw_only=True)
+    _: dataclasses.KW_ONLY
+    position: Vector = (0.0, 0.0, 0.0)
     """Position of its centre where `Task.place` says nothing, task frame [m]."""
-    rgba: tuple[float, float, float, float] = dataclasses.field(
-        default=(0.55, 0.58, 0.62, 1.0), kw_only=True
-    )
+    rgba: tuple[float, float, float, float] = (0.55, 0.58, 0.62, 1.0)
     """Colour and opacity, each between 0 and 1."""
-    grip: float = dataclasses.field(default=0.0, kw_only=True)
+    grip: float = 0.0
     """With how many times its weight it holds an aircraft whose feet touch it; none by default. The
     rotors of who is held stop for the rest of the episode."""
 
