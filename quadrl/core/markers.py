@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -45,13 +45,7 @@ class Marker:
 
     def moved(self, offset: np.ndarray) -> Marker:
         """The same marker, shifted by an offset (3,) [m]."""
-
-        def shifted(point: Any) -> Any:
-            return None if point is None else tuple(np.asarray(point) + offset)
-
-        return dataclasses.replace(
-            self,
-            position=shifted(self.position),
-            end=shifted(self.end),
-            points=np.asarray(self.points, dtype=float) + offset if len(self.points) else (),
-        )
+        position = tuple(np.add(self.position, offset))
+        end = None if self.end is None else tuple(np.add(self.end, offset))
+        points = np.add(self.points, offset) if len(self.points) else ()
+        return dataclasses.replace(self, position=position, end=end, points=points)
