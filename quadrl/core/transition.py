@@ -18,7 +18,7 @@ from quadrl.conditions.sensor import Sizes
 from quadrl.core.rewards import total
 from quadrl.core.task import EpisodeEnd, Snapshot, Task
 from quadrl.engines.rng import Rng
-from quadrl.engines.state import Start, State
+from quadrl.engines.state import SIZES, Start, State
 
 Observation = dict[str, Array]
 SAMPLE = 64  # episodes that are begun to check a task
@@ -111,13 +111,12 @@ def begin(
         around: The solids about the aircraft; None where there are none.
     """
     xp = namespace(state.speed)
-    none = [0.0 * state.speed for _ in range(4)]
-    action = xp.stack([none[0]] * actions, axis=-1)
-    now = Snapshot(state, task_state, parameters, action, state.rotor_speed + 0.0, none[0])
-    now.around = around
-    episode = Episode(*none[1:])
+    time, *none = (0.0 * state.speed for _ in range(4))
+    action = xp.stack([time] * actions, axis=-1)
+    given = task_state, parameters, action, state.rotor_speed + 0.0, time
+    now = Snapshot(state, *given, around=around)
     now.potentials = task.measure(now)
-    return now, episode
+    return now, Episode(*none)
 
 
 def finish(
@@ -154,9 +153,8 @@ def finish(
     xp = namespace(state.speed)
     steps = episode.steps + 1.0
     time = steps * clock.control_timestep
-    now = Snapshot(state, before.task, before.parameters, action, rotor_command, time)
-    now.around = around
-    now.sensed = sensed or {}
+    given = before.task, before.parameters, action, rotor_command, time
+    now = Snapshot(state, *given, sensed=sensed or {}, around=around)
     now.potentials = task.measure(now)
     terminated = task.terminated(now) | diverged
     truncated = (steps >= clock.time_limit_steps) & ~terminated
@@ -232,9 +230,9 @@ def check_task(
     if not isinstance(given, tuple) or not isinstance(given[0], Start):
         raise QuadrlError(name=f"{task.name} begin", value=begun, allowed="a Start and a TaskState")
     start, task_state = begun
-    sizes = {"position": 3, "quaternion": 4, "velocity": 3, "body_rate": 3, "rotor_speed": rotors}
-    for name, columns in sizes.items():
-        _check_array(task, f"{name} of begin", getattr(start, name), (rows, columns), "f")
+    coordinates = {f.name: getattr(start, f.name) for f in dataclasses.fields(start)}
+    for name, array in coordinates.items():
+        _check_array(task, f"{name} of begin", array, (rows, SIZES[name] or rotors), "f")
     for field in dataclasses.fields(task_state):
         value: Any = getattr(task_state, field.name)
         if not isinstance(value, np.ndarray) or cast(Array, value).shape[:1] != (rows,):
@@ -246,8 +244,7 @@ def check_task(
     scene = Scene(task.solids())
     scene.poses(task.place(Rng(keys, 0 * keys, SOLIDS), start, task_state), rows, np.zeros(3))
     around = scene.nothing_near(rows) if scene.solids else None
-    start_state = {f.name: getattr(start, f.name) for f in dataclasses.fields(start)}
-    state = State.of_coordinates(**start_state, origin_height=origin_height)
+    state = State.of_coordinates(**coordinates, origin_height=origin_height)
     now, _ = begin(task, state, task_state, parameters, actions, around)
     for name, options in task.sensors.items():
         made = sensor.make(name, options)
