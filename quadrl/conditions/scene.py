@@ -8,7 +8,6 @@ MuJoCo. What is free, and what was hit, stands in the `Surroundings` of a snapsh
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -59,8 +58,16 @@ class Scene:
             if not isinstance(cast(Any, solid), Solid):
                 allowed = "Sphere, Cylinder, Box and Gate of quadrl.conditions.solids"
                 raise QuadrlError(name="solids", value=solid, allowed=allowed)
+        self.names = tuple(solid.name for solid in self.solids)
+        """Of the solids, in their order."""
         if len(set(self.names)) < len(self.names):
             raise QuadrlError(name="solids", value=self.names, allowed="a name of its own for each")
+        counts = [len(solid.parts) for solid in self.solids]
+        self._first = (np.cumsum(counts) - counts).astype(int).tolist()
+        """Number of the first geom of each solid."""
+        parts = [(solid.position, part.offset) for solid in self.solids for part in solid.parts]
+        self._declared = np.array(parts, dtype=float).reshape(-1, 2, 3).swapaxes(0, 1)
+        """Centres (K, 3) of the geoms' solids, task frame, and the ways from there [m]."""
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the geoms to a world; where they stand is a row's own."""
@@ -127,23 +134,6 @@ class Scene:
                 made[:, k, :3] = position + origin + _rotated(turn, offset)
                 made[:, k, 3:] = turn
         return made
-
-    @functools.cached_property
-    def _first(self) -> list[int]:
-        """Number of the first geom of each solid."""
-        counts = [len(solid.parts) for solid in self.solids]
-        return (np.cumsum(counts) - counts).astype(int).tolist()
-
-    @functools.cached_property
-    def _declared(self) -> np.ndarray:
-        """Centres (K, 3) of the geoms' solids, task frame, and the ways from there [m]."""
-        parts = [(solid.position, part.offset) for solid in self.solids for part in solid.parts]
-        return np.array(parts, dtype=float).reshape(-1, 2, 3).swapaxes(0, 1)
-
-    @functools.cached_property
-    def names(self) -> tuple[str, ...]:
-        """Of the solids, in their order."""
-        return tuple(solid.name for solid in self.solids)
 
     def nothing_near(self, count: int) -> Surroundings:
         """The surroundings of aircraft (n,) far from everything, before there is an engine."""
