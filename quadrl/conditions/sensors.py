@@ -20,7 +20,6 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, norm, to_body, to_world
 from quadrl.base.validation import choice, number
 from quadrl.conditions.sensor import SENSORS as SENSORS
-from quadrl.conditions.sensor import Channel as Channel
 from quadrl.conditions.sensor import Memory, Moment, Sensor, Sizes, register_sensor
 from quadrl.conditions.sensor import make as make
 from quadrl.engines.dynamics import thrust_wrench

@@ -209,8 +209,7 @@ class Environment(saving.Copied):
         around = self.scene.surroundings(self.engine, rows) if self.scene.solids else None
         given = task_state, seen, self.action_size, around
         now, episode = transition.begin(self.task, state, *given)
-        see = self.observer.begin if self.observer else None
-        observation = see(rows, now) if see else self.task.observe(now)
+        observation = self.observer.begin(rows, now) if self.observer else self.task.observe(now)
         self.seeds.episodes[rows] += 1
         if len(rows) == self.num_envs:
             self._take(now, episode)
