@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import abc
 import contextlib
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torch.nn import Parameter
-from torchrl.modules import set_recurrent_mode
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, set_recurrent_mode
 
 
 class Algorithm(abc.ABC):
@@ -20,20 +20,18 @@ class Algorithm(abc.ABC):
     whole: ClassVar[bool] = False
     """Whether it learns from batches (aircraft, time), with the networks that flew them."""
 
-    def __init__(self, config: Any) -> None:
-        """Start without optimisers, with the settings of the algorithm."""
-        self.config = config
-        self.parameters: list[Parameter] = []
-        self._optimisers: dict[str, tuple[torch.optim.Adam, list[Parameter], float]] = {}
-
-    def add_optimiser(
-        self, name: str, parameters: Iterable[Parameter], rate: float, **options: Any
+    def __init__(
+        self, actor: ProbabilisticActor, critic: TensorDictModuleBase, config: Any
     ) -> None:
-        """Let Adam optimise some parameters under a name, with an initial learning rate."""
-        own = list(parameters)
-        self.parameters += own
-        adam = torch.optim.Adam(own, lr=rate, eps=1e-5, **options)
-        self._optimisers[name] = adam, own, rate
+        """Start without optimisers, with the networks and the settings of the algorithm."""
+        self.actor, self.critic, self.config = actor, critic, config
+        self.parameters = [*actor.parameters(), *critic.parameters()]
+        self._optimisers: dict[str, torch.optim.Adam] = {}
+
+    def add_optimiser(self, name: str, network: nn.Module, rate: float, **options: Any) -> None:
+        """Let Adam optimise a network under a name, with an initial learning rate."""
+        group = {"params": [*network.parameters()], "initial_rate": rate}
+        self._optimisers[name] = torch.optim.Adam([group], lr=rate, eps=1e-5, **options)
 
     def update(self, batch: TensorDictBase, remaining: float) -> dict[str, float]:
         """Learn from a batch.
@@ -47,9 +45,9 @@ class Algorithm(abc.ABC):
         Returns:
             Metrics for the log.
         """
-        for adam, _, rate in self._optimisers.values():
+        for adam in self._optimisers.values():
             for group in adam.param_groups:
-                group["lr"] = rate * remaining
+                group["lr"] = group["initial_rate"] * remaining
         with set_recurrent_mode():
             return self.learn(batch)
 
@@ -65,7 +63,7 @@ class Algorithm(abc.ABC):
             *names: Names of the optimisers.
         """
         for name in names:
-            self._optimisers[name][0].zero_grad()
+            self._optimisers[name].zero_grad()
         torch.autograd.backward(loss)
         self.move(*names)
 
@@ -75,36 +73,43 @@ class Algorithm(abc.ABC):
         Each clips the norm of its own gradient: a critic that is far off, as at the begin of a
         training, does not hold the policy back.
         """
-        for adam, parameters, _ in (self._optimisers[name] for name in names):
+        for adam in (self._optimisers[name] for name in names):
             if hasattr(self.config, "max_gradient"):
-                torch.nn.utils.clip_grad_norm_(parameters, self.config.max_gradient)
+                own = adam.param_groups[0]["params"]
+                nn.utils.clip_grad_norm_(own, self.config.max_gradient)
             adam.step()
 
-    def rows(self, batch: TensorDictBase) -> int:
-        """Of a minibatch: transitions, or the aircraft that have as many."""
-        return max(1, self.config.minibatch * len(batch) // batch.numel())
+    def minibatches(self, batch: TensorDictBase, epochs: int) -> Iterator[TensorDictBase]:
+        """Passes over a batch, each in another order, some rows at a time.
 
-    def fit_critic(
-        self, loss: Callable[[TensorDictBase], Tensor], batch: TensorDictBase
-    ) -> dict[str, float]:
+        Rows are as many transitions as the settings say, or the aircraft that have as many.
+        """
+        rows = max(1, self.config.minibatch * len(batch) // batch.numel())
+        for _ in range(epochs):
+            order = torch.randperm(len(batch))
+            # A quarter of the time that it would take to index the batch.
+            entries = {name: x.index_select(0, order.to(x.device)) for name, x in batch.items()}
+            yield from TensorDict(entries, batch_size=batch.batch_size).split(rows)
+
+    def fit_critic(self, batch: TensorDictBase) -> dict[str, float]:
         """Passes of the optimiser "critic" over a batch; returns the last loss for the log."""
-        value = torch.zeros(())
-        for _ in range(self.config.critic_epochs):
-            for part in shuffled(batch).split(self.rows(batch)):
-                value = loss(part)
-                self.step(value, "critic")
-        return {"critic_loss": value.item()}
+        entries = batch.select(*self.critic.in_keys, "value_target")
+        loss = torch.zeros(())
+        for part in self.minibatches(entries, self.config.critic_epochs):
+            loss = (self.critic(part)["state_value"] - part["value_target"]).square().mean()
+            self.step(loss, "critic")
+        return {"critic_loss": loss.item()}
 
     def save(self) -> dict[str, Any]:
         """Tensors of the optimisers by optimiser, parameter and name."""
         return {
             name: {str(k): dict(v) for k, v in adam.state_dict()["state"].items()}
-            for name, (adam, _, _) in self._optimisers.items()
+            for name, adam in self._optimisers.items()
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Continue from what `save` returned; an optimiser that had made no step has none."""
-        for name, (adam, _, _) in self._optimisers.items():
+        for name, adam in self._optimisers.items():
             tensors = {int(k): v for k, v in saved.get(name, {}).items()}
             adam.load_state_dict(adam.state_dict() | {"state": tensors})
 
@@ -135,10 +140,3 @@ def set_generators(states: dict[str, Tensor], device: torch.device) -> None:
         torch.set_rng_state(states["cpu"])
     if "cuda" in states and device.type == "cuda":
         torch.cuda.set_rng_state(states["cuda"], device)
-
-
-def shuffled(batch: TensorDictBase) -> TensorDictBase:
-    """The rows of a batch in another order, in a quarter of the time that indexing would take."""
-    order = torch.randperm(len(batch))
-    entries = {name: x.index_select(0, order.to(x.device)) for name, x in batch.items()}
-    return TensorDict(entries, batch_size=batch.batch_size)

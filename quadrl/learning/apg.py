@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
-from quadrl.learning.algorithm import Algorithm, shuffled
+from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.environments import RecordingEnv
 from quadrl.learning.settings import APGConfig
 from quadrl.learning.window import Window
@@ -48,11 +48,10 @@ class APG(Algorithm):
             gamma: Discount per control step.
             reward_scale: Factor on the rewards.
         """
-        super().__init__(config)
-        self.actor, self.critic, self._env = actor, critic, env
-        self._gamma, self._reward_scale = gamma, reward_scale
-        self.add_optimiser("policy", actor.parameters(), config.learning_rate)
-        self.add_optimiser("critic", critic.parameters(), config.critic_rate)
+        super().__init__(actor, critic, config)
+        self._env, self._gamma, self._reward_scale = env, gamma, reward_scale
+        self.add_optimiser("policy", actor, config.learning_rate)
+        self.add_optimiser("critic", critic, config.critic_rate)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """One window (aircraft, time): the policy's epochs, then the critic's."""
@@ -67,11 +66,9 @@ class APG(Algorithm):
         moves = self._moves(torch.from_numpy(by_action).float().reshape(mean.shape))
         better = (mean + moves).detach()
         aims = seen.detach().update({"better": better, "usual": deviation.log().detach()})
-        for _ in range(self.config.epochs):
-            for part in shuffled(aims).split(self.config.minibatch):
-                self.step(self._distance(part), "policy")
-        entries = batch.select(*self.critic.in_keys, "value_target")
-        return self.fit_critic(self._critic_loss, entries.reshape(-1))
+        for part in self.minibatches(aims, self.config.epochs):
+            self.step(self._distance(part), "policy")
+        return self.fit_critic(batch.reshape(-1))
 
     def _earned(self, window: Window) -> Tensor:
         """The rewards of a window and what the critic expects after it, ()."""
@@ -100,6 +97,3 @@ class APG(Algorithm):
         """Mean and deviation of the actions (n, k)."""
         found: Any = self.actor.get_dist_params(seen.select("observation"))
         return found["loc"], found["scale"]
-
-    def _critic_loss(self, batch: TensorDictBase) -> Tensor:
-        return (self.critic(batch)["state_value"] - batch["value_target"]).square().mean()

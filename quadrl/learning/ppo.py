@@ -9,7 +9,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
 from quadrl.base.errors import QuadrlError
-from quadrl.learning.algorithm import Algorithm, shuffled
+from quadrl.learning.algorithm import Algorithm
 from quadrl.learning.fused import PPOGradients
 from quadrl.learning.networks import Entries
 from quadrl.learning.settings import PPOConfig
@@ -24,7 +24,7 @@ class PPO(Algorithm):
         Raises:
             QuadrlError: The fused gradients are asked for, and do not know the networks.
         """
-        super().__init__(config)
+        super().__init__(actor, critic, config)
         policy: Any = actor.module[0]
         self.loss = ClipPPOLoss(
             actor,
@@ -45,8 +45,8 @@ class PPO(Algorithm):
                 raise QuadrlError(reason, name="ppo.fused", value=True, allowed="False for others")
             self._fused = PPOGradients(policy.plain, critic.plain, config)
         adam = {"betas": (0.9, config.beta2), "fused": True}
-        self.add_optimiser("policy", actor.parameters(), config.learning_rate, **adam)
-        self.add_optimiser("critic", critic.parameters(), config.learning_rate, **adam)
+        self.add_optimiser("policy", actor, config.learning_rate, **adam)
+        self.add_optimiser("critic", critic, config.learning_rate, **adam)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Epochs over minibatches."""
@@ -54,15 +54,14 @@ class PPO(Algorithm):
         if fused is not None:
             batch = fused.prepare(batch)
         found: Any = None
-        for _ in range(self.config.epochs):
-            for part in shuffled(batch).split(self.rows(batch)):
-                if fused is not None:
-                    found = fused.gradients(part)
-                    self.move("policy", "critic")
-                else:
-                    found = self.loss(part)
-                    losses = [value for name, value in found.items() if name.startswith("loss_")]
-                    self.step(losses, "policy", "critic")
+        for part in self.minibatches(batch, self.config.epochs):
+            if fused is not None:
+                found = fused.gradients(part)
+                self.move("policy", "critic")
+            else:
+                found = self.loss(part)
+                losses = [value for name, value in found.items() if name.startswith("loss_")]
+                self.step(losses, "policy", "critic")
         if fused is not None:
             found = fused.figures(*found)
         logged = {"critic_loss": "loss_critic", "kl": "kl_approx", "clip_fraction": "clip_fraction"}

@@ -84,21 +84,14 @@ class TRPO(Algorithm):
         self, actor: ProbabilisticActor, critic: TensorDictModule, config: TRPOConfig
     ) -> None:
         """Make the loss and the critic's optimiser."""
-        super().__init__(config)
-        self.loss = TRPOLoss(
-            actor, critic, loss_critic_type="l2", log_explained_variance=False, functional=False
-        )
+        super().__init__(actor, critic, config)
+        self.loss = TRPOLoss(actor, functional=False)
         self.policy = list(actor.parameters())
-        self.add_optimiser("critic", critic.parameters(), config.critic_rate)
-        self.parameters += self.policy
+        self.add_optimiser("critic", critic, config.critic_rate)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """The policy's step, then the critic's epochs."""
-        return self.natural_step(batch) | self.fit_critic(self.critic_loss, batch)
-
-    def critic_loss(self, batch: TensorDictBase) -> Tensor:
-        """Mean squared error of the critic, a scalar."""
-        return self.loss.loss_critic(batch)[0].mean()
+        return self.natural_step(batch) | self.fit_critic(batch)
 
     def natural_step(self, batch: TensorDictBase) -> dict[str, float]:
         """The policy's step: natural gradient, then a line search under the KL bound.

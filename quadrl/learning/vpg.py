@@ -21,19 +21,14 @@ class VPG(Algorithm):
         self, actor: ProbabilisticActor, critic: TensorDictModule, config: VPGConfig
     ) -> None:
         """Make the loss and the optimisers."""
-        super().__init__(config)
-        self.loss = A2CLoss(
-            actor,
-            critic,
-            entropy_bonus=False,
-            critic_coeff=1.0,
-            loss_critic_type="l2",
-            functional=False,
-        )
-        self.add_optimiser("policy", actor.parameters(), config.learning_rate)
-        self.add_optimiser("critic", critic.parameters(), config.critic_rate)
+        super().__init__(actor, critic, config)
+        # Of the policy alone: the critic has epochs of its own.
+        own = {"critic_coeff": None, "entropy_bonus": False, "functional": False}
+        self.loss = A2CLoss(actor, critic, **own)
+        self.add_optimiser("policy", actor, config.learning_rate)
+        self.add_optimiser("critic", critic, config.critic_rate)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """The policy's step, then the critic's epochs."""
         self.step(self.loss(batch)["loss_objective"], "policy")
-        return self.fit_critic(lambda part: self.loss.loss_critic(part)[0].mean(), batch)
+        return self.fit_critic(batch)

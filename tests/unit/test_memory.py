@@ -198,9 +198,8 @@ def test_what_is_learned_from_is_what_was_flown(tmp_path):
 def test_a_minibatch_holds_as_many_transitions(memory):
     config = PPOConfig(minibatch=48, fused=memory == "none")
     algorithm = PPO(*make_actor_critic(3, 2, changed(memory=memory))[:2], config)
-    assert algorithm.rows(TensorDict({}, [256, 16])) == 3
-    assert algorithm.rows(TensorDict({}, [256 * 16])) == 48
-    assert algorithm.rows(TensorDict({}, [4, 100])) == 1
+    for size, rows in (([256, 16], 3), ([256 * 16], 48), ([4, 100], 1)):
+        assert len(next(algorithm.minibatches(TensorDict({}, size), epochs=1))) == rows
 
 
 def test_it_continues_bit_for_bit(tmp_path):
