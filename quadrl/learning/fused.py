@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from quadrl.evaluation.policy import LOG_VARIANCE
 from quadrl.learning.settings import PPOConfig
@@ -27,25 +27,32 @@ LOG_2_PI = math.log(2 * math.pi)
 class Plain:
     """The parts of a network of linear layers with tanh between them, behind normalisers."""
 
-    entries: Sequence[str]
-    """What it reads, an entry for each normaliser."""
-    normalisers: Sequence[nn.Module]
+    sees: Mapping[str, Callable[[Tensor], Tensor]]
+    """What the first layer reads of each entry, side by side: they are normalised."""
     layers: Sequence[Any]
     goal: Any = None
     """The `HoldsGoal` that takes the mean at the goal away, if there is one."""
 
     def seen(self, batch: TensorDictBase) -> Tensor:
         """What the first layer reads of a batch, (n, inputs)."""
-        pairs = zip(self.normalisers, self.entries, strict=True)
-        parts = [_rows(normaliser(batch.get(name))) for normaliser, name in pairs]
-        seen = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
-        return seen if self.goal is None else self.goal.looks * seen
+        parts = [_rows(sees(batch.get(name))) for name, sees in self.sees.items()]
+        return torch.cat(parts, -1) if len(parts) > 1 else parts[0]
 
-    def with_goal(self, seen: Tensor) -> Tensor:
-        """`seen` with the goal as one row more, where the network holds one."""
-        if self.goal is None:
-            return seen
-        return torch.cat([seen, (self.goal.looks * self.goal.normaliser(self.goal.at_goal))[None]])
+    def forward_policy(
+        self, seen: Tensor, weights: Sequence[Tensor]
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
+        """What each layer of a policy reads, and mean and log-variance of its actions, (n, k).
+
+        The variance is not yet bounded. A goal that the policy holds is one row more of what the
+        layers read, and its mean is taken away.
+        """
+        if self.goal is not None:
+            seen = torch.cat([seen, self.goal.seen(self.goal.at_goal)[None]])
+        values, output = forward(seen, weights)
+        mean, log_variance = output.chunk(2, -1)
+        if self.goal is not None:
+            mean, log_variance = mean[:-1] - mean[-1], log_variance[:-1]
+        return values, mean, log_variance
 
     def weights(self) -> list[Tensor]:
         """Weights and biases of the layers in turn."""
@@ -90,19 +97,6 @@ def backward(error: Tensor, values: Sequence[Tensor], weights: Sequence[Tensor])
     return found[::-1]
 
 
-def mean_and_log_variance(output: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Of the actions, (count, k), from a policy's output; the variance is not yet bounded.
-
-    Args:
-        output: (count, 2 * k), or with one row more: that of the goal, whose mean is taken away.
-        count: Number of observations.
-    """
-    mean, free = output.chunk(2, -1)
-    if len(output) > count:
-        return mean[:count] - mean[-1], free[:count]
-    return mean, free
-
-
 class BehaviourPolicy(TensorDictModuleBase):
     """Draws the actions of a plain policy, for a collector: the actor's entries, no gradients."""
 
@@ -110,15 +104,14 @@ class BehaviourPolicy(TensorDictModuleBase):
         """Fly with the weights of a network, as they are at each step."""
         super().__init__()
         self._plain = plain
-        self.in_keys = list(plain.entries)
+        self.in_keys = list(plain.sees)
         self.out_keys = ["loc", "scale", "action", "action_log_prob"]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add mean, deviation and action (N, k), and the action's log-probability (N,)."""
-        seen = self._plain.seen(tensordict)
-        _, output = forward(self._plain.with_goal(seen), self._plain.weights())
-        mean, free = mean_and_log_variance(output, len(seen))
+        plain = self._plain
+        _, mean, free = plain.forward_policy(plain.seen(tensordict), plain.weights())
         log_variance = free.clamp(*LOG_VARIANCE)
         deviation, noise = (0.5 * log_variance).exp(), torch.randn_like(mean)
         log_probability = -0.5 * (noise.square() + log_variance + LOG_2_PI).sum(-1)
@@ -161,8 +154,7 @@ class PPOGradients:
         weights, critic_weights = self._policy.weights(), self._critic.weights()
         share = 1 / len(action)  # of each row in a mean
         # The policy: gain = min(r, clip(r)) * advantage with the ratio r of the probabilities.
-        values, output = forward(self._policy.with_goal(part.get("policy")), weights)
-        mean, free = mean_and_log_variance(output, len(action))
+        values, mean, free = self._policy.forward_policy(part.get("policy"), weights)
         log_variance = free.clamp(*LOG_VARIANCE)
         off = action - mean
         by_mean = off * (-log_variance).exp()
@@ -176,7 +168,7 @@ class PPOGradients:
         to_mean = by_ratio * by_mean
         to_variance = 0.5 * (by_ratio * (square - 1) - share * self._config.entropy)
         to_output = torch.cat([to_mean, to_variance * (free == log_variance)], -1)
-        if len(output) > len(action):
+        if self._policy.goal is not None:
             at_goal = torch.cat([-to_mean.sum(0), torch.zeros_like(to_mean[0])])
             to_output = torch.cat([to_output, at_goal[None]])
         # The critic: its squared error.

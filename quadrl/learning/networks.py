@@ -96,12 +96,16 @@ class HoldsGoal(nn.Module):
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and standard deviation of the actions (..., k) for observations (..., size)."""
-        mean, deviation = self.last(self.network(self.looks * self.normaliser(observation)))
+        mean, deviation = self.last(self.network(self.seen(observation)))
         return mean - self.mean_at_goal(), deviation
+
+    def seen(self, observation: torch.Tensor) -> torch.Tensor:
+        """What the network reads of observations (..., size)."""
+        return self.looks * self.normaliser(observation)
 
     def mean_at_goal(self) -> torch.Tensor:
         """The output at the goal, which is subtracted, (k,)."""
-        return self.last(self.network(self.looks * self.normaliser(self.at_goal)))[0]
+        return self.last(self.network(self.seen(self.at_goal)))[0]
 
 
 class Memory(nn.Module):
@@ -207,26 +211,22 @@ def make_actor_critic(
         privileged: Numbers in the privileged observation; 0 for none.
     """
     remembered = config.memory_width if config.memory == "gru" else 0
-    normalisers = {"observation": Normaliser(size)}
+    normaliser = Normaliser(size)
+    normalisers = {"observation": normaliser}
     network = make_network(size + remembered, config.hidden, 2 * actions, gain=0.01)
     bias: Any = network[-1].bias
     with torch.no_grad():
         bias[actions:] = 2 * torch.tensor(config.initial_deviation).log()
-    reads: list[Any] = ["observation"]
-    gives: list[Any] = ["loc", "scale"]
-    policy: nn.Module
-    layers, goal = [*network], None
-    if config.holds_goal:
-        policy = goal = HoldsGoal(normalisers["observation"], network, *goal_state(config))
-    elif remembered:
-        network.append(MeanAndDeviation())
-        policy = Memory(normalisers["observation"], remembered, network)
-        reads, gives = [*reads, STATE, BEGINS], [*gives, ("next", STATE)]
+    layers = [*network][::2]
+    if remembered:
+        policy = Memory(normaliser, remembered, network.append(MeanAndDeviation()))
+        given = ["loc", "scale", ("next", STATE)]
+        entries = Entries(policy, ["observation", STATE, BEGINS], given)
     else:
-        policy = nn.Sequential(normalisers["observation"], *network, MeanAndDeviation())
-    entries = Entries(policy, reads, gives)
-    if not remembered:
-        entries.plain = Plain(reads, [normalisers["observation"]], layers[::2], goal)
+        goal = HoldsGoal(normaliser, network, *goal_state(config)) if config.holds_goal else None
+        policy = goal or nn.Sequential(normaliser, *network, MeanAndDeviation())
+        entries = Entries(policy, ["observation"], ["loc", "scale"])
+        entries.plain = Plain({"observation": goal.seen if goal else normaliser}, layers, goal)
     actor = ProbabilisticActor(
         entries,
         in_keys=["loc", "scale"],
@@ -240,7 +240,7 @@ def make_actor_critic(
     first = [*normalisers.values()]
     value = Informed(first, network) if privileged else nn.Sequential(*first, *network)
     critic = Entries(value, [*normalisers], ["state_value"])
-    critic.plain = Plain([*normalisers], first, [*network][::2])
+    critic.plain = Plain(normalisers, [*network][::2])
     return actor, critic, normalisers
 
 
