@@ -9,6 +9,7 @@ time.
 from __future__ import annotations
 
 import dataclasses
+import operator
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from quadrl.engines.engine import Engine
 from quadrl.engines.state import State
 
 FLAGS = ("terminated", "truncated")
+LEAVES = ("was", "end", "command", "before.rotor_command", "action")
+"""Of a `Moment`, what the derivatives are taken by."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,24 +82,20 @@ class Window:
         """
         self.moments, task = moments, environment.task
         self.shape = len(moments), environment.num_envs  # (T, N)
-        parts = ("was", "end", "action")
-        self.was, self.end, self.action = (_leaf([getattr(m, n) for m in moments]) for n in parts)
-        self.command = _leaf([m.command for m in moments])
-        self.last_command = _leaf([m.before.rotor_command for m in moments])
-        clock = environment.vehicle.control_timestep
+        leaves = (_joined(moments, name).double().requires_grad_() for name in LEAVES)
+        self._leaves = was, end, command, last_command, action = tuple(leaves)
+        clock = Clock.of(task, environment.vehicle.control_timestep)
         self._control, self._pilot = environment.control_mode, environment.autopilot
-        parameters = moments[0].before.parameters.map(_tensor)
-        origin = environment.origin
-        diverged = torch.from_numpy(np.concatenate([m.diverged for m in moments]))
-        time = torch.from_numpy(np.concatenate([m.before.time for m in moments]))
-        state = _joined([m.before.task for m in moments])
-        moment = state, parameters, torch.zeros_like(self.action), self.last_command, time
-        before = Snapshot(_state(self.was, origin), *moment)
-        steps = _joined([m.episode for m in moments])
-        flown = _state(self.end, origin), self.action, self.command, diverged
+        own, origin = moments[0].before.parameters, environment.origin
+        parameters = own.map(lambda rows: torch.tensor(np.ascontiguousarray(rows)))
+        time, diverged = _joined(moments, "before.time"), _joined(moments, "diverged")
+        moment = parameters, torch.zeros_like(action), last_command, time
+        before = Snapshot(_state(was, origin), _joined(moments, "before.task"), *moment)
+        steps = _joined(moments, "episode")
+        flown = _state(end, origin), action, command, diverged
         try:
             before.potentials = task.measure(before)
-            done = finish(task, Clock.of(task, clock), steps, before, *flown)[2]
+            done = finish(task, clock, steps, before, *flown)[2]
             self.observation = torch.cat(list(task.observe(before).values()), -1)
             """What was seen before each step, (T * N, size)."""
         except (AttributeError, RuntimeError, TypeError, ValueError) as error:
@@ -123,11 +122,11 @@ class Window:
             action: The actions as they follow from `observation`, (T * N, k).
             gamma: Discount per control step.
         """
-        leaves = self.was, self.end, self.command, self.last_command, self.action
-        by = torch.autograd.grad(earned, leaves, retain_graph=True, allow_unused=True)
-        was, end, command, last, own = (self._steps(*pair) for pair in zip(by, leaves, strict=True))
+        leaves = self._leaves
+        by = torch.autograd.grad(earned, leaves, retain_graph=True, materialize_grads=True)
+        was, end, command, last, own = map(self._steps, by)
         jacobian = [
-            self._steps(torch.autograd.grad(one.sum(), self.was, retain_graph=True)[0], self.was)
+            self._steps(torch.autograd.grad(one.sum(), leaves[0], retain_graph=True)[0])
             for one in action.unbind(-1)
         ]  # k of (T, N, 13 + R)
         by_action = np.zeros_like(own)
@@ -171,22 +170,16 @@ class Window:
         by_motion, by_action = back.setpoint(moment.was, moment.action, by_setpoint)
         return by + by_motion, by_action
 
-    def _steps(self, gradient: Tensor | None, leaf: Tensor) -> np.ndarray:
+    def _steps(self, gradient: Tensor) -> np.ndarray:
         """A gradient by a leaf as (T, N, ...)."""
-        whole = torch.zeros_like(leaf) if gradient is None else gradient
-        return whole.numpy().reshape(*self.shape, -1)
+        return gradient.numpy().reshape(*self.shape, -1)
 
 
-def _tensor(array: np.ndarray) -> Tensor:
-    return torch.tensor(np.ascontiguousarray(array))
-
-
-def _leaf(arrays: list[np.ndarray]) -> Tensor:
-    return torch.from_numpy(np.concatenate(arrays).astype(np.float64)).requires_grad_()
-
-
-def _joined(parts: list[Any]) -> Any:
-    """Records of arrays (N, ...) as one of tensors (T * N, ...)."""
+def _joined(moments: list[Moment], name: str) -> Any:
+    """What moments have by a name, arrays (N, ...) or records, as one of tensors (T * N, ...)."""
+    parts = [operator.attrgetter(name)(moment) for moment in moments]
+    if isinstance(parts[0], np.ndarray):
+        return torch.from_numpy(np.concatenate(parts))
     columns = zip(*map(records.leaves, parts), strict=True)
     joined = (torch.from_numpy(np.concatenate(column)) for column in columns)
     return records.filled(parts[0], joined)
