@@ -8,12 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    dispatch,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from torch import Tensor
 from torch.distributions import Distribution, kl_divergence
 from torchrl.modules.distributions.utils import has_analytic_kl
@@ -64,34 +59,18 @@ class TRPOLoss(PPOLoss):
             if settings.get(name):
                 raise ValueError(f"TRPOLoss has no {name}: leave it out.")
         super().__init__(actor_network, critic_network, entropy_bonus=False, **settings)
+        # In the order in which a call with tensors returns them.
+        self.out_keys = ["loss_objective", "kl", *["loss_critic"] * self._has_critic]
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
         keys, names = sorted(self._in_keys, key=str), self.tensor_keys
-        _maybe_add_or_extend_key(keys, self._distribution_keys())
+        _maybe_add_or_extend_key(keys, self.actor_network.dist_params_keys)
         # Last, since a call with positional arguments may leave them out.
         _maybe_add_or_extend_key(keys, names.advantage)
         if self.critic_network is not None:
             _maybe_add_or_extend_key(keys, names.value_target)
         self._in_keys = list(dict.fromkeys(keys))
-
-    def _distribution_keys(self) -> list[Any]:
-        """What the last probabilistic module of the actor reads."""
-        for module in reversed(list(self.actor_network.modules())):
-            if isinstance(module, ProbabilisticTensorDictModule):
-                return list(module.in_keys)
-        raise RuntimeError("Could not find the probabilistic module in the actor.")
-
-    @property
-    def out_keys(self) -> list[Any]:
-        """Names of the outputs, in the order in which a call with tensors returns them."""
-        if self._out_keys is None:
-            self._out_keys = ["loss_objective", "kl", *["loss_critic"] * self._has_critic]
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[Any]) -> None:
-        self._out_keys = values
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -127,7 +106,8 @@ class TRPOLoss(PPOLoss):
 
     def _policy_terms(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Surrogate and divergence, reduced."""
-        absent = [key for key in self._distribution_keys() if tensordict.get(key, None) is None]
+        needed = self.actor_network.dist_params_keys
+        absent = [key for key in needed if tensordict.get(key, None) is None]
         if absent:
             raise KeyError(
                 f"The input has no {absent}, parameters of the policy that acted, which TRPOLoss "
