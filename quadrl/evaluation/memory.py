@@ -38,7 +38,7 @@ class GRU:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays by their names in a file."""
-        return {PREFIX + field.name: getattr(self, field.name) for field in FIELDS}
+        return {PREFIX + name: array for name, array in vars(self).items()}
 
     def fits(self, size: int) -> bool:
         """Whether the arrays are those of one unit with some numbers in an input."""
@@ -47,8 +47,7 @@ class GRU:
         return width > 0 and [array.shape for array in self.arrays().values()] == shapes
 
 
-FIELDS = dataclasses.fields(GRU)
-NAMES = tuple(PREFIX + field.name for field in FIELDS)
+NAMES = tuple(PREFIX + field.name for field in dataclasses.fields(GRU))
 
 
 class PolicyInFlight:

@@ -28,8 +28,7 @@ class PolicyModule(nn.Module):
         # Without first weights, so that torch's random numbers stay where they are.
         if unit := policy.memory:
             self.memory = nn.utils.skip_init(nn.GRUCell, policy.size, policy.state_size)
-            own = unit.input_weight, unit.state_weight, unit.input_bias, unit.state_bias
-            _fill(self.memory, own)
+            _fill(self.memory, unit.arrays().values())
         for weight, bias in policy.mean_layers:
             layer = nn.utils.skip_init(nn.Linear, *reversed(weight.shape))
             _fill(layer, (weight, bias))

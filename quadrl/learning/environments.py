@@ -149,22 +149,20 @@ def make_device(name: str) -> torch.device:
 
 def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
     """The aircraft of a training."""
+    scenario = config.training_scenario
+    if config.algo == "apg" and (late := scenario.vehicle.dead_time):
+        said = f"apg trains without the dead time of the aircraft, {late:g} s, for want of its"
+        warnings.warn(f"{said} derivatives; evaluations fly with it", QuadrlWarning, stacklevel=2)
+        prompt = dataclasses.replace(scenario.vehicle, dead_time=0.0)
+        scenario = dataclasses.replace(scenario, vehicle=prompt)
     settings: dict[str, Any] = dict(
-        task=config.training_scenario,
+        task=scenario,
         num_envs=config.num_envs,
         seed=config.seed * SEED_STRIDE,
         device=device,
         num_threads=config.num_threads,
     )
     if config.algo == "apg":
-        scenario = config.training_scenario
-        if late := scenario.vehicle.dead_time:
-            said = f"apg trains without the dead time of the aircraft, {late:g} s, for want of its"
-            warnings.warn(
-                f"{said} derivatives; evaluations fly with it", QuadrlWarning, stacklevel=2
-            )
-            prompt = dataclasses.replace(scenario.vehicle, dead_time=0.0)
-            settings["task"] = dataclasses.replace(scenario, vehicle=prompt)
         return RecordingEnv(**settings)
     if config.memory == "none":
         return QuadrotorEnv(**settings)

@@ -108,11 +108,10 @@ class TRPO(Algorithm):
         curvature = direction @ product(direction)
         start = flat([p.detach() for p in self.policy])
         before = surrogate.item()
-        if not math.isfinite(curvature.item()) or curvature <= 0:
-            return {"kl": 0.0, "step": 0.0, "surrogate_gain": 0.0}
         full = direction * torch.sqrt(2 * config.max_kl / curvature)
+        curved = 0 < curvature.item() < math.inf  # otherwise no step has a length
         share = 1.0
-        for _ in range(config.backtracks):
+        for _ in range(config.backtracks if curved else 0):
             self._set(start + (share * full).to(start.dtype))
             with torch.no_grad():
                 after, divergence = (x.item() for x in self.loss.surrogate_and_kl(batch))
