@@ -37,7 +37,7 @@ def begun(vehicle, weather, height, **settings):
 def acceleration(environment):
     """Right after a reset, in the mean wind alone, without noise (N, 3) [m/s^2] and [rad/s^2]."""
     engine, blowing = environment.engine, environment.blowing
-    place = blowing.save()["weather.streams"]
+    place = blowing.save()["streams"]
     mean = blowing.mean_wind(*place, engine.qpos[:, 2])
     wind = np.concatenate([mean, 0 * mean[:, :1]], axis=1)
     motion = Motion(
