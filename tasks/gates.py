@@ -13,7 +13,7 @@ from quadrl.base.rotation import Array, namespace, norm, to_body
 from quadrl.base.validation import number
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.observation import OBSERVATION, ROTATION, ObservationTerm
+from quadrl.core.observation import MOTION, ROTATION, ObservationTerm, observed_motion
 from quadrl.core.task import EpisodeEnd, Snapshot, Task, TaskState
 from quadrl.tasks.tracks import Track, crossing
 
@@ -48,7 +48,7 @@ class GateRace(Task):
     keeps_place = False
     observation = {
         **ROTATION,
-        **{name: OBSERVATION[name] for name in ("velocity", "body_rate", "rotor_speed", "goal")},
+        **MOTION,
         "through": ObservationTerm(3, "1", "unit vector through the next gate, body frame"),
         "next_goal": ObservationTerm(3, "m", "to the centre of the gate after it, body frame"),
         "next_through": ObservationTerm(3, "1", "unit vector through that, body frame"),
@@ -130,9 +130,7 @@ class GateRace(Task):
         }
         return {
             "rotation": state.rotation_entries,
-            "velocity": state.body_velocity,
-            "body_rate": state.body_rate,
-            "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
+            **observed_motion(now),
             **{name: to_body(state.rotation, vector) for name, vector in seen.items()},
         }
 

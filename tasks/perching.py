@@ -19,7 +19,7 @@ from quadrl.base.validation import number
 from quadrl.conditions.solids import Box, Pose, Solid
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.observation import OBSERVATION, ROTATION, ObservationTerm
+from quadrl.core.observation import MOTION, ROTATION, ObservationTerm, observed_motion
 from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
@@ -73,11 +73,7 @@ class Perching(Task):
     }
     keeps_place = False
     contact = True
-    observation = {
-        **ROTATION,
-        **{name: OBSERVATION[name] for name in ("velocity", "body_rate", "rotor_speed", "goal")},
-        "normal": NORMAL,
-    }
+    observation = ROTATION | MOTION | {"normal": NORMAL}
 
     time_limit: float = 6.0
     """Time limit of an episode [s]."""
@@ -226,15 +222,8 @@ class Perching(Task):
 
     def observe(self, now: Snapshot) -> dict[str, Array]:
         """The aircraft's motion, and the surface as it sees it."""
-        state = now.state
-        return {
-            "rotation": state.rotation_entries,
-            "velocity": state.body_velocity,
-            "body_rate": state.body_rate,
-            "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
-            "goal": to_body(state.rotation, now.potentials.to_goal),
-            "normal": to_body(state.rotation, now.task.normal),
-        }
+        state, normal = now.state, to_body(now.state.rotation, now.task.normal)
+        return {"rotation": state.rotation_entries, **observed_motion(now), "normal": normal}
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """To the surface and aligned with it; and what the touch is worth."""

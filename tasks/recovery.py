@@ -6,10 +6,10 @@ import dataclasses
 import math
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.base.rotation import Array, namespace, norm, stack, to_body
+from quadrl.base.rotation import Array, namespace, norm, stack
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.observation import OBSERVATION, ROTATION
+from quadrl.core.observation import MOTION, ROTATION, observed_motion
 from quadrl.core.task import STILL, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
@@ -54,10 +54,7 @@ class Recovery(Task):
             },
         },
     }
-    observation = {
-        **ROTATION,
-        **{name: OBSERVATION[name] for name in ("velocity", "body_rate", "rotor_speed", "goal")},
-    }
+    observation = ROTATION | MOTION
 
     time_limit: float = 5.0
     """Time limit of an episode [s]."""
@@ -108,14 +105,7 @@ class Recovery(Task):
 
         The height above the ground is in the last two.
         """
-        state = now.state
-        return {
-            "rotation": state.rotation_entries,
-            "velocity": state.body_velocity,
-            "body_rate": state.body_rate,
-            "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
-            "goal": to_body(state.rotation, now.potentials.to_goal),
-        }
+        return {"rotation": now.state.rotation_entries, **observed_motion(now)}
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Upright, slower, nearer to the origin, at little effort, in the air."""

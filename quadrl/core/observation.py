@@ -6,6 +6,9 @@ import dataclasses
 import itertools
 from collections.abc import Mapping
 
+from quadrl.base.rotation import Array, to_body
+from quadrl.core.snapshot import Snapshot
+
 
 @dataclasses.dataclass(frozen=True)
 class ObservationTerm:
@@ -29,14 +32,19 @@ def layout(terms: Mapping[str, ObservationTerm], rotors: int) -> dict[str, slice
     return dict(zip(terms, map(slice, [0, *ends], ends), strict=False))
 
 
-OBSERVATION = {
-    "position": ObservationTerm(3, "m", "world frame, from the origin of the task's frame"),
-    "sin_attitude": ObservationTerm(3, "1", "sine of roll, pitch and yaw (Z-Y-X)"),
-    "cos_attitude": ObservationTerm(3, "1", "cosine of roll, pitch and yaw"),
+MOTION = {
     "velocity": ObservationTerm(3, "m/s", "body frame"),
     "body_rate": ObservationTerm(3, "rad/s", "angular velocity, body frame"),
     "rotor_speed": ObservationTerm(1, "1", "over the largest rotor speed", per_rotor=True),
     "goal": ObservationTerm(3, "m", "from the aircraft to the goal, body frame"),
+}
+"""What `observed_motion` gives: the part that depends neither on a place nor on a heading."""
+
+OBSERVATION = {
+    "position": ObservationTerm(3, "m", "world frame, from the origin of the task's frame"),
+    "sin_attitude": ObservationTerm(3, "1", "sine of roll, pitch and yaw (Z-Y-X)"),
+    "cos_attitude": ObservationTerm(3, "1", "cosine of roll, pitch and yaw"),
+    **MOTION,
 }
 """The observation of every task, in the order of the flat vector."""
 
@@ -56,3 +64,14 @@ TARGET_MOTION = {
 ROTATION = {"rotation": ObservationTerm(9, "1", "rotation matrix from body to world, row by row")}
 """What tasks add that fly in any attitude, `State.rotation_entries`: the sines and cosines of roll
 and yaw jump where the pitch passes 90 degrees."""
+
+
+def observed_motion(now: Snapshot) -> dict[str, Array]:
+    """The aircraft's motion and the way to the goal, as it sees them itself."""
+    state = now.state
+    return {
+        "velocity": state.body_velocity,
+        "body_rate": state.body_rate,
+        "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
+        "goal": to_body(state.rotation, now.potentials.to_goal),
+    }

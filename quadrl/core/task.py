@@ -24,7 +24,7 @@ from quadrl.conditions.scene import Scene
 from quadrl.conditions.solids import Pose, Solid
 from quadrl.core import rewards
 from quadrl.core.markers import Marker
-from quadrl.core.observation import OBSERVATION, ObservationTerm
+from quadrl.core.observation import OBSERVATION, ObservationTerm, observed_motion
 from quadrl.core.observation import ROTATION as ROTATION  # for users' tasks
 from quadrl.core.observation import TARGET_MOTION as TARGET_MOTION
 from quadrl.core.observation import TARGET_VELOCITY as TARGET_VELOCITY
@@ -188,10 +188,7 @@ class Task(abc.ABC):
             "position": state.position,
             "sin_attitude": state.sin_attitude,
             "cos_attitude": state.cos_attitude,
-            "velocity": state.body_velocity,
-            "body_rate": state.body_rate,
-            "rotor_speed": state.rotor_speed / now.parameters.rotor.max_speed,
-            "goal": to_body(state.rotation, now.potentials.to_goal),
+            **observed_motion(now),
         }
         target_velocity = self.target_velocity(now)
         if target_velocity is not None:
