@@ -26,7 +26,7 @@ CALLBACKS = ("act_dyn", "act_gain", "passive")
 MAX_WARNINGS = 500
 """Lines of a file of MuJoCo's warnings: at most 60 kB."""
 
-_POINTER = ctypes.c_void_p
+_POINTER, _INTEGER, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 _ACTUATOR_CALLBACK = ctypes.CFUNCTYPE(ctypes.c_double, _POINTER, _POINTER, ctypes.c_int)
 _KINDS = {
     "act_dyn": _ACTUATOR_CALLBACK,
@@ -35,6 +35,20 @@ _KINDS = {
     "time": ctypes.CFUNCTYPE(ctypes.c_double),
     "warning": ctypes.CFUNCTYPE(None, ctypes.c_char_p),
 }
+"""Functions that MuJoCo calls."""
+_KERNELS = {
+    "state": (_INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER),
+    "unsound_air": (_INTEGER, _POINTER, _INTEGER),
+    "clearance": (None, _POINTER, _INTEGER, _POINTER, _POINTER),
+    "free_flight": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _INTEGER),
+    "weather": (None, _POINTER, _INTEGER, _POINTER, _INTEGER),
+    "estimate": (None, _POINTER, _INTEGER),
+    "push": (None, _INTEGER, *[_POINTER] * 3, _INTEGER, *[_REAL] * 3, _POINTER, _INTEGER),
+    "normal": (None, _INTEGER, *[_POINTER] * 3, _INTEGER, _INTEGER, _POINTER),
+    "uniform": (None, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _INTEGER, _POINTER),
+    "write_warnings": (None, ctypes.c_char_p, ctypes.c_int),
+}
+"""Functions that Python calls: the kind of what each returns, and of its arguments."""
 
 
 def load(path: Path) -> ctypes.CDLL:
@@ -52,31 +66,9 @@ def load(path: Path) -> ctypes.CDLL:
         )
     for name, kind in _KINDS.items():
         setattr(opened, name, ctypes.cast(getattr(opened, f"quadrl_{name}"), kind))
-    integer = ctypes.c_int64
-    for kernel in (opened.quadrl_state, opened.quadrl_unsound_air, opened.quadrl_free_flight):
-        kernel.restype = integer
-    opened.quadrl_state.argtypes = [_POINTER, integer, _POINTER, _POINTER]
-    opened.quadrl_unsound_air.argtypes = [_POINTER, integer]
-    opened.quadrl_clearance.restype = None
-    opened.quadrl_clearance.argtypes = [_POINTER, integer, _POINTER, _POINTER]
-    opened.quadrl_free_flight.argtypes = [_POINTER, integer, integer, integer]
-    opened.quadrl_uniform.restype = opened.quadrl_weather.restype = None
-    opened.quadrl_write_warnings.restype = None
-    opened.quadrl_write_warnings.argtypes = [ctypes.c_char_p, ctypes.c_int]
-    opened.quadrl_weather.argtypes = [_POINTER, integer, _POINTER, integer]
-    real, stride = ctypes.c_double, integer
-    opened.quadrl_estimate.restype = opened.quadrl_push.restype = None
-    opened.quadrl_normal.restype = None
-    opened.quadrl_estimate.argtypes = [_POINTER, integer]
-    opened.quadrl_push.argtypes = [
-        *(integer, _POINTER, _POINTER, _POINTER, integer, real, real, real, _POINTER, stride),
-    ]
-    opened.quadrl_normal.argtypes = [
-        *(integer, _POINTER, _POINTER, _POINTER, integer, integer, _POINTER),
-    ]
-    opened.quadrl_uniform.argtypes = [
-        *(integer, _POINTER, _POINTER, integer, integer, integer, _POINTER),
-    ]
+    for name, (result, *arguments) in _KERNELS.items():
+        kernel = getattr(opened, f"quadrl_{name}")
+        kernel.restype, kernel.argtypes = result, arguments
     return opened
 
 
