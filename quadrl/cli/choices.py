@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import functools
 import typing
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable
 from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
 
 from tyro.conf import Positional, arg
@@ -21,6 +21,7 @@ from quadrl.base.docstrings import docstrings
 from quadrl.conditions.randomization import RANDOMIZATIONS
 from quadrl.conditions.weather import WEATHERS
 from quadrl.control import CONTROL_MODES, CONTROLLERS
+from quadrl.core.scenario import Conditions
 from quadrl.engines.mujoco import ENGINES
 from quadrl.learning.config import ALGORITHMS, ALIASES, MEMORIES
 from quadrl.learning.defaults import PAIRS, VARIANTS
@@ -77,19 +78,16 @@ def enforced() -> Generator[None]:
             object.__setattr__(spec, "choices", None)
 
 
-def optional(
-    kind: Any, default: Callable[[str], str], texts: Mapping[str, str] = {}, within: str = ""
-) -> Any:
+def optional(kind: Any, default: Callable[[str], str], within: str = "") -> Any:
     """A dataclass of options that are empty by default: "not given".
 
     Args:
         kind: A dataclass or a TypedDict with a field for each option; a field that is a dataclass
-            is a group of options.
+            is a group of options. One without a docstring is that of `Conditions`.
         default: What help says is used where an option is not given, from its whole name.
-        texts: What help says of some, in place of their docstrings.
         within: The group that they are in, with a dot.
     """
-    said = {**docstrings(kind), **texts}
+    said = docstrings(Conditions) | docstrings(kind)
     fields: list[tuple[str, Any, Any]] = []
     for name, hint in typing.get_type_hints(kind).items():
         if typing.get_origin(hint) is ClassVar:

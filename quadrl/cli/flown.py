@@ -19,19 +19,7 @@ from quadrl.evaluation.controllers import comes_with_quadrl
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.defaults import PAIRS
 
-HELP = {
-    "vehicle": "The aircraft",
-    "aerodynamics": "Effects of the air on the rotors: none, full, or names of single ones with "
-    "commas between them; by default those of the aircraft, and full in wind",
-    "weather": "The weather: calm, light, moderate or severe, or JSON such as "
-    "'{\"wind_speed\": 5}'",
-    "randomization": "What is drawn for each aircraft at each reset and disturbs it: none, light "
-    "or full, or JSON such as '{\"mass\": [0.8, 1.2]}'",
-    "observe": "Options of the observation, such as action_history=2",
-    "engine": "The engine: mujoco, or free_flight (MuJoCo only near what can be touched)",
-}
-"""Of conditions that Python takes in more forms than a command line."""
-ConditionOptions: Any = choices.optional(Conditions, lambda name: "", HELP)
+ConditionOptions: Any = choices.optional(Conditions, lambda name: "")
 
 
 class Conditioned(ConditionOptions):

@@ -167,7 +167,8 @@ ALGORITHM_CONFIGS = {"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig, "ap
 class TrainSettings:
     """The fields of `quadrl.learning.config.TrainConfig`.
 
-    Their defaults are the first layer of those of a task: see `quadrl.learning.defaults`.
+    Their defaults are the first layer of those of a task: see `quadrl.learning.defaults`. Those
+    without a docstring are conditions of flight, which `quadrl.core.scenario.Conditions` documents.
     """
 
     task: str = "hover"
@@ -183,28 +184,18 @@ class TrainSettings:
     vehicle: str = "paper"
     """Name of the aircraft."""
     vehicle_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Numbers of the aircraft that differ from it, such as mass=0.7 action_scale=90."""
     control_mode: str = "rotor"
-    """Meaning of the actions: rotor (the paper's), thrust_body_rate, velocity or position."""
     engine: str = "free_flight"
     """Engine of the training: free_flight (MuJoCo only near the ground) or mujoco. Evaluations
     always fly in mujoco."""
     task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the task that differ from its defaults, such as time_limit=5."""
     training_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the task in the training alone, such as farthest=3: a policy is weakest at the
     edge of what it was trained on."""
     aerodynamics: str = ""
-    """Effects of the air on the rotors: none, full, or names of single ones with commas between
-    them; by default those of the aircraft, and full in wind."""
     weather: Any = "calm"
-    """Weather of the training: calm, light, moderate or severe; or JSON such as
-    {"wind_speed": 5}, in Python a Weather."""
     randomization: Any = "none"
-    """What is drawn for each aircraft at each reset and disturbs it: none, light or full; or JSON
-    such as {"mass": [0.8, 1.2]}, in Python a Randomization."""
     observe: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the observation, such as action_history=2 rotor_speed=estimated."""
     num_envs: int = 256
     """Aircraft flown together."""
     rollout: int = 16

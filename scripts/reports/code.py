@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import inspect
 import re
-import typing
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -15,12 +14,13 @@ from quadrl.aircraft import presets, rotors
 from quadrl.aircraft.rotors import GRAVITY, Rotor
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
-from quadrl.cli.flown import Conditioned, ConditionOptions
+from quadrl.cli.flown import Conditioned
 from quadrl.cli.tasks import observation_rows, reward_rows
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
 from quadrl.control import CONTROL_MODES
 from quadrl.core import snapshot
+from quadrl.core.scenario import Conditions
 from quadrl.engines import state
 from quadrl.learning.description import describe, describe_action
 from scripts.reports.report import Parts, table
@@ -148,10 +148,8 @@ def command(name: str) -> str:
 
 def conditions() -> str:
     """The options that every command which flies has."""
-    hints, rows = typing.get_type_hints(ConditionOptions, include_extras=True), []
-    for name, hint in hints.items():
-        (text,) = (one.help for one in hint.__metadata__ if getattr(one, "help", None))
-        rows.append((f"`--{name.replace('_', '-')}`", f"{text}."))
+    said = docstrings(Conditions).items()
+    rows = ((f"`--{name.replace('_', '-')}`", f"{text}.") for name, text in said)
     return table(("option", "meaning"), rows)
 
 
