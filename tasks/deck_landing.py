@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
@@ -15,18 +15,15 @@ from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, dot, namespace, norm, stack, to_body, to_world
 from quadrl.base.validation import number
 from quadrl.conditions.solids import Box, Pose, Solid
+from quadrl.control.reading import Reading
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY, ObservationTerm
-from quadrl.core.task import EpisodeEnd, Snapshot, Target, TaskState, heads_east
+from quadrl.core.task import EpisodeEnd, Rollout, Snapshot, Target, TaskState, heads_east
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import REST_SPEED, REST_TURN, Start
 from quadrl.tasks import sea
 from quadrl.tasks.landing import Landing
 from quadrl.tasks.sea import Waves
-
-if TYPE_CHECKING:
-    from quadrl.control.reading import Reading
-    from quadrl.core.snapshot import Rollout
 
 DECK = Box("deck", length=4.0, width=4.0, height=0.2, rgba=(0.38, 0.42, 0.46, 1.0))
 FREEBOARD = 1.5  # [m], of the deck over the water

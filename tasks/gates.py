@@ -5,21 +5,18 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from quadrl.base.rotation import Array, namespace, norm, to_body
 from quadrl.base.validation import number
+from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.observation import MOTION, ROTATION, ObservationTerm, observed_motion
-from quadrl.core.task import EpisodeEnd, Snapshot, Task, TaskState
+from quadrl.core.task import EpisodeEnd, Rollout, Snapshot, Task, TaskState
 from quadrl.tasks.tracks import Track, crossing
-
-if TYPE_CHECKING:
-    from quadrl.control.reading import Reading
-    from quadrl.core.snapshot import Rollout
 
 # How the yardstick controllers fly: to a place so far behind a gate [m], and so fast there [m/s].
 OVERSHOOT, CRUISE = 0.5, 2.0

@@ -5,23 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, namespace, norm, square_norm, stack
+from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import stands, strikes_ground
 from quadrl.core.markers import Marker
+from quadrl.core.snapshot import Rollout
 from quadrl.core.task import TURNING, EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import REST_SPEED, Start
-
-if TYPE_CHECKING:
-    from quadrl.control.reading import Reading
-    from quadrl.core.snapshot import Rollout
 
 # How the yardstick controllers come down.
 DESCENT_RATE = 0.8  # [1/s], sink speed over the height

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace, norm
 from quadrl.base.validation import number
+from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY
+from quadrl.core.snapshot import Rollout
 from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
-
-if TYPE_CHECKING:
-    from quadrl.control.reading import Reading
-    from quadrl.core.snapshot import Rollout
 
 LINE: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.45)
 

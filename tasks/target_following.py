@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,18 +11,15 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, norm
 from quadrl.base.validation import number
+from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_MOTION, TARGET_VELOCITY
-from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task
+from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Rollout, Snapshot, Target, Task
 from quadrl.engines.rng import FULL_TURN, Rng
 from quadrl.engines.state import Start
 from quadrl.tasks.references import AXES, WAVES, Sines, by_axis
-
-if TYPE_CHECKING:
-    from quadrl.control.reading import Reading
-    from quadrl.core.snapshot import Rollout
 
 SLOWEST = 1e-6  # [rad/s]; the slower, the longer the waves, and the fewer digits are left
 PATH: tuple[float, float, float, float] = (0.95, 0.55, 0.20, 0.35)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,13 +17,10 @@ from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_MOTION, TARGET_VELOCITY, ObservationTerm
-from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task
+from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Rollout, Snapshot, Target, Task
 from quadrl.engines.rng import FULL_TURN, Rng, hovering
 from quadrl.engines.state import Start
 from quadrl.tasks.references import AXES, SINES, WAVES, Reference, Table, sines
-
-if TYPE_CHECKING:
-    from quadrl.core.snapshot import Rollout
 
 AHEAD, EVERY = 10, 0.1  # samples of the reference, and the time between them [s]
 SLOWEST, FASTEST = 0.2, 4.5  # [rad/s], sines of a random reference

@@ -10,8 +10,9 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Any, Unpack
 
+import mujoco
 from typing_extensions import TypedDict
 
 from quadrl.aircraft import presets
@@ -29,9 +30,6 @@ from quadrl.core.task import Task
 from quadrl.engines import mjcf
 from quadrl.engines.air import LOWEST, mean_wind
 from quadrl.engines.engine import ENGINES, Engine, EngineName
-
-if TYPE_CHECKING:
-    import mujoco
 
 
 class Conditions(TypedDict, total=False, extra_items=Any):

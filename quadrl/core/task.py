@@ -13,7 +13,9 @@ import abc
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
+
+import mujoco
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
@@ -22,24 +24,19 @@ from quadrl.base.rotation import Array, norm, to_body
 from quadrl.base.validation import keys, like, number
 from quadrl.conditions.scene import Scene
 from quadrl.conditions.solids import Pose, Solid
+from quadrl.control.reading import Motion, Reading
 from quadrl.core import rewards
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, ObservationTerm, observed_motion
 from quadrl.core.observation import ROTATION as ROTATION  # for users' tasks
 from quadrl.core.observation import TARGET_MOTION as TARGET_MOTION
 from quadrl.core.observation import TARGET_VELOCITY as TARGET_VELOCITY
-from quadrl.core.snapshot import EpisodeEnd, Potentials, Snapshot, TaskState
+from quadrl.core.snapshot import EpisodeEnd, Potentials, Rollout, Snapshot, TaskState
 from quadrl.core.solved import STILL as STILL
 from quadrl.core.solved import TURNING as TURNING
 from quadrl.core.solved import Target
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
-
-if TYPE_CHECKING:
-    import mujoco
-
-    from quadrl.control.reading import Motion, Reading
-    from quadrl.core.snapshot import Rollout
 
 
 @dataclasses.dataclass(frozen=True)
