@@ -228,7 +228,3 @@ class DeckLanding(Landing):
         over_pad = now.potentials.distance < self.pad_radius
         rests = now.touched[..., 0] & now.landed & still & over_pad
         return namespace(now.task.rest).where(rests, now.task.rest + 1, 0 * now.task.rest)
-
-    def _rested(self, now: Snapshot) -> Array:
-        """Whether it has been at rest on the pad for long enough, (N,) bool."""
-        return self._rest(now) * now.parameters.control_timestep >= self.rest_time

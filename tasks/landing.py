@@ -140,14 +140,13 @@ class Landing(Task):
         hard = (now.task.down == 0) & (now.task.speed > self.max_touchdown)
         sinks = state.body_velocity[..., 2] < -self.max_sink
         away = now.potentials.distance > self.max_distance
-        rested = self._rest(now) * now.parameters.control_timestep >= self.rest_time
-        return strikes_ground(now) | (down & (tilted | hard)) | sinks | away | rested
+        crashed = strikes_ground(now) | (down & (tilted | hard))
+        return crashed | sinks | away | self._rested(now)
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """At rest on the pad for long enough, upright, on its feet alone, and heading east."""
-        rested = self._rest(now) * now.parameters.control_timestep >= self.rest_time
         upright = now.state.cos_tilt >= math.cos(self.max_tilt)
-        stood = end.terminated & rested & upright & ~strikes_ground(now)
+        stood = end.terminated & self._rested(now) & upright & ~strikes_ground(now)
         return stood & heads_east(now, self.heading_tolerance)
 
     def update(self, before: Snapshot, now: Snapshot) -> TaskState:
@@ -224,3 +223,7 @@ class Landing(Task):
         over_pad = square_norm(now.state.position[..., :2]) < self.pad_radius**2
         rests = stands(now) & now.state.at_rest & over_pad
         return namespace(now.task.rest).where(rests, now.task.rest + 1, 0 * now.task.rest)
+
+    def _rested(self, now: Snapshot) -> Array:
+        """Whether it has been at rest on the pad for long enough, (N,) bool."""
+        return self._rest(now) * now.parameters.control_timestep >= self.rest_time
