@@ -27,15 +27,6 @@ Seed = int | Sequence[int | None] | None
 """Of all rows, or one for each; None for one from the system, or for none."""
 
 
-def check_seed(seed: Any) -> int:
-    """Check a seed and return it as an int.
-
-    Raises:
-        QuadrlError: It is no whole number from 0 to `MAX_SEED`.
-    """
-    return number("seed", seed, 0, MAX_SEED, whole=True)
-
-
 def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
     """Select the rows that get a seed, (m,), and the seed of each of them, (m,).
 
@@ -55,7 +46,8 @@ def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray,
         allowed = f"a whole number, or a sequence of {count}"
         raise QuadrlError(name="seed", value=seed, allowed=allowed)
     own = [row for row in rows.tolist() if seed[row] is not None]
-    return np.array(own, dtype=np.int64), [check_seed(seed[row]) for row in own]
+    found = [number("seed", seed[row], 0, MAX_SEED, whole=True) for row in own]
+    return np.array(own, dtype=np.int64), found
 
 
 def philox(counter: tuple[Array, ...], key: tuple[Array, Array]) -> tuple[Array, ...]:

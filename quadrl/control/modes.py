@@ -275,12 +275,3 @@ def kind(name: str) -> type[ControlMode]:
     """
     name = named(name)
     return EvenThrustBodyRate if name == EvenThrustBodyRate.name else CONTROL_MODES[name]
-
-
-def make(name: str, vehicle: Vehicle) -> ControlMode:
-    """Make the control mode of a name for a vehicle.
-
-    Raises:
-        QuadrlError: Unknown name; the message lists the choices.
-    """
-    return kind(name)(vehicle)

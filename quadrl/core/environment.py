@@ -97,7 +97,7 @@ class Environment(saving.Copied):
         self.scene = Scene(self.task.solids())
         self.scene.check(engine)
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
-        self.control_mode = modes.make(self.scenario.control_mode, self.vehicle)
+        self.control_mode = modes.kind(self.scenario.control_mode)(self.vehicle)
         self.action_size = self.control_mode.size
         timestep = self.vehicle.control_timestep
         self._clock = Clock.of(self.task, timestep)

@@ -332,12 +332,12 @@ def test_scales_by_worked_numbers():
     }
     assert set(expected) == set(CONTROL_MODES)
     for name, (centre, scale) in expected.items():
-        mode = modes.make(name, PAPER)
+        mode = modes.kind(name)(PAPER)
         np.testing.assert_allclose(mode.centre, centre, atol=6e-4)
         np.testing.assert_allclose(mode.scale, scale, atol=6e-4)
         down = [0.286, *scale[1:]] if name == "thrust_body_rate" else scale
         np.testing.assert_allclose(mode.scale_down, down, atol=6e-4)
-    hexa = [modes.make(name, VEHICLES["hexa"]) for name in ("rotor", "velocity")]
+    hexa = [modes.kind(name)(VEHICLES["hexa"]) for name in ("rotor", "velocity")]
     assert [term.name for term in hexa[0].terms] == [f"rotor_{k}" for k in range(1, 7)]
     assert [mode.size for mode in hexa] == [6, 4]
 
@@ -406,7 +406,7 @@ def test_the_largest_thrust_is_that_of_all_rotors_and_the_least_is_none():
 
 def test_what_was_saved_asks_for_as_much_thrust_as_it_did():
     before, now = "thrust_body_rate-v0", "thrust_body_rate"
-    old, new = (modes.make(name, VEHICLES["racer"]) for name in (before, now))
+    old, new = (modes.kind(name)(VEHICLES["racer"]) for name in (before, now))
     ends = np.array([[1.0, 1.0, -1.0, 1.0], [-1.0] * 4])
     share = Gains().authority * new.scale_down[0]  # of what can be taken away, both ways
     np.testing.assert_allclose(old.values(ends)[:, 0], [1 + share, 1 - share], atol=1e-12)
@@ -644,7 +644,7 @@ def test_the_motion_of_the_target_is_the_slope_of_its_velocity():
         (lambda: make_controller("lqg", "hover"), "controller", "lqg"),
         (lambda: make_controller("lqr", "hovr"), "task", "hovr"),
         (lambda: make_controller("lqr", "hover", "papr"), "vehicle", "papr"),
-        (lambda: modes.make("velocty", PAPER), "control_mode", "velocty"),
+        (lambda: modes.kind("velocty"), "control_mode", "velocty"),
         (lambda: Environment("hover", control_mode="velocty"), "control_mode", "velocty"),
         (lambda: make_controller("lqr", "hover")(np.zeros(25)), "observation size", 25),
         (lambda: Gains(authority=1.1), "authority", 1.1),

@@ -174,10 +174,11 @@ def test_attitudes_have_a_heading_and_a_tilt():
 @pytest.mark.parametrize("seed", [-1, 2**62, 2**70, 1.5, "7", True, math.nan])
 def test_what_is_no_seed_is_refused(seed):
     with pytest.raises(QuadrlError) as caught:
-        philox.check_seed(seed)
+        philox.seeds_of_rows([seed], np.arange(1), 1)
     assert caught.value.name == "seed" and caught.value.value is seed
     assert caught.value.allowed
 
 
 def test_every_whole_number_of_32_bits_is_a_seed():
-    assert [philox.check_seed(s) for s in (0, np.int64(5), 2**32 - 1)] == [0, 5, 2**32 - 1]
+    given = (0, np.int64(5), 2**32 - 1)
+    assert [philox.seeds_of_rows([s], np.arange(1), 1)[1] for s in given] == [[0], [5], [2**32 - 1]]
