@@ -10,16 +10,9 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Generator, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 Handler = Callable[[int, Any], object]
-
-
-class Asked(Protocol):
-    """A training that can be asked for a checkpoint."""
-
-    def ask(self, *, stop: bool = False) -> None:
-        """Write one at the end of the iteration, and stop there or go on."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -59,11 +52,11 @@ IN_ORDER: Mapping[int, Handler] = {signal.SIGTERM: ending, signal.SIGUSR1: unhee
 
 
 @contextlib.contextmanager
-def heeded(training: Asked) -> Generator[None]:
-    """Let signals ask a training for a checkpoint at the end of its iteration.
+def heeded(ask: Callable[..., None]) -> Generator[None]:
+    """Let signals `ask` a training for a checkpoint at the end of its iteration.
 
-    After SIGTERM and Ctrl-C it stops there; a further Ctrl-C stops it at once. After SIGUSR1 it
-    goes on.
+    After SIGTERM and Ctrl-C it stops there (`ask(stop=True)`); a further Ctrl-C stops it at once.
+    After SIGUSR1 it goes on.
 
     Raises:
         Stopped: A signal came that stops it.
@@ -74,10 +67,10 @@ def heeded(training: Asked) -> Generator[None]:
         if came and number == signal.SIGINT:
             signal.default_int_handler(number, frame)
         came.append(number)
-        training.ask(stop=True)
+        ask(stop=True)
 
     def check(number: int, frame: Any) -> None:
-        training.ask()
+        ask()
 
     handlers: dict[int, Handler] = {signal.SIGTERM: stop, signal.SIGUSR1: check}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # in the background it is not

@@ -131,15 +131,15 @@ def train_in(
     resume: bool,
     episodes: int,
     show: Callable[[Progress], None],
-    heed: Callable[[Training], AbstractContextManager[None]] = contextlib.nullcontext,
+    heed: Callable[[Callable[..., None]], AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> Run:
-    """Train as `train` does, with settings and folder prepared, in the context `heed`."""
+    """Train as `train` does, with settings and folder prepared, within `heed(training.ask)`."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = config.scenario
     asked = scenario.randomization, scenario.control_mode, scenario.mean_wind
     warn_of_unreached(scenario.aircraft, *asked)
     training = Training(config, folder, resume=resume)
-    with heed(training):
+    with heed(training.ask):
         policy = training.run(_evaluating(training, show) if config.evaluations else show)
     found = evaluate(policy, scenario, episodes=episodes)
     seconds = round(training.seconds, 2)
