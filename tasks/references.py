@@ -85,8 +85,8 @@ class Table:
 
     def at(self, reference: Reference, time: Array, order: int = 0) -> Array:
         """References at times (N,) [s], or derivatives of an order to 3, (N, 3) [m/s^order]."""
-        xp, last = namespace(time), self.count - 1
-        if last == 0:
+        if self.count == 1:
+            xp = namespace(time)
             angle = reference.frequency * time[..., None] + reference.phase
             size = reference.amplitude
             for _ in range(order):
@@ -95,24 +95,24 @@ class Table:
             waves = -waves if order > 1 else waves
             value = by_axis(waves)
             return value if order else reference.goal + value
-        step = xp.floor(time / PIECE)
-        step = xp.where(step < last, step, 0 * step + last)
-        piece = look_up(self.pieces, reference.track * self.count + step)
-        since, value = (time - PIECE * step)[..., None], 0 * piece[..., 0, :]
-        for k in range(3, order - 1, -1):
-            value = value * since + math.perm(k, order) * piece[..., k, :]
-        return value
+        return self._polynomial(self.pieces, reference.track * self.count, time, order)
 
     def heading(self, time: Array) -> Array:
         """Heading of the reference at times (N,) [rad], from east."""
         if self.turns is None:
             return 0 * time
+        return self._polynomial(self.turns[..., None], 0 * time, time)[..., 0]
+
+    def _polynomial(self, pieces: np.ndarray, first: Array, time: Array, order: int = 0) -> Array:
+        """Derivatives (N, k) of pieces (n, 4, k), of a track that begins with some piece (N,)."""
         xp, last = namespace(time), self.count - 1
         step = xp.floor(time / PIECE)
         step = xp.where(step < last, step, 0 * step + last)
-        piece, since = look_up(self.turns, step), time - PIECE * step
-        first, second, third, fourth = (piece[..., k] for k in range(4))
-        return first + since * (second + since * (third + since * fourth))
+        piece = look_up(pieces, first + step)
+        since, value = (time - PIECE * step)[..., None], 0 * piece[..., 0, :]
+        for k in range(3, order - 1, -1):
+            value = value * since + math.perm(k, order) * piece[..., k, :]
+        return value
 
 
 def by_axis(waves: Array) -> Array:
