@@ -150,9 +150,12 @@ class Vehicle:
             reason = f"a rotor's rate is {fastest:g} 1/s, and rate times step may be at most 1"
             allowed = f"at most {1 / fastest:.3g} s"
             raise QuadrlError(reason, name="physics_timestep", value=step, allowed=allowed)
+        falls = 0.0  # [m/s]; without drag a fall never stops getting faster
+        if self.drag_coefficient:
+            falls = min(math.sqrt(self.mass * GRAVITY / self.drag_coefficient), MAX)
         for resolved, needed, unit, names in (
             (self.resolved_turn, SLOWEST_TURN, "rad/s", "moment_coefficient and inertia"),
-            (self.resolved_speed, self._terminal_speed, "m/s", "drag_coefficient and mass"),
+            (self.resolved_speed, falls, "m/s", "drag_coefficient and mass"),
         ):
             if resolved < needed:
                 raise QuadrlError(
@@ -217,13 +220,6 @@ class Vehicle:
         """
         own = min(self.inertia), self.moment_coefficient, self.physics_timestep
         return float(resolved_turn(*own))
-
-    @functools.cached_property
-    def _terminal_speed(self) -> float:
-        """[m/s]; 0 without drag, where a fall never stops getting faster."""
-        if self.drag_coefficient == 0:
-            return 0.0
-        return min(math.sqrt(self.mass * GRAVITY / self.drag_coefficient), MAX)
 
     @functools.cached_property
     def size(self) -> float:

@@ -277,12 +277,7 @@ class Engine(abc.ABC):
     def _saved(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """What `save` gives, with the rows of the simulation."""
         saved = {"rows": rows, "parameters": parameters.numbers(self.parameters).copy()}
-        return saved | ({"solids": self.solids.save()} if self.has_solids else {})
-
-    @property
-    def has_solids(self) -> bool:
-        """Whether there are solids in the world."""
-        return bool(len(self.solids.geoms))
+        return saved | ({"solids": self.solids.save()} if len(self.solids.geoms) else {})
 
     def clearance(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Lower bound of aircraft's distance to a solid, (n,) [m]; infinite without solids."""
