@@ -100,7 +100,12 @@ class Track:
     @functools.cached_property
     def axes(self) -> np.ndarray:
         """Unit vectors through each gate, to its left and up along it, (G, 3, 3)."""
-        return _fixed(_axes(self.gates))
+        heading, climb = np.radians([gate[3:] for gate in self.gates]).T
+        zero = 0 * heading
+        level = np.array([np.cos(heading), np.sin(heading), zero])
+        through = level * np.cos(climb) + np.array([zero, zero, np.sin(climb)])
+        left = np.array([-np.sin(heading), np.cos(heading), zero])
+        return _fixed(np.stack([through.T, left.T, np.cross(through.T, left.T)], axis=1))
 
     def drawn(
         self, following: int, centre: Any = None, axes: Any = None, poles: Any = None
@@ -149,16 +154,6 @@ def _before(gate: tuple[float, ...]) -> tuple[float, ...]:
     """A start before a gate (x, y, z, heading, climb), as high [m]."""
     heading = math.radians(gate[3])
     return gate[0] - RUN_IN * math.cos(heading), gate[1] - RUN_IN * math.sin(heading), gate[2]
-
-
-def _axes(gates: Any) -> np.ndarray:
-    """Unit vectors through gates (x, y, z, heading, climb), left and up along them, (G, 3, 3)."""
-    heading, climb = np.radians([gate[3:] for gate in gates]).T
-    zero = 0 * heading
-    level = np.array([np.cos(heading), np.sin(heading), zero])
-    through = level * np.cos(climb) + np.array([zero, zero, np.sin(climb)])
-    left = np.array([-np.sin(heading), np.cos(heading), zero])
-    return np.stack([through.T, left.T, np.cross(through.T, left.T)], axis=1)
 
 
 def _fixed(values: Any) -> np.ndarray:
