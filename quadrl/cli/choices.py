@@ -22,7 +22,7 @@ from quadrl.conditions.randomization import RANDOMIZATIONS
 from quadrl.conditions.weather import WEATHERS
 from quadrl.control import CONTROL_MODES, CONTROLLERS
 from quadrl.core.scenario import Conditions
-from quadrl.engines.mujoco import ENGINES
+from quadrl.engines.engine import ENGINES
 from quadrl.learning.config import ALGORITHMS, ALIASES, MEMORIES
 from quadrl.learning.defaults import PAIRS, VARIANTS
 from quadrl.tasks import TASKS

@@ -21,8 +21,6 @@ from quadrl.engines import mjcf, native
 from quadrl.engines.engine import ENGINES, Engine, EngineName
 from quadrl.engines.free_flight import FIELDS
 
-__all__ = ["ENGINES", "BatchEngine", "DataEngine", "Engine", "EngineName", "make"]
-
 MAX_ENVS = 1 << 20
 MAX_THREADS = 1024
 _BATCHES: weakref.WeakSet[BatchEngine] = weakref.WeakSet()

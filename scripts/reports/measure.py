@@ -13,7 +13,7 @@ from typing import Any
 
 from quadrl import VEHICLES, tasks
 from quadrl.base.units import length, quantity
-from quadrl.engines.mujoco import ENGINES
+from quadrl.engines.engine import ENGINES
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.plotting import learning_curves, save
 from quadrl.evaluation.policy import Policy
