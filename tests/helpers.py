@@ -1,10 +1,12 @@
 """What tests share. Each heading has the helpers of one kind of test."""
 
+import contextlib
 import dataclasses
 import math
 
 import mujoco
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from quadrl import tasks
@@ -13,6 +15,7 @@ from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import VEHICLES, in_real_air
 from quadrl.aircraft.rotors import ring
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.errors import QuadrlError
 from quadrl.conditions.randomization import Randomization
 from quadrl.conditions.weather import Weather
 from quadrl.core.environment import Environment
@@ -317,3 +320,22 @@ def assert_records(got, expected, rows=slice(None)):
             mine = value[fresh] if name.startswith("fresh.") else value[chosen]
             if not name.startswith("fresh.") or len(fresh):
                 np.testing.assert_array_equal(now[name], mine, err_msg=f"{name}, step {step}")
+
+
+# ------------------------------------------------------------------- what is refused
+
+
+@contextlib.contextmanager
+def refused(name=None, value=..., allowed=None, *, lists="", match=None):
+    """Expect a QuadrlError of one line, with these attributes where they are given.
+
+    `lists` is a part of what is allowed; `match` is searched in the message, as pytest does it.
+    """
+    with pytest.raises(QuadrlError, match=match) as caught:
+        yield caught
+    error = caught.value
+    assert str(error) and "\n" not in str(error)
+    assert name in (None, error.name)
+    assert value is ... or [type(value), value] == [type(error.value), error.value]
+    assert allowed in (None, error.allowed) and lists in error.allowed
+    assert error.name is None or error.allowed

@@ -1,6 +1,5 @@
 """Small trainings, and what their tests compare."""
 
-import contextlib
 import csv
 import dataclasses
 from pathlib import Path
@@ -10,7 +9,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from quadrl.base.errors import QuadrlError
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training
@@ -105,14 +103,3 @@ def assert_same_run(a: Path, b: Path) -> None:
     task = TrainConfig.of_folder(a).scenario.task
     one, other = (evaluate(folder, task, episodes=4).metrics for folder in (a, b))
     assert one == other
-
-
-@contextlib.contextmanager
-def refused(name=None, value=None, allowed=None):
-    """A QuadrlError of one line; with these attributes where they are given."""
-    with pytest.raises(QuadrlError) as caught:
-        yield caught
-    error = caught.value
-    assert str(error) and "\n" not in str(error)
-    for given, own in ((name, error.name), (value, error.value), (allowed, error.allowed)):
-        assert given is None or given == own

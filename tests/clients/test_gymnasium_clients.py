@@ -6,6 +6,7 @@ import pytest
 from gymnasium import wrappers
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import vector as vector_wrappers
+from helpers import refused
 
 import quadrl  # noqa: F401 - registers the ids
 from quadrl.base.errors import QuadrlError
@@ -185,9 +186,8 @@ def test_an_impossible_list_of_seeds_is_refused_and_changes_nothing(seeds):
     vector, other = (gym.make_vec(HOVER, num_envs=3) for _ in range(2))
     vector.reset(seed=0)
     other.reset(seed=0)
-    with pytest.raises(QuadrlError) as caught:
+    with refused("seed"):
         vector.reset(seed=seeds)
-    assert caught.value.name == "seed"
     np.testing.assert_array_equal(vector.reset()[0], other.reset()[0])
 
 
@@ -255,9 +255,8 @@ def test_options_of_a_vectors_reset_are_for_its_rows():
 @pytest.mark.parametrize("make", [gym.make, gym.make_vec])
 def test_an_impossible_option_of_a_reset_is_refused(make, options, name):
     environment = make(HOVER)
-    with pytest.raises(QuadrlError) as caught:
+    with refused(name):
         environment.reset(options=options)
-    assert caught.value.name == name
     environment.reset(seed=0)
 
 

@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from tensordict import TensorDict
 
 import quadrl
-from quadrl.base.errors import QuadrlError
 from quadrl.testing import varied_actions
 
 pytest.importorskip("rsl_rl")
@@ -123,9 +123,8 @@ def test_a_length_that_is_set_back_does_not_outlast_the_time_limit():
 @pytest.mark.parametrize("lengths", [torch.zeros(3, dtype=int), torch.zeros(COUNT), [-1, 0, 0, 0]])
 def test_impossible_lengths_are_refused(lengths):
     envs = QuadrotorVecEnv("hover", COUNT)
-    with pytest.raises(QuadrlError, match="episode_length_buf.*4 whole numbers") as caught:
+    with refused(match="episode_length_buf.*4 whole numbers"):
         envs.episode_length_buf = lengths
-    assert "\n" not in str(caught.value)
     assert (envs.episode_length_buf == 0).all()
 
 

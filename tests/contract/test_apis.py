@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from apis import APIS, StableBaselines, Vector
+from helpers import refused
 
 import quadrl
 from quadrl.base.errors import QuadrlError
@@ -55,9 +56,8 @@ def test_a_dead_time_is_the_same_through_every_api(api, engine):
 def test_an_impossible_seed_is_refused(api, seed):
     if api is StableBaselines and seed in ("three", True):
         pytest.skip("it adds the number of the row to it")
-    with pytest.raises(QuadrlError) as caught:
+    with refused("seed", seed):
         api(seed=seed).reset()
-    assert (caught.value.name, caught.value.value) == ("seed", seed)
 
 
 @pytest.mark.parametrize(
@@ -112,10 +112,8 @@ def test_a_divergence_ends_the_episode(api):
     ids=lambda value: str(value) if isinstance(value, str) else None,
 )
 def test_an_unknown_name_or_value_is_refused(api, settings, name):
-    with pytest.raises(QuadrlError) as caught:
+    with refused(name) as caught:
         api(**settings)
-    assert caught.value.name == name
-    assert caught.value.allowed
     if name == "hover option":  # what the API takes beside the options of the task is listed too
         assert {"vehicle", "engine", "randomization", "observe", "tolerance"} <= set(
             re.findall(r"\w+", str(caught.value))

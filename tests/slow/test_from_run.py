@@ -5,7 +5,8 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from runs import TINY, assert_same_run, changed, contents, refused, stopped, train
+from helpers import refused
+from runs import TINY, assert_same_run, changed, contents, stopped, train
 
 import quadrl
 from quadrl.learning.config import TrainConfig

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from runs import TINY, assert_same_run, changed, contents, metrics, refused, stopped, train
+from helpers import refused
+from runs import TINY, assert_same_run, changed, contents, metrics, stopped, train
 from safetensors.torch import save as to_safetensors
 from tensordict import TensorDict
 

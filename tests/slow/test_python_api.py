@@ -8,10 +8,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers import refused
 from policies import make_remembering
 from processes import python
 from rich.console import Console
-from runs import TINY, refused
+from runs import TINY
 
 import quadrl
 from quadrl.base.errors import QuadrlError

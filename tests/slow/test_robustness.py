@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import processes
 import pytest
-from runs import refused
+from helpers import refused
 from scipy.stats import binomtest
 
 import quadrl

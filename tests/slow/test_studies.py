@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from helpers import refused
 from processes import python
 
 import quadrl
@@ -285,9 +286,8 @@ def test_ray_on_this_machine_with_a_task_of_ones_own(tmp_path, monkeypatch):
 def test_a_cluster_that_is_not_there(tmp_path):
     pytest.importorskip("ray")
     for address, said in (("127.0.0.1:1", "there is no Ray cluster at"), ("there", "HOST:PORT")):
-        with pytest.raises(QuadrlError, match=said) as caught:
+        with refused(match=said):
             quadrl.study(STUDY, out=tmp_path, ray=address)
-        assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from runs import metrics, refused, train
+from helpers import refused
+from runs import metrics, train
 
 from quadrl import tasks
 from quadrl.base.errors import QuadrlWarning

@@ -13,7 +13,6 @@ import pytest
 import torch
 from policies import linear, make_remembering
 from processes import python
-from runs import refused
 
 import quadrl
 from quadrl import cli
@@ -308,7 +307,7 @@ def test_a_run_is_exported_by_its_folder(tmp_path):
     ],
 )
 def test_what_cannot_be_exported_is_said_in_a_line(what, to, out, said, tmp_path):
-    with refused() as caught:
+    with helpers.refused() as caught:
         export(what, to, out)
     assert said in str(caught.value) and "\n" not in str(caught.value)
     assert not [*tmp_path.iterdir()]
@@ -327,7 +326,7 @@ def test_a_folder_that_cannot_be_written_is_said_in_a_line(capsys, tmp_path):
 def test_a_missing_library_is_named(monkeypatch):
     monkeypatch.delitem(sys.modules, "quadrl.deploy.onnx", raising=False)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with refused() as caught:
+    with helpers.refused() as caught:
         export("hover", "onnx")
     assert str(caught.value) == (
         "onnx is not installed: python -m pip install 'quadrl[export]' installs it"

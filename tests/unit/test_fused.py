@@ -5,7 +5,8 @@ import math
 
 import pytest
 import torch
-from runs import one_thread, refused  # noqa: F401
+from helpers import refused
+from runs import one_thread  # noqa: F401
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import set_recurrent_mode

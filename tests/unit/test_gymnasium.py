@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
+from helpers import refused
 
 import quadrl
 from quadrl import envs
-from quadrl.base.errors import QuadrlError
 from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
 
@@ -149,9 +149,8 @@ def test_a_mask_resets_and_seeds_its_rows_alone():
 def test_an_impossible_mask_is_refused(mask):
     vector = gym.make_vec(HOVER, num_envs=3, autoreset_mode="DISABLED")
     vector.reset()
-    with pytest.raises(QuadrlError) as caught:
+    with refused("reset_mask"):
         vector.reset(options={"reset_mask": mask})
-    assert caught.value.name == "reset_mask"
 
 
 @pytest.mark.parametrize("make", [gym.make, gym.make_vec])
@@ -182,9 +181,8 @@ def test_vehicle_task_options_randomization_and_the_time_limit_arrive(make):
     ],
 )
 def test_an_impossible_setting_is_refused(kind, name, value):
-    with pytest.raises(QuadrlError) as caught:
+    with refused(name, value):
         kind(**{name: value})
-    assert (caught.value.name, caught.value.value) == (name, value)
 
 
 # ------------------------------------------------------------------------------------ pictures

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from runs import assert_same_run, changed, stopped, train
 from tensordict import TensorDict
 
-from quadrl.base.errors import QuadrlError
 from quadrl.core.environment import Environment
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import make_env
@@ -94,13 +94,12 @@ def test_it_is_trained_and_continued_bit_for_bit(tmp_path):
 
 @pytest.mark.parametrize("task", ["straight_and_level", "target_following"])
 def test_a_task_without_one_goal_state_is_refused(task):
-    with pytest.raises(QuadrlError) as caught:
+    with refused("holds_goal") as caught:
         some_policy(task)
-    assert caught.value.name == "holds_goal" and "target_velocity" in str(caught.value)
+    assert "target_velocity" in str(caught.value)
 
 
 def test_a_memory_is_refused():
     for given in ({"memory": "gru", "holds_goal": True}, {"holds_goal": 1}):
-        with pytest.raises(QuadrlError) as caught:
+        with refused("holds_goal"):
             TrainConfig("hover", **given)
-        assert caught.value.name == "holds_goal"

@@ -6,8 +6,9 @@ import warnings
 
 import numpy as np
 import pytest
+from helpers import refused
 from policies import make_policy, make_remembering
-from runs import TINY, changed, refused, train
+from runs import TINY, changed, train
 from test_hostile_files import unsealed
 
 from quadrl.base.errors import QuadrlWarning

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from policies import linear
-from runs import TINY, refused
+from runs import TINY
 
 import quadrl
 from quadrl import tasks
@@ -107,7 +108,7 @@ def test_a_training_has_at_least_the_steps_that_are_asked_for():
         ({"ppo": {"entropy": -0.1}}, "ppo.entropy", -0.1),
         ({"trpo": {"iterations": 0.5}}, "trpo.iterations", 0.5),
         ({"randomization": "much"}, "randomization", "much"),
-        ({"randomization": {"command_delay": 0.003}}, "command_delay", None),
+        ({"randomization": {"command_delay": 0.003}}, "command_delay", (0.003, 0.003)),
         ({"observe": {"wind": True}}, "option of observe", "wind"),
         ({"weather": "foul"}, "weather", "foul"),
         ({"aerodynamics": "ground"}, "aerodynamics", "ground"),

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from runs import refused
+from helpers import refused
 
 from quadrl import tasks
 from quadrl.core.environment import Environment

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from policies import WIDTH, make_remembering
 from runs import (
     assert_same_run,
     changed,
     contents,
     one_thread,  # noqa: F401
-    refused,
     stopped,
     train,
 )

@@ -2,9 +2,10 @@
 
 import gymnasium
 import pytest
+from helpers import refused
 
 import quadrl
-from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.errors import QuadrlWarning
 from quadrl.learning.config import TrainConfig
 
 
@@ -40,9 +41,8 @@ MISTAKES = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_are_answered(mistake):
     call, answer = MISTAKES[mistake]
-    with pytest.raises(QuadrlError, match=answer) as caught:
+    with refused(match=answer):
         call()
-    assert "\n" not in str(caught.value)
 
 
 def test_a_discount_of_one_is_warned_of():

@@ -206,9 +206,8 @@ def test_a_reset_calms_the_air(count):
 
 def test_a_batch_of_equal_aircraft_draws_no_parameters():
     alike = engines.make("mujoco", PAPER, mjcf.compile_model(PAPER, drawn=False), 4, altitude=3.0)
-    with pytest.raises(QuadrlError) as caught:
+    with helpers.refused("engine"):
         Environment("hover", engine=alike, randomization={"mass": (0.9, 1.1)})
-    assert caught.value.name == "engine"
     Environment("hover", engine=alike, randomization={"command_delay": 0.02}).reset()
 
 
@@ -361,11 +360,8 @@ REFUSED = [  # randomization, name, value, a part of what is allowed
 
 @pytest.mark.parametrize(("randomization", "name", "value", "allowed"), REFUSED)
 def test_a_randomization_that_holds_what_cannot_be_is_refused(randomization, name, value, allowed):
-    with pytest.raises(QuadrlError) as caught:
+    with helpers.refused(name, value, lists=allowed):
         Environment("hover", randomization=randomization)
-    error = caught.value
-    assert error.name == name and allowed in error.allowed
-    assert value is ... or error.value == value
 
 
 def hovers(vehicle, low, high):

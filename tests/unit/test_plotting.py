@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from runs import refused
+from helpers import refused
 from scipy.spatial.transform import Rotation
 
 import quadrl

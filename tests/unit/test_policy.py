@@ -10,8 +10,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from helpers import refused
 from policies import WIDTH, linear, make_policy, make_remembering, parts
-from runs import refused
 from safetensors.numpy import save
 
 import quadrl

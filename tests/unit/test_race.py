@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from runs import refused
+from helpers import refused
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle

@@ -3,7 +3,6 @@
 import helpers
 import numpy as np
 import pytest
-from runs import refused
 
 import quadrl  # noqa: F401 - registers the ids
 from quadrl.base.philox import MAX_SEED
@@ -41,7 +40,7 @@ def test_a_refused_reset_changes_nothing(setting, engine):
     environment, other = (flying(task, engine=engine, **settings) for _ in range(2))
     for name, start in STARTS.items():
         for rows, seed in ((None, None), ([2, 4], 11)):
-            with refused() as caught:
+            with helpers.refused() as caught:
                 environment.reset(rows, start, seed)
             assert caught.value.name.startswith(name)
     # They fly on alike, and so do their next episodes.
@@ -72,7 +71,7 @@ def test_air_that_is_not_finite_ends_in_a_line_before_the_step(engine, value):
             (environment.engine.air, 5, f"engine.air[{row}]"),
         ):
             array[row, column] = value
-            with refused(name, allowed="finite"):
+            with helpers.refused(name, allowed="finite"):
                 helpers.idle(environment)
             array[row, column] = 0.0
         got, expected = (helpers.recorded(e, helpers.idle(e)) for e in (environment, other))
@@ -83,7 +82,7 @@ def test_air_that_is_not_finite_ends_in_a_line_before_the_step(engine, value):
 def test_parameters_that_are_not_finite_end_in_a_line(count, drawn):
     environment = helpers.begun(num_envs=count, randomization=drawn)
     environment.engine.parameters["drag_coefficient"][-1] = np.nan
-    with refused("engine.parameters['drag_coefficient']", allowed="finite"):
+    with helpers.refused("engine.parameters['drag_coefficient']", allowed="finite"):
         helpers.idle(environment)
     environment.reset(seed=1)
     if count == 1:
@@ -117,7 +116,7 @@ def test_counters_that_no_environment_has_are_not_restored(name, begun):
         table = saved[name]
         column = table[ROW_OF_STEPS] if name == "weather.table" else table.reshape(-1)
         column[-1] = value
-        with refused(name):
+        with helpers.refused(name):
             into.restore(saved)
     if not begun:
         with pytest.raises(RuntimeError, match="call reset"):
@@ -129,7 +128,7 @@ def test_counters_that_no_environment_has_are_not_restored(name, begun):
 def test_the_last_row_of_a_batch_has_a_seed_too():
     environment = flying()
     for seed in (MAX_SEED, MAX_SEED - ROWS + 2):
-        with refused("seed", seed):
+        with helpers.refused("seed", seed):
             environment.seed(seed)
     environment.seed(MAX_SEED - ROWS + 1)
     environment.reset()

@@ -115,13 +115,6 @@ def flight(states=4, **values):
     )
 
 
-def refusal(call, *given, **options):
-    """Name and value of what a call refuses, and what is allowed."""
-    with pytest.raises(QuadrlError) as caught:
-        call(*given, **options)
-    return caught.value.name, caught.value.value, str(caught.value.allowed)
-
-
 def test_every_camera_shows_which_way_the_aircraft_heads(renderer):
     assert renderer.cameras == CAMERAS
     for camera in CAMERAS:
@@ -206,14 +199,18 @@ def test_blades_turn_counter_clockwise_by_their_angle(renderer, rotor):
 
 def test_what_cannot_be_drawn_is_refused(model, renderer):
     allowed = "one of follow, fixed, track, chase, onboard"
-    assert refusal(renderer.frame, POSE, camera="sky") == ("camera", "sky", allowed)
-    for size, name, limit in (((1922, 9), "width", "1920"), ((9, 0), "height", "1080")):
-        *refused, allowed = refusal(Renderer, model, *size)
-        assert refused == [name, size[name == "height"]] and limit in allowed
-    many = [Marker("ring")] * 50  # of 48 shapes each
-    assert refusal(renderer.frame, POSE, markers=many)[:2] == ("shapes to draw", 2001)
-    assert refusal(Marker, "cube")[:2] == ("kind", "cube")
-    assert refusal(Marker, "line")[:2] == ("end", None)
+    with helpers.refused("camera", "sky", allowed):
+        renderer.frame(POSE, camera="sky")
+    with helpers.refused("width", 1922, lists="1920"):
+        Renderer(model, 1922, 9)
+    with helpers.refused("height", 0, lists="1080"):
+        Renderer(model, 9, 0)
+    with helpers.refused("shapes to draw", 2001):
+        renderer.frame(POSE, markers=[Marker("ring")] * 50)  # of 48 shapes each
+    with helpers.refused("kind", "cube"):
+        Marker("cube")
+    with helpers.refused("end", None):
+        Marker("line")
 
 
 def test_follow_keeps_what_matters_in_view():
@@ -428,8 +425,8 @@ def test_a_video_plays(model, tmp_path):
 )
 def test_what_cannot_be_a_video_is_refused_before_anything_is_written(model, name, value):
     options = SMALL | {"path": "new/a.mp4", name: value}
-    refused = refusal(write_video, flight(), model, **options)
-    np.testing.assert_equal(refused[:2], (name, value))
+    with helpers.refused(name, value):
+        write_video(flight(), model, **options)
     assert not list(Path().iterdir())
 
 
@@ -486,8 +483,9 @@ def test_a_gif_and_contact_sheets(model):
     first, last = next(render_trajectory(two[0], model, **SMALL, overlay=False)), tiles[2, 3]
     assert changed(tiles[0, 0], first).sum() < 0.2 * first[..., 0].size  # but for the time
     assert changed(first, last).mean() > 0.05
-    refused = refusal(write_contact_sheet, two[0], model, "new/a.mp4", **SMALL)
-    assert refused[:2] == ("path", "new/a.mp4") and not Path("new").exists()
+    with helpers.refused("path", "new/a.mp4"):
+        write_contact_sheet(two[0], model, "new/a.mp4", **SMALL)
+    assert not Path("new").exists()
 
 
 @leaves_pipes

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from runs import refused
+from helpers import refused
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle

@@ -9,7 +9,6 @@ from helpers import EVERYTHING, drawn, flying
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.errors import QuadrlError
 from quadrl.core.task import TaskState
 from quadrl.tasks.hover import Hover
 
@@ -117,9 +116,8 @@ def test_the_state_of_another_aircraft_is_not_restored(randomization, changed):
     wrong = flying(randomization=randomization, vehicle=vehicle).save()
     broken["engine.rows"][0, 0] = np.nan
     for saved, name in ((wrong, "engine.parameters"), (broken, "engine.rows")):
-        with pytest.raises(QuadrlError) as caught:
+        with helpers.refused(name):
             other.restore(saved)
-        assert caught.value.name == name
         np.testing.assert_array_equal(drawn(other), before)
 
 

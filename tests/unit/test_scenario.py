@@ -6,7 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
-from runs import refused
+from helpers import refused
 
 import quadrl
 from quadrl.aircraft.aerodynamics import Aerodynamics
@@ -134,10 +134,8 @@ def test_wind_blows_in_real_air_unless_something_else_is_asked_for():
     ids=["unknown", "other rotors", "too light for the step"],
 )
 def test_an_aircraft_without_numbers_for_real_air_is_told_so_in_wind(vehicle, why):
-    with pytest.raises(QuadrlError, match=why) as caught:
+    with refused("aerodynamics", lists="'none'", match=why):
         Scenario.of("hover", vehicle=vehicle, weather="light")
-    assert caught.value.name == "aerodynamics" and "'none'" in caught.value.allowed
-    assert "\n" not in str(caught.value)
     Scenario.of("hover", vehicle=vehicle, weather="light", aerodynamics="none")
     Scenario.of("hover", vehicle=vehicle)
 
@@ -251,9 +249,8 @@ def test_wind_that_no_step_of_the_aircraft_resolves_is_refused():
     # 2 k_D v dt / m = 1 at 0.001 / (2 * 5e-3 * 0.005) = 20 m/s for a Crazyflie of 1 g.
     given = {"vehicle": "crazyflie", "vehicle_options": {"mass": 1e-3}, "aerodynamics": "none"}
     for weather in ("severe", {"wind_speed": 15.0, "gust_speed": 5.1}):
-        with pytest.raises(QuadrlError, match="20 m/s") as caught:
+        with refused("weather", match="20 m/s"):
             Scenario.of("hover", weather=weather, **given)
-        assert caught.value.name == "weather"
     with pytest.raises(QuadrlError, match="20 m/s"):  # twice the mean wind may be drawn
         Scenario.of("hover", weather={"wind_speed": 11.0}, randomization={"wind": (0, 2)}, **given)
     assert Scenario.of("hover", weather={"wind_speed": 19.9}, **given).aircraft.mass == 1e-3

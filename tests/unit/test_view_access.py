@@ -10,6 +10,7 @@ import urllib.request
 
 import numpy as np
 import pytest
+from helpers import refused
 
 from quadrl import tasks
 from quadrl.aircraft.presets import resolve
@@ -193,9 +194,8 @@ def test_a_viser_that_starts_another_server_is_not_served(monkeypatch):
     started = []
     stop = viser.ViserServer.stop
     monkeypatch.setattr(viser.ViserServer, "stop", lambda it: (started.append(it), stop(it)))
-    with pytest.raises(QuadrlError, match="any web page") as refused:
+    with refused(match="any web page"):
         flying(1)
-    assert str(refused.value).count("\n") == 0
     with socket.socket() as probe:
         assert probe.connect_ex(("localhost", started[0].get_port())) != 0
 
