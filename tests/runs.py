@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.networks import make_actor_critic
 from quadrl.learning.train import Training
 
 # 6 batches of 32 transitions; episodes of 10 steps, so that many end in between.
@@ -56,9 +57,9 @@ def stopped(config: TrainConfig, folder: Path, after: int, *, resume: bool = Fal
     return folder
 
 
-def metrics(folder: Path) -> list[dict[str, str]]:
-    """The rows of metrics.csv but for the wall clock."""
-    with open(folder / "metrics.csv", newline="") as file:
+def metrics(folder: Path, name: str = "metrics.csv") -> list[dict[str, str]]:
+    """The rows of metrics.csv, or of another file of a run, but for the wall clock."""
+    with open(folder / name, newline="") as file:
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
 
 
@@ -71,12 +72,21 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-def disturbed(actor: Any) -> Any:
-    """A policy away from the start, where the mean hardly depends on the weights."""
+def actor_critic(
+    seed: int = 0, size: int = 5, actions: int = 2, privileged: int = 0, **settings: Any
+) -> tuple[Any, Any, Any]:
+    """Small networks as they are at the start of a training, and their normalisers."""
+    torch.manual_seed(seed)
+    small = {"hidden": (6,), "critic_hidden": (6,), "initial_deviation": 0.5, "holds_goal": False}
+    return make_actor_critic(size, actions, TrainConfig(**small | settings), privileged)
+
+
+def disturbed(network: Any, by: float = 0.3) -> Any:
+    """A network away from the start, where a policy's mean hardly depends on the weights."""
     with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter += 0.3 * torch.randn_like(parameter)
-    return actor
+        for parameter in network.parameters():
+            parameter += by * torch.randn_like(parameter)
+    return network
 
 
 def batch_of(actor: Any, size: int, seed: int = 0, rows: int = 24) -> Any:

@@ -1,17 +1,14 @@
 """What the policy of a training reaches along the way."""
 
-import csv
-
 import pytest
+from runs import Stop, assert_same_run, changed, metrics
 
 import quadrl
 from quadrl.learning.run import train_in
-from tests.runs import Stop, assert_same_run, changed
 
 
 def rows(folder):
-    with open(folder / "evaluations.csv", newline="") as file:
-        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+    return metrics(folder, "evaluations.csv")
 
 
 def trained(folder, *, last=None, resume=False, **settings):

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 from helpers import refused
-from runs import one_thread  # noqa: F401
+from runs import actor_critic, disturbed, one_thread  # noqa: F401
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import set_recurrent_mode
@@ -32,19 +32,13 @@ CASES = {
 SETTINGS = [{}, {"clip": 0.1, "entropy": 0.25, "critic": 0.75}, {"critic": 0.0}]
 
 
-def networks(privileged=0, **settings):
+def networks(**settings):
     """Actor and critic in double precision, away from the start, and their normalisers."""
-    config = TrainConfig(
-        **({"hidden": (16,), "critic_hidden": (8, 8), "holds_goal": False} | settings)
-    )
-    size, actions = 22, 4  # of hover, whose goal one of the policies holds
-    torch.manual_seed(0)
-    actor, critic, normalisers = make_actor_critic(size, actions, config, privileged)
+    settings = {"hidden": (16,), "critic_hidden": (8, 8)} | settings
+    # Of the size of hover, whose goal one of the policies holds.
+    actor, critic, normalisers = actor_critic(size=22, actions=4, **settings)
     for network in (actor, critic):
-        with torch.no_grad():
-            for parameter in network.parameters():
-                parameter += 0.2 * torch.randn_like(parameter)
-        network.double()
+        disturbed(network, 0.2).double()
     for normaliser in normalisers.values():
         normaliser.update(2 * torch.randn(100, len(normaliser.mean)) + 1)
     return actor, critic, normalisers

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from helpers import refused
-from runs import assert_same_run, changed, stopped, train
+from helpers import begun, refused
+from runs import assert_same_run, changed, disturbed, stopped, train
 from tensordict import TensorDict
 
-from quadrl.core.environment import Environment
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import make_env
 from quadrl.learning.networks import export, make_actor_critic
@@ -23,10 +22,7 @@ def some_policy(task, **settings):
     actor, _, normalisers = make_actor_critic(environment.size, environment.action_size, config)
     seen = 0.3 + torch.rand(50, environment.size)
     normalisers["observation"].update(seen)
-    with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter += 0.3 * torch.randn_like(parameter)
-    return export(actor, task, {"vehicle_options": config.vehicle_options}), actor
+    return export(disturbed(actor), task, {"vehicle_options": config.vehicle_options}), actor
 
 
 def at_rest(environment, goal, yaw):
@@ -42,10 +38,7 @@ def at_rest(environment, goal, yaw):
 @pytest.mark.parametrize("task", HELD)
 def test_at_the_goal_it_hovers_and_stays(task):
     policy, _ = some_policy(task)
-    environment = Environment(task, num_envs=3, seed=1, engine="free_flight")
-    environment.reset()
-    environment.seed(1)
-    environment.reset()
+    environment = begun(task, 3, seed=1, engine="free_flight")
     goals = environment.goals() - environment.origin
     environment.seed(1)
     seen = at_rest(environment, goals, 0.0 if environment.task.heading_matters else 2.0)
@@ -69,8 +62,7 @@ def test_its_file_is_a_plain_network(variant):
 
 def test_where_the_heading_is_free_it_flies_the_same_in_every_direction():
     policy, _ = some_policy("random_waypoint")
-    environment = Environment("random_waypoint", num_envs=2, seed=0)
-    environment.reset()
+    environment = begun("random_waypoint", 2)
     goal = environment.goals()[0] - environment.origin
     turned = np.array([-goal[1], goal[0], goal[2]])
     # A quarter turn about the vertical through the goal: all that it sees turns with it.
@@ -94,12 +86,5 @@ def test_it_is_trained_and_continued_bit_for_bit(tmp_path):
 
 @pytest.mark.parametrize("task", ["straight_and_level", "target_following"])
 def test_a_task_without_one_goal_state_is_refused(task):
-    with refused("holds_goal") as caught:
+    with refused("holds_goal", match="target_velocity"):
         some_policy(task)
-    assert "target_velocity" in str(caught.value)
-
-
-def test_a_memory_is_refused():
-    for given in ({"memory": "gru", "holds_goal": True}, {"holds_goal": 1}):
-        with refused("holds_goal"):
-            TrainConfig("hover", **given)

@@ -101,28 +101,24 @@ def test_a_training_has_at_least_the_steps_that_are_asked_for():
         ({"hidden": 16}, "hidden", 16),
         ({"initial_deviation": 0.0}, "initial_deviation", 0.0),
         ({"algo": "sac"}, "algo", "sac"),
-        ({"vehicle": "paprr"}, "vehicle", "paprr"),
-        ({"control_mode": "thrust"}, "control_mode", "thrust"),
+        ({"memory": "lstm"}, "memory", "lstm"),
+        ({"memory": "gru", "memory_width": 0}, "memory_width", 0),
+        ({"memory": "gru", "holds_goal": True}, "holds_goal", True),
+        ({"holds_goal": 1}, "holds_goal", 1),
         ({"ppo": {"minibatch": -1}}, "ppo.minibatch", -1),
         ({"ppo": {"learning_rate": math.inf}}, "ppo.learning_rate", math.inf),
         ({"ppo": {"entropy": -0.1}}, "ppo.entropy", -0.1),
         ({"trpo": {"iterations": 0.5}}, "trpo.iterations", 0.5),
-        ({"randomization": "much"}, "randomization", "much"),
         ({"randomization": {"command_delay": 0.003}}, "command_delay", (0.003, 0.003)),
-        ({"observe": {"wind": True}}, "option of observe", "wind"),
         ({"weather": "foul"}, "weather", "foul"),
-        ({"aerodynamics": "ground"}, "aerodynamics", "ground"),
         ({"variant": "sturdy"}, "variant", "sturdy"),
-        ({"vehicle_options": {"rotors": 3}}, "vehicle option", "rotors"),
         ({"vehicle_options": {"mass": -1.0}}, "mass", -1.0),
         ({"task": "hovver"}, "task", "hovver"),
         ({"gama": 0.9}, "setting", "gama"),
         ({"ppo": {"clp": 0.2}}, "setting of ppo", "clp"),
         ({"ppo": 3}, "ppo", 3),
         ({"task_options": {"horizn": 5}}, "hover option", "horizn"),
-        ({"task_options": {"time_limit": "long"}}, "hover time_limit", "long"),
         ({"task_options": "time_limit=5"}, "task_options", "time_limit=5"),
-        ({"training_options": {"farthst": 3}}, "hover option", "farthst"),
         ({"training_options": {"time_limit": -1}}, "hover time_limit", -1),
         ({"training_options": 3}, "training_options", 3),
     ],
@@ -168,9 +164,8 @@ def test_a_run_in_wind_says_what_the_air_does_and_an_older_one_flew_by_drag_alon
 def test_damaged_settings_are_refused(tmp_path, text):
     if text is not None:
         (tmp_path / "config.json").write_text(text)
-    with refused() as caught:
+    with refused(match=str(tmp_path)):
         TrainConfig.of_folder(tmp_path)
-    assert str(tmp_path) in str(caught.value)
 
 
 @pytest.mark.parametrize(("part", "name"), [("task", "radius"), ("vehicle", "mass")])

@@ -5,27 +5,19 @@ import copy
 import numpy as np
 import pytest
 import torch
-from runs import batch_of, disturbed, one_thread  # noqa: F401
+from runs import actor_critic, batch_of, disturbed, one_thread  # noqa: F401
 from tensordict import TensorDict
 
 import quadrl
-from quadrl.learning.config import TrainConfig
-from quadrl.learning.networks import Normaliser, export, make_actor_critic
+from quadrl.learning.networks import Normaliser, export
 from quadrl.learning.ppo import PPO
 from quadrl.learning.settings import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.trpo import TRPO, flat
 from quadrl.learning.vpg import VPG
 
-SIZE, ACTIONS = 5, 2
+SIZE = 5
 pytestmark = pytest.mark.usefixtures("one_thread")
 ALGORITHMS = {PPO: PPOConfig(minibatch=64), TRPO: TRPOConfig(), VPG: VPGConfig(minibatch=64)}
-
-
-def actor_critic(seed=0, size=SIZE, actions=ACTIONS, hidden=(6,)):
-    torch.manual_seed(seed)
-    config = TrainConfig(hidden=hidden, critic_hidden=(6,), initial_deviation=0.5, holds_goal=False)
-    actor, critic, normalisers = make_actor_critic(size, actions, config)
-    return actor, critic, normalisers["observation"]
 
 
 # ---------------------------------------------------------------- the normaliser and the networks
@@ -53,10 +45,10 @@ def test_normaliser_is_the_mean_and_deviation_of_everything(sizes):
 @pytest.mark.parametrize("hidden", [(), (7,), (16, 5)])
 @pytest.mark.parametrize("actions", [4, 6])
 def test_an_exported_policy_is_the_actors_mean(hidden, actions, tmp_path):
-    actor, _, normaliser = actor_critic(actions=actions, hidden=hidden)
+    actor, _, normalisers = actor_critic(actions=actions, hidden=hidden)
     disturbed(actor)
     observations = 4 * torch.randn(1000, SIZE) + 2
-    normaliser.update(observations[:50])
+    normalisers["observation"].update(observations[:50])
     policy = export(actor, "hover", {})
     with torch.no_grad():
         mean = actor.get_dist(TensorDict({"observation": observations}, [1000])).mean
@@ -68,9 +60,9 @@ def test_an_exported_policy_is_the_actors_mean(hidden, actions, tmp_path):
 
 
 def test_actions_start_with_the_deviation_that_was_asked_for():
-    actor, _, normaliser = actor_critic(hidden=(16,))
+    actor, _, normalisers = actor_critic(hidden=(16,))
     observations = torch.randn(100, SIZE)
-    normaliser.update(observations)
+    normalisers["observation"].update(observations)
     with torch.no_grad():
         batch = actor(TensorDict({"observation": observations}, [100]))
     np.testing.assert_allclose(batch["scale"], 0.5, atol=0.02)

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from runs import batch_of, disturbed, one_thread  # noqa: F401
+from runs import actor_critic, batch_of, disturbed, one_thread  # noqa: F401
 from tensordict import TensorDict
 from torch.func import functional_call, jacrev
 from torchrl.modules import set_recurrent_mode
 
-from quadrl.learning.config import TrainConfig
-from quadrl.learning.networks import BEGINS, STATE, make_actor_critic
+from quadrl.learning.networks import BEGINS, STATE
 from quadrl.learning.settings import TRPOConfig
 from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
 
@@ -19,18 +18,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def trpo(seed=0, memory="none", **settings):
     """A policy away from the start, and its update."""
-    torch.manual_seed(seed)
-    config = TrainConfig(
-        holds_goal=False,
-        hidden=(6,),
-        critic_hidden=(6,),
-        initial_deviation=0.5,
-        memory=memory,
-        memory_width=4,
-    )
-    actor, critic, _ = make_actor_critic(SIZE, ACTIONS, config)
-    disturbed(actor)
-    return actor, TRPO(actor, critic, TRPOConfig(**settings))
+    actor, critic, _ = actor_critic(seed, SIZE, ACTIONS, memory=memory, memory_width=4)
+    return disturbed(actor), TRPO(actor, critic, TRPOConfig(**settings))
 
 
 def explicit_fisher(actor, observation):
