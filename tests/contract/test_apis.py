@@ -1,16 +1,13 @@
 """What every API has to do alike: seeds, resets, copies, divergence, refusals."""
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from apis import APIS, StableBaselines, Vector
 from helpers import refused
+from processes import python
 
 import quadrl
 from quadrl.base.errors import QuadrlError
@@ -167,8 +164,4 @@ def test_the_import_is_light_and_sets_no_variable():
         "assert not heavy & set(sys.modules), heavy & set(sys.modules);"
         "quadrl.suite, quadrl.rendering, quadrl.testing, quadrl.envs.dm_control"
     )
-    paths = {"PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ | paths, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    python("-c", code)

@@ -10,7 +10,6 @@ from pathlib import Path
 import mujoco
 import pytest
 
-import quadrl
 from quadrl.engines import native
 from quadrl.engines.native import compiling
 
@@ -173,13 +172,11 @@ def test_what_the_system_does_not_load_is_said_in_a_line(cache, monkeypatch):
 def run(tmp_path, cache):
     """Starts Python with a TMPDIR of its own."""
     (tmp_path / "tmp").mkdir()
-    repository = str(Path(quadrl.__file__).parents[1])
-    settings = {"TMPDIR": str(tmp_path / "tmp"), "PYTHONPATH": repository}
     processes = []
 
     def start(code, **variables):
         code = f"from quadrl.engines.native import compiling, library; {code}"
-        environment = os.environ | settings | variables
+        environment = os.environ | {"TMPDIR": str(tmp_path / "tmp")} | variables
         command = [sys.executable, "-c", code]
         processes.append(subprocess.Popen(command, env=environment, start_new_session=True))
         return processes[-1]

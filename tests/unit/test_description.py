@@ -3,11 +3,10 @@
 import dataclasses
 import importlib
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from processes import python
 
 import quadrl
 from quadrl import tasks
@@ -74,4 +73,4 @@ def test_modules_that_have_moved_are_found_under_their_old_names():
         module = importlib.import_module(f"quadrl.{old}")
         assert module is importlib.import_module(f"quadrl.{new}") is getattr(quadrl, old)
     code = "from quadrl.rotation import namespace; from quadrl.base.errors import QuadrlError"
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+    python("-W", "error", "-c", code)

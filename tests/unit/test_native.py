@@ -1,8 +1,6 @@
 """The compiled callbacks: harmless to others, never silently absent."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import helpers
@@ -10,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import rollout
+from processes import python
 
 import quadrl
 from quadrl.aircraft.vehicle import Vehicle
@@ -240,12 +239,7 @@ with native.warnings_in(path):
 
 def diverged(body, before=""):
     """What a process wrote to stderr, standing in this folder."""
-    command = [sys.executable, "-c", DIVERGE.format(before=before, body=body)]
-    repository = str(Path(quadrl.__file__).parents[1])
-    environment = os.environ | {"PYTHONPATH": repository}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stderr.splitlines()
+    return python("-c", DIVERGE.format(before=before, body=body)).stderr.splitlines()
 
 
 def test_a_few_warnings_of_mujoco_are_told_and_none_written_where_one_stands():

@@ -1,17 +1,14 @@
 """The policy as numbers: what it computes, what it refuses to read, what it does not import."""
 
 import json
-import os
 import struct
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import refused
 from policies import WIDTH, linear, make_policy, make_remembering, parts
+from processes import python
 from safetensors.numpy import save
 
 import quadrl
@@ -141,9 +138,8 @@ def test_what_is_no_policy_is_refused(tmp_path, content):
     path = tmp_path / "policy.safetensors"
     if content is not None:
         path.write_bytes(content)
-    with refused() as caught:
+    with refused(match=str(path)):
         Policy.load(tmp_path)
-    assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -236,21 +232,11 @@ def test_a_policy_that_does_not_ship(task, algo):
     assert all(file.stem in caught.value.allowed for file in shipped())
 
 
-def imported(code: str) -> set[str]:
-    """The modules of a fresh interpreter after some code."""
-    code += "\nimport sys; print(' '.join(sys.modules))"
-    environment = os.environ | {"PYTHONPATH": str(Path(quadrl.__file__).parents[1])}
-    command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True)
-    assert done.returncode == 0, done.stderr.decode()
-    return set(done.stdout.decode().split())
-
-
 def test_a_policy_and_its_evaluation_stay_light(tmp_path):
     make_policy().save(tmp_path / "policy.safetensors")
     load = f"quadrl.Policy.load({str(tmp_path)!r})([1, 2, 3])"
-    code = f"import quadrl, quadrl.evaluation.rollout\n{load}"
-    modules = imported(code)
+    code = f"import sys, quadrl, quadrl.evaluation.rollout\n{load}\nprint(' '.join(sys.modules))"
+    modules = set(python("-W", "error", "-c", code).stdout.split())
     assert "quadrl.evaluation.policy" in modules
     heavy = {"torch", "tensordict", "torchrl", "matplotlib", "mediapy", "PIL", "quadrl.rendering"}
     assert not heavy & modules
@@ -264,9 +250,8 @@ def test_a_policy_and_its_evaluation_stay_light(tmp_path):
 def test_a_robust_policy_flies_its_own_aircraft_or_says_which(name):
     policy = Policy.pretrained(name)
     plain = Environment(policy.task, observe=policy.conditions["observe"])
-    with refused("action_scale", 35.0) as caught:
+    with refused("action_scale", 35.0, lists="90", match="keywords"):
         policy.check_fits(plain)
-    assert "90" in caught.value.allowed and "keywords" in str(caught.value)
     for flown in (policy, policy.flying(4)):
         with refused("action_scale", 35.0):
             fly(flown, policy.task, episodes=4, vehicle=VEHICLES["paper"])
@@ -298,12 +283,5 @@ def test_a_policy_of_before_flies_the_thrust_that_it_was_trained_with():
     flown = Environment(policy.scenario)
     policy.check_fits(flown)
     assert flown.control_mode.name == "thrust_body_rate-v0"
-    with refused("control_mode", "thrust_body_rate"):
+    with refused("control_mode", "thrust_body_rate", lists="'thrust_body_rate-v0'"):
         policy.check_fits(Environment("hover", control_mode="thrust_body_rate"))
-
-
-def test_another_control_mode_is_refused():
-    policy = Policy.pretrained("hover")
-    with refused("control_mode", "velocity") as caught:
-        policy.check_fits(Environment("hover", control_mode="velocity"))
-    assert "'rotor'" in caught.value.allowed

@@ -1,13 +1,12 @@
 """Many threads of Python at once: nobody's numbers depend on who else flies."""
 
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 
 import mujoco
 import numpy as np
 import pytest
+from processes import python
 
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.core.environment import Environment
@@ -124,4 +123,4 @@ def test_the_first_environments_of_a_process_may_be_made_in_threads():
         "list(ThreadPoolExecutor(4).map(make, range(4)))\n"
         "make(4)"
     )
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+    python("-W", "error", "-c", code)
