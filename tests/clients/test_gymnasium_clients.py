@@ -206,10 +206,10 @@ def test_attributes_of_a_vector_are_asked_as_those_of_gymnasiums_own():
         vector.set_attr("anything", [4.5, 4.5, 4.5])
         assert vector.get_attr("anything") == (4.5, 4.5, 4.5)
     for values in ([1, 2, 3], [1, 1]):
-        with pytest.raises(QuadrlError):
+        with refused():
             ours.set_attr("anything", values)
     for name in ("reset", "step", "close"):
-        with pytest.raises(QuadrlError):
+        with pytest.raises(QuadrlError, match=f"call {name} of the vector itself"):
             ours.call(name)
     with pytest.raises(AttributeError):
         ours.get_attr("nothing_of_that_name")
@@ -241,22 +241,12 @@ def test_options_of_a_vectors_reset_are_for_its_rows():
     np.testing.assert_array_equal(position[1], other.environment.snapshot.state.position[1])
 
 
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        ({"positon": (0, 0, 1)}, "start"),
-        ({"position": (0, 1)}, "position"),
-        ({"position": "high"}, "position"),
-        ({"position": (0, 0, np.nan)}, "position at the start"),
-        ({"velocity": (1e9, 0, 0)}, "velocity at the start"),
-        ({"quaternion": (0, 0, 0, 0)}, "quaternion"),
-    ],
-)
 @pytest.mark.parametrize("make", [gym.make, gym.make_vec])
-def test_an_impossible_option_of_a_reset_is_refused(make, options, name):
+def test_an_impossible_option_of_a_reset_is_refused(make):
     environment = make(HOVER)
-    with refused(name):
-        environment.reset(options=options)
+    for name, value in {"position": (0, 1), "start": {"positon": (0, 0, 1)}}.items():
+        with refused(name):
+            environment.reset(options={name: value})
     environment.reset(seed=0)
 
 
@@ -264,7 +254,7 @@ def test_an_unknown_keyword_is_refused_in_pythons_words():
     # Libraries try keywords, and read in the TypeError which one they have to leave out.
     with pytest.raises(TypeError, match="got an unexpected keyword argument 'frameskip'"):
         gym.make(HOVER, frameskip=1)
-    with pytest.raises(QuadrlError, match=r"vehicle\b.*control_timestep.*did you mean vehicle"):
+    with refused(match=r"vehicle\b.*control_timestep.*did you mean vehicle"):
         gym.make(HOVER, vehical="crazyflie")
 
 

@@ -118,20 +118,6 @@ def test_contact_gives_the_same_numbers_too(altitude):
     assert (height < 0.15).sum() > 20  # and lies there for a second of the two
 
 
-@dataclasses.dataclass(frozen=True)
-class Smooth(Hover):
-    """Rewards by the last two actions and the command."""
-
-    def reward(self, before, now, end):
-        change = abs(now.action - before.action).sum(-1)
-        turn = (now.rotor_command - before.rotor_command)[..., 0]
-        return super().reward(before, now, end) | {"change": -change, "turn": turn}
-
-
-def test_a_row_that_begins_anew_has_forgotten_its_last_action():
-    check_identity(Smooth(time_limit=0.5), ACTIONS[:40])
-
-
 # ------------------------------------------------------------------------- faults are noticed
 
 

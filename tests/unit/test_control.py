@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import LAYOUTS, refused
+from helpers import LAYOUTS, begun, refused
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
@@ -583,8 +583,7 @@ def test_the_derivatives_of_commands_are_those_of_differences(name, vehicle):
 @looped
 @pytest.mark.parametrize("broken", [0, 4])
 def test_loops_fly_every_physics_step_and_a_divergence_in_any_ends_the_episode(name, broken):
-    environment = Environment("hover", num_envs=3, seed=0, control_mode=name)
-    environment.reset()
+    environment = begun("hover", num_envs=3, control_mode=name)
     control_rotors, commands = environment.control, []
 
     def noted(most):
@@ -623,8 +622,7 @@ def test_who_knows_how_the_target_goes_on_lags_behind_no_longer(vehicle):
 
 def test_the_motion_of_the_target_is_the_slope_of_its_velocity():
     task = tasks.make("target_following", sees_motion=True)
-    environment = Environment(task, num_envs=8, seed=3)
-    environment.reset()
+    environment = begun(task, num_envs=8, seed=3)
     now, step = environment.snapshot, 1e-5
 
     def at(seconds):
@@ -645,7 +643,6 @@ def test_the_motion_of_the_target_is_the_slope_of_its_velocity():
         (lambda: make_controller("lqr", "hovr"), "task", "hovr"),
         (lambda: make_controller("lqr", "hover", "papr"), "vehicle", "papr"),
         (lambda: modes.kind("velocty"), "control_mode", "velocty"),
-        (lambda: Environment("hover", control_mode="velocty"), "control_mode", "velocty"),
         (lambda: make_controller("lqr", "hover")(np.zeros(25)), "observation size", 25),
         (lambda: Gains(authority=1.1), "authority", 1.1),
         (lambda: Gains(max_tilt=2.0), "max_tilt", 2.0),

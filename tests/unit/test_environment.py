@@ -6,10 +6,7 @@ import pytest
 from helpers import begun, idle
 
 from quadrl import tasks
-from quadrl.base.errors import QuadrlError
 from quadrl.core.environment import Environment
-from quadrl.core.rewards import total
-from quadrl.evaluation.controllers import make_controller
 from quadrl.tasks.hover import Hover
 
 
@@ -43,29 +40,7 @@ def test_seeding_again_gives_the_same_episodes_and_another_seed_others():
     assert equal.tolist() == [False, True]
 
 
-def test_the_episodes_of_an_aircraft_do_not_depend_on_when_it_is_reset():
-    early, late = begun(num_envs=2, seed=3), begun(num_envs=2, seed=3)
-    first = early.reset(np.array([1]))
-    for action in helpers.random_actions(5, 2):
-        late.step(action)
-    late.reset(np.array([0]))
-    second = late.reset(np.array([1]))
-    for name, value in first.items():
-        np.testing.assert_array_equal(value, second[name], err_msg=name)
-
-
 # ------------------------------------------------------------------------------- reward and goals
-
-
-@pytest.mark.parametrize("name", tasks.TASKS)
-def test_the_reward_is_exactly_the_sum_of_its_terms_in_order(name):
-    environment = begun(name, 3)
-    for action in helpers.random_actions(20, 3):
-        now = environment.step(action)
-        assert tuple(now.reward_terms) == environment.term_names
-        assert environment.term_names[0] == "progress"
-        assert all(term.shape == (3,) for term in now.reward_terms.values())
-        np.testing.assert_array_equal(now.reward, total(now.reward_terms))
 
 
 def test_control_costs_the_square_of_the_deviation():
@@ -87,7 +62,7 @@ def test_smoothness_costs_the_square_of_the_change_of_the_commands():
     assert first == pytest.approx(-2 * 0.027059, abs=1e-6) and second == 0
     assert third == pytest.approx(-2 * 1225 * 1.25 / 101861, abs=1e-6)
     assert "smoothness" not in helpers.begun("hover").term_names
-    with pytest.raises(QuadrlError):
+    with helpers.refused():
         tasks.make("hover", smoothness_weight=-1.0)
 
 
@@ -155,19 +130,6 @@ def test_what_ends_a_hover_early():
     now = idle(environment)
     np.testing.assert_array_equal(now.terminated, [True, True, True, False])
     assert not now.truncated.any() and not now.is_success.any() and not now.diverged.any()
-
-
-@pytest.mark.parametrize("name", ["hover", "static_waypoint", "random_waypoint"])
-def test_success_at_the_end_of_a_flight_that_is_held_at_the_goal(name):
-    environment = Environment(name, num_envs=6, seed=0)
-    fly = make_controller("geometric", environment.task, environment.vehicle)
-    seen = environment.flatten(environment.reset())
-    for k in range(200):
-        now = environment.step(fly(seen))
-        seen = environment.flatten(now.observation)
-        assert not now.terminated.any()
-        assert (now.is_success == (k == 199)).all()
-    assert now.truncated.all() and (now.error < 0.05).all()
 
 
 def test_success_is_judged_on_the_mean_of_the_last_two_seconds():

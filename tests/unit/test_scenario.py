@@ -11,7 +11,7 @@ from helpers import refused
 import quadrl
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
-from quadrl.base.errors import QuadrlError, UnknownKeyword
+from quadrl.base.errors import UnknownKeyword
 from quadrl.conditions.weather import WEATHERS, Weather
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario, as_saved
@@ -182,13 +182,10 @@ def test_timing_is_the_aircrafts_and_the_tasks():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("vehicle", "brick"),
         ("vehicle", 3),
         ("weather", "windy"),
         ("randomization", "heavy"),
         ("observe", "all"),
-        ("control_mode", "thrust"),
-        ("engine", "jet"),
         ("aerodynamics", "thick"),
         ("max_episode_steps", 0),
     ],
@@ -251,6 +248,6 @@ def test_wind_that_no_step_of_the_aircraft_resolves_is_refused():
     for weather in ("severe", {"wind_speed": 15.0, "gust_speed": 5.1}):
         with refused("weather", match="20 m/s"):
             Scenario.of("hover", weather=weather, **given)
-    with pytest.raises(QuadrlError, match="20 m/s"):  # twice the mean wind may be drawn
+    with refused(match="20 m/s"):  # twice the mean wind may be drawn
         Scenario.of("hover", weather={"wind_speed": 11.0}, randomization={"wind": (0, 2)}, **given)
     assert Scenario.of("hover", weather={"wind_speed": 19.9}, **given).aircraft.mass == 1e-3

@@ -4,12 +4,12 @@ import dataclasses
 import inspect
 import re
 
+import helpers
 import numpy as np
 import pytest
 
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.core.environment import Environment
 from quadrl.engines.rng import Rng
 from quadrl.evaluation.rollout import fly
 
@@ -51,13 +51,9 @@ def check(record, **lengths):
 
 
 @pytest.mark.parametrize("name", sorted(tasks.TASKS))
-@pytest.mark.parametrize("vehicle", ["paper", "hexa"])
-def test_arrays_have_the_shapes_that_stand_behind_them(name, vehicle):
-    count, rotors = 3, VEHICLES[vehicle].rotor_count
-    environment = Environment(
-        name, num_envs=count, vehicle=vehicle, seed=0, control_mode="velocity"
-    )
-    environment.reset()
+def test_arrays_have_the_shapes_that_stand_behind_them(name):
+    count, rotors = 3, 6  # and four actions
+    environment = helpers.begun(name, count, vehicle="hexa", control_mode="velocity")
     lengths = {"N": count, "n": count, "R": rotors, "k": environment.action_size}
     begun = environment.task.begin(
         Rng(np.arange(count), np.zeros(count, dtype=np.int64)), environment.snapshot.parameters

@@ -83,23 +83,6 @@ def test_episodes_begin_anew_as_torchrl_itself_would_have_it(task):
     assert begun > COUNT
 
 
-def test_a_restored_environment_goes_on_where_it_was_saved():
-    environment = QuadrotorEnv("hover", COUNT, seed=0, time_limit=0.5)
-    met = environment.reset()
-    for action in ACTIONS[:14]:
-        _, met = environment.step_and_maybe_reset(met.set("action", action))
-    other = QuadrotorEnv("hover", COUNT, seed=99, time_limit=0.5)
-    other.restore(environment.environment.save())
-    again = other.reset()
-    assert torch.equal(met["observation"], again["observation"])
-    for action in ACTIONS[14:40]:
-        one, met = environment.step_and_maybe_reset(met.set("action", action))
-        same, again = other.step_and_maybe_reset(again.set("action", action))
-        for name in ("observation", "reward", "done"):
-            assert torch.equal(one["next", name], same["next", name])
-        assert torch.equal(met["observation"], again["observation"])
-
-
 @pytest.mark.parametrize("mode", ["DISABLED", "SAME_STEP"])
 @pytest.mark.parametrize("name", ["hover", "target_following"])
 def test_torchrls_gymnasium_wrapper_sees_the_same_episodes(name, mode):
