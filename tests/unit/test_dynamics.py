@@ -65,14 +65,6 @@ def assert_close(got, expected, tolerance=1e-12):
         np.testing.assert_allclose(getattr(got, name), value, rtol=0, atol=atol, err_msg=name)
 
 
-def batch(case, engine):
-    flying = BatchEngine(case.vehicle, COUNT, altitude=3.0, engine=engine, per_row=True)
-    flying.write_parameters(np.arange(COUNT), case.table)
-    helpers.put(flying, case.motion, origin=0)
-    flying.ctrl[:], flying.air[:] = case.command, case.air
-    return flying
-
-
 def step_of_equations(p, motion, command, wind, gravity, timestep):
     """One step [s] of the classical Runge-Kutta method."""
 
@@ -94,7 +86,10 @@ def step_of_equations(p, motion, command, wind, gravity, timestep):
 @every_layout
 def test_a_step_of_free_flight_is_that_of_the_equations(name):
     case = Case.of(name)
-    flying = batch(case, "free_flight")
+    flying = BatchEngine(case.vehicle, COUNT, altitude=3.0, engine="free_flight", per_row=True)
+    flying.write_parameters(np.arange(COUNT), case.table)
+    helpers.put(flying, case.motion, origin=0)
+    flying.ctrl[:], flying.air[:] = case.command, case.air
     flying.advance(1)
     step = case.equations(step_of_equations, case.vehicle.physics_timestep)
     assert_close(helpers.taken(flying, origin=0), step)

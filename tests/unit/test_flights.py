@@ -2,6 +2,7 @@
 
 import ctypes
 
+import helpers
 import numpy as np
 import pytest
 
@@ -24,10 +25,16 @@ class Memory:
         source, self.drawn = flights.write(environment)
         self._library = compiling.compile_generated("#include <math.h>\n" + exported(source))
         self._prefix = f"{environment.task.name}_{environment.vehicle.name}"
+        self["parameters"][:] = parameters.rows(environment.vehicle).view(float)
 
     def __getitem__(self, part):
         first = flights.LAYOUT[part]
         return self.numbers[first : first + flights.PARTS[part]]
+
+    def read(self, engine):
+        """The state, as the engine knows it."""
+        state = engine.frames[0]
+        self["state"][: len(state.table)] = state.table[:, 0]
 
     def call(self, name):
         getattr(self._library, f"{self._prefix}_{name}")(ctypes.c_void_p(self.numbers.ctypes.data))
@@ -46,7 +53,6 @@ def test_a_flight_is_that_of_the_environment_bit_for_bit(task, vehicle):
     controller = GeometricController(VEHICLES[vehicle], tasks.make(task))
     memory, engine = Memory(environment), environment.engine
     rotors, size = environment.vehicle.rotor_count, environment.size
-    memory["parameters"][:] = parameters.rows(environment.vehicle).view(float)
     memory["scale"][:] = environment.vehicle.action_scale
     memory["drawn"][: memory.drawn] = uniform(
         np.array([seed]), np.array([0]), START, 0, memory.drawn
@@ -56,8 +62,7 @@ def test_a_flight_is_that_of_the_environment_bit_for_bit(task, vehicle):
     np.testing.assert_allclose(memory["qpos"], engine.qpos[0], rtol=1e-14, atol=1e-14)
     np.testing.assert_allclose(memory["qvel"], engine.qvel[0], rtol=1e-14, atol=1e-14)
     np.testing.assert_array_equal(memory["act"][:rotors], engine.act[0])
-    state = engine.frames[0]
-    memory["state"][: len(state.table)] = state.table[:, 0]
+    memory.read(engine)
     memory.call("first")
     np.testing.assert_allclose(memory["observation"][:size], observation[0], rtol=1e-6, atol=1e-7)
     for _ in range(steps):
@@ -68,7 +73,7 @@ def test_a_flight_is_that_of_the_environment_bit_for_bit(task, vehicle):
         memory.call("command")
         now = environment.step(action)
         np.testing.assert_array_equal(memory["ctrl"][:rotors], engine.ctrl[0])
-        memory["state"][: len(state.table)] = engine.frames[0].table[:, 0]
+        memory.read(engine)
         memory.call("step")
         observation = environment.flatten(now.observation)
         error, reward, *goal = memory["given"][:5]
@@ -80,14 +85,10 @@ def test_a_flight_is_that_of_the_environment_bit_for_bit(task, vehicle):
 
 
 def test_an_end_is_told():
-    environment = Environment("hover", engine="free_flight", seed=0)
-    environment.reset()
+    environment = helpers.begun(engine="free_flight")
     memory = Memory(environment)
-    memory["parameters"][:] = parameters.rows(environment.vehicle).view(float)
-    environment.step(np.zeros((1, 4)))
-    memory["state"][: len(environment.engine.frames[0].table)] = environment.engine.frames[0].table[
-        :, 0
-    ]
+    helpers.idle(environment)
+    memory.read(environment.engine)
     memory.call("first")
     memory.call("step")
     assert not memory["given"][5:].any()

@@ -78,6 +78,17 @@ def test_what_could_touch_the_ground_is_mujocos_bit_by_bit():
     assert touched > 20
 
 
+def by_both(vehicle, motion, command):
+    """Coordinates (n, 13 + R) after a control step over the ground: in free flight, by MuJoCo."""
+    for engine in ("free_flight", "mujoco"):
+        model = helpers.grounded(vehicle)
+        batch = BatchEngine(vehicle, len(command), altitude=3.0, model=model, engine=engine)
+        helpers.put(batch, motion, origin=0)
+        batch.ctrl[:] = command
+        batch.advance(vehicle.substeps)
+        yield helpers.coordinates(batch)
+
+
 @pytest.mark.parametrize("name", EVERY)
 def test_nothing_that_free_flight_takes_comes_near_the_ground_in_a_step(name):
     # The wildest flights: fast, tilted, in wind, at any height. Whoever is handed over is flown
@@ -92,18 +103,10 @@ def test_nothing_that_free_flight_takes_comes_near_the_ground_in_a_step(name):
     # Every other one is on its back, at its fastest: nothing is pushed down more.
     wild.quaternion[::2], wild.body_rate[::2] = (0, 1, 0, 0), 0.0
     wild.rotor_speed[::2], command[::2] = vehicle.max_speed, vehicle.max_speed
-    ends = []
-    for engine in ("free_flight", "mujoco"):
-        batch = BatchEngine(
-            vehicle, count, altitude=3.0, model=helpers.grounded(vehicle), engine=engine
-        )
-        helpers.put(batch, wild, origin=0)
-        batch.ctrl[:] = command
-        batch.advance(vehicle.substeps)
-        ends.append(helpers.coordinates(batch))
-    near = (ends[0] == ends[1]).all(axis=-1)
+    free, whole = by_both(vehicle, wild, command)
+    near = (free == whole).all(axis=-1)
     assert 0.1 < near.mean() < 0.95
-    assert (ends[0][~near, 2] > reach + MARGIN).all()
+    assert (free[~near, 2] > reach + MARGIN).all()
 
 
 @pytest.mark.parametrize("name", ["drag", "drag of the rotors"])
@@ -119,17 +122,9 @@ def test_an_aircraft_that_the_wind_pushes_to_the_ground_is_handed_over(name):
     motion = helpers.random_motion(vehicle, count, speed=0.0, turn=0.0, rotor=0.0)
     motion.quaternion[:], motion.wind[:] = attitude, (0, 0, -60)
     motion.position[:, 2] = reach + MARGIN + np.linspace(0.001, 1.0, count)
-    ends = []
-    for engine in ("free_flight", "mujoco"):
-        batch = BatchEngine(
-            vehicle, count, altitude=3.0, model=helpers.grounded(vehicle), engine=engine
-        )
-        helpers.put(batch, motion, origin=0)
-        batch.ctrl[:] = motion.rotor_speed
-        batch.advance(vehicle.substeps)
-        ends.append(helpers.coordinates(batch))
-    near = (ends[0] == ends[1]).all(axis=-1)
-    low = ends[1][:, 2] < reach + MARGIN
+    free, whole = by_both(vehicle, motion, motion.rotor_speed)
+    near = (free == whole).all(axis=-1)
+    low = whole[:, 2] < reach + MARGIN
     assert 0.05 < low.mean() and near[low].all() and not near.all()
 
 
