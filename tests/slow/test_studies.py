@@ -18,7 +18,6 @@ from processes import python
 
 import quadrl
 from quadrl import cli
-from quadrl.base.errors import QuadrlError
 from quadrl.core.rules import import_own
 from quadrl.core.scenario import Scenario
 from quadrl.learning import executor
@@ -195,7 +194,7 @@ def test_a_worker_that_always_dies_is_given_up(tmp_path, monkeypatch):
 
     monkeypatch.setattr(executor, "Process", Dying)
     lines = []
-    with pytest.raises(QuadrlError, match="killed by signal 9"):
+    with refused(match="killed by signal 9"):
         quadrl.study(STUDY | {"seeds": [0]}, out=tmp_path, on_line=lines.append)
     assert sum(": begun" in line for line in lines) == executor.ATTEMPTS
 
@@ -293,7 +292,7 @@ def test_a_cluster_that_is_not_there(tmp_path):
 
 def test_without_ray(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(QuadrlError, match=r"pip install 'quadrl\[ray\]'"):
+    with refused(match=r"pip install 'quadrl\[ray\]'"):
         quadrl.study(STUDY, out=tmp_path, ray="local")
 
 

@@ -20,7 +20,6 @@ from quadrl.aircraft.aerodynamics import EFFECTS, Aerodynamics
 from quadrl.aircraft.parameters import WIND, Parameters, rows
 from quadrl.aircraft.presets import VEHICLES, at_air_density, in_real_air, with_effects
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.errors import QuadrlError
 from quadrl.engines import dynamics, mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
 
@@ -196,9 +195,9 @@ def test_thin_air_asks_for_faster_rotors_and_damps_less():
     assert in_real_air(thin).aerodynamics == high.aerodynamics
     assert with_effects(high, "none").aerodynamics == Aerodynamics(air_density=1.007)
     for density in (0.0, 1e-4, math.nan, "thin"):
-        with pytest.raises(QuadrlError, match="air_density"):
+        with helpers.refused(match="air_density"):
             at_air_density(PAPER, density)
-    with pytest.raises(QuadrlError, match="max_speed of rotor 1"):
+    with helpers.refused(match="max_speed of rotor 1"):
         at_air_density(PAPER, 0.6)  # half the air, and twice the weight at most in all of it
 
 
@@ -558,9 +557,8 @@ def test_quadratic_drag_is_less_where_the_rotors_have_their_own():
     [("windy", "windy"), ("inflow,lift", "lift"), ("full,inflow", "full"), ("", ""), (3, 3)],
 )
 def test_an_effect_that_is_not_known_is_refused(asked, value):
-    with helpers.refused("aerodynamics", value, lists="inflow") as caught:
+    with helpers.refused("aerodynamics", value, lists="inflow", match="must be.*ground_effect"):
         with_effects(PAPER, asked)
-    assert "ground_effect" in caught.value.allowed
 
 
 def test_an_aircraft_without_a_full_set_is_refused_until_it_has_one():
@@ -614,9 +612,8 @@ def test_a_disc_that_makes_power_from_nothing_is_refused():
     ],
 )
 def test_effects_that_are_too_fast_for_the_step_are_refused(effect, named):
-    with helpers.refused("physics_timestep", 0.01, lists="at most 0.00") as caught:
+    with helpers.refused("physics_timestep", 0.01, lists="at most 0.00", match=f";.*{named}"):
         Vehicle(aerodynamics=Aerodynamics(**effect))
-    assert named in caught.value.reason
 
 
 def test_rotors_that_weigh_more_than_the_aircraft_are_refused():

@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 import pytest
+from helpers import refused
 from scipy import stats
 
 from quadrl import cli
-from quadrl.base.errors import QuadrlError
 from quadrl.learning import study
 from quadrl.learning.comparison import VERDICTS, compare, power, sums
 from quadrl.learning.study import StudyResult, along
@@ -93,7 +93,7 @@ def test_what_cannot_be_compared_is_refused():
         (("error", "ppo", "vgp"), "compared = 'vgp': must be one of ppo, vpg, trpo"),
         (("error", "ppo", "trpo"), "seeds of trpo, hover = 1: must be 2 or more"),
     ):
-        with pytest.raises(QuadrlError, match=said):
+        with refused(match=said):
             compare(given, *wrong)
 
 

@@ -12,8 +12,6 @@ import pytest
 import reference
 import solutions
 
-from quadrl.core.environment import Environment
-
 ENGINES = ("mujoco", "free_flight")
 AIRCRAFT = 12
 
@@ -68,8 +66,7 @@ def test_every_row_is_finite_and_moves_or_is_counted_and_neighbours_fly_on(task,
 @pytest.mark.parametrize("engine", ENGINES)
 def test_whoever_hits_the_ground_at_speed_has_crashed_and_is_not_under_it(engine):
     for vehicle in extreme.vehicles(6):
-        environment = Environment("landing", num_envs=16, seed=0, vehicle=vehicle, engine=engine)
-        environment.reset()
+        environment = helpers.begun("landing", num_envs=16, vehicle=vehicle, engine=engine)
         flying, sinking = environment.engine, np.geomspace(2.5, 200.0, 16)  # [m/s]
         flying.qpos[:, :2], flying.qvel[:] = 0.0, 0.0
         flying.qpos[:, 2] = 0.1 + 2 * sinking * vehicle.control_timestep

@@ -10,8 +10,6 @@ import pytest
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import in_real_air
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
-from quadrl.base.errors import QuadrlError
-from quadrl.core.environment import Environment
 from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import LANES
 from quadrl.engines.mujoco import BatchEngine, DataEngine
@@ -177,12 +175,11 @@ def test_any_numbers_anywhere_disturb_no_memory():
 @pytest.mark.parametrize("place", ["rotor_count", "effects"])
 @pytest.mark.parametrize("number", NUMBERS)
 def test_free_flight_from_a_live_row(vehicle, place, number):
-    environment = Environment("hover", seed=0, engine="free_flight", vehicle=vehicle)
-    environment.reset()
+    environment = helpers.begun("hover", engine="free_flight", vehicle=vehicle)
     sound = 4.0 if place == "rotor_count" else (0.0, 1.0, 2.0)
     environment.engine.parameters[place] = number
     if not np.isfinite(number):
-        with pytest.raises(QuadrlError, match=f"parameters.*{place}"):
+        with helpers.refused(match=f"parameters.*{place}"):
             helpers.idle(environment)
         return
     transition = helpers.idle(environment)
@@ -206,7 +203,7 @@ def test_free_flight_beside_a_row_that_is_not_sound(number):
         engine.advance(3)
         said = contextlib.nullcontext()
         if bad and not np.isfinite(number):
-            said = pytest.raises(QuadrlError, match="parameters.*rotor_count")
+            said = helpers.refused(match="parameters.*rotor_count")
         broken = np.arange(count) == faulty
         with said:
             broken = engine.read()
@@ -225,5 +222,5 @@ def test_free_flight_beside_a_row_that_is_not_sound(number):
 def test_a_model_whose_row_has_other_rotors_is_refused_to_fly():
     model = mjcf.compile_model(CALM)
     row_of(model)["rotor_count"] = 5
-    with pytest.raises(QuadrlError, match="the parameters of an aircraft"):
+    with helpers.refused(match="the parameters of an aircraft"):
         DataEngine(CALM, model, mujoco.MjData(model), altitude=3.0)

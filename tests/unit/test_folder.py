@@ -7,8 +7,9 @@ import subprocess
 import sys
 
 import pytest
+from helpers import refused
 
-from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.errors import QuadrlWarning
 from quadrl.learning.folder import LOCK, lock_folder
 
 HERE = socket.gethostname()
@@ -33,7 +34,7 @@ def locked(folder):
 def test_a_file_takes_the_place_of_the_lock(folder):
     unlock = locked(folder)
     assert (folder / LOCK).read_text().split() == [HERE, str(os.getpid())]
-    with pytest.raises(QuadrlError, match=f"another training works in .*process {os.getpid()} on"):
+    with refused(match=f"another training works in .*process {os.getpid()} on"):
         lock_folder(folder)  # of this process as well
     unlock()
     assert list(folder.iterdir()) == []
@@ -44,7 +45,7 @@ def test_it_is_refused_while_its_process_lives_and_taken_over_when_it_is_dead(fo
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
         owner = f"{HERE} {other.pid}\n"
         (folder / LOCK).write_text(owner)
-        with pytest.raises(QuadrlError, match=f"process {other.pid} on"):
+        with refused(match=f"process {other.pid} on"):
             lock_folder(folder)
         assert (folder / LOCK).read_text() == owner
         other.communicate()
@@ -59,7 +60,7 @@ def test_it_is_refused_while_its_process_lives_and_taken_over_when_it_is_dead(fo
 @pytest.mark.parametrize("content", ["elsewhere 12\n", "", "\xff\xfe", f"{HERE} x\n", HERE])
 def test_of_another_host_it_is_refused_with_what_to_do(folder, content):
     (folder / LOCK).write_bytes(content.encode("latin-1"))
-    with pytest.raises(QuadrlError, match=rf"on.*{LOCK}.*if that process is gone, delete the file"):
+    with refused(match=rf"on.*{LOCK}.*if that process is gone, delete the file"):
         lock_folder(folder)
     assert (folder / LOCK).read_bytes() == content.encode("latin-1")
 

@@ -14,13 +14,8 @@ AT_REST = {"velocity": (0.0, 0.0, 0.0), "quaternion": (1, 0, 0, 0)}
 
 def begun(count=1, position=None, **options):
     """An environment at its first snapshot, the aircraft at rest somewhere."""
-    environment = Environment(
-        LsyRace(**options),
-        num_envs=count,
-        seed=3,
-        vehicle="crazyflie_brushless",
-        engine="free_flight",
-    )
+    settings = {"vehicle": "crazyflie_brushless", "engine": "free_flight"}
+    environment = Environment(LsyRace(**options), num_envs=count, seed=3, **settings)
     environment.reset(start=None if position is None else AT_REST | {"position": position})
     return environment
 

@@ -3,10 +3,10 @@
 import resource
 
 import pytest
+from helpers import refused
 from runs import changed
 
 from quadrl.base import machine
-from quadrl.base.errors import QuadrlError
 from quadrl.core.environment import Environment
 from quadrl.evaluation.rollout import fly
 from quadrl.learning.train import Training
@@ -35,7 +35,7 @@ def little(monkeypatch):
 @pytest.mark.parametrize("settings", LARGE.values(), ids=LARGE)
 def test_more_aircraft_than_fit_are_refused_before_they_are_made(settings):
     taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(QuadrlError, match=r"num_envs = 1048576 would take \d{2,}.\d GiB .*: ask"):
+    with refused(match=r"num_envs = 1048576 would take \d{2,}.\d GiB .*: ask"):
         Environment("hover", **settings)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - taken < 200_000  # [kB]
 
@@ -56,12 +56,12 @@ def test_the_memory_that_is_free_is_the_least_of_all_limits(tmp_path, monkeypatc
 
 
 def test_flights_and_trainings_that_do_not_fit_are_refused(little, tmp_path):
-    with pytest.raises(QuadrlError, match=r"20 flights of 2000000 steps would take .* GiB"):
+    with refused(match=r"20 flights of 2000000 steps would take .* GiB"):
         fly(lambda seen: seen[:, :4], Hover(time_limit=1e5), episodes=20)
     for settings, name in (
         ({"hidden": (30_000, 30_000)}, "hidden = .30000, 30000. would take 13.4 GiB"),
         ({"num_envs": 1 << 16, "rollout": 64}, "num_envs . rollout = 4194304 would take"),
     ):
-        with pytest.raises(QuadrlError, match=name):
+        with refused(match=name):
             Training(changed(**settings), tmp_path / "run")
         assert not (tmp_path / "run").exists()

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from helpers import refused
 
 from quadrl import tasks
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.rotors import GRAVITY
-from quadrl.base.errors import QuadrlError
 from quadrl.conditions.solids import Box
 from quadrl.core.environment import Environment
 from quadrl.tasks import perching
@@ -145,7 +145,7 @@ def test_a_way_ends_in_the_touch_that_it_was_flown_backwards_from(incline):
 
 @pytest.mark.parametrize("name", ["grip", "length"])
 def test_a_surface_of_a_negative_number_is_refused(name):
-    with pytest.raises(QuadrlError, match=name):
+    with refused(match=name):
         Box("wall", **{name: -1.0})
 
 
@@ -159,5 +159,5 @@ def test_a_surface_of_a_negative_number_is_refused(name):
     ],
 )
 def test_ranges_that_are_none_are_refused(name, options):
-    with pytest.raises(QuadrlError, match=name):
+    with refused(match=name):
         tasks.make("perching", **options)

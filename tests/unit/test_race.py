@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import begun, refused
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
@@ -115,8 +115,7 @@ def test_low_flight_costs_by_depth_and_time(height, cost):
 
 def test_practice_flights_begin_on_the_way_to_every_gate():
     task = Race(flying=1.0, track="alphapilot")
-    environment = Environment(task, num_envs=300, seed=3, engine="free_flight")
-    environment.reset()
+    environment = begun(task, num_envs=300, seed=3, engine="free_flight")
     course, state = environment.snapshot.task, environment.snapshot.state
     assert set(course.gate) == set(range(11))
     before = task.course.centre[course.gate.astype(int) - 1]
@@ -221,20 +220,17 @@ OVERLAP = ((0.0, 0.0, 5.0, 0.0, 0.0), (0.0, 1.0, 5.0, 0.0, 0.0))
     ],
 )
 def test_races_that_cannot_be(options, said):
-    with refused() as caught:
+    with refused(match=said):
         tasks.make("race", **options)
-    assert said in str(caught.value)
 
 
 def test_a_track_without_gates_is_refused():
-    with refused(name="none gates") as caught:
+    with refused(name="none gates", match="at least one gate"):
         Track("none", (), (0.0, 0.0, 1.0), 1.5, 2.0)
-    assert "at least one gate" in str(caught.value)
 
 
 def test_the_next_gate_is_drawn_in_its_own_colour():
-    environment = Environment(Race(), num_envs=1, seed=1)
-    environment.reset()
+    environment = begun(Race(), seed=1)
     bars = environment.markers()
     assert len(bars) == 4 * 7
     first = {tuple(bar.rgba) for bar in bars[:4]}

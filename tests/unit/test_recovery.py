@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import helpers
 import numpy as np
 import pytest
 
@@ -11,9 +12,7 @@ from quadrl.core.environment import Environment
 
 
 def begun(count=1, **settings):
-    environment = Environment("recovery", num_envs=count, seed=1, **settings)
-    environment.reset()
-    return environment
+    return helpers.begun("recovery", count, seed=1, **settings)
 
 
 def rolled(degrees):

@@ -23,10 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from quadrl import rendering
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.base.errors import QuadrlError, RenderingUnavailable
+from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.primitives import Primitive
 from quadrl.base.shield import shield_triton
-from quadrl.core.environment import Environment
 from quadrl.core.markers import Kind, Marker
 from quadrl.core.scenario import Scenario
 from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER, outcome
@@ -497,7 +496,7 @@ def test_what_is_drawn_carries_its_scenarios(model, name):
     write = write_video if name in ("a.mp4", "a.gif") else write_contact_sheet
     path = write(flights, model, name, **SMALL, fine=False)
     assert [one.to_json() for one in read_scenarios(path)] == [one.to_json() for one in told]
-    with pytest.raises(QuadrlError, match=f"{name} carries no scenario .*quadrl render"):
+    with helpers.refused(match=f"{name} carries no scenario .*quadrl render"):
         path.write_bytes(b"no picture")
         read_scenarios(path)
 
@@ -507,7 +506,7 @@ def test_of_a_flight_made_by_hand_no_scenario_is_known(model):
     write_video(flight(2), model, "a.gif", **SMALL)
     with Image.open("a.gif") as gif:
         assert gif.n_frames == 2  # with the comment before them
-    with pytest.raises(QuadrlError, match="a.gif carries no scenario .its comment holds none"):
+    with helpers.refused(match="a.gif carries no scenario .its comment holds none"):
         read_scenarios("a.gif")
 
 
@@ -547,8 +546,7 @@ def test_gymnasium_shows_the_panel_and_the_outcome():
     begin, same, *_, late, end = pictures[0]
     assert changed(begin, same).sum() < 5
     assert changed(late[119:144, 13:100], end[119:144, 13:100]).mean() > 0.5  # the outcome
-    environment = Environment("hover", seed=0)
-    environment.reset()
+    environment = helpers.begun("hover")
     with contextlib.closing(Pictures(environment, "follow", 160, 96)) as drawing:
         small = drawing.frame()
     with Renderer(environment.scenario.compile_model(), 400, 300) as opened:

@@ -177,10 +177,7 @@ def test_reductions():
         TRPOLoss(actor, critic, reduction="median")(data)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [ValueEstimators.GAE, ValueEstimators.TD0],
-)
+@pytest.mark.parametrize("kind", [ValueEstimators.GAE, ValueEstimators.TD0])
 def test_it_computes_the_advantage_itself(kind):
     actor, critic = make_actor(), make_critic()
     data = rollout(actor)

@@ -14,7 +14,6 @@ from scipy import stats
 from quadrl import tasks
 from quadrl.aircraft import parameters
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.errors import QuadrlError
 from quadrl.conditions.weather import WEATHERS, Weather, WeatherProcess
 from quadrl.core.environment import Environment
 from quadrl.engines import air
@@ -420,7 +419,7 @@ def test_what_was_saved_in_another_weather_is_not_taken_up():
         assert caught.value.allowed
     broken = severe.save()
     broken["weather.table"][-1, 0] = np.nan
-    with pytest.raises(QuadrlError):
+    with helpers.refused():
         severe.restore(broken)
     np.testing.assert_array_equal(severe.engine.air, before)
 
