@@ -182,7 +182,7 @@ def lsy_picture(raced: Iterable[Result]) -> Figure:
     axis.axhline(100 * success, color=ORANGE, lw=0.8)
     title = "LSY's course, level 2: quadrl (circles), the final of summer 2026 (squares)"
     axis.set(xlabel="time [s]", ylabel="successful [%]", title=title)
-    axis.set(xlim=(2.82, 5.2), ylim=(40, 104))
+    axis.set(xlim=(2.82, 5.8), ylim=(40, 104))
     tidy(axis)
     return figure
 
