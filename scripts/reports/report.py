@@ -80,7 +80,7 @@ def packed(value: Any) -> Any:
 def beside(name: str, rows: Mapping[str, list[Result]], only: Collection[str]) -> Result:
     """Rows of some tasks, each with its commit, beside the kept ones of others, in their order."""
     found: Result = {
-        part: [row | {"commit": commit()} for row in new] for part, new in rows.items()
+        part: [{"commit": commit()} | row for row in new] for part, new in rows.items()
     }
     if only:
         before, places = load(name), [*tasks.TASKS]
