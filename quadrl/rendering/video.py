@@ -246,7 +246,7 @@ def _together(
         for drawing in drawings:
             stack.enter_context(contextlib.closing(drawing))
         for pictures in zip(*drawings, strict=True):
-            yield grid(pictures)
+            yield pictures[0] if len(pictures) == 1 else grid(pictures)
 
 
 def listed(one_or_more: Any, count: int = 1) -> list[Any]:
