@@ -272,7 +272,7 @@ class Perching(Task):
         return now.touched[..., 0] & ~now.held
 
     def _shares(self, now: Snapshot) -> list[Array]:
-        """Rate the touch as shares of what is allowed: each is 1 at its limit, (N,)."""
+        """How hard the touch is, as shares of what is allowed, (N,): 1 is the limit."""
         into, along, cosine, rate = (now.touch[..., k] for k in range(4))
         middle, half = (
             (self.most_touch + self.least_touch) / 2,

@@ -31,7 +31,7 @@ def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray,
     """Select the rows that get a seed, (m,), and the seed of each of them, (m,).
 
     Args:
-        seed: Row i gets seed + i, or seed[i] unless that is None.
+        seed: Row i gets seed + i or, of a sequence, seed[i]; None there leaves a row its own.
         rows: Numbers (n,) of the rows that it is for.
         count: Number of all rows.
 

@@ -140,7 +140,8 @@ class Environment(saving.Copied):
         """Begin with the first episode of a seed at the next reset; returns the seed.
 
         Args:
-            seed: Row i gets seed + i, or seed[i] unless that is None; None for one from the system.
+            seed: Row i gets seed + i or, of a sequence, seed[i], where None leaves a row its own;
+                None alone for one from the system.
             rows: Numbers (n,) or mask (N,) of the aircraft that it is for; None for all.
 
         Raises:

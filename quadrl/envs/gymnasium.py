@@ -171,7 +171,7 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         """Begin an episode in every row, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Row i is seeded with seed + i, or with seed[i] unless that is None.
+            seed: Row i gets seed + i or, of a sequence, seed[i]; None there leaves a row its own.
             options: `reset_mask`, (N,) bool; and arrays (N, k) or (k,) of the start, as above.
 
         Returns:
