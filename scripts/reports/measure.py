@@ -13,11 +13,12 @@ from typing import Any
 
 from quadrl import VEHICLES, tasks
 from quadrl.base.units import length, quantity
+from quadrl.control import GeometricController
+from quadrl.core.scenario import Scenario
 from quadrl.engines.engine import ENGINES
-from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.plotting import learning_curves, save
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import Controller, fly, summarize
+from quadrl.evaluation.rollout import Controller, fly, scenario_of, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
@@ -27,7 +28,11 @@ from scripts.reports.report import Result, asked, say, table
 
 # Seeds are not those that settings were chosen with.
 HOVER_SEEDS, SEEDS = (225, 226, 227, 228, 229), (385, 386, 387)
-EPISODES, LONGEST = 100, 300.0  # of an evaluation; [s] that a training may take
+EPISODES = 100  # of an evaluation
+LONGEST = {"race": 3600, "lsy_race": 3600} | dict.fromkeys(
+    ("recovery", "trajectory", "perching", "deck_landing"), 600
+)
+"""Seconds that a training may take; 300 of any other task."""
 AIRBORNE = ("hover", "static_waypoint", "random_waypoint", "straight_and_level", "target_following")
 
 
@@ -57,40 +62,42 @@ def training(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
         only: Names of tasks, beside what was measured of the others; by default all.
     """
     wanted = [task for task in tasks.TASKS if not only or task in only]
-    pairs = [
-        (task, vehicle)
-        for task in wanted
-        for vehicle in VEHICLES
-        if (task == "hover") != (vehicle == "paper")
-    ]
-    both = itertools.product(ENGINES, HOVER_SEEDS if "hover" in wanted else ())
+    hovers = "hover" in wanted
+    both = itertools.product(ENGINES, HOVER_SEEDS if hovers else ())
     alone = [TrainConfig("hover", engine=engine, seed=seed) for engine, seed in both]
+    kinds = [("hover", vehicle) for vehicle in VEHICLES if hovers and vehicle != "paper"]
+    kinds += [(task, tasks.TASKS[task].trained_on) for task in wanted if task != "hover"]
     together = [
-        TrainConfig(task, vehicle=vehicle, seed=seed, num_threads=1)
-        for (task, vehicle), seed in itertools.product(pairs, SEEDS)
-    ]
+        TrainConfig(task, vehicle=vehicle, algo=tasks.TASKS[task].trained_by, seed=seed,
+                    num_threads=1)
+        for (task, vehicle), seed in itertools.product(kinds, SEEDS)
+    ]  # fmt: skip
     runs = runs_of("training", alone, 1, EPISODES) + runs_of("training", together, jobs, EPISODES)
-    found = [
-        trained(run) | flown(Policy.load(run.folder), run.config.task, run.config.vehicle)
-        for run in runs
-    ]
-    yardstick = [
-        flown(make_controller("geometric", *pair), *pair)
-        for pair in dict.fromkeys((run["task"], run["vehicle"]) for run in found)
-    ]
-    for task in wanted:
-        names = runs[0].folder.parent.glob(f"{task}-paper-free_flight-*")
-        metrics = {"ppo": [read_metrics(folder / METRICS) for folder in sorted(names)]}
-        path = report.IMAGES / "curves" / f"{task}.png"
-        save(learning_curves(metrics, task, clocks=("steps",)), path)
-    rows = report.beside("training", {"yardstick": yardstick, "runs": found}, only)
+    found: list[Result] = []
+    yardstick: dict[tuple[str, str], Result] = {}
+    for run in runs:
+        policy = Policy.load(run.folder)
+        scenario = scenario_of(policy, engine="mujoco")
+        found.append(trained(run) | {"metrics": flown(policy, scenario)})
+        kind = task, vehicle = run.config.task, run.config.vehicle
+        if kind not in yardstick:
+            controller = GeometricController(scenario.aircraft, scenario.task)
+            metrics = flown(controller, scenario)
+            yardstick[kind] = {"task": task, "vehicle": vehicle, "metrics": metrics}
+    for name in wanted:
+        task = tasks.TASKS[name]
+        folders = f"{name}-{task.trained_on}-free_flight-{task.trained_by}-*"
+        own = sorted((report.RUNS / "training").glob(folders))
+        metrics = {task.trained_by: [read_metrics(folder / METRICS) for folder in own]}
+        path = report.IMAGES / "curves" / f"{name}.png"
+        save(learning_curves(metrics, name, clocks=("steps",)), path)
+    rows = report.beside("training", {"yardstick": [*yardstick.values()], "runs": found}, only)
     report.save("training", {"episodes": EPISODES} | rows)
 
 
-def flown(controller: Controller, task: str, vehicle: str) -> Result:
-    """What a controller, or the mean action of a policy, reaches in MuJoCo."""
-    rollout = fly(controller, task, episodes=EPISODES, vehicle=vehicle)
-    return {"task": task, "vehicle": vehicle, "metrics": summarize(rollout)}
+def flown(controller: Controller, scenario: Scenario) -> Result:
+    """What a controller, or the mean action of a policy, reaches."""
+    return summarize(fly(controller, scenario, episodes=EPISODES))
 
 
 def speed() -> None:
@@ -137,14 +144,14 @@ def reached_table(name: str) -> str:
 
 def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
     """What a task asks and what each seed and the controller reached, and the seeds."""
-    result = report.load("training")
+    result, task = report.load("training"), tasks.TASKS[name]
     runs, known = (
-        [row for row in result[part] if (row["task"], row["vehicle"]) == (name, "paper")]
+        [row for row in result[part] if (row["task"], row["vehicle"]) == (name, task.trained_on)]
         for part in ("runs", "yardstick")
     )
     runs = [run for run in runs if run["engine"] == "free_flight"][: len(SEEDS)]
     rows = []
-    for target in tasks.TASKS[name].targets:
+    for target in task.targets:
         cells = []
         for metrics in (each["metrics"] for each in (*runs, *known)):
             # Older trainings were not asked for all.
@@ -155,7 +162,7 @@ def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
     if runs:
         words = f"training, {runs[0]['steps']:,} steps, seeds {', '.join(map(str, seeds))}"
         took = (f"{run['training_s']:.0f} s" for run in runs)
-        rows.append((words, f"at most {LONGEST:.0f} s", *took, ""))
+        rows.append((words, f"at most {LONGEST.get(name, 300)} s", *took, ""))
     return rows, seeds
 
 
