@@ -13,7 +13,6 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import (
     Array,
-    cross,
     dot,
     namespace,
     norm,
@@ -27,29 +26,15 @@ from quadrl.core.observation import ObservationTerm
 from quadrl.core.task import EpisodeEnd, Snapshot, Target
 from quadrl.engines.rng import FULL_TURN, Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.gates import Course, GateRace
-from quadrl.tasks.tracks import POLE, Track, attitude, known
+from quadrl.tasks.arena import STAND, Arena, furnished
+from quadrl.tasks.gates import GateRace
+from quadrl.tasks.tracks import Track, attitude, known
 
-NEAR = 0.7  # [m], from how far on it is seen where a gate or a pole truly stands
-ASIDE = 0.15, 0.15, 0.1  # [m], by how much gates may be elsewhere along x, y and z
-ASIDE_POLE = 0.15, 0.15, 0.05  # [m], the same of poles, whose tops are higher or lower
-LEANING = 0.05, 0.1, 0.2  # [rad], by how much gates roll, pitch and turn at most
 BOX = (-2.5, 2.5), (-1.5, 1.5), (0.0, 2.0)  # [m], along x, y and z, which ends a race
-STAND, DEPTH = 0.05, 0.01  # [m], of stands and frames, half their width
 STRAIGHT, LEAD = 0.05, 0.3  # [m]: who is farther aside of a gate than this flies by a place so far
 # before it at most
 WOOD = (0.55, 0.45, 0.35, 1.0)
 ROOM = 0.15  # [m], about the ball, in which a flight costs more
-
-
-@dataclasses.dataclass(frozen=True)
-class Arena(Course):
-    """The race, and where things truly stand."""
-
-    gates: Array  # (N, 9 G) centre [m], unit vectors through each gate and to its left
-    poles: Array  # (N, 3 P) x, y and height of the top [m] of each pole
-    ball: Array  # (N,) [m], radius of the ball that the aircraft is taken for
-    seen: Array  # (N, G + P) 1 for gates and poles that have been near, 0 for others
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,16 +113,10 @@ class LsyRace(GateRace):
         """The track that is flown, as it should be."""
         return known("lsy")
 
-    @functools.cached_property
-    def nominal(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Where gates and poles should be, rows as `Arena` has them, (9 G,) and (3 P,)."""
-        axes = self.course.axes
-        gates = np.concatenate([self.course.centre, axes[:, 0], axes[:, 1]], axis=1)
-        return tuple(gates.ravel().tolist()), tuple(sum(self.course.poles, ()))
-
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Arena]:
         """At rest at the start; or in practice in flight, in the middle of a gate."""
-        arena = self._furnished(rng)
+        size = 1.0 if self.level == 2 else 0.0
+        arena = furnished(rng, self.course, size, (self.least_ball, self.ball))
         where, u = namespace(arena.gates), [rng.uniform(-1.0, 1.0) for _ in range(5)]
         flies = rng.uniform(0.0, 1.0) < self.flying
         middle = rng.uniform(0.0, len(self.course.gates) - 1.0)
@@ -162,54 +141,23 @@ class LsyRace(GateRace):
         begun |= {"passed": gate, "position": position, "leg": norm(goal - position)}
         return start, dataclasses.replace(arena, **begun)
 
-    def _furnished(self, rng: Rng) -> Arena:
-        """An arena with everything where it stands in this episode, before the start."""
-        count, size = len(self.course.gates), 1.0 if self.level == 2 else 0.0
-        gates, poles = self.nominal
-        shift = rng.uniform(-size, size, 6 * count + len(poles))
-        ball = rng.uniform(self.least_ball, self.ball)
-        rows: list[Array] = []
-        for k in range(count):
-            x, y, z, east, north = gates[9 * k : 9 * k + 5]
-            off = [most * shift[..., 6 * k + i] for i, most in enumerate((*ASIDE, *LEANING))]
-            rows += [x + off[0], y + off[1], z + off[2], *_leaning(east, north, *off[3:])]
-        aside = ASIDE_POLE * (len(poles) // 3)
-        stand = [poles[k] + aside[k] * shift[..., 6 * count + k] for k in range(len(poles))]
-        one = 0.0 * shift[..., 0]
-        three, seen = stack(one, one, one), 0.0 * shift[..., : count + len(poles) // 3]
-        course = Course(three, one, three, three, one, one, three, one)
-        return Arena(**vars(course), gates=stack(*rows), poles=stack(*stand), ball=ball, seen=seen)
-
     def update(self, before: Snapshot, now: Snapshot) -> Arena:
         """Go on to the next gate when this one is passed, and remember what has been near."""
-        course = cast(Arena, super().update(before, now))
-        place, xp, seen = now.state.position, namespace(now.time), list[Array]()
-        gates = [(centre[..., 0], centre[..., 1]) for centre, *_ in self._gates(course)]
-        poles = [pole[:2] for pole in self._poles(course)]
-        for k, (x, y) in enumerate([*gates, *poles]):
-            near = _length(place[..., 0] - x, place[..., 1] - y) < NEAR
-            seen.append(xp.where(near, 0 * x + 1, course.seen[..., k]))
-        return dataclasses.replace(course, seen=stack(*seen))
+        arena = cast(Arena, super().update(before, now))
+        return dataclasses.replace(arena, seen=arena.seen_from(now.state.position))
 
     def observe(self, now: Snapshot) -> dict[str, Array]:
         """The race, as far as it has been seen, and the poles."""
-        task, xp, state = now.task, namespace(now.time), now.state
-        count, (gates, poles) = len(self.course.gates), self.nominal
-        near = [task.seen[..., k] > 0 for k in range(count + len(poles) // 3)]
-        places = [xp.where(near[k // 9], task.gates[..., k], gates[k]) for k in range(len(gates))]
-        stand = [
-            xp.where(near[count + k // 3], task.poles[..., k], poles[k]) for k in range(len(poles))
-        ]
-        guessed = dataclasses.replace(task, gates=stack(*places), poles=stack(*stand))
-        ways = [stack(*pole) - state.position for pole in self._poles(guessed)]
+        state, arena = now.state, now.task.guessed(self.course)
+        ways = [stack(*top) - state.position for top in arena.tops]
         away = [to_body(state.rotation, way) for way in ways]
-        seen = super().observe(dataclasses.replace(now, task=guessed))
+        seen = super().observe(dataclasses.replace(now, task=arena))
         return seen | {"poles": stack(*(way[..., k] for way in away for k in range(3)))}
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """As in a race, and away from what stands about."""
         time, xp = rewards.time_share(now.parameters), namespace(now.time)
-        close = xp.clip(1 - (self.room(now) - now.task.ball) / ROOM, 0.0, 1.0)
+        close = xp.clip(1 - (self._room(now) - now.task.ball) / ROOM, 0.0, 1.0)
         nearer = self._way_left(now.task, before.state.position)
         nearer = nearer - self._way_left(now.task, now.state.position)
         nearer = xp.minimum(nearer, self.paid_speed * now.parameters.control_timestep)
@@ -220,22 +168,14 @@ class LsyRace(GateRace):
 
     def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
         """Gates with some numbers (N,), where they stand in the episode."""
-        first, *others = self._gates(task)
-        centre, through, left = first
-        for k, other in enumerate(others, 1):
-            this, xp = (number == k)[..., None], namespace(number)
-            centre, through, left = (
-                xp.where(this, own, before)
-                for own, before in zip(other, (centre, through, left), strict=True)
-            )
-        return centre, through, left
+        return task.frame(number)
 
     def markers(self, now: Snapshot) -> Sequence[Primitive]:
         """The gates with their stands and the poles, where they stand."""
         task, number = now.task, int(now.task.gate[0])
-        gates = [[vector[0] for vector in gate] for gate in self._gates(task)]
+        gates = [[vector[0] for vector in gate] for gate in task.frames]
         axes = [(through, left, np.cross(through, left)) for _, through, left in gates]
-        poles = [[float(x[0]) for x in pole] for pole in self._poles(task)]
+        poles = [[float(x[0]) for x in pole] for pole in task.tops]
         stands: list[Primitive] = []
         for (centre, *_), turned in zip(gates, axes, strict=True):
             frame = self.course.frame / 2
@@ -247,32 +187,14 @@ class LsyRace(GateRace):
 
     def _failed(self, now: Snapshot) -> Array:
         """Against something, on the ground, or out of the box, (N,) bool."""
-        place, out = now.state.position, self.room(now) < now.task.ball
+        place, out = now.state.position, self._room(now) < now.task.ball
         for k, (low, high) in enumerate(BOX):
             out = out | (place[..., k] < low) | (place[..., k] > high)
         return out | super()._failed(now)
 
-    def room(self, now: Snapshot) -> Array:
+    def _room(self, now: Snapshot) -> Array:
         """Distance of the nearest pole, frame or stand from the aircraft's centre, (N,) [m]."""
-        place, xp = now.state.position, namespace(now.time)
-        inner, outer = self.course.opening / 2, self.course.frame / 2
-
-        def past(away: Array, limit: float) -> Array:
-            return xp.clip(away - limit, 0.0, None)
-
-        rooms: list[Array] = []
-        for x, y, top in self._poles(now.task):
-            beside = _length(place[..., 0] - x, place[..., 1] - y)
-            rooms.append(_length(past(beside, POLE), past(place[..., 2], top)))
-        for centre, through, left in self._gates(now.task):
-            off = place - centre
-            along, aside = abs(dot(off, through)), abs(dot(off, left))
-            up = dot(off, cross(through, left))
-            within = past(-xp.maximum(aside, abs(up)), -inner)
-            out = past(aside, outer), past(abs(up), outer)
-            rooms.append(_length(past(along, DEPTH), within, *out))
-            rooms.append(_length(past(along, STAND), past(aside, STAND), past(up, -outer)))
-        return functools.reduce(xp.minimum, rooms)
+        return now.task.room(now.state.position, self.course)
 
     def _way_left(self, task: Any, place: Array) -> Array:
         """Way to the next gate [m], (N,); from aside or behind by a place before it."""
@@ -281,38 +203,3 @@ class LsyRace(GateRace):
         aside = norm(off - along[..., None] * task.through)
         lead = xp.clip(aside + 2 * xp.clip(along, 0.0, None) - STRAIGHT, 0.0, LEAD)
         return norm(off + lead[..., None] * task.through) + lead
-
-    def _gates(self, task: Any) -> list[tuple[Array, Array, Array]]:
-        """Centre, and unit vectors through it and to its left, of each gate, (N, 3) each."""
-        rows = [task.gates[..., 9 * k : 9 * k + 9] for k in range(len(self.course.gates))]
-        return [(row[..., :3], row[..., 3:6], row[..., 6:]) for row in rows]
-
-    def _poles(self, task: Any) -> list[tuple[Array, ...]]:
-        """East, north and height of the top of each pole, (N,) each."""
-        return [
-            tuple(task.poles[..., 3 * pole + k] for k in range(3))
-            for pole in range(len(self.course.poles))
-        ]
-
-
-def _leaning(east: float, north: float, roll: Array, pitch: Array, turn: Array) -> list[Array]:
-    """Unit vectors through a gate and to its left, (N,) each component.
-
-    Args:
-        east: Of the way through it as it should be, which is level.
-        north: The same.
-        roll: About that way [rad], (N,).
-        pitch: Down, about what is to its left [rad], (N,).
-        turn: Counter-clockwise from above [rad], (N,).
-    """
-    xp = namespace(turn)
-    (a, b), (c, d), (e, f) = ((xp.cos(x), xp.sin(x)) for x in (turn, pitch, roll))
-    cosine, sine = east * a - north * b, north * a + east * b
-    across = d * f
-    through = [cosine * c, sine * c, -d]
-    return [*through, cosine * across - sine * e, sine * across + cosine * e, c * f]
-
-
-def _length(*parts: Array) -> Array:
-    """Length of vectors by their components, (N,)."""
-    return norm(stack(*parts))

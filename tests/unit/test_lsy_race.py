@@ -7,6 +7,7 @@ from helpers import refused
 
 from quadrl import tasks
 from quadrl.core.environment import Environment
+from quadrl.tasks.arena import nominal
 from quadrl.tasks.lsy_race import LsyRace
 
 AT_REST = {"velocity": (0.0, 0.0, 0.0), "quaternion": (1, 0, 0, 0)}
@@ -45,7 +46,7 @@ def test_what_is_free_is_the_distance_that_mujoco_measures():
     draw = np.random.default_rng(0)
     places = draw.uniform((-1.6, -1.0, 0.3), (1.4, 1.0, 1.6), (60, 3))
     now = begun(60, places).snapshot
-    found = LsyRace().room(now)
+    found = now.task.room(now.state.position, LsyRace().course)
     for row in range(60):
         model, data = world(now.task, row)
         data.mocap_pos[0] = now.state.position[row]
@@ -57,7 +58,7 @@ def test_what_is_free_is_the_distance_that_mujoco_measures():
 
 
 def test_gates_and_poles_stand_elsewhere_in_each_episode_of_level_two_alone():
-    gates, poles = (np.array(rows) for rows in LsyRace().nominal)
+    gates, poles = (np.array(rows) for rows in nominal(LsyRace().course))
     for level in (0, 1, 2):
         task = begun(200, level=level).snapshot.task
         moved = abs(task.gates - gates).reshape(200, -1, 3, 3)[..., 0, :]
@@ -84,7 +85,7 @@ def test_gates_and_poles_stand_elsewhere_in_each_episode_of_level_two_alone():
 def test_where_they_truly_stand_is_seen_from_near_and_known_from_then_on():
     environment = begun(1, (-1.5, 0.75, 0.5))
     truth = environment.snapshot.task
-    gates, poles = (np.array(rows).reshape(4, -1) for rows in LsyRace().nominal)
+    gates, poles = (np.array(rows).reshape(4, -1) for rows in nominal(LsyRace().course))
 
     def seen(position):
         """The first gate and the poles, world frame, as an aircraft sees them from somewhere."""

@@ -1,0 +1,147 @@
+"""What stands about in the LSY race: its gates and poles, elsewhere in each episode."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from quadrl.base.rotation import Array, cross, dot, namespace, norm, stack
+from quadrl.engines.rng import Rng
+from quadrl.tasks.gates import Course
+from quadrl.tasks.tracks import POLE, Track
+
+NEAR = 0.7  # [m], from how far on it is seen where a gate or a pole truly stands
+ASIDE = 0.15, 0.15, 0.1  # [m], by how much gates may be elsewhere along x, y and z
+ASIDE_POLE = 0.15, 0.15, 0.05  # [m], the same of poles, whose tops are higher or lower
+LEANING = 0.05, 0.1, 0.2  # [rad], by how much gates roll, pitch and turn at most
+STAND, DEPTH = 0.05, 0.01  # [m], of stands and frames, half their width
+
+
+@dataclasses.dataclass(frozen=True)
+class Arena(Course):
+    """The race, and where G gates and P poles truly stand."""
+
+    gates: Array  # (N, 9 G) centre [m], unit vectors through each gate and to its left
+    poles: Array  # (N, 3 P) x, y and height of the top [m] of each pole
+    ball: Array  # (N,) [m], radius of the ball that the aircraft is taken for
+    seen: Array  # (N, G + P) 1 for gates and poles that have been near, 0 for others
+
+    @property
+    def frames(self) -> list[tuple[Array, Array, Array]]:
+        """Centre, and unit vectors through it and to its left, of each gate, (N, 3) each."""
+        rows = [self.gates[..., k : k + 9] for k in range(0, self.gates.shape[-1], 9)]
+        return [(row[..., :3], row[..., 3:6], row[..., 6:]) for row in rows]
+
+    @property
+    def tops(self) -> list[tuple[Array, ...]]:
+        """East, north and height of the top of each pole, (N,) each."""
+        columns = [self.poles[..., k] for k in range(self.poles.shape[-1])]
+        return [tuple(columns[k : k + 3]) for k in range(0, len(columns), 3)]
+
+    def frame(self, number: Array) -> tuple[Array, Array, Array]:
+        """The gates with some numbers (N,), as `frames` has them."""
+        (centre, through, left), *others = self.frames
+        for k, other in enumerate(others, 1):
+            this, xp = (number == k)[..., None], namespace(number)
+            centre, through, left = (
+                xp.where(this, own, before)
+                for own, before in zip(other, (centre, through, left), strict=True)
+            )
+        return centre, through, left
+
+    def seen_from(self, place: Array) -> Array:
+        """What has been near, with what is near a place (N, 3)."""
+        xp, seen = namespace(place), list[Array]()
+        gates = [(centre[..., 0], centre[..., 1]) for centre, *_ in self.frames]
+        for k, (x, y) in enumerate([*gates, *(top[:2] for top in self.tops)]):
+            near = _length(place[..., 0] - x, place[..., 1] - y) < NEAR
+            seen.append(xp.where(near, 0 * x + 1, self.seen[..., k]))
+        return stack(*seen)
+
+    def guessed(self, track: Track) -> Arena:
+        """Everything where it has been seen, or else where it should be."""
+        xp, (gates, poles) = namespace(self.ball), nominal(track)
+        near = [self.seen[..., k] > 0 for k in range(self.seen.shape[-1])]
+        places = [xp.where(near[k // 9], self.gates[..., k], gates[k]) for k in range(len(gates))]
+        rest = near[len(track.gates) :]
+        stand = [xp.where(rest[k // 3], self.poles[..., k], poles[k]) for k in range(len(poles))]
+        return dataclasses.replace(self, gates=stack(*places), poles=stack(*stand))
+
+    def room(self, place: Array, track: Track) -> Array:
+        """Distance of the nearest pole, frame or stand from a place (N, 3), (N,) [m]."""
+        xp = namespace(place)
+        inner, outer = track.opening / 2, track.frame / 2
+
+        def past(away: Array, limit: float) -> Array:
+            return xp.clip(away - limit, 0.0, None)
+
+        rooms: list[Array] = []
+        for x, y, top in self.tops:
+            beside = _length(place[..., 0] - x, place[..., 1] - y)
+            rooms.append(_length(past(beside, POLE), past(place[..., 2], top)))
+        for centre, through, left in self.frames:
+            off = place - centre
+            along, aside = abs(dot(off, through)), abs(dot(off, left))
+            up = dot(off, cross(through, left))
+            within = past(-xp.maximum(aside, abs(up)), -inner)
+            out = past(aside, outer), past(abs(up), outer)
+            rooms.append(_length(past(along, DEPTH), within, *out))
+            rooms.append(_length(past(along, STAND), past(aside, STAND), past(up, -outer)))
+        return functools.reduce(xp.minimum, rooms)
+
+
+@functools.cache
+def nominal(track: Track) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Where gates and poles should be, rows as `Arena` has them, (9 G,) and (3 P,)."""
+    gates = np.concatenate([track.centre, track.axes[:, 0], track.axes[:, 1]], axis=1)
+    return tuple(gates.ravel().tolist()), tuple(sum(track.poles, ()))
+
+
+def furnished(rng: Rng, track: Track, size: float, balls: tuple[float, float]) -> Arena:
+    """An arena before the start of an episode.
+
+    Args:
+        rng: Draws where everything stands.
+        track: Where it should.
+        size: 1 where it stands elsewhere, 0 where it does not.
+        balls: Radius of the smallest and of the largest ball [m].
+    """
+    count, (gates, poles) = len(track.gates), nominal(track)
+    shift = rng.uniform(-size, size, 6 * count + len(poles))
+    ball = rng.uniform(*balls)
+    rows: list[Array] = []
+    for k in range(count):
+        x, y, z, east, north = gates[9 * k : 9 * k + 5]
+        off = [most * shift[..., 6 * k + i] for i, most in enumerate((*ASIDE, *LEANING))]
+        rows += [x + off[0], y + off[1], z + off[2], *_leaning(east, north, *off[3:])]
+    aside = ASIDE_POLE * (len(poles) // 3)
+    stand = [poles[k] + aside[k] * shift[..., 6 * count + k] for k in range(len(poles))]
+    one = 0.0 * shift[..., 0]
+    three, seen = stack(one, one, one), 0.0 * shift[..., : count + len(poles) // 3]
+    course = Course(three, one, three, three, one, one, three, one)
+    return Arena(**vars(course), gates=stack(*rows), poles=stack(*stand), ball=ball, seen=seen)
+
+
+def _leaning(east: float, north: float, roll: Array, pitch: Array, turn: Array) -> list[Array]:
+    """Unit vectors through a gate and to its left, (N,) each component.
+
+    Args:
+        east: Of the way through it as it should be, which is level.
+        north: The same.
+        roll: About that way [rad], (N,).
+        pitch: Down, about what is to its left [rad], (N,).
+        turn: Counter-clockwise from above [rad], (N,).
+    """
+    xp = namespace(turn)
+    (a, b), (c, d), (e, f) = ((xp.cos(x), xp.sin(x)) for x in (turn, pitch, roll))
+    cosine, sine = east * a - north * b, north * a + east * b
+    across = d * f
+    through = [cosine * c, sine * c, -d]
+    return [*through, cosine * across - sine * e, sine * across + cosine * e, c * f]
+
+
+def _length(*parts: Array) -> Array:
+    """Length of vectors by their components, (N,)."""
+    return norm(stack(*parts))
