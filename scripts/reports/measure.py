@@ -130,7 +130,8 @@ def suite_table() -> str:
     """Every task beside what counts as solved and the geometric controller."""
     rows = []
     for name in tasks.TASKS:
-        rows += [(f"`{name}`" if k == 0 else "", *row) for k, row in enumerate(reached(name)[0])]
+        own, seeds = reached(name)
+        rows += [(f"`{name}`" if k == 0 else "", *row) for k, row in enumerate(own) if seeds]
     seeds = ("first seed", "second seed", "third seed")
     return table(("task", "figure", "asked", *seeds, "geometric controller"), rows)
 
