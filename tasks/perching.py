@@ -98,7 +98,8 @@ class Perching(Task):
     survival_weight: float = 0.0
     """Reward per 0.05 s: none, or it would stay in the air."""
     time_weight: float = 4.0
-    """Cost of each 0.05 s before the touch: without it aircraft learn to wait before a wall."""
+    """Cost of each 0.05 s, in `perching` before the touch: without it aircraft learn to wait
+    before a wall."""
     success_weight: float = 250.0
     """Reward for staying on the surface."""
     touch_weight: float = 50.0
