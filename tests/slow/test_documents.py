@@ -161,10 +161,16 @@ def test_every_task_has_a_page():
 
 
 @pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)
-def test_studies_of_the_paper_can_be_trained(file, tmp_path):
-    plan = read_plan(file, tmp_path)
+def test_every_study_can_be_read_and_is_on_a_page(file, tmp_path):
+    assert read_plan(file, tmp_path).runs
+    assert any(f"docs/studies/{file.name}" in text for text in TEXTS.values())
+
+
+@pytest.mark.parametrize("name", ["paper", "paper_noise"])
+def test_studies_of_the_paper_can_be_trained(name, tmp_path):
+    plan = read_plan(REPOSITORY / "docs" / "studies" / f"{name}.toml", tmp_path)
     assert {run.config.seed for run in plan.runs} == {*range(1000, 1020)}
-    assert f"docs/studies/{file.name}" in TEXTS["docs/paper.md"]
+    assert f"docs/studies/{name}.toml" in TEXTS["docs/paper.md"]
     # A task's algorithms get as many steps, and practise the same.
     practised = {
         task: {
