@@ -173,3 +173,11 @@ def test_progress_is_paid_up_to_a_speed_and_leads_around_the_second_gate():
         done = environment.step(np.zeros((1, 4)))
         step = environment.vehicle.control_timestep
         assert done.reward_terms["progress"][0] == pytest.approx(10.0 * paid * step, rel=0.25)
+
+
+def test_a_moment_costs_what_is_asked_for_five_hundredths_of_a_second():
+    for weight in (0.0, 0.5):
+        environment = begun(2, time_weight=weight)
+        done = environment.step(np.zeros((2, 4)))
+        cost = weight * environment.vehicle.control_timestep / 0.05
+        assert done.reward_terms["time"] == pytest.approx([-cost, -cost])
