@@ -16,7 +16,7 @@ from quadrl import tasks
 from quadrl.aircraft.aerodynamics import EFFECTS
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm
-from quadrl.base.units import length
+from quadrl.base.units import length, quantity
 from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Randomization
 from quadrl.conditions.weather import WEATHERS
 from quadrl.control import Gains, GeometricController
@@ -25,12 +25,13 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import setting
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import flights, fly
+from quadrl.evaluation.rollout import BEHAVIOUR, flights, fly
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import WIDE
 from scripts.reports import report
 from scripts.reports.measure import AIRBORNE, runs_of
 from scripts.reports.report import Result, say, table
+from scripts.reports.task_pages import FIGURES
 
 UNCERTAIN = Randomization(
     mass=(0.8, 1.2), command_delay=(0.02, 0.02), noise=Errors(1e-3, 1e-3, 2e-3, 2e-3)
@@ -41,6 +42,7 @@ NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without eff
 FRESH = 100_300  # first episode, beyond those that the gains were chosen by
 ALL_TOGETHER: Conditions = {"weather": "light", "randomization": "full", "aerodynamics": "full"}
 SEEDS = range(645, 650)  # not used for tuning
+WAYS_OF = ("nothing", "uncertain", "all together")  # of which `ways_table` says how they fly
 
 
 class Integrating(GeometricController):
@@ -103,8 +105,10 @@ def flown(flyer: Any, task: str, condition: Conditions, episodes: int) -> Result
     given: Any = UNDISTURBED | condition | {"engine": engine}
     _, controller, scenario = setting(flyer, made, **given)
     each = flights(fly(controller, scenario, episodes=episodes, seed=FRESH))
-    middle = {name: float(np.median(each[name])) for name in ("position_error_m", "yaw_rate_rad_s")}
-    return {"success": float(each["success"].mean()), **middle}
+    reached = {"success": float(each["success"].mean())}
+    for name in ("position_error_m", *(name for name in BEHAVIOUR if name in each)):
+        reached[name] = float((np.min if name == "least_height_m" else np.median)(each[name]))
+    return reached
 
 
 def robust(
@@ -218,5 +222,25 @@ def robust_table() -> str:
     return f"{table(('task', 'flown by', *UNSURE), rows)}\n\n{note}"
 
 
-PARTS: report.Parts = {"robust": robust_table, "robustness-half": half_table,
-                       "robustness-alone": alone_table}  # fmt: skip
+def ways_table() -> str:
+    """How the policies for uncertain aircraft and the controller fly, beside where."""
+    result, groups = report.load("robust"), {}
+    for row in result["rows"]:
+        who = "tuned controller" if row["seed"] == "controller" else "robust policies"
+        if row["condition"] in WAYS_OF:
+            groups.setdefault((f"`{row['task']}`", who, row["condition"]), []).append(row)
+    rows = []
+    for key, found in groups.items():
+        values = {name: [row[name] for row in found if row.get(name) is not None]
+                  for name in BEHAVIOUR}  # fmt: skip
+        middle = {name: np.median(each) for name, each in values.items() if each}
+        if values["least_height_m"]:
+            middle["least_height_m"] = min(values["least_height_m"])
+        cells = (quantity(name, middle[name]) if name in middle else "" for name in BEHAVIOUR)
+        rows.append((*key, *cells))
+    head = ("task", "flown by", "flown in", *(FIGURES[name] for name in BEHAVIOUR))
+    return table(head, rows)
+
+
+PARTS: report.Parts = {"robust": robust_table, "robust-ways": ways_table,
+                       "robustness-half": half_table, "robustness-alone": alone_table}  # fmt: skip

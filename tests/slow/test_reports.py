@@ -134,6 +134,10 @@ def test_policies_for_uncertain_aircraft_fly_beside_the_controller(short):
     assert set(calm.values()) == {0.0} and len(calm) == 2  # two batches teach nothing
     text = robustness.robust_table()
     assert "| 100.0, " in text and "| 0.0 [0.0, 0.0], " in text and "rad/s |" in text
+    ways = robustness.ways_table().splitlines()[2:]
+    assert len(ways) == 2 * len(robustness.WAYS_OF)
+    _, fallen, _, _, calm, _ = (float(row.split("|")[5].split()[-2]) for row in ways)  # circling
+    assert calm < 0.05 < fallen
 
 
 def test_every_policy_is_flown_in_every_condition(monkeypatch):
