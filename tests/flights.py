@@ -19,6 +19,7 @@ from quadrl.engines import mjcf
 from quadrl.engines.rng import Rng
 from quadrl.engines.solids import Solids
 from quadrl.engines.state import State
+from quadrl.engines.threads import Threads
 
 
 def fly(api, task, seed, actions, mode="rotor"):
@@ -76,7 +77,7 @@ def by_mj_step(task, seed, mode):
     data, scene = mujoco.MjData(model), Scene(task.solids())
     row = parameters.rows(vehicle)
     origin = np.array([0.0, 0.0, max(task.altitude, vehicle.ground_clearance)])
-    solids = Solids(model, 1, origin, lambda name: getattr(model, name)[None])
+    solids = Solids(model, 1, origin, lambda name: getattr(model, name)[None], Threads(1, 1))
     hits, feet = np.split(data.userdata[None, parameters.AIR :], [parameters.HIT], axis=1)
     world = types.SimpleNamespace(solids=solids, hits=hits, feet=feet)
     world.clearance = lambda rows: solids.clearance(data.qpos[None], row, vehicle.rotor_count)

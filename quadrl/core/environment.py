@@ -120,6 +120,10 @@ class Environment(saving.Copied):
         """Where each named term of the observation stands in the flat vector."""
         self.size = max(part.stop for part in self.layout.values())
         self._solids_move = type(self.task).move is not Task.move
+        self._solids_leave = self._solids_move or type(self.task).place is not Task.place
+        if self.scene.solids:
+            declared = self.scene.poses({}, self.num_envs, self.origin)
+            engine.solids.place(np.arange(self.num_envs), declared)
         self.stepwise = self.control_mode.has_loops or self.randomizer.late or self._solids_move
         """Whether a control step is flown in parts, which `control` prepares."""
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
@@ -198,8 +202,8 @@ class Environment(saving.Copied):
             height = begun.position[:, 2] + self.origin[2]
             mean = self.blowing.mean_wind(*place, height, wind_speed)
             begun = trimmed(self.vehicle, begun, mean)
-        poses = None  # of the solids, where there are any
-        if self.scene.solids:
+        poses = None  # of the solids, where they do not stay
+        if self._solids_leave:
             placed = self.task.place(Rng(*place, SOLIDS), begun, task_state)
             poses = self.scene.poses(placed, len(rows), self.origin)
         state = self.engine.place(rows, begun, table, poses)

@@ -25,8 +25,8 @@ from quadrl.aircraft.parameters import AIR, AIRCRAFT, MAX_ROTORS, ROW_SIZE, Para
 from quadrl.base.rotation import Array
 from quadrl.base.trace import Trace
 from quadrl.engines import dynamics
-from quadrl.engines.free_flight import LANES
 from quadrl.engines.native import compiling
+from quadrl.engines.threads import LANES
 
 COORDINATES = 13
 """Numbers of a motion beside its rotor speeds: 7 of qpos, 6 of qvel."""

@@ -20,6 +20,7 @@ from quadrl.engines.adjoint import Leg
 from quadrl.engines.free_flight import FreeFlight
 from quadrl.engines.solids import Solids
 from quadrl.engines.state import FIRST, Frame, Start, State
+from quadrl.engines.threads import Threads
 
 EngineName = Literal["mujoco", "free_flight"]
 ENGINES: tuple[EngineName, ...] = ("mujoco", "free_flight")
@@ -63,15 +64,17 @@ class Engine(abc.ABC):
         )
         self.air = fields["userdata"][:, : parameters.AIR]
         self.wind = self.air[:, :3]
-        self.solids = Solids(self.model, self.num_envs, self.origin, self._model_field)
+        self._threads = Threads(self.num_envs, threads)
+        placed = self.model, self.num_envs, self.origin, self._model_field
+        self.solids = Solids(*placed, self._threads)
         self.hits, self.feet = (
             fields["userdata"][:, parameters.AIR :][:, part]
             for part in (np.s_[: parameters.HIT], np.s_[parameters.HIT :])
         )
         """(N, HIT) of this control step and (N, FEET) of this episode, live; (N, 0) in a world
         without solids."""
-        flies = name != "mujoco"
-        self._free_flight = FreeFlight(self.model, fields, threads, self.solids) if flies else None
+        flies, flown = name != "mujoco", (self.model, fields, self._threads, self.solids)
+        self._free_flight = FreeFlight(*flown) if flies else None
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
         self._middle: Frame | None = None
@@ -281,6 +284,8 @@ class Engine(abc.ABC):
 
     def clearance(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Lower bound of aircraft's distance to a solid, (n,) [m]; infinite without solids."""
+        if rows is None and self.forked:
+            rows = np.arange(self.num_envs)  # without threads
         return self.solids.clearance(self.qpos, self.parameters, self.vehicle.rotor_count, rows)
 
     def _write(self, rows: np.ndarray, start: Start | State) -> None:

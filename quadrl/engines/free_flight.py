@@ -9,7 +9,6 @@ are the callbacks' own (`native/aero.h`), and so are the bytes of the parameters
 from __future__ import annotations
 
 import math
-from concurrent.futures import Future, ThreadPoolExecutor
 
 import mujoco
 import numpy as np
@@ -18,13 +17,10 @@ from quadrl.aircraft.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 from quadrl.base.errors import QuadrlError
 from quadrl.engines import native
 from quadrl.engines.solids import Solids, geoms_of_solids
+from quadrl.engines.threads import LANES, Threads
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
 """Those of mjData that free flight reads or writes."""
-ROWS_PER_THREAD = 256
-"""Aircraft that are worth a thread."""
-LANES = 8
-"""Aircraft that the kernel flies side by side."""
 MARGIN = 0.05
 """Clearance at which MuJoCo takes over [m]; more than what a contact's own margin is."""
 
@@ -33,14 +29,14 @@ class FreeFlight:
     """Advances the rows of a simulation in place."""
 
     def __init__(
-        self, model: mujoco.MjModel, fields: dict[str, np.ndarray], threads: int, solids: Solids
+        self, model: mujoco.MjModel, fields: dict[str, np.ndarray], threads: Threads, solids: Solids
     ) -> None:
         """Check the model and take the addresses.
 
         Args:
             model: A model of `quadrl.engines.mjcf`.
             fields: Live arrays (N, k) of FIELDS, all with one stride between aircraft.
-            threads: Threads to fly on.
+            threads: To fly on.
             solids: Those about the aircraft.
 
         Raises:
@@ -54,11 +50,7 @@ class FreeFlight:
         self._stride = stride
         self.world, self._solids = world(model), solids
         self._near = np.zeros(count, dtype=np.int8)
-        parts = max(1, min(threads, count // ROWS_PER_THREAD))
-        # Whole groups of lanes to each, so that no group is flown twice.
-        ends = [LANES * (count * k // parts // LANES) for k in range(parts)] + [count]
-        self._parts = list(zip(ends, ends[1:], strict=False))
-        self._pool = ThreadPoolExecutor(parts - 1) if parts > 1 else None
+        self._threads = threads
 
     def use(self, table: np.ndarray) -> None:
         """Take rows of parameters (N,), or one (1,) for all; that one is live."""
@@ -88,12 +80,8 @@ class FreeFlight:
             None, or the numbers of the aircraft that could touch something meanwhile: they were
             left as they are, and are MuJoCo's.
         """
-        waiting: list[Future[int]] = []
-        if self._pool is not None:  # ctypes lets go of the interpreter, so the parts fly together
-            others = self._parts[1:]
-            waiting = [self._pool.submit(self._kernel, self._address, *p, steps) for p in others]
-        marked = self._kernel(self._address, *self._parts[0], steps)
-        marked += sum(part.result() for part in waiting)
+        address = self._address
+        marked = self._threads.call(lambda first, end: self._kernel(address, first, end, steps))
         return np.flatnonzero(self._near) if marked else None
 
 

@@ -17,6 +17,7 @@ from quadrl.aircraft.parameters import MARK
 from quadrl.base.primitives import Shape
 from quadrl.base.rotation import cross, rotation_matrix
 from quadrl.engines import native
+from quadrl.engines.threads import Threads
 
 KINDS: dict[mujoco.mjtGeom, Shape] = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
@@ -28,7 +29,7 @@ MOTION = 6
 """Where velocity and angular velocity of a geom stand in its user data, and their derivatives."""
 SOLID = np.dtype([("kind", "f8"), ("size", "f8", 3), ("position", "f8", 3), ("turn", "f8", 9)])
 """`Solid` in native/solids.h."""
-NEARBY = np.dtype([("place", "f8", 3), ("distance", "f8", 9), ("which", "i4", 8)])
+NEARBY = np.dtype([("place", "f8", 3), ("distance", "f8", 9), ("solid", SOLID, 8)])
 """`Nearby` there."""
 
 
@@ -48,6 +49,7 @@ class Solids:
         count: int,
         origin: np.ndarray,
         field: Callable[[str], np.ndarray],
+        threads: Threads,
     ) -> None:
         """Take kinds and sizes from the model; all stand at the origin until they are placed.
 
@@ -56,8 +58,10 @@ class Solids:
             count: Number of aircraft, N.
             origin: (3,) of the task frame [m], world frame.
             field: Gives a field of the model with a leading axis N, live.
+            threads: To measure on.
         """
         self.geoms, self._origin, self._field = geoms_of_solids(model), origin, field
+        self._threads, self._kernel = threads, native.library().quadrl_clearance
         _, which, *offset = model.geom_user[self.geoms].T[:5] if len(self.geoms) else [[]] * 5
         self._first = np.unique(which, return_index=True)[1]  # geom of each solid
         self._offsets = np.transpose(offset)[self._first]
@@ -145,8 +149,7 @@ class Solids:
             rotors: How many each has.
             rows: Of which aircraft; by default of all.
         """
-        count, ids = (len(qpos), None) if rows is None else (len(rows), rows.ctypes.data)
-        out = np.full(count, np.inf)
+        out = np.full(len(qpos) if rows is None else len(rows), np.inf)
         if len(self.geoms):
             row = parameters.strides[0] // 8 if len(parameters) > 1 else 0
             arrays = (qpos, parameters, self.table, self.nearby)
@@ -155,7 +158,11 @@ class Solids:
                 [*(array.ctypes.data for array in arrays), qpos.strides[0] // 8, row,
                  len(self.geoms), rotors]
             )  # fmt: skip
-            native.library().quadrl_clearance(where.ctypes.data, count, ids, out.ctypes.data)
+            measure, about, into = self._kernel, where.ctypes.data, out.ctypes.data
+            if rows is None:
+                self._threads.call(lambda first, end: measure(about, first, end, None, into))
+            else:
+                measure(about, 0, len(rows), rows.ctypes.data, into)
         return out
 
 

@@ -154,6 +154,7 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
         Layer("the same by velocities, flown by loops", FREE_FLIGHT,
               flying(task, control_mode="velocity"), 1 / 3),
         Layer(f"the same among {POSTS} posts", FREE_FLIGHT, flying(_among_posts(task)), 0.80),
+        Layer("only how far those posts are", FREE_FLIGHT, _clearance(_among_posts(task)), 4.0),
         Layer(f"Gymnasium make_vec of {size}", ALL_CORES, _vectors(vectors)),
     ]  # fmt: skip
     if importlib.util.find_spec("torchrl"):
@@ -272,6 +273,14 @@ def _among_posts(task: Task) -> Task:
     ]
     own = {"name": f"{task.name}_among_posts", "solids": lambda _: posts}
     return type("AmongPosts", (type(task),), own)()
+
+
+def _clearance(task: Task) -> Work:
+    environment = Environment(task, num_envs=FREE_FLIGHT_ENVS, seed=0, engine="free_flight")
+    environment.reset()
+    while True:
+        environment.engine.clearance()
+        yield FREE_FLIGHT_ENVS
 
 
 def _vectors(envs: Any) -> Work:

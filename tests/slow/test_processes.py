@@ -193,6 +193,12 @@ FORKED = """
             in_a_child(lambda: in_a_child(child))
             assert fly(environment, 5) == expected
 
+    boat = Environment("deck_landing", num_envs=1024, seed=3, num_threads=2)
+    boat.reset()
+    boat.step(np.zeros((1024, 4)))
+    saved = boat.save()
+    in_a_child(lambda: boat.restore(saved))  # which measures how far the deck is
+
     bare = BatchEngine(Vehicle(), 128, altitude=3.0, num_threads=2)
     bare.advance(1)
 

@@ -11,8 +11,8 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import in_real_air
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
 from quadrl.engines import mjcf, native
-from quadrl.engines.free_flight import LANES
 from quadrl.engines.mujoco import BatchEngine, DataEngine
+from quadrl.engines.threads import LANES
 
 CALM, IN_AIR = Vehicle(), in_real_air(Vehicle())
 VEHICLES = {"calm": CALM, "in air": IN_AIR}

@@ -39,7 +39,7 @@ _KINDS = {
 _KERNELS = {
     "state": (_INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER),
     "unsound_air": (_INTEGER, _POINTER, _INTEGER),
-    "clearance": (None, _POINTER, _INTEGER, _POINTER, _POINTER),
+    "clearance": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER),
     "free_flight": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _INTEGER),
     "weather": (None, _POINTER, _INTEGER, _POINTER, _INTEGER),
     "estimate": (None, _POINTER, _INTEGER),

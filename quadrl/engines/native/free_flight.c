@@ -77,7 +77,7 @@ static int may_touch(const Solid* solids, int64_t count, Nearby* list, double re
   if (way_since(list, p) + way < list->distance[0]) return 0;
   if (!(way_since(list, p) + way < list->distance[LISTED])) list_nearest(solids, count, p, list);
   for (int64_t k = 0; k < count && k < LISTED; ++k) {
-    if (!(solid_distance(solids + list->which[k], p) > way)) return 1;
+    if (!(solid_distance(list->solid + k, p) > way)) return 1;
   }
   return !(way_since(list, p) + way < list->distance[LISTED]);
 }

@@ -18,6 +18,8 @@ typedef struct {
   int64_t stride, row, count, rotors;
 } Rows;
 
+enum { AHEAD = 4, CACHE_LINE = 64 };  // aircraft, bytes
+
 // The spheres around the hull and around each rotor's disc, body frame, and a radius about the
 // centre of mass that holds all of them.
 typedef struct {
@@ -44,11 +46,12 @@ static Outline outline_of(const Aircraft* a, int64_t rotors) {
   return o;
 }
 
-// Distance of the nearest solid from the spheres of the outline, for n aircraft (ids: which; NULL:
-// the first n): what is free at least [m].
-QUADRL_EXPORT void quadrl_clearance(const Rows* rows, int64_t n, const int64_t* ids, double* out) {
+// Distance of the nearest solid from the spheres of the outline, for the aircraft first..last-1, or
+// for those of ids: what is free at least [m].
+QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t last,
+                                       const int64_t* ids, double* out) {
   Outline own = outline_of((const Aircraft*)rows->parameters, rows->rotors);
-  for (int64_t row = 0; row < n; ++row) {
+  for (int64_t row = first; row < last; ++row) {
     const int64_t i = ids ? ids[row] : row;
     const double* p = rows->qpos + i * rows->stride;
     const double w = p[3], x = p[4], y = p[5], z = p[6];
@@ -67,6 +70,14 @@ QUADRL_EXPORT void quadrl_clearance(const Rows* rows, int64_t n, const int64_t* 
     }
     const Solid* solids = rows->solids + i * rows->count;
     Nearby* list = rows->nearby + i;
+    // What the next aircraft knows is not in the cache.
+    if (row + AHEAD < last) {
+      const int64_t next = ids ? ids[row + AHEAD] : row + AHEAD;
+      for (size_t k = 0; k < sizeof(Nearby) / 3; k += CACHE_LINE) {
+        __builtin_prefetch((const char*)(rows->nearby + next) + k);
+      }
+      __builtin_prefetch(rows->qpos + next * rows->stride);
+    }
     // Whether some part of the aircraft may be nearer to a solid that is not listed.
     const double *then = list->distance, *next = then + LISTED;
     double way = way_since(list, p);
@@ -80,7 +91,7 @@ QUADRL_EXPORT void quadrl_clearance(const Rows* rows, int64_t n, const int64_t* 
       // No part of the aircraft is nearer to it than this, which spares most solids a closer look:
       // nor to any of those that were farther when they were listed.
       if (!all && then[s] - way - own.reach > least) break;
-      const Solid* solid = solids + (all ? s : list->which[s]);
+      const Solid* solid = (all ? solids : list->solid) + s;
       if (solid_distance(solid, p) - own.reach > least) continue;
       for (int64_t k = 0; k <= rows->rotors; ++k) {
         const double free = solid_distance(solid, points[k]) - own.radius[k];
@@ -89,4 +100,5 @@ QUADRL_EXPORT void quadrl_clearance(const Rows* rows, int64_t n, const int64_t* 
     }
     out[row] = least;
   }
+  return last - first;
 }

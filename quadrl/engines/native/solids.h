@@ -37,16 +37,16 @@ static double solid_distance(const Solid* s, const double point[3]) {
   return out > 0 ? sqrt(out) : in;
 }
 
-// The solids that were the nearest to a place, in order, and how far they were; the last distance is
-// that of the next one, which is not listed. On the way from there a distance changes by no more
-// than the way is long, so that most steps need no look at all the others. A place that is not a
-// number: they are not known. Written here, and made unknown by quadrl/engines/solids.py whenever a
-// solid is put somewhere else.
+// Copies of the solids that were the nearest to a place, in order, and how far they were; the last
+// distance is that of the next one, which is not listed. On the way from there a distance changes by
+// no more than the way is long, so that most steps need no look at all the others, which are far
+// away in memory. A place that is not a number: they are not known. Written here, and made unknown
+// by quadrl/engines/solids.py whenever a solid is put somewhere else.
 enum { LISTED = 8 };
 #define ROUNDING 1e-9  // [m], more than the error of any distance
 typedef struct {
   double place[3], distance[LISTED + 1];
-  int32_t which[LISTED];
+  Solid solid[LISTED];
 } Nearby;
 
 // How far a point is from the place of a list [m].
@@ -61,7 +61,7 @@ static double way_since(const Nearby* list, const double point[3]) {
 // Lists the solids that are the nearest to a point.
 static void list_nearest(const Solid* solids, int64_t count, const double point[3], Nearby* list) {
   double* sorted = list->distance;
-  int32_t which[LISTED + 1] = {0};
+  int64_t which[LISTED + 1] = {0};
   for (int k = 0; k <= LISTED; ++k) sorted[k] = HUGE_VAL;
   for (int64_t s = 0; s < count; ++s) {
     const double distance = solid_distance(solids + s, point);
@@ -70,8 +70,8 @@ static void list_nearest(const Solid* solids, int64_t count, const double point[
     for (; k > 0 && !(distance >= sorted[k - 1]); --k) {
       sorted[k] = sorted[k - 1], which[k] = which[k - 1];
     }
-    sorted[k] = distance, which[k] = (int32_t)s;
+    sorted[k] = distance, which[k] = s;
   }
   for (int k = 0; k < 3; ++k) list->place[k] = point[k];
-  for (int k = 0; k < LISTED; ++k) list->which[k] = which[k];
+  for (int k = 0; k < LISTED && k < count; ++k) list->solid[k] = solids[which[k]];
 }
