@@ -11,21 +11,11 @@ import numpy as np
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, stack
 from quadrl.base.trace import look_up
-from quadrl.base.validation import choice
 from quadrl.core.snapshot import TaskState
+from quadrl.engines.state import State
 
 AXES, WAVES = 3, 2  # sines in each coordinate
-SINES = {
-    # SimpleFlight: 2 m x 1 m, begun in the crossing, where it is fastest.
-    "lemniscate": (5.5, ((1.0, 1, math.pi), (0.5, 2, math.pi), (0.0, 1, 0.0))),
-    # crazyflow: east and up.
-    "vertical": (10.0, ((1.0, 1, 0.0), (0.0, 1, 0.0), (0.5, 2, 0.0))),
-}
-"""Figures of one sine in each coordinate: the usual period [s]; amplitude [m], turns in a period,
-and phase [rad] of each."""
-FIGURES = ("random", *SINES, "zigzag", "pentagram", "polynomial")
 PIECE = 0.02  # [s], length of a piece of a table
-TRACKS, SEED = 32, 0  # curves of a figure that is drawn once and for all
 LONGEST_GAP, FASTEST = 0.5, 20.0  # [s], [m/s], from one row of a file to the next
 FILE = "a csv file: a line of names, then at least 4 rows of time [s], x, y, z [m], maybe yaw [rad]"
 
@@ -54,35 +44,6 @@ class Table:
     count: int = 1  # pieces of a track; in the last one it stands still
     turns: np.ndarray | None = None  # (count, 4) [rad/s^k], of a heading other than east
 
-    @classmethod
-    def of(cls, figure: str, seconds: float, name: str) -> Table:
-        """Make the curves of a figure, or the one of a csv file.
-
-        Args:
-            figure: One of FIGURES, or a path.
-            seconds: For which it is flown.
-            name: What a refusal calls the figure.
-
-        Raises:
-            QuadrlError: There is no such figure or file, or the file has a gap or a jump.
-        """
-        pieces, count, turns = np.zeros((1, 4, AXES)), 1, None
-        if figure in ("zigzag", "pentagram"):
-            points = _drawn(1.0, 1.5, 0.0, seconds) if figure == "zigzag" else _star(seconds)
-            pieces, count = _pieces(*points, 1, seconds)
-        elif figure == "polynomial":
-            pieces, count = _pieces(*_drawn(1.5, 4.0, 0.5, seconds), 5, seconds)
-        elif figure not in FIGURES:
-            if not figure.endswith(".csv"):
-                choice(name, figure, [*FIGURES, "the path of a .csv file"])
-            times, rows = _read(name, figure)
-            pieces, count = _pieces(times, rows[..., :AXES], 3, seconds)
-            if rows.shape[-1] > AXES:
-                turns = _pieces(times, np.unwrap(rows[..., AXES:], axis=1), 3, seconds)[0][..., 0]
-                turns.flags.writeable = False
-        pieces.flags.writeable = False
-        return cls(pieces, count, turns)
-
     def at(self, reference: Reference, time: Array, order: int = 0) -> Array:
         """References at times (N,) [s], or derivatives of an order to 3, (N, 3) [m/s^order]."""
         if self.count == 1:
@@ -103,6 +64,25 @@ class Table:
             return 0 * time
         return self._polynomial(self.turns[..., None], 0 * time, time)[..., 0]
 
+    def headed(self, quaternion: Array) -> Array:
+        """Attitudes (N, 4), turned to the left by the heading of the reference at first."""
+        if self.turns is None:
+            return quaternion
+        w, x, y, z = (quaternion[..., k] for k in range(4))
+        heading, xp = self.heading(0 * w), namespace(w)
+        cosine, sine = xp.cos(heading / 2), xp.sin(heading / 2)
+        turned = cosine * w - sine * z, cosine * x - sine * y, cosine * y + sine * x
+        return stack(*turned, cosine * z + sine * w)
+
+    def off(self, state: State, time: Array) -> tuple[Array, Array]:
+        """Sine and cosine (N,) of the angle from the heading of the reference to an aircraft's."""
+        sine, cosine = state.sin_attitude[..., 2], state.cos_attitude[..., 2]
+        if self.turns is None:
+            return sine, cosine
+        asked, xp = self.heading(time), namespace(time)
+        east, north = xp.cos(asked), xp.sin(asked)
+        return sine * east - cosine * north, cosine * east + sine * north
+
     def _polynomial(self, pieces: np.ndarray, first: Array, time: Array, order: int = 0) -> Array:
         """Derivatives (N, k) of pieces (n, 4, k), of a track that begins with some piece (N,)."""
         xp, last = namespace(time), self.count - 1
@@ -120,17 +100,7 @@ def by_axis(waves: Array) -> Array:
     return stack(*(waves[..., k] + waves[..., k + 1] for k in range(0, AXES * WAVES, WAVES)))
 
 
-def sines(figure: str, period: float, zero: Array) -> tuple[Array, Array, Array]:
-    """Amplitude, frequency and phase of a figure, none for one of a table; for zeros (N,)."""
-    waves = SINES[figure][1] if figure in SINES else ((0.0, 1, 0.0),) * AXES
-    turn = math.tau / period  # [rad/s]
-    pairs = (((size, turns * turn, phase), (0.0, turn, 0.0)) for size, turns, phase in waves)
-    rows = zip(*(wave for pair in pairs for wave in pair), strict=True)
-    amplitude, frequency, phase = (stack(*(zero + x for x in row)) for row in rows)
-    return amplitude, frequency, phase
-
-
-def _pieces(
+def pieces(
     times: np.ndarray, points: np.ndarray, degree: int, seconds: float
 ) -> tuple[np.ndarray, int]:
     """Splines of a degree through points (tracks, n, k) at times (tracks, n) [s]."""
@@ -152,28 +122,12 @@ def _pieces(
     return np.concatenate(tracks), count
 
 
-def _drawn(
-    shortest: float, longest: float, height: float, seconds: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points within 1 m east and north and a height up, with legs of some duration [s]."""
-    draw, count = np.random.default_rng(SEED), math.ceil(seconds / shortest) + 6
-    # In whole pieces: a corner is where two of them meet.
-    shape = TRACKS, count
-    steps = draw.integers(round(shortest / PIECE), round(longest / PIECE), shape, endpoint=True)
-    times = PIECE * np.cumsum(steps, axis=1)
-    return times - times[:, :1], draw.uniform(-1, 1, (*shape, AXES)) * [1.0, 1.0, height]
+def read(name: str, path: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times (1, n) [s] and rows (1, n, 3 or 4) of a csv file: place [m], maybe heading [rad].
 
-
-def _star(seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """SimpleFlight's pentagram, within 0.7 m, at 1 m/s, again and again."""
-    leg = PIECE * round(2 * 0.7 * math.sin(math.tau / 5) / PIECE)  # whole pieces
-    corner = np.arange(math.ceil(seconds / leg) + 2)
-    angle = math.pi / 2 + 2 * math.tau / 5 * corner
-    points = 0.7 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
-    return leg * corner[None], points[None]
-
-
-def _read(name: str, path: str) -> tuple[np.ndarray, np.ndarray]:
+    Raises:
+        QuadrlError: There is no such file, or it has a gap or a jump. `name` is what it is called.
+    """
     try:
         rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
     except (OSError, ValueError) as error:

@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, stack, to_body
 from quadrl.core import rewards
@@ -18,14 +17,12 @@ from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_MOTION, TARGET_VELOCITY, ObservationTerm
 from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Rollout, Snapshot, Target, Task
-from quadrl.engines.rng import FULL_TURN, Rng, hovering
+from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.references import AXES, SINES, WAVES, Reference, Table, sines
+from quadrl.tasks.figures import LOWEST, SHORTEST, SINES, Figure, tabulated
+from quadrl.tasks.references import AXES, Reference, Table
 
 AHEAD, EVERY = 10, 0.1  # samples of the reference, and the time between them [s]
-SLOWEST, FASTEST = 0.2, 4.5  # [rad/s], sines of a random reference
-CLIMB = 0.3  # share of the largest acceleration with which it climbs and sinks
-SHORTEST, LOWEST = 1.0, 0.3  # period of a figure [s]; height of a reference above the ground [m]
 MEANING = "from the aircraft to the reference in 0.1 s, 0.2 s and so on to 1 s, body frame"
 PREVIEW = {"ahead": ObservationTerm(AXES * AHEAD, "m", MEANING)}
 LINE: tuple[float, float, float, float] = (0.95, 0.55, 0.20, 0.35)
@@ -36,6 +33,7 @@ class Trajectory(Task):
     """Be where the reference is, at every moment, heading east."""
 
     table: ClassVar[Table]  # each task has its own
+    curve: ClassVar[Figure]
 
     name = "trajectory"
     asks = "follow a reference in time, heading east: a random curve, a figure or a file"
@@ -98,23 +96,14 @@ class Trajectory(Task):
             allowed = f"0, or at least {SHORTEST:g} s with the figures {', '.join(SINES)}"
             raise QuadrlError(name=f"{self.name} period", value=self.period, allowed=allowed)
         name, seconds = f"{self.name} figure", self.time_limit + AHEAD * EVERY
-        object.__setattr__(self, "table", Table.of(self.figure, seconds, name))
-        place = self._sampled(0)
-        most = np.abs(place).max(axis=0)
-        if most.max() > self.box or place[:, 2].min() < LOWEST - self.altitude:
-            reason = f"it goes {', '.join(f'{x:.3g}' for x in most)} m far in x, y and z"
-            allowed = f"within {self.box:g} m (box), {LOWEST:g} m above the ground"
-            raise QuadrlError(reason, name=name, value=self.figure, allowed=allowed)
+        object.__setattr__(self, "table", tabulated(self.figure, seconds, name))
+        known = self.table, self.cycle, self.acceleration, self.extent
+        object.__setattr__(self, "curve", Figure(self.figure, *known))
+        self.curve.check_room(name, self.box, LOWEST - self.altitude)
 
     def check(self, parameters: Parameters) -> None:
         """Refuse a reference that asks for more thrust than there is."""
-        rotor, up = parameters.rotor, np.array([0.0, 0.0, GRAVITY])
-        thrust = (rotor.thrust_coefficient * rotor.max_speed**2).sum(axis=-1) / parameters.mass
-        asked = np.linalg.norm(self._sampled(2) + up, axis=-1).max() / GRAVITY
-        if asked > (there := float(thrust.min()) / GRAVITY):
-            reason = f"it asks for {asked:.3g} weights of thrust, and the aircraft has {there:.3g}"
-            name, allowed = f"{self.name} figure", "a slower one"
-            raise QuadrlError(reason, name=name, value=self.figure, allowed=allowed)
+        self.curve.check_thrust(f"{self.name} figure", parameters)
 
     @property
     def cycle(self) -> float:
@@ -125,12 +114,9 @@ class Trajectory(Task):
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Reference]:
         """At rest in the first point, heading east, slightly disturbed."""
         velocity = rng.vector(self.disturbance)
-        quaternion = rng.attitude(self.disturbance, heading=0.0)
-        if self.table.turns is not None:
-            quaternion = _headed(quaternion, self.table.heading(0 * velocity[..., 0]))
+        quaternion = self.table.headed(rng.attitude(self.disturbance, heading=0.0))
         body_rate = rng.vector(self.disturbance)
-        random = self.figure == "random"
-        reference = self._random(rng) if random else self._named(rng, velocity)
+        reference = self.curve.reference(rng, velocity)
         position = self.table.at(reference, 0 * velocity[..., 0])
         start = Start(
             position=position,
@@ -155,7 +141,7 @@ class Trajectory(Task):
 
     def measure(self, now: Snapshot) -> Potentials:
         """Of the attitude only the heading counts, since a curve asks for tilts."""
-        sine, cosine = self._off(now)
+        sine, cosine = self.table.off(now.state, now.time)
         return dataclasses.replace(super().measure(now), attitude=abs(sine) + abs(cosine - 1))
 
     def observe(self, now: Snapshot) -> dict[str, Array]:
@@ -164,7 +150,8 @@ class Trajectory(Task):
         seen = [to_body(now.state.rotation, place - now.state.position) for place in later]
         terms = super().observe(now) | {"ahead": namespace(seen[0]).concat(seen, axis=-1)}
         if self.table.turns is not None:  # as one that heads east sees itself
-            for name, own in zip(("sin_attitude", "cos_attitude"), self._off(now), strict=True):
+            off = self.table.off(now.state, now.time)
+            for name, own in zip(("sin_attitude", "cos_attitude"), off, strict=True):
                 terms[name] = stack(terms[name][..., 0], terms[name][..., 1], own)
         return terms
 
@@ -201,56 +188,3 @@ class Trajectory(Task):
         parts = {"distance_m": rollout.error, "settled_m": settled}
         known = {name: part[np.isfinite(part)] for name, part in parts.items()}
         return {name: float(part.mean()) if part.size else math.nan for name, part in known.items()}
-
-    def _off(self, now: Snapshot) -> tuple[Array, Array]:
-        """Sine and cosine (N,) of the angle from the heading that is asked for to the present."""
-        sine, cosine = now.state.sin_attitude[..., 2], now.state.cos_attitude[..., 2]
-        if self.table.turns is None:
-            return sine, cosine
-        asked, xp = self.table.heading(now.time), namespace(now.time)
-        east, north = xp.cos(asked), xp.sin(asked)
-        return sine * east - cosine * north, cosine * east + sine * north
-
-    def _random(self, rng: Rng) -> Reference:
-        """Two sines in each coordinate, from slow ones to those of the largest acceleration."""
-        bearing, split = rng.uniform(0.0, FULL_TURN), rng.uniform(0.0, 1.0, AXES)
-        xp = namespace(bearing)
-        sides = (abs(xp.cos(bearing)), abs(xp.sin(bearing)), 0 * bearing + CLIMB)
-        parts = ((split[..., k], 1 - split[..., k]) for k in range(AXES))
-        halves = (side * part for side, pair in zip(sides, parts, strict=True) for part in pair)
-        share = stack(*halves)
-        peak = self.acceleration * rng.uniform(0.0, 1.0)[..., None] * share
-        amplitude = self.extent / WAVES * rng.uniform(0.1, 1.0, AXES * WAVES)
-        return Reference(
-            goal=self.extent * rng.uniform(-0.5, 0.5, AXES),
-            amplitude=amplitude,
-            frequency=xp.sqrt(xp.clip(peak / amplitude, SLOWEST**2, FASTEST**2)),
-            phase=rng.uniform(0.0, FULL_TURN, AXES * WAVES),
-            track=0 * bearing,
-        )
-
-    def _named(self, rng: Rng, like: Array) -> Reference:
-        """The figure, or one of its curves; rows as in an array (N, 3)."""
-        zero, track = 0 * like[..., 0], 0 * like[..., 0]
-        if (tracks := len(self.table.pieces) // self.table.count) > 1:
-            track = namespace(like).floor(rng.uniform(0.0, tracks))
-        return Reference(0 * like, *sines(self.figure, self.cycle, zero), track)
-
-    def _sampled(self, order: int) -> np.ndarray:
-        """Places [m] or accelerations [m/s^2] (its derivative 0 or 2) of the reference, (n, 3)."""
-        if self.figure == "random":
-            most = (1.0, 0.0, CLIMB) if order else (1.5, 1.5, 1.5)
-            return np.array([most]) * (self.acceleration if order else self.extent)
-        if self.figure in SINES:
-            none = np.zeros(1, dtype=int)
-            one = self._named(Rng(none, none), np.zeros((1, AXES)))
-            return self.table.at(one, np.linspace(0.0, self.cycle, 400), order)
-        return self.table.pieces[:, order] * math.factorial(order)
-
-
-def _headed(quaternion: Array, heading: Array) -> Array:
-    """Attitudes (N, 4), turned to the left by angles (N,) [rad]."""
-    xp, (w, x, y, z) = namespace(heading), (quaternion[..., k] for k in range(4))
-    cosine, sine = xp.cos(heading / 2), xp.sin(heading / 2)
-    turned = cosine * w - sine * z, cosine * x - sine * y, cosine * y + sine * x
-    return stack(*turned, cosine * z + sine * w)
