@@ -7,15 +7,18 @@ import functools
 
 import numpy as np
 
-from quadrl.base.rotation import Array, cross, dot, namespace, norm, stack
+from quadrl.base.primitives import Primitive
+from quadrl.base.rotation import Array, cross, dot, namespace, norm, stack, to_body
 from quadrl.engines.rng import Rng
+from quadrl.engines.state import State
 from quadrl.tasks.gates import Course
-from quadrl.tasks.tracks import POLE, Track
+from quadrl.tasks.tracks import POLE, Track, attitude
 
 NEAR = 0.7  # [m], from how far on it is seen where a gate or a pole truly stands
 ASIDE = 0.15, 0.15, 0.1  # [m], by how much gates may be elsewhere along x, y and z
 ASIDE_POLE = 0.15, 0.15, 0.05  # [m], the same of poles, whose tops are higher or lower
 LEANING = 0.05, 0.1, 0.2  # [rad], by how much gates roll, pitch and turn at most
+WOOD = (0.55, 0.45, 0.35, 1.0)
 STAND, DEPTH = 0.05, 0.01  # [m], of stands and frames, half their width
 
 
@@ -68,6 +71,26 @@ class Arena(Course):
         rest = near[len(track.gates) :]
         stand = [xp.where(rest[k // 3], self.poles[..., k], poles[k]) for k in range(len(poles))]
         return dataclasses.replace(self, gates=stack(*places), poles=stack(*stand))
+
+    def ways_to_poles(self, state: State) -> Array:
+        """The way to the top of each pole, x, y and z, body frame, (N, 3 P) [m]."""
+        ways = [stack(*top) - state.position for top in self.tops]
+        away = [to_body(state.rotation, way) for way in ways]
+        return stack(*(way[..., k] for way in away for k in range(3)))
+
+    def drawn(self, track: Track) -> list[Primitive]:
+        """Gates with their stands and poles, as the first row has them."""
+        gates = [[vector[0] for vector in gate] for gate in self.frames]
+        axes = [(through, left, np.cross(through, left)) for _, through, left in gates]
+        poles = [[float(x[0]) for x in pole] for pole in self.tops]
+        stands: list[Primitive] = []
+        for (centre, *_), turned in zip(gates, axes, strict=True):
+            frame = track.frame / 2
+            high = centre[2] - frame
+            place = centre - (frame + high / 2) * turned[2]
+            size = STAND, STAND, high / 2
+            stands.append(Primitive("box", size, place, attitude(turned), WOOD, glow=0.2))
+        return [*track.drawn(int(self.gate[0]), [gate[0] for gate in gates], axes, poles), *stands]
 
     def room(self, place: Array, track: Track) -> Array:
         """Distance of the nearest pole, frame or stand from a place (N, 3), (N,) [m]."""

@@ -7,8 +7,6 @@ import functools
 from collections.abc import Sequence
 from typing import Any, cast
 
-import numpy as np
-
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import (
@@ -18,7 +16,6 @@ from quadrl.base.rotation import (
     norm,
     quaternion_from_heading_and_tilt,
     stack,
-    to_body,
 )
 from quadrl.base.validation import number
 from quadrl.core import rewards
@@ -26,14 +23,13 @@ from quadrl.core.observation import ObservationTerm
 from quadrl.core.task import EpisodeEnd, Snapshot, Target
 from quadrl.engines.rng import FULL_TURN, Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.arena import STAND, Arena, furnished
+from quadrl.tasks.arena import Arena, furnished
 from quadrl.tasks.gates import GateRace
-from quadrl.tasks.tracks import Track, attitude, known
+from quadrl.tasks.tracks import Track, known
 
 BOX = (-2.5, 2.5), (-1.5, 1.5), (0.0, 2.0)  # [m], along x, y and z, which ends a race
 STRAIGHT, LEAD = 0.05, 0.3  # [m]: who is farther aside of a gate than this flies by a place so far
 # before it at most
-WOOD = (0.55, 0.45, 0.35, 1.0)
 ROOM = 0.15  # [m], about the ball, in which a flight costs more
 
 
@@ -160,10 +156,8 @@ class LsyRace(GateRace):
     def observe(self, now: Snapshot) -> dict[str, Array]:
         """The race, as far as it has been seen, and the poles."""
         state, arena = now.state, now.task.guessed(self.course)
-        ways = [stack(*top) - state.position for top in arena.tops]
-        away = [to_body(state.rotation, way) for way in ways]
         seen = super().observe(dataclasses.replace(now, task=arena))
-        return seen | {"poles": stack(*(way[..., k] for way in away for k in range(3)))}
+        return seen | {"poles": arena.ways_to_poles(state)}
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """As in a race, and away from what stands about."""
@@ -184,18 +178,7 @@ class LsyRace(GateRace):
 
     def markers(self, now: Snapshot) -> Sequence[Primitive]:
         """The gates with their stands and the poles, where they stand."""
-        task, number = now.task, int(now.task.gate[0])
-        gates = [[vector[0] for vector in gate] for gate in task.frames]
-        axes = [(through, left, np.cross(through, left)) for _, through, left in gates]
-        poles = [[float(x[0]) for x in pole] for pole in task.tops]
-        stands: list[Primitive] = []
-        for (centre, *_), turned in zip(gates, axes, strict=True):
-            frame = self.course.frame / 2
-            high = centre[2] - frame
-            place = centre - (frame + high / 2) * turned[2]
-            size = STAND, STAND, high / 2
-            stands.append(Primitive("box", size, place, attitude(turned), WOOD, glow=0.2))
-        return [*self.course.drawn(number, [gate[0] for gate in gates], axes, poles), *stands]
+        return now.task.drawn(self.course)
 
     def _failed(self, now: Snapshot) -> Array:
         """Against something, on the ground, or out of the box, (N,) bool."""
