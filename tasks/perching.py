@@ -12,7 +12,6 @@ from typing import cast
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, norm, stack, to_body
 from quadrl.base.validation import number
@@ -21,12 +20,12 @@ from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.observation import MOTION, ROTATION, ObservationTerm, observed_motion
 from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
-from quadrl.engines.rng import Rng, hovering
+from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
+from quadrl.tasks.approach import Way, on_the_way
 
 WALL = Box("wall", length=2.0, width=2.0, height=0.1, rgba=(0.62, 0.58, 0.52, 1.0), grip=12.0)
 NEAR = 0.6  # [m], from the goal, where the attitude counts half
-RATE, THRUST, DIVE = (1.5, 3.5), (0.75, 1.1), 0.5  # [rad/s], [weights], [rad]: ways to a touch
 SPREAD = 0.2  # of what is beside a way, as a share of what is beside a start
 WORST = 3.0  # times what a limit is exceeded by, or [m/s] of what strikes: more costs no more
 OFF = 1.0  # [m], from the middle of the surface
@@ -163,43 +162,14 @@ class Perching(Task):
         away = self.aside * rng.uniform(-1.0, 1.0, 3)
         away = stack(none, away[..., 1], away[..., 2])
         comes = (rng.uniform(0.0, 1.0) < self.approach)[..., None]
-        position, velocity, pitch, rate = self._on_the_way(rng, incline)
-        position = xp.where(comes, goal + position + SPREAD * away, before + away)
-        pitch = xp.where(comes[..., 0], pitch, none)
-        start = Start(
-            position=position,
-            quaternion=stack(xp.cos(pitch / 2), none, -xp.sin(pitch / 2), none),
-            velocity=xp.where(comes, velocity, 0.0 * velocity),
-            body_rate=xp.where(comes, stack(none, -rate, none), 0.0 * velocity),
-            rotor_speed=hovering(position, parameters),
+        way = on_the_way(rng, incline, (self.least_touch, self.most_touch))
+        begun = Way(
+            xp.where(comes, goal + way.position + SPREAD * away, before + away),
+            xp.where(comes, way.velocity, 0.0 * way.velocity),
+            xp.where(comes[..., 0], way.pitch, none),
+            xp.where(comes[..., 0], way.rate, none),
         )
-        return start, Perch(goal=goal, normal=normal, rest=none)
-
-    def _on_the_way(self, rng: Rng, incline: Array) -> tuple[Array, Array, Array, Array]:
-        """States some time before good touches, (N, 3), (N, 3), (N,), (N,).
-
-        They lead there at a constant pitch rate and a constant thrust, so that their motion in the
-        plane of the approach can be integrated backwards by hand.
-
-        Returns:
-            Position from the goal [m], velocity [m/s], pitch, nose up [rad], and its rate [rad/s].
-        """
-        xp, none = namespace(incline), 0.0 * incline
-        rate, thrust = rng.uniform(*RATE), GRAVITY * rng.uniform(*THRUST)
-        into = rng.uniform(self.least_touch, self.most_touch)
-        time = rng.uniform(0.1, 1.0) * (incline + DIVE) / rate
-        pitch = incline - rate * time
-        # Integrals of sine and cosine of the pitch over the time that is left, and over that again.
-        sine = (xp.cos(pitch) - xp.cos(incline)) / rate
-        cosine = (xp.sin(incline) - xp.sin(pitch)) / rate
-        sines = (cosine - time * xp.cos(incline)) / rate
-        cosines = (time * xp.sin(incline) - sine) / rate
-        last_x, last_z = into * xp.sin(incline), -into * xp.cos(incline)
-        fall = GRAVITY * time
-        velocity = stack(last_x + thrust * sine, none, last_z - thrust * cosine + fall)
-        x = -last_x * time - thrust * sines
-        z = -last_z * time + thrust * cosines - fall * time / 2
-        return stack(x, none, z), velocity, pitch, rate
+        return begun.start(parameters), Perch(goal=goal, normal=normal, rest=none)
 
     def update(self, before: Snapshot, now: Snapshot) -> Perch:
         """Count the control steps on the surface."""
