@@ -27,8 +27,9 @@ IN_GUSTS: dict[str, Any] = {
     "steps": 24_576_000,
     "task_options": {"spin_weight": 7.0},
 }
-"""Settings of the variant `robust` of the tasks that keep a place, from which gusts move the
-aircraft: enough neurons and steps to learn how to answer them."""
+"""Settings of the variant `robust` of this task and of random_waypoint, whose place gusts move the
+aircraft from: enough neurons and steps to learn how to answer them. static_waypoint gains nothing
+by these: docs/robustness.md."""
 # Flights from the edge of what was trained on fail more often; and with the task's own weight of
 # the attitude who begins nearly west turns too late now and then.
 FARTHER = {"tilt": 0.3, "spin": 0.6, "radius": 0.75, "speed": 0.5, "attitude_weight": 60.0}

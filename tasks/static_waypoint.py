@@ -26,7 +26,6 @@ from quadrl.core.task import (
 )
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.hover import IN_GUSTS
 
 WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
 
@@ -61,16 +60,12 @@ class StaticWaypoint(Task):
     )
     training = {"gamma": 0.9, "holds_goal": True, "ppo": {"learning_rate": 8e-3}}
     training_with = {"apg": {"steps": 153_600, "holds_goal": False}}
-    # One way alone teaches little of holding a place in wind: it is another one in each episode.
-    variants = {"robust": {"training_options": {"elsewhere": 2.0}, **IN_GUSTS}}
     heading_matters = True
 
     waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)
     """Where to fly, in order [m], task frame."""
     reach: float = 0.2
     """Distance at which a waypoint counts as reached and the next one is the goal [m]."""
-    elsewhere: float = 0.0
-    """How far the first waypoint is at most from where it should be [m]."""
     disturbance: float = 0.05
     """Largest tilt [rad], speed [m/s] and body rate [rad/s] at the start."""
     max_distance: float = 5.0
@@ -104,8 +99,7 @@ class StaticWaypoint(Task):
             body_rate=rng.vector(self.disturbance),
             rotor_speed=hovering(position, parameters),
         )
-        goal = self._waypoint(0, position) + rng.vector(self.elsewhere)
-        return start, Route(goal=goal, leg=position[..., 0])
+        return start, Route(goal=self._waypoint(0, position), leg=position[..., 0])
 
     def update(self, before: Snapshot, now: Snapshot) -> Route:
         """Advance to the next waypoint when this one is reached."""
