@@ -20,7 +20,6 @@ from quadrl.learning.folder import write_config
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
 from scripts.reports import (
-    learning,
     measure,
     pages,
     report,
@@ -226,41 +225,3 @@ def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch, capsys):
     assert told.count(f"misses what its task asks: seed {seed}") == 1
     assert f"successful, {asked.words} " in told
     assert not list((tmp_path / "out").iterdir())
-
-
-def test_who_is_ahead_is_said_where_it_is_no_chance():
-    # Of 1,000 flights shares of a half have a standard error of 0.022 between two of them.
-    for figures, found in (
-        (("success_rate", 1000, 0.52, 0.48), "level"),
-        (("success_rate", 1000, 0.53, 0.48), "policy"),
-        (("success_rate", 1000, 0.0, 0.01), "controller"),
-        (("settled_m", 1000, 0.02, 0.019), "level"),
-        (("settled_m", 1000, 0.02, 0.01), "controller"),
-        (("settled_m", 1000, None, 0.01), "controller"),  # all its flights fall
-    ):
-        assert learning.ahead(*figures) == found
-    robust = [
-        {"task": "hover", "seed": seed, "condition": name, "success": share, "position_error_m": 1}
-        for name in learning.UNSURE
-        for seed, share in (("640", 0.75), ("641", 0.25), ("controller", 0.25))
-    ]
-    both = {"robust policy": 1.0, "tuned controller": 0.0}
-    windy = {"task": "hover", "condition": "weather light"} | both
-    laps = [
-        {"race": "one lap", "success_rate": share, "race_time_mean_s": time}
-        for share, time in ((0.8, 5.0), (1.0, 20.0))
-    ]
-    report.save("robust", {"episodes": 1000, "rows": robust})
-    report.save("robustness", {"episodes": 100, "alone": [windy]})
-    flown = {"condition": "eight", "task": "trajectory", "metric": "settled_m"}
-    settled = {"seed 1": 0.01, "seed 2": 0.02, "controller": 0.03}
-    rows = [flown | {"who": who, "settled_m": value} for who, value in settled.items()]
-    report.save("missions", {"episodes": 300, "rows": rows})
-    report.save("race", {"episodes": 300, "rows": laps})
-    lines = learning.wins_table().splitlines()
-    hover = "| nothing (hover) | successful | 50 % | 25 % | one set | policy: hover |"
-    race = "| one lap (race) | successful | 80 % | 100 % | usual | controller: race |"
-    given = "distance, mean | 1.5 cm | 3.0 cm | for the row | policy: trajectory"
-    eight = f"| eight (trajectory) | {given} |"
-    rows = {hover: "robust` |", race: "race` at 6fa4e93 |", eight: "missions` at af7f29c |"}
-    assert {f"{row} `scripts/report {rest}" for row, rest in rows.items()} < set(lines)
