@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -62,6 +63,8 @@ def settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
         word = prefix + name.replace("_", "-")
         if name in PAIRS:
             yield " ".join((word, *(f"{option}={given}" for option, given in value.items())))
+        elif name == "randomization":
+            yield f"{word} '{json.dumps(value)}'"
         elif isinstance(value, dict):
             yield from settings(value, f"{word}.")
         elif isinstance(value, bool):

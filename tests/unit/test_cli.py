@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import warnings
@@ -359,7 +360,7 @@ def test_the_settings_that_are_shown_are_those_of_the_command(refusal, monkeypat
 
     monkeypatch.setattr(cli.train, "prepare", prepared)
     own = own_settings(tasks.TASKS[name])
-    refusal("train", name, *" ".join(cli.tasks.settings(own)).split())
+    refusal("train", name, *shlex.split(" ".join(cli.tasks.settings(own))))
     assert set(seen) == set(own)
     assert TrainConfig(name, **seen) == TrainConfig(name)
 
