@@ -78,6 +78,7 @@ def test_shares_of_the_benchmark_are_within_one_turn():
         None,
         0.90,
         20.0,
+        4.0,
         0.80,
         0.75,
         0.35,
