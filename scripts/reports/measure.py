@@ -18,13 +18,13 @@ from quadrl.core.scenario import Scenario
 from quadrl.engines.engine import ENGINES
 from quadrl.evaluation.plotting import learning_curves, save
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import Controller, fly, scenario_of, summarize
+from quadrl.evaluation.rollout import BEHAVIOUR, Controller, fly, scenario_of, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
 from quadrl.learning.folder import EVALUATION, METRICS, read_metrics
 from scripts.reports import report
-from scripts.reports.report import Result, asked, say, table
+from scripts.reports.report import FIGURES, Result, asked, say, table
 
 # Seeds are not those that settings were chosen with.
 HOVER_SEEDS, SEEDS = (225, 226, 227, 228, 229), (385, 386, 387)
@@ -116,9 +116,11 @@ def hover_table() -> str:
         row += [f"{run['training_s']:.1f} s"]
         row += [f"{100 * got[name]:.0f} %" for name in ("survival_rate", "success_rate")]
         row += [length(got["position_error_m"]), f"{got['heading_error_deg']:.1f} deg"]
+        row += [quantity(name, got[name]) for name in BEHAVIOUR]
         rows.append(row)
     head = ("aircraft", "engine", "seed", "control steps", "training", "flown to the end",
-            "successful", "error", "heading off east")  # fmt: skip
+            "successful", "error", "heading off east",
+            *(FIGURES[name] for name in BEHAVIOUR))  # fmt: skip
     error = max(row["metrics"]["position_error_m"] for row in own)
     success = min(100 * row["metrics"]["success_rate"] for row in own)
     note = f"The geometric controller, in the same episodes and with every aircraft: {success:.0f} "

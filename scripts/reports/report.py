@@ -21,6 +21,17 @@ DOCS, RUNS = REPOSITORY / "docs", REPOSITORY / "runs"
 RESULTS, IMAGES = DOCS / "results", DOCS / "images"
 CODE = ("quadrl", "tasks", "assets", "scripts")  # what a result depends on
 
+FIGURES = {
+    "success_rate": "successful",
+    "position_error_m": "error over the last 2 s",
+    "yaw_rate_rad_s": "turning over the last 2 s",
+    "circling_m_s": "circling over the last 2 s",
+    "command_change_rate": "change of the commands",
+    "saturated_rate": "commands at their ends",
+    "least_height_m": "least height",
+}
+"""Of flights, and what tables call them."""
+
 Result = dict[str, Any]
 Parts = Mapping[str, Callable[[], str]]
 """Parts of pages by name; a part that raises FileNotFoundError has not been measured yet."""

@@ -30,8 +30,7 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import WIDE
 from scripts.reports import report
 from scripts.reports.measure import AIRBORNE, runs_of
-from scripts.reports.report import Result, say, table
-from scripts.reports.task_pages import FIGURES
+from scripts.reports.report import FIGURES, Result, say, table
 
 UNCERTAIN = Randomization(
     mass=(0.8, 1.2), command_delay=(0.02, 0.02), noise=Errors(1e-3, 1e-3, 2e-3, 2e-3)
@@ -42,7 +41,8 @@ NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without eff
 FRESH = 100_300  # first episode, beyond those that the gains were chosen by
 ALL_TOGETHER: Conditions = {"weather": "light", "randomization": "full", "aerodynamics": "full"}
 SEEDS = range(645, 650)  # not used for tuning
-WAYS_OF = ("nothing", "uncertain", "all together")  # of which `ways_table` says how they fly
+WAYS_OF = ("nothing", "50 ms of delay", "twice the lag", "uncertain", "all together")
+"""Of which `ways_table` says how they fly."""
 
 
 class Integrating(GeometricController):

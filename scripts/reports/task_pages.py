@@ -17,7 +17,7 @@ from quadrl.learning.defaults import own_settings
 from quadrl.learning.description import describe, describe_action
 from scripts.reports import measure, report, shipping
 from scripts.reports.code import shown
-from scripts.reports.report import Parts, asked, table
+from scripts.reports.report import FIGURES, Parts, asked, table
 
 PAGE = """{asks}
 
@@ -86,15 +86,6 @@ policy is a safetensors file, with a .json of all its settings beside it, in
 POLICIES = """The mean action in {flown} fresh episodes, in the conditions of the training. The last
 column is what the task asks and the policy misses in as many episodes where nothing disturbs it.
 {source}"""
-FIGURES = {
-    "success_rate": "successful",
-    "position_error_m": "error over the last 2 s",
-    "yaw_rate_rad_s": "turning over the last 2 s",
-    "circling_m_s": "circling over the last 2 s",
-    "command_change_rate": "change of the commands",
-    "saturated_rate": "commands at their ends",
-    "least_height_m": "least height",
-}
 SEEDS = "Median and range over the seeds of `scripts/report training`."
 PAPER = "The three algorithms in [the paper's experiments](paper.md)."
 PICTURES = {
