@@ -121,7 +121,7 @@ class Environment(saving.Copied):
         self.size = max(part.stop for part in self.layout.values())
         self._solids_move = type(self.task).move is not Task.move
         self._solids_leave = self._solids_move or type(self.task).place is not Task.place
-        if self.scene.solids:
+        if self.scene.solids and not self._solids_leave:
             declared = self.scene.poses({}, self.num_envs, self.origin)
             engine.solids.place(np.arange(self.num_envs), declared)
         self.stepwise = self.control_mode.has_loops or self.randomizer.late or self._solids_move

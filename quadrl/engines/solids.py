@@ -71,7 +71,7 @@ class Solids:
         self.table["kind"] = model.geom_type[self.geoms]
         self.table["size"] = model.geom_size[self.geoms]
         self.table["turn"] = np.eye(3).reshape(-1)
-        self.nearby = np.zeros(count, dtype=NEARBY)
+        self.nearby = np.zeros(count if len(self.geoms) else 0, dtype=NEARBY)
         """Which solids are the nearest to each aircraft; unknown where it is not a number."""
         self.nearby["place"] = np.nan
         self.poses = np.zeros((count, len(self.geoms), 7))

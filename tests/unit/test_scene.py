@@ -145,6 +145,18 @@ def test_among_many_posts_the_nearest_is_known_all_the_way(engine):
     np.testing.assert_array_equal(flight.clearance(), there.clearance())
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_a_solid_that_no_episode_places_stands_where_it_is_declared(engine):
+    post = Cylinder("post", radius=0.1, height=4.0, position=(1.0, 2.0, 0.0))
+    task = type("BesidePost", (Hover,), {"name": "beside_post", "solids": lambda _: [post]})()
+    environment = Environment(task, num_envs=3, seed=0, engine=engine)
+    for rows in (None, np.array([False, True, False])):
+        environment.reset() if rows is None else environment.reset(rows)
+        np.testing.assert_array_equal(environment.snapshot.solid("post"), [post.position] * 3)
+        environment.step(np.zeros((3, 4)))
+        assert (abs(environment.snapshot.clearance - 5**0.5) < 1.2).all()
+
+
 def test_far_from_every_solid_an_aircraft_flies_bit_for_bit_as_without():
     velocity = np.array([[3.0, 1.0, 0.5], [0.0, -2.0, 0.0]])
     far = {solid.name: Pose(np.full((2, 3), 20.0)) for solid in EVERY.solids}

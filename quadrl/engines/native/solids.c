@@ -70,10 +70,10 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
     }
     const Solid* solids = rows->solids + i * rows->count;
     Nearby* list = rows->nearby + i;
-    // What the next aircraft knows is not in the cache.
+    // What the next aircraft knows is not in the cache: its list as far as the two nearest.
     if (row + AHEAD < last) {
       const int64_t next = ids ? ids[row + AHEAD] : row + AHEAD;
-      for (size_t k = 0; k < sizeof(Nearby) / 3; k += CACHE_LINE) {
+      for (size_t k = 0; k < offsetof(Nearby, solid[2]); k += CACHE_LINE) {
         __builtin_prefetch((const char*)(rows->nearby + next) + k);
       }
       __builtin_prefetch(rows->qpos + next * rows->stride);
