@@ -23,6 +23,8 @@ DENSITIES = (1e-3, 100.0)  # [kg/m^3]
 MAX_BODY_LIFT = 2.0
 MOST_OFFSET = 0.2
 """Largest distance of the centre of lift from the hub by `flapping_moment`, in radii (chosen)."""
+MOST_TAKEN = 0.36
+"""Largest share of the flow through a disc that the ground takes: lift over 0.64."""
 WINDMILL = 1.85
 """What the flow through a disc falls by over what a descent exceeds 2 w0 by, on the way to the
 windmill state: chosen for 1.58 times the thrust of hover at 2.4 w0, a Crazyflie's by Johnson's

@@ -8,14 +8,18 @@ loops are those of `quadrl.control.loops`, flown at the control step; a task say
 from __future__ import annotations
 
 import abc
+import dataclasses
 import math
 
 import numpy as np
 
+from quadrl.aircraft.aerodynamics import MOST_TAKEN
+from quadrl.aircraft.parameters import Parameters, rows
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array
 from quadrl.control.loops import MAX_HEADING_ERROR, Gains, Loops, turned
 from quadrl.control.reading import Guide, Reading
+from quadrl.engines.dynamics import ground_share
 
 
 class Controller(abc.ABC):
@@ -54,6 +58,7 @@ class GeometricController(Controller):
         super().__init__(vehicle, task)
         gains = gains or Gains(**task.gains)
         self._loops = Loops(vehicle, vehicle.control_timestep, "position", gains)
+        self._parameters = Parameters.of(rows(vehicle))
 
     def action(self, reading: Reading, offset: Array, velocity: Array) -> Array:
         """The loops from the outermost to the innermost."""
@@ -61,8 +66,20 @@ class GeometricController(Controller):
         heading = towards_east(reading.heading) if self.task.heading_matters else reading.heading
         error = reading.velocity - velocity - approach
         motion = self.task.feed_forward(reading)
-        command = self._loops.rotor_command(reading, error, heading, target_motion=motion)
+        # The loops know rotors far from the ground: at what speeds those have the same lift.
+        slower = self._slower(reading)
+        reading = dataclasses.replace(reading, rotor_speed=reading.rotor_speed / slower)
+        command = slower * self._loops.rotor_command(reading, error, heading, target_motion=motion)
         return np.clip((command - self.vehicle.hover_speed) / self.vehicle.action_scale, -1.0, 1.0)
+
+    def _slower(self, reading: Reading) -> Array | float:
+        """Rotor speeds over those of the same lift far from the ground, (N, R)."""
+        if reading.height is None or not self.vehicle.aerodynamics.ground_effect:
+            return 1.0
+        origin = max(self.task.altitude, self.vehicle.ground_clearance)
+        up, height = reading.rotation[..., 2, :], reading.height + origin
+        taken = ground_share(self._parameters, up, height)
+        return np.sqrt(1 - np.clip(taken, 0.0, MOST_TAKEN))
 
 
 def towards_east(heading: Array) -> Array:

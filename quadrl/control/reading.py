@@ -28,6 +28,7 @@ class Reading:
     to_goal: Array  # (N, 3) [m], from the aircraft to the goal, world frame
     target_velocity: Array  # (N, 3) [m/s], world frame; zero where nothing moves
     target_motion: Motion | None = None  # of the target; None where it is not observed
+    height: Array | None = None  # (N,) [m] over the task's origin; None where it is not observed
 
     @classmethod
     def of(cls, observation: Array, terms: Mapping[str, Any], vehicle: Vehicle) -> Reading:
@@ -59,6 +60,7 @@ class Reading:
             to_goal=to_world(rotation, term["goal"]),
             target_velocity=velocity + relative,
             target_motion=(ahead[0], ahead[1]) if ahead else None,
+            height=term["position"][..., 2] if "position" in term else None,
         )
 
     @functools.cached_property
@@ -86,6 +88,11 @@ class Guide(Protocol):
     """Gains of the geometric controller that differ from its defaults."""
     heading_matters: ClassVar[bool]
     """Whether to head east."""
+
+    @property
+    def altitude(self) -> float:
+        """Height of the origin of the task's frame above the ground [m]."""
+        ...
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """Where to be, as an offset (N, 3) [m], and the velocity (N, 3) [m/s] of that place."""

@@ -14,7 +14,13 @@ import math
 import operator
 from typing import Any
 
-from quadrl.aircraft.aerodynamics import GROUND_EFFECT, MOST_OFFSET, STILL_AIR, WINDMILL
+from quadrl.aircraft.aerodynamics import (
+    GROUND_EFFECT,
+    MOST_OFFSET,
+    MOST_TAKEN,
+    STILL_AIR,
+    WINDMILL,
+)
 from quadrl.aircraft.parameters import WIND, Parameters
 from quadrl.base.rotation import (
     Array,
@@ -177,7 +183,7 @@ def rotor_wrench(
         rest = rotor.thrust_coefficient * speed * speed
         hover = (_disc(p)[1] * speed) ** 2
         taken = ground_share(p, up, height) * hover / (hover + p_square + 1e-12)
-        most = clip(taken, high=0.36)
+        most = clip(taken, high=MOST_TAKEN)
         change = change + (rest + change) * (most / (1 - most))  # lift / (1 - most)
     drag = (p.rotor_drag[..., None] * speed)[..., None] * across
     push = change[..., None] * rotor.axis - drag
