@@ -17,7 +17,7 @@ from quadrl import __version__
 from quadrl.aircraft.aerodynamics import FULL
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import free_name
-from quadrl.base.validation import choice, keys, number, tuples
+from quadrl.base.validation import choice, keys, number, resolved, tuples
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.observing import resolve as resolve_observing
 from quadrl.conditions.randomization import Randomization
@@ -64,19 +64,17 @@ class TrainConfig(TrainSettings):
         settings = _given(renamed(settings))
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
         settings = with_networks(settings)
-        algo = settings.get("algo", _of(task).trained_by)
+        kind = TASKS.get(task, Task)  # an unknown task is refused with the defaults
+        algo = settings.get("algo", kind.trained_by)
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
-        vehicle = settings.setdefault("vehicle", _of(task).trained_on)
+        vehicle = settings.setdefault("vehicle", kind.trained_on)
         variant = settings.get("variant", TrainConfig.variant)
         values, _ = training_defaults(task, algo, vehicle, variant, settings.get("memory"))
-        for name, kind in ALGORITHM_CONFIGS.items():
+        for name, own in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
             if isinstance(given, dict):
-                keys(f"setting of {name}", given, [f.name for f in dataclasses.fields(kind)])
-                given = kind(**values[name] | _given(given))
-            elif not isinstance(given, kind):
-                raise QuadrlError(name=name, value=given, allowed=f"a {kind.__name__} or a dict")
-            settings[name] = given
+                given = values[name] | _given(given)
+            settings[name] = resolved(name, given, own, word="setting")
         if isinstance(given := settings.get("randomization"), Randomization):
             settings["randomization"] = given.given() or "none"
         if isinstance(given := settings.get("weather"), Weather):
@@ -267,11 +265,6 @@ def as_saved(settings: dict[str, Any]) -> dict[str, Any]:
     """
     given = {k: v for k, v in renamed(settings).items() if (k, v) != ("aerodynamics", "")}
     return {"aerodynamics": ""} | conditions_as_saved(given)
-
-
-def _of(task: str) -> type[Task]:
-    """The task of a name; where it is unknown, which is refused later, what all have in common."""
-    return TASKS.get(task, Task)
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
