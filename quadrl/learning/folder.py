@@ -171,6 +171,14 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
+def read_rows(path: Path, columns: Sequence[str]) -> list[list[str]]:
+    """Rows of a table, without its head and without a row that a kill cut off; none of no file."""
+    if not path.exists():
+        return []
+    with open(path, newline="") as file:
+        return [row for row in [*csv.reader(file)][1:] if len(row) == len(columns)]
+
+
 def read_metrics(path: Path) -> dict[str, np.ndarray]:
     """Columns of a metrics.csv, (iterations,) each; missing values are NaN.
 
@@ -208,12 +216,7 @@ class Log:
         from torch.utils.tensorboard import SummaryWriter
 
         path = folder / METRICS
-        kept: list[list[str]] = []
-        if path.exists():
-            with open(path, newline="") as file:
-                rows = list(csv.reader(file))[1:]
-            kept = [row for row in rows if len(row) == len(self.COLUMNS)][:iteration]
-        write_csv(path, self.COLUMNS, kept)
+        write_csv(path, self.COLUMNS, read_rows(path, self.COLUMNS)[:iteration])
         self._file = open(path, "a", newline="")  # noqa: SIM115 - closed by close
         self._writer = csv.writer(self._file)
         self._events = SummaryWriter(str(folder / EVENTS), purge_step=iteration + 1)

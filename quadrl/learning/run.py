@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,14 @@ from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning.config import TrainConfig, prepare
-from quadrl.learning.folder import EVALUATION, EVALUATIONS, LEARNING_CURVE, TRAJECTORY, VIDEO
+from quadrl.learning.folder import (
+    EVALUATION,
+    EVALUATIONS,
+    LEARNING_CURVE,
+    TRAJECTORY,
+    VIDEO,
+    read_rows,
+)
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training
 from quadrl.rendering import write_video
@@ -162,12 +168,11 @@ def _evaluating(training: Training, show: Callable[[Progress], None]) -> Callabl
     actions in episodes that began up to two time limits of every aircraft ago.
     """
     config, file = training.config, training.folder / EVALUATIONS
+    head = ("steps", "seconds", *COLUMNS)
     times = range(1, config.evaluations + 1)
     due = {max(1, round(time * config.iterations / config.evaluations)) for time in times}
-    rows: list[Sequence[Any]] = []
-    if file.exists():  # a row after the checkpoint is made again
-        with open(file, newline="") as opened:
-            rows += [row for row in [*csv.reader(opened)][1:] if int(row[0]) <= training.steps]
+    # A row after the checkpoint is made again.
+    rows: list[Any] = [row for row in read_rows(file, head) if int(row[0]) <= training.steps]
 
     def after(progress: Progress) -> None:
         if progress.iteration in due:
@@ -175,7 +180,7 @@ def _evaluating(training: Training, show: Callable[[Progress], None]) -> Callabl
             found = evaluate(policy, config.scenario, episodes=EPISODES, engine="free_flight")
             reached = (found.metrics[of] for of in COLUMNS.values())
             rows.append([progress.steps, round(progress.seconds, 3), *reached])
-            write_csv(file, ("steps", "seconds", *COLUMNS), rows)
+            write_csv(file, head, rows)
         show(progress)
 
     return after
