@@ -71,11 +71,8 @@ def begin_with(path: Path, actor: nn.Module, critic: nn.Module) -> None:
         try:
             network.load_state_dict(given | own)
         except RuntimeError as error:
-            reason = (
-                f"its {name} sees other numbers than that of this training, or has other layers"
-            )
-            allowed = f"a run whose {name} is alike"
-            folder = str(path.parent)
+            reason = f"its {name} sees other numbers than this training's, or has other layers"
+            allowed, folder = f"a run whose {name} is alike", str(path.parent)
             raise QuadrlError(reason, name="from", value=folder, allowed=allowed) from error
 
 

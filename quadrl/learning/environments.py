@@ -155,18 +155,12 @@ def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
         warnings.warn(f"{said} derivatives; evaluations fly with it", QuadrlWarning, stacklevel=2)
         prompt = dataclasses.replace(scenario.vehicle, dead_time=0.0)
         scenario = dataclasses.replace(scenario, vehicle=prompt)
-    settings: dict[str, Any] = dict(
-        task=scenario,
-        num_envs=config.num_envs,
-        seed=config.seed * SEED_STRIDE,
-        device=device,
-        num_threads=config.num_threads,
-    )
+    given: Any = scenario, config.num_envs, config.seed * SEED_STRIDE, device
     if config.algo == "apg":
-        return RecordingEnv(**settings)
+        return RecordingEnv(*given, num_threads=config.num_threads)
     if config.memory == "none":
-        return QuadrotorEnv(**settings)
-    return RememberingEnv(config.memory_width, **settings)
+        return QuadrotorEnv(*given, num_threads=config.num_threads)
+    return RememberingEnv(config.memory_width, *given, num_threads=config.num_threads)
 
 
 def make_collector(env: QuadrotorEnv, actor: ProbabilisticActor, frames: int) -> Collector:
