@@ -29,7 +29,7 @@ from quadrl.engines import native
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE as POLICY_FILE
-from quadrl.learning import checkpoint
+from quadrl.learning import checkpoint, networks
 from quadrl.learning.algorithm import Algorithm, generators, one_thread, set_generators
 from quadrl.learning.apg import APG
 from quadrl.learning.config import TrainConfig, as_saved
@@ -50,15 +50,7 @@ from quadrl.learning.folder import (
     run_of,
     write_config,
 )
-from quadrl.learning.networks import (
-    BEGINS,
-    PRIVILEGED,
-    STATE,
-    check_fits,
-    export,
-    make_actor_critic,
-    update_normalisers,
-)
+from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE
 from quadrl.learning.origin import Origin
 from quadrl.learning.ppo import PPO
 from quadrl.learning.trpo import TRPO
@@ -94,9 +86,9 @@ class Training:
         torch.manual_seed(config.seed)
         self.env = make_env(config, device)
         size, actions = self.env.environment.size, self.env.environment.action_size
-        check_fits(config, size)
+        networks.check_fits(config, size)
         given = self.env.observation_spec.get(PRIVILEGED, None)
-        self.actor, self.critic, self.normalisers = make_actor_critic(
+        self.actor, self.critic, self.normalisers = networks.make_actor_critic(
             size, actions, config, 0 if given is None else given.shape[-1]
         )
         for network in (self.actor, self.critic):
@@ -219,7 +211,7 @@ class Training:
             "rotors": config.scenario.vehicle.rotor_count,
             **config.scenario.to_json(),
         }
-        return export(self.actor, config.task, metadata)
+        return networks.export(self.actor, config.task, metadata)
 
     def _learn(self, batch: Any) -> dict[str, float]:
         """One iteration on a batch (aircraft, time)."""
@@ -233,7 +225,7 @@ class Training:
             fresh = self.iteration == 0 and not self.config.from_run
             first = fresh and not self.algorithm.whole
             if first:  # the first batch was collected without a normaliser
-                update_normalisers(self.normalisers, batch)
+                networks.update_normalisers(self.normalisers, batch)
                 with set_recurrent_mode():
                     present = self.actor.get_dist(batch)
                 batch["action_log_prob"] = present.log_prob(batch["action"])
@@ -245,7 +237,7 @@ class Training:
             flat = flat.reshape(-1)
         metrics |= self.algorithm.update(flat, 1 - self.iteration / self.config.iterations)
         if not first:
-            update_normalisers(self.normalisers, batch)
+            networks.update_normalisers(self.normalisers, batch)
         return metrics | {"deviation": float(batch["scale"].mean())}
 
     def _evaluate(self, batch: Any) -> None:
