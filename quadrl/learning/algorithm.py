@@ -53,10 +53,10 @@ class Algorithm(abc.ABC):
 
     @abc.abstractmethod
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """The update at the present learning rates."""
+        """Learn from a batch at the present learning rates."""
 
     def step(self, loss: Tensor | Sequence[Tensor], *names: str) -> None:
-        """One gradient step of each of the named optimisers, all on one loss.
+        """Take a gradient step of each named optimiser, all on one loss.
 
         Args:
             loss: A scalar, or several whose sum it is.
@@ -68,10 +68,10 @@ class Algorithm(abc.ABC):
         self.move(*names)
 
     def move(self, *names: str) -> None:
-        """One step of each of the named optimisers along the gradients that there are.
+        """Take a step of each named optimiser along the present gradients.
 
-        Each clips the norm of its own gradient: a critic that is far off, as at the begin of a
-        training, does not hold the policy back.
+        Each clips the norm of its own gradient: a critic that is far off, as at the start of a
+        training, does not slow the policy down.
         """
         for adam in (self._optimisers[name] for name in names):
             if hasattr(self.config, "max_gradient"):
@@ -80,19 +80,20 @@ class Algorithm(abc.ABC):
             adam.step()
 
     def minibatches(self, batch: TensorDictBase, epochs: int) -> Iterator[TensorDictBase]:
-        """Passes over a batch, each in another order, some rows at a time.
+        """Iterate over minibatches of a batch, in `epochs` passes of another order each.
 
-        Rows are as many transitions as the settings say, or the aircraft that have as many.
+        A minibatch holds as many transitions as the settings say, or whole aircraft that have as
+        many together.
         """
         rows = max(1, self.config.minibatch * len(batch) // batch.numel())
         for _ in range(epochs):
             order = torch.randperm(len(batch))
-            # A quarter of the time that it would take to index the batch.
+            # Takes a quarter of the time of indexing the batch.
             entries = {name: x.index_select(0, order.to(x.device)) for name, x in batch.items()}
             yield from TensorDict(entries, batch_size=batch.batch_size).split(rows)
 
     def fit_critic(self, batch: TensorDictBase) -> dict[str, float]:
-        """Passes of the optimiser "critic" over a batch; returns the last loss for the log."""
+        """Fit the critic to a batch in several passes; returns the last loss for the log."""
         entries = batch.select(*self.critic.in_keys, "value_target")
         loss = torch.zeros(())
         for part in self.minibatches(entries, self.config.critic_epochs):
@@ -101,14 +102,14 @@ class Algorithm(abc.ABC):
         return {"critic_loss": loss.item()}
 
     def save(self) -> dict[str, Any]:
-        """Tensors of the optimisers by optimiser, parameter and name."""
+        """Return the tensors of the optimisers by optimiser, parameter and name."""
         return {
             name: {str(k): dict(v) for k, v in adam.state_dict()["state"].items()}
             for name, adam in self._optimisers.items()
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Continue from what `save` returned; an optimiser that had made no step has none."""
+        """Restore what `save` returned; an optimiser that had made no step has no tensors."""
         for name, adam in self._optimisers.items():
             tensors = {int(k): v for k, v in saved.get(name, {}).items()}
             adam.load_state_dict(adam.state_dict() | {"state": tensors})
@@ -129,7 +130,7 @@ def one_thread() -> Generator[None]:
 
 
 def generators(device: torch.device) -> dict[str, Tensor]:
-    """The state of every random number generator that a training on a device draws from."""
+    """Return the state of each random number generator that a training on a device uses."""
     states = {"cpu": torch.get_rng_state()}
     return states | ({"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {})
 

@@ -25,7 +25,7 @@ FARTHEST = 2.0  # times the usual move of an action
 
 
 class APG(Algorithm):
-    """The policy's epochs towards better actions, then the critic's."""
+    """Epochs of the policy towards better actions on each window, then those of the critic."""
 
     whole = True
 
@@ -42,7 +42,7 @@ class APG(Algorithm):
 
         Args:
             actor: The policy.
-            critic: Critic of the windows' ends.
+            critic: Says what comes after the end of a window.
             config: Settings.
             env: Flies the windows.
             gamma: Discount per control step.
@@ -54,12 +54,12 @@ class APG(Algorithm):
         self.add_optimiser("critic", critic, config.critic_rate)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """One window (aircraft, time): the policy's epochs, then the critic's."""
+        """Learn from one window (aircraft, time): epochs of the policy, then of the critic."""
         window = Window(self._env.environment, self._env.taken())
         seen = TensorDict({"observation": window.observation.float()}, len(window.observation))
         mean, deviation = self._distribution(seen)
         flown = batch["action"].transpose(0, 1).reshape(mean.shape)
-        # The random numbers stay as they were drawn, whatever the policy.
+        # The noise stays as it was drawn, however the policy changes.
         action = mean + deviation * ((flown - mean) / deviation).detach()
         earned = self._earned(window)
         by_action = window.vector_jacobian_product(earned, action, self._gamma)
@@ -78,9 +78,9 @@ class APG(Algorithm):
         return self._reward_scale * window.reward.sum() + value
 
     def _moves(self, by_action: Tensor) -> Tensor:
-        """How far actions are moved, (n, k): by `config.step` where the gradient is the median.
+        """How far each action is moved, (n, k): `config.step` where the gradient is the median.
 
-        The gradient at some moments is a thousand times as strong as at others.
+        At some moments the gradient is a thousand times as large as at others.
         """
         strength = by_action.norm(dim=-1, keepdim=True)
         moves = self.config.step * by_action / strength.median().clamp(min=1e-9)

@@ -1,7 +1,7 @@
 """The speed of every layer, measured in one process.
 
 The yardstick is bare `mj_step`: the same lean model with the same callbacks under random commands,
-which move it as random actions do (a step at rest is an eighth shorter). Everything is counted in
+which move it as random actions do (a step at rest takes an eighth less time). Every rate is in
 control steps per second.
 """
 
@@ -36,7 +36,7 @@ from quadrl.core.task import Task
 from quadrl.engines.mujoco import BatchEngine
 
 Work = Iterator[int]
-"""Flies some control steps each time, and says how many."""
+"""An iterator that flies some control steps at each `next` and gives their number."""
 
 ALL_CORES, ONE_CORE = "all cores", "one core"
 CHUNK = 200  # control steps of one aircraft between two looks at the clock
@@ -45,7 +45,7 @@ HEIGHT = 3.0  # [m], where the aircraft of bare mj_step begin; in a FLIGHT they 
 LOW = 0.5  # [m], where they feel the ground
 FULL = RANDOMIZATIONS["full"]
 DIFFERENT = Randomization(**{name: getattr(FULL, name) for name in (*FACTORS, "rotors")})
-"""Aircraft that differ, and nothing else."""
+"""Aircraft that differ; nothing else is drawn."""
 FREE_FLIGHT_ENVS = 4096
 POSTS = 100
 FREE_FLIGHT = "free flight"  # Environment of FREE_FLIGHT_ENVS
@@ -53,7 +53,7 @@ KERNEL = "kernel"  # free flight of FREE_FLIGHT_ENVS on one core and nothing els
 
 
 class Layer(NamedTuple):
-    """One thing that is measured."""
+    """One row of the measurement."""
 
     what: str
     of: str
@@ -62,19 +62,20 @@ class Layer(NamedTuple):
     target: float | None = None
     """Share of the yardstick that it should reach."""
     is_yardstick: str = ""
-    """The yardstick that it may be; of several the fastest is."""
+    """The yardstick that it is a candidate for; the fastest candidate is the yardstick."""
 
 
 def benchmark(
     task: str, *, num_envs: int = 1024, seconds: float = 0.2, repeats: int = 30
 ) -> dict[str, Any]:
-    """Measure every layer, in turn and several times over, so that drift affects all alike.
+    """Measure all layers in turns, several times each, so that drift affects all alike.
 
     Args:
         task: Name of a task.
         num_envs: Aircraft in the batches.
         seconds: Length of each measurement; short, since the speed of a machine drifts.
-        repeats: Measurements of each. The fastest is the rate: other work only slows it down.
+        repeats: Measurements of each layer. The fastest is the rate: other work on the machine only
+            slows a layer down.
 
     Returns:
         `rates`: for each layer `what`, `rate` [control steps/s], all `repeats` of it, `share` of
@@ -99,7 +100,7 @@ def benchmark(
 
 
 def rows(measured: dict[str, Any]) -> list[tuple[str, ...]]:
-    """What `benchmark` returned as rows of text, the head first."""
+    """Format what `benchmark` returned as rows of text, the head first."""
     written: list[tuple[str, ...]] = [("what", "steps/s", "median", "share", "of", "target")]
     for row in measured["rates"]:
         what, rate = row["what"], row["rate"]
@@ -113,9 +114,9 @@ def rows(measured: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def _measure(works: list[Work], seconds: float, repeats: int) -> list[list[float]]:
-    """Control steps per second of each, `repeats` times over."""
+    """Measure the control steps per second of each work, `repeats` times over."""
     for work in works:
-        next(work)  # the first time is slower
+        next(work)  # the first call is slower
     rates: list[list[float]] = [[] for _ in works]
     for _ in range(repeats):
         for work, measured in zip(works, rates, strict=True):
@@ -128,7 +129,7 @@ def _measure(works: list[Work], seconds: float, repeats: int) -> list[list[float
 
 
 def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Layer]:
-    """Everything that is measured; what has to be closed goes to the stack."""
+    """Make all layers; what has to be closed goes to the stack."""
     gymnasium_id = f"quadrl/{task.name.title().replace('_', '')}-v0"
     vehicle, size, free = Vehicle(), f"{num_envs:,}", f"{FREE_FLIGHT_ENVS:,}"
     air = in_real_air(vehicle)
@@ -177,19 +178,19 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
 
 
 def _actions(*shape: int) -> Iterator[np.ndarray]:
-    """Random actions (*shape) float32, over and over; drawing them is not measured."""
+    """Repeat 64 random actions (*shape) float32 for ever, so that no drawing is measured."""
     drawn = np.random.default_rng(0).uniform(-1, 1, (64, *shape))
     return itertools.cycle(drawn.astype(np.float32))
 
 
 def _commands(vehicle: Vehicle, *shape: int) -> Iterator[np.ndarray]:
-    """The rotor commands (*shape, R) [rad/s] of random actions, over and over."""
+    """Repeat the rotor commands (*shape, R) [rad/s] of random actions for ever."""
     shape = (64, *shape, vehicle.rotor_count)
     return itertools.cycle(vehicle.rotor_command(np.random.default_rng(0).uniform(-1, 1, shape)))
 
 
 def _mj_step(vehicle: Vehicle, model: mujoco.MjModel, cores: int) -> Work:
-    """As `mj_step` can be at its best: an aircraft per core, and a command per flight."""
+    """Fly with `mj_step` at its best: one aircraft per core, one command per flight."""
     aircraft, commands = [mujoco.MjData(model) for _ in range(cores)], _commands(vehicle)
 
     def fly(data: mujoco.MjData) -> None:
@@ -206,7 +207,7 @@ def _mj_step(vehicle: Vehicle, model: mujoco.MjModel, cores: int) -> Work:
 
 
 def _batched_mj_step(vehicle: Vehicle, model: mujoco.MjModel, num_envs: int) -> Work:
-    """MuJoCo's native batch on all cores."""
+    """Fly with MuJoCo's native batch on all cores."""
     batch, commands = Batch(model, num_envs), _commands(vehicle, num_envs)
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
     batch.bind("qpos")[:, 2] = HEIGHT
@@ -221,7 +222,7 @@ def _batched_mj_step(vehicle: Vehicle, model: mujoco.MjModel, num_envs: int) -> 
 
 
 def _with_clock(work: Work) -> Work:
-    """The same as mujoco comes: it reads the clock at every stage of a step."""
+    """Do the same with mujoco's own clock, which it reads at every stage of a step."""
     while True:
         ours = mujoco.get_mjcb_time()
         mujoco.set_mjcb_time(None)
@@ -235,7 +236,7 @@ def _with_clock(work: Work) -> Work:
 def _free_flight(
     vehicle: Vehicle, height: float, randomization: Randomization | None = None
 ) -> Work:
-    """From hover at a height [m]."""
+    """Fly from hover at a height [m] with the free-flight engine alone."""
     count, sampler = FREE_FLIGHT_ENVS, AircraftSampler(randomization, vehicle)
     per_row = sampler.randomization.per_row
     settings: Any = {"engine": "free_flight", "num_threads": 1, "per_row": per_row}
@@ -266,7 +267,7 @@ def _environment(task: Task, **settings: Any) -> Work:
 
 
 def _among_posts(task: Task) -> Task:
-    """The task in a world with posts, none of them near enough to be hit."""
+    """Put the task into a world with posts, all of them too far away to be hit."""
     places = np.random.default_rng(0).uniform(8, 30, (POSTS, 2)) * (-1, 1)
     posts = [
         Cylinder(f"post_{k}", height=8.0, position=(x, y, 4.0)) for k, (x, y) in enumerate(places)
@@ -291,7 +292,7 @@ def _vectors(envs: Any) -> Work:
 
 
 def _single(env: Any, size: int, over: Callable[[Any], bool]) -> Work:
-    """One aircraft, reset when its episode is over."""
+    """Fly one aircraft, which is reset when its episode is over."""
     actions = _actions(size)
     env.reset()
     while True:
@@ -302,7 +303,7 @@ def _single(env: Any, size: int, over: Callable[[Any], bool]) -> Work:
 
 
 def _collector(task: Task, num_envs: int, stack: contextlib.ExitStack) -> Work:
-    """The collector and the policy as a training has them."""
+    """Collect with the collector and the policy of a training."""
     from quadrl.envs.torchrl import QuadrotorEnv
     from quadrl.learning.algorithm import one_thread
     from quadrl.learning.config import TrainConfig

@@ -1,7 +1,7 @@
 """Checkpoints from which training continues bit for bit.
 
 A checkpoint is one safetensors file, so that reading it runs nothing: tensors by name, and a
-header of JSON. It is written whole or not at all.
+header of JSON. It is written completely or not at all.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def save(path: Path, tensors: dict[str, Any], numbers: dict[str, Any]) -> None:
     """Write a checkpoint.
 
     Args:
-        path: The file; an old one is replaced once the new one is on the disk.
+        path: The file; it replaces an old one once it is on the disk.
         tensors: Tensors and arrays, in nested dicts.
         numbers: Whatever JSON can hold.
     """
@@ -57,9 +57,9 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def begin_with(path: Path, actor: nn.Module, critic: nn.Module) -> None:
-    """Give networks the weights of a checkpoint, and what it knows of the observations.
+    """Load the weights and the normalisers of a checkpoint into the networks.
 
-    What a policy that holds the goal sees there stays its own: the goal may be another one.
+    A policy that holds the goal keeps its own observation at the goal, which may be another one.
 
     Raises:
         QuadrlError: The file cannot be read, or the networks are of other sizes.
@@ -77,12 +77,12 @@ def begin_with(path: Path, actor: nn.Module, critic: nn.Module) -> None:
 
 
 def check_same(path: Path, saved: dict[str, Any], present: dict[str, Any]) -> None:
-    """Refuse a checkpoint whose settings would end in another policy than the present ones.
+    """Refuse a checkpoint whose settings lead to another policy than the present ones.
 
     Args:
         path: The checkpoint.
         saved: Its resolved configuration.
-        present: The one that it is to be continued with.
+        present: The configuration to continue it with.
 
     Raises:
         QuadrlError: A setting differs.
@@ -90,7 +90,7 @@ def check_same(path: Path, saved: dict[str, Any], present: dict[str, Any]) -> No
     was, now = dict(flat(saved)), dict(flat(present))
     for name in was | now:
         if name not in was and name.partition(".")[0] in ALGORITHM_CONFIGS:
-            continue  # a setting of an algorithm that is new since then
+            continue  # a setting of an algorithm that was added later
         if was.get(name) != now.get(name) and name not in CHANGEABLE:
             reason = f"{path} was trained with it; restore that setting or start a new run"
             value = now.get(name, present.get(name))

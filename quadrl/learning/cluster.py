@@ -1,6 +1,6 @@
 """Trainings on the nodes of a Ray cluster, in a folder that all machines share.
 
-Ray begins a training again where the node that it was on is lost; it goes on from its last
+When a node is lost, Ray starts its training again on another one, where it goes on from its last
 checkpoint.
 """
 
@@ -28,7 +28,7 @@ QUIET = {
 
 
 def carry_out_here(what: dict[str, Any], log: Path) -> End:
-    """On a node: carry out a training in a process, which dies with this one."""
+    """Carry out a training on this node, in a process that dies with this one."""
     for path in (what["folder"], *what["own"]):
         if not Path(path).exists():
             shared = "a folder that all machines share (--out), and files there (--import)"
@@ -37,13 +37,13 @@ def carry_out_here(what: dict[str, Any], log: Path) -> End:
 
 
 class Task(NamedTuple):
-    """A training on some node, as a task of Ray."""
+    """A training on a node, as a task of Ray."""
 
     ray: Any
     task: Any
 
     def poll(self) -> End | None:
-        """How it ended; None while it works or waits for a node."""
+        """Return how it ended; None while it works or waits for a node."""
         if not self.ray.wait([self.task], timeout=0)[0]:
             return None
         try:
@@ -61,16 +61,16 @@ class Task(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Nodes(Local):
-    """The nodes of a cluster. They see the folders of the runs under the same paths."""
+    """The nodes of a cluster, which share the folders of the runs under the same paths."""
 
     ray: Any = None
 
     def slots(self) -> int:
-        """How many at the same time: one per CPU of the cluster as it is now."""
+        """Number of trainings at a time: one per CPU that the cluster has now."""
         return self.jobs or max(1, int(self.ray.cluster_resources().get("CPU", 1)))
 
     def begin(self, run: PlannedRun) -> Task:
-        """Begin a training, or continue it, on a node with a CPU to spare."""
+        """Begin a training, or continue it, on a node with a free CPU."""
         for folder in (run.folder, run.log.parent):
             folder.mkdir(parents=True, exist_ok=True)
         needs = {"num_cpus": 1, "num_gpus": int(run.config.device.startswith("cuda"))}
@@ -81,12 +81,12 @@ class Nodes(Local):
 
 @contextlib.contextmanager
 def on_ray(address: str, local: Local) -> Generator[Nodes]:
-    """The nodes of the cluster at an address.
+    """Give the nodes of the cluster at an address.
 
     Args:
         address: HOST:PORT; "auto" for the cluster that this machine belongs to; "local" for a
             cluster of this machine alone that ends with the study.
-        local: What the processes of one machine would be.
+        local: The processes that one machine alone would use, whose settings the nodes take.
 
     Raises:
         QuadrlError: Ray is not installed, or there is no cluster at the address.
@@ -119,7 +119,7 @@ def _connect(ray: Any, address: str, jobs: int | None) -> None:
             allowed = "HOST:PORT such as 10.0.0.1:6379, auto, or local"
             raise QuadrlError(name="ray", value=address, allowed=allowed)
     try:
-        if host:  # Ray itself waits for minutes
+        if host:  # Ray itself would wait for minutes
             socket.create_connection((host, int(port)), REACH_SECONDS).close()
         ray.init(**given, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, OSError, OverflowError, RuntimeError, ValueError) as error:

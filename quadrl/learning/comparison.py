@@ -1,8 +1,8 @@
 """Whether seeds of one algorithm, or with one setting, reach more than those of another.
 
-Seeds are compared within a task alone, and what the tasks say is added up by van Elteren's test
-(1960), which is Mann and Whitney's where there is one task. Two one-sided tests beside it say where
-there is no difference that matters, which is more than not to have shown one.
+Seeds are compared within each task, and the tasks are combined by van Elteren's test (1960), which
+with one task is Mann and Whitney's. Two one-sided tests show that there is no difference that
+matters, which is more than the lack of evidence for one.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from quadrl.base.validation import choice
 
 LEVEL = 0.05
 MARGIN = 0.25
-"""How far from one half a chance is that matters: a seed of the one is ahead in three of four."""
+"""Distance of a chance from one half that matters: a seed of the one wins three times in four."""
 DRAWS = 1000
-"""Experiments by which a power is estimated."""
+"""Simulated experiments by which a power is estimated."""
 STEEPEST = 300.0
 VERDICTS = ("smaller", "larger", "no difference", "undecided")
 Pair = tuple[np.ndarray, np.ndarray]
@@ -31,53 +31,53 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 class Sums(NamedTuple):
-    """What decides of an experiment, (), or of each of many."""
+    """The statistics of one experiment, (), or of each of many."""
 
     chance: np.ndarray
-    """That a seed of the one has the smaller figure; a tie counts as half."""
+    """Probability that a seed of the one has the smaller figure; a tie counts as half."""
     score: np.ndarray
-    """By how many deviations, as they are without a difference, it is above one half."""
+    """Standard deviations that the chance lies above one half, if there were no difference."""
     error: np.ndarray
-    """Its standard error."""
+    """Standard error of the chance."""
 
     def p_values(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of "smaller", of "larger", and, by two one-sided tests, of "no difference"."""
+        """P values of "smaller", "larger", and, by two one-sided tests, of "no difference"."""
         room = (MARGIN - np.abs(self.chance - 0.5)) / self.error
         return stats.norm.sf(self.score), stats.norm.sf(-self.score), stats.norm.sf(room)
 
     def verdict(self, level: float) -> np.ndarray:
-        """Places in `VERDICTS`; each is false with a chance of `level` at most."""
+        """Indices in `VERDICTS`; each is false with a probability of `level` at most."""
         smaller, larger, equal = self.p_values()
         return np.select([smaller < level / 2, larger < level / 2, equal < level], [0, 1, 2], 3)
 
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """How a figure of the seeds of `one` lies to that of the seeds of `other`."""
+    """A figure of the seeds of `one` compared with that of the seeds of `other`."""
 
     figure: str
     one: str
     other: str
     seeds: dict[str, tuple[int, int]]
-    """How many of each, by task."""
+    """Number of seeds of each, by task."""
     by_task: dict[str, float]
     """The chance that a seed of the one has the smaller figure; a tie counts as half."""
     chance: float
-    """The same over the tasks, with van Elteren's weights."""
+    """The same over all tasks, with van Elteren's weights."""
     low: float
-    """Of its 95 % interval."""
+    """Lower end of its 95 % interval."""
     high: float
     p_smaller: float
-    """One-sided p value that the one's figure is smaller."""
+    """One-sided p value of the verdict "smaller"."""
     p_larger: float
     p_equal: float
-    """That the chance is within `MARGIN` of one half."""
+    """P value of the verdict "no difference": the chance is within `MARGIN` of one half."""
     verdict: str
     """One of `VERDICTS`."""
     power_differs: float
-    """How often so many seeds show a difference where the chance is `MARGIN` above one half."""
+    """How often as many seeds show a difference if the chance is `MARGIN` above one half."""
     power_equal: float
-    """How often they show that there is none where there is none."""
+    """How often they show that there is no difference if there is none."""
 
 
 def compare(
@@ -129,12 +129,12 @@ def compare(
 
 
 def arm(run: Mapping[str, Any]) -> str:
-    """The algorithm of a run, and its variant."""
+    """Name the algorithm of a run, and its variant."""
     return f"{run['algo']} {run['variant']}".strip()
 
 
 def sums(pairs: Sequence[Pair]) -> Sums:
-    """What decides, of the figures of each task."""
+    """Compute the statistics from the figures of each task."""
     terms, weights = [], []
     for one, other in pairs:
         m, n = one.shape[-1], other.shape[-1]
@@ -145,7 +145,7 @@ def sums(pairs: Sequence[Pair]) -> Sums:
         ties = (same**2 - 1).sum(-1) / (count * (count - 1))
         spread = less.mean(-1).var(-1, ddof=1) / m + less.mean(-2).var(-1, ddof=1) / n
         without_ties = (count + 1) / (12 * m * n)
-        # Where nearly all seeds are equal, few of them would seem to know the chance exactly.
+        # If nearly all seeds are equal, few of them would seem to give the chance exactly.
         error = np.maximum(spread, without_ties)
         terms.append((less.mean((-2, -1)), without_ties - ties / (12 * m * n), error))
         weights.append(m * n / (count + 1))
@@ -159,14 +159,14 @@ def sums(pairs: Sequence[Pair]) -> Sums:
 
 
 def power(pairs: Sequence[Pair], chance: float, level: float = LEVEL) -> float:
-    """How often so many seeds, with their ties, get the right verdict.
+    """Estimate how often as many seeds, with as many ties, get the right verdict.
 
-    Both are drawn from all figures of a task, with weights that fall with the rank for the one, and
-    rise for the other, so far that a seed of the one has the smaller figure with the chance.
+    Both are drawn from all figures of a task. Their weights fall with the rank for the one and rise
+    for the other, just so steeply that a seed of the one has the smaller figure with the chance.
 
     Args:
         pairs: Figures of each task, (m,) and (n,).
-        chance: One half, where "no difference" is right, or more, where "smaller" is.
+        chance: One half, if "no difference" is right, or more, if "smaller" is.
         level: As `compare` takes it.
     """
     rng, drawn = np.random.default_rng(0), []
@@ -185,7 +185,7 @@ def _falling(ranks: np.ndarray, steepness: float) -> np.ndarray:
 
 
 def _steepness(ranks: np.ndarray, chance: float) -> Any:
-    """With which a rank drawn with falling weights is below one drawn with rising ones."""
+    """Find the steepness at which a rank with falling weights is below one with rising ones."""
     less = (ranks[:, None] < ranks) + 0.5 * (ranks[:, None] == ranks)
 
     def excess(steepness: float) -> float:

@@ -37,13 +37,13 @@ from quadrl.tasks import TASKS
 
 ALGORITHMS = tuple(ALGORITHM_CONFIGS)
 ALIASES = {"gae": "vpg"}
-"""The paper names the plain policy gradient after its advantages."""
+"""The paper calls the plain policy gradient by the name of its advantages."""
 MAX_BATCH = 1 << 24
-"""Most transitions in a batch: some GB."""
+"""Most transitions in a batch, which are some GB."""
 MAX_WIDTH = 1 << 16
 MEMORIES = ("none", "gru")
 OLD_NAMES = {"practice": "training_options"}
-"""Settings that were renamed, as runs from before that have them."""
+"""Former names of settings, as older runs have them, and the present ones."""
 
 
 @dataclasses.dataclass(frozen=True, init=False)
@@ -51,12 +51,12 @@ class TrainConfig(TrainSettings):
     """All settings of a training but its folder; `sources` says where each comes from."""
 
     def __init__(self, task: str = "hover", **settings: Any) -> None:
-        """Fill in what is not given: defaults of the task, else of the algorithm, else the above.
+        """Fill in the defaults (`quadrl.learning.defaults`) of all settings that are not given.
 
         Args:
             task: Name of the task.
-            **settings: The other fields, None for the default; those of an algorithm (`ppo`) may
-                be a dict of some.
+            **settings: The other fields, None for the default; the settings of an algorithm (`ppo`)
+                may be a dict with some of them.
 
         Raises:
             QuadrlError: A setting is unknown or out of range.
@@ -84,7 +84,7 @@ class TrainConfig(TrainSettings):
         if "control_mode" in settings:
             settings["control_mode"] = modes.named(settings["control_mode"])
         if isinstance(given := settings.get("task_options"), dict):
-            usual = values["training_options"]  # not in place of what is asked for
+            usual = values["training_options"]  # they do not replace options that are given
             values["training_options"] = {k: v for k, v in usual.items() if k not in given}
         for name in PAIRS:
             if isinstance(settings.get(name), dict):
@@ -114,7 +114,7 @@ class TrainConfig(TrainSettings):
         return values, sources
 
     def _wind_brings(self) -> str:
-        """Effects of the air where none are asked for; the aircraft of a training have none."""
+        """Effects of the air if none are given: the full set in wind, none in calm weather."""
         return "" if Weather.of(self.weather).calm else FULL
 
     def sources(self) -> Iterator[tuple[str, Any, str]]:
@@ -153,10 +153,10 @@ class TrainConfig(TrainSettings):
                 raise QuadrlError(name=name, value=value, allowed=f"a {kind.__name__}")
         for width in (*self.hidden, *self.critic_hidden):
             number("width of a hidden layer", width, 1, MAX_WIDTH, whole=True)
-        batch = self.num_envs * self.rollout  # the advantage of a single one has no deviation
+        batch = self.num_envs * self.rollout  # one advantage alone has no standard deviation
         number("num_envs * rollout", batch, 2, MAX_BATCH, whole=True)
         if self.gamma == 1.0:
-            said = "gamma = 1: what is far counts as much as what is near; usual are 0.9 to 0.99"
+            said = "gamma = 1: distant rewards count as much as near ones; usual are 0.9 to 0.99"
             warnings.warn(said, QuadrlWarning, stacklevel=4)
         choice("memory", self.memory, MEMORIES)
         if not isinstance(self.holds_goal, bool) or (self.holds_goal and self.memory != "none"):
@@ -170,7 +170,7 @@ class TrainConfig(TrainSettings):
 
     @property
     def scenario(self) -> Scenario:
-        """What the policy is asked to fly, in MuJoCo, and what it observes."""
+        """What the policy has to fly, in MuJoCo, and what it observes."""
         observe = resolve_observing(self.observe).for_policy()
         return Scenario.of(self._conditions(), engine="mujoco", observe=observe)
 
@@ -190,7 +190,7 @@ class TrainConfig(TrainSettings):
         return max(1, math.ceil(self.steps / (self.num_envs * self.rollout)))
 
     def resolved(self) -> dict[str, Any]:
-        """The settings and everything that their names stand for, as JSON gives them back."""
+        """Return the settings and the values behind their names, as they come back from JSON."""
         flown = self.training_scenario
         whole = dataclasses.asdict(self) | {
             "control_mode": modes.to_save(self.control_mode),
@@ -200,16 +200,16 @@ class TrainConfig(TrainSettings):
             "resolved_randomization": dataclasses.asdict(flown.randomization),
             "versions": _versions(),
         }
-        if not self.from_run:  # as in runs of before there was the setting
+        if not self.from_run:  # as in runs from before this setting existed
             del whole["from_run"]
         return json.loads(json.dumps(whole))
 
     @classmethod
     def of_folder(cls, folder: Path) -> TrainConfig:
-        """The configuration of a run.
+        """Read the configuration of a run.
 
         Raises:
-            QuadrlError: The folder holds no run, or what its names stand for has changed since.
+            QuadrlError: The folder holds no run, or the values behind its names have changed since.
         """
         saved = {"from_run": "", "evaluations": 0} | as_saved(read_config(folder))
         names = [field.name for field in dataclasses.fields(cls)]
@@ -230,11 +230,11 @@ def prepare(
     resume: str | Path | None,
     settings: dict[str, Any],
 ) -> tuple[TrainConfig, Path]:
-    """Settings and folder of a training, as `quadrl.train` takes them.
+    """Make settings and folder of a training from the arguments of `quadrl.train`.
 
     Raises:
-        QuadrlError: A setting is unknown or out of range; or it may not change in a run that is to
-            be continued.
+        QuadrlError: A setting is unknown or out of range, or may not change when a run is
+            continued.
     """
     if resume is not None:
         config = TrainConfig.of_folder(Path(resume))
@@ -254,14 +254,14 @@ def prepare(
 
 
 def renamed(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings with those that a run was saved with under an old name under the present one."""
+    """Rename the settings that a run was saved with under an old name."""
     return {OLD_NAMES.get(name, name): value for name, value in settings.items()}
 
 
 def as_saved(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings from the file of a run, some of which may be of an earlier version.
+    """Convert settings from the file of a run, which may be of an earlier version.
 
-    What an empty `aerodynamics` means in wind is for `quadrl.core.scenario.as_saved` to say.
+    `quadrl.core.scenario.as_saved` decides what an empty `aerodynamics` means in wind.
     """
     given = {k: v for k, v in renamed(settings).items() if (k, v) != ("aerodynamics", "")}
     return {"aerodynamics": ""} | conditions_as_saved(given)
@@ -273,6 +273,6 @@ def _given(settings: dict[str, Any]) -> dict[str, Any]:
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    """Of quadrl and of what a training runs on; each is looked up in a file, and never changes."""
+    """Versions of quadrl and of the packages that decide results; cached, since files have them."""
     packages = ("mujoco", "torch", "torchrl", "numpy")
     return {"quadrl": __version__} | {name: version(name) for name in packages}

@@ -26,15 +26,15 @@ from quadrl.core.task import Task
 from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
-"""Settings that the defaults follow from, or that have no better default than another."""
+"""Settings that the other defaults depend on, or that have no better default than another."""
 PAIRS = ("task_options", "training_options", "vehicle_options", "observe")
-"""Settings that are dicts; what is given is added to the defaults."""
+"""Settings that are dicts: given entries are added to the default ones."""
 PER_STEP: dict[str, Callable[[Any, float], Any]] = {
     "gamma": lambda gamma, often: round(gamma ** (1 / often), 4),
     "rollout": lambda steps, often: max(1, round(steps * often)),
     "steps": lambda steps, often: round(steps * often),
 }
-"""Settings that count control steps, and what they are where there are so many times as many."""
+"""Settings that count control steps, and their values at `often` times the control rate."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "robust": {
@@ -43,12 +43,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
             "mass": (0.8, 1.2),
             "lag": (0.5, 2.2),
             "command_delay": (0.0, 0.06),
-            # How much the air acts on the rotors is not known either; with its full strength alone
-            # late commands are learned less well.
+            # The strength of the effects of the air on the rotors is uncertain too; if it is always
+            # full, policies learn to cope with late commands less well.
             "inflow": (0.01, 1.2),
             "drag": (0.5, 1.5),
             "noise": dataclasses.asdict(RANDOMIZATIONS["light"].noise),
-            # Unlike rotors, since nothing else in the practice needs the aim.
+            # Rotors differ, since nothing else in the training makes the aim necessary.
             "rotors": (0.96, 1.04),
             "centre_of_mass": 0.002,
         },
@@ -60,19 +60,19 @@ VARIANTS: dict[str, dict[str, Any]] = {
             "disturbance": True,
             "rotor_speed": "estimated",
             "privileged": True,
-            # A gust's offset passes, and is answered otherwise than what lasts; and smoothed over
-            # more than a control step the disturbance shows gusts too late.
+            # The offset by a gust passes, and needs another answer than one that lasts. Smoothed
+            # over more than a control step, the disturbance shows gusts too late.
             "sensors": {"aim": {"beside_goal": True}, "disturbance": {"smoothing": 0.02}},
         },
-        "holds_goal": False,  # in wind the goal is held with a tilt that the wind gives
-        # The critic sees the gusts, so that it tells more of an action than many steps of luck.
+        "holds_goal": False,  # in wind an aircraft stays at the goal only with a tilt
+        # The critic sees the gusts, so it judges an action better than many noisy steps do.
         "gae_lambda": 0.9,
         "gamma": 0.95,  # with a shorter horizon heavy aircraft begin to swing, and fall
         "ppo": {"learning_rate": 3e-3, "beta2": 0.999},
         "steps": 16_384_000,
-        # A lasting error costs (1 - gamma) of its weight alone: with the tasks' own weights these
-        # policies spin, head wrong with another mass, and stay aside in wind. Without
-        # smoothness_weight actions alternate between their ends on aircraft with quick rotors.
+        # A lasting error costs only (1 - gamma) of its weight: with the tasks' own weights these
+        # policies spin, head wrong with another mass, and stay off the goal in wind. Without
+        # smoothness_weight actions jump between their limits on aircraft with quick rotors.
         "task_options": {
             "spin_weight": 10.0,
             "attitude_weight": 75.0,
@@ -84,12 +84,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
 """Settings that go together."""
 WIDE = 90.0
 """Action scale of the paper's aircraft in the variant robust [rad/s]: with its own, 35, the rotors
-carry 1.33 times the specified weight at most, too little for one that is 20 % heavier in wind."""
+lift at most 1.33 times the specified weight, too little for one that is 20 % heavier in wind."""
 _SMALL: dict[str, Any] = {
-    "weather": {"wind_speed": 2.0},  # in light weather, 7.7 m/s, these do not learn to stay up
+    "weather": {"wind_speed": 2.0},  # in light weather, 7.7 m/s, they do not learn to stay up
     "randomization": {"lag": (0.5, 2.0), "command_delay": (0.0, 0.04), "centre_of_mass": 0.0005},
-    "observe": {"action_history": 4},  # as many as are on their way at most, at their control rate
-    # In the wind of these the wider layer of hover and random_waypoint has not been tried.
+    "observe": {"action_history": 4},  # as many as can be on their way at their control rate
+    # The wider layer of hover and random_waypoint has not been tried with this wind.
     "hidden": (128,),
     "task_options": {"spin_weight": 10.0},
     "steps": 3_276_800,
@@ -99,18 +99,18 @@ OF_VEHICLE: dict[tuple[str, str], dict[str, Any]] = {
     ("robust", "crazyflie"): _SMALL,
     ("robust", "crazyflie_brushless"): _SMALL,
 }
-"""What a variant changes for one aircraft alone."""
+"""Settings of a variant for one aircraft."""
 WITH_MEMORY: dict[str, Any] = {
-    "holds_goal": False,  # what is remembered differs at the goal
+    "holds_goal": False,  # at the goal, too, the memory differs
     "ppo": {"fused": False},
 }
-"""What holds for a policy with a memory, over all layers."""
+"""Settings of a policy with a memory, over all layers."""
 
 
 def training_defaults(
     task: str, algo: str, vehicle: str, variant: str, memory: str | None = None
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """The fields of `TrainConfig` where nothing is given, and the layer that each comes from.
+    """Return the defaults of the fields of `TrainConfig`, and the layer of each.
 
     Args:
         task: Name of the task.
@@ -120,7 +120,7 @@ def training_defaults(
         memory: Memory of the policy; None for that of the layers.
 
     Returns:
-        The values, those of an algorithm as a dict; and a label of the layer by the name of the
+        The values, those of an algorithm as a dict; and the label of the layer by the name of the
         setting, as in `flat`.
 
     Raises:
@@ -156,7 +156,7 @@ def training_defaults(
 
 
 def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
-    """A layer's settings as they are for an aircraft: the same in seconds."""
+    """Convert a layer's settings to the control rate of an aircraft: the same times in seconds."""
     timestep = VEHICLES["paper"].control_timestep
     often = round(timestep / VEHICLES[vehicle].control_timestep, 9)
     if often == 1:
@@ -165,22 +165,23 @@ def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
 
 
 def own_settings(task: Task | type[Task]) -> dict[str, Any]:
-    """Settings that have other defaults with a task and its own algorithm.
+    """Return the settings that have other defaults with a task and its own algorithm.
 
-    They are as `quadrl train` takes them, at the control rate of the aircraft that it trains on.
+    They are as `quadrl train` takes them, at the control rate of the aircraft that the task is
+    trained on.
     """
     return at_rate(_unusual(task, task.trained_by), task.trained_on)
 
 
 def _unusual(task: Task | type[Task], algo: str) -> dict[str, Any]:
-    """The same with any algorithm, at the control rate of the paper's aircraft."""
+    """Return the same with any algorithm, at the control rate of the paper's aircraft."""
     chosen = {"vehicle": task.trained_on, "algo": task.trained_by}
     unusual = {name: own for name, own in chosen.items() if own != getattr(TrainSettings, name)}
     return merged(unusual, task.training, task.training_with.get(algo, {}))
 
 
 def merged(*settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings with later ones in place of earlier ones; dicts are added, at every depth."""
+    """Merge settings: later ones replace earlier ones; dicts are merged, at every depth."""
     whole: dict[str, Any] = {}
     for given in settings:
         for name, value in given.items():
@@ -192,7 +193,7 @@ def merged(*settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Names and values of nested settings, as `ppo.learning_rate`; an empty dict is a value."""
+    """Iterate over nested settings by names as `ppo.learning_rate`; an empty dict is a value."""
     for name, value in settings.items():
         if isinstance(value, dict) and value:
             yield from flat(value, f"{prefix}{name}.")

@@ -20,8 +20,8 @@ def describe(task: Task) -> dict[str, Any]:
     Returns:
         name, asks, starts, ends, solved (texts); time_limit [s]; training: settings that have other
         defaults with this task; observation: name, first, last, unit and meaning of each
-        term of the flat vector; action (text); reward: name, weight (None without an option of that
-        name) and meaning of each term; options: name, value and meaning of the others.
+        term of the flat vector; action (text); reward: name, weight (None if there is no option for
+        it) and meaning of each term; options: name, value and meaning of the others.
     """
     environment, texts = Environment(task, seed=0), docstrings(type(task))
     values = dataclasses.asdict(task)
@@ -45,7 +45,7 @@ def describe(task: Task) -> dict[str, Any]:
 
 
 def describe_observation(environment: Environment) -> list[dict[str, Any]]:
-    """Name, first and last place, unit and meaning of each term of the flat observation."""
+    """Describe each term of the flat observation: name, first and last index, unit and meaning."""
     seen = environment.observer.terms if environment.observer else environment.task.observation
     return [
         {"name": name, "first": where.start, "last": where.stop - 1, "unit": seen[name].unit,
@@ -55,7 +55,7 @@ def describe_observation(environment: Environment) -> list[dict[str, Any]]:
 
 
 def describe_action(vehicle: Vehicle) -> str:
-    """What the numbers of an action mean with the control mode "rotor", in words."""
+    """Describe the numbers of an action in the control mode "rotor"."""
     hover, fastest = (_span(speeds) for speeds in (vehicle.hover_speed, vehicle.max_speed))
     return (
         f"{vehicle.rotor_count} numbers in [-1, 1], one per rotor: the change of its speed command "

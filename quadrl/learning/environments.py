@@ -1,4 +1,4 @@
-"""The aircraft of a training, what a recurrent policy remembers of each, and their collector."""
+"""The environments of a training, the memory of a recurrent policy, and the collector."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ with warnings.catch_warnings():
     from torchrl.collectors import Collector
 
 SEED_STRIDE = 1 << 20
-"""Distance between the aircraft's seeds of two trainings: the most aircraft that there can be."""
+"""Distance between the first seeds of the aircraft of two trainings, for as many aircraft."""
 
 
 class RememberingEnv(QuadrotorEnv):
-    """Aircraft with the state of a recurrent policy beside each, (N, width); zero at each reset."""
+    """Environments with the states (N, width) of a recurrent policy; they are zero at a reset."""
 
     def __init__(self, width: int, *given: Any, **settings: Any) -> None:
-        """Make the environments for states of a width."""
+        """Make the environments and states of a width."""
         super().__init__(*given, **settings)
         self._state = torch.zeros(self.num_envs, width, device=self.device)
         observation = self.observation_spec.clone()
@@ -43,7 +43,7 @@ class RememberingEnv(QuadrotorEnv):
         self.observation_spec = observation
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Go on from what `environment.save` gave, and the states beside it."""
+        """Restore what `environment.save` returned, and the states beside it."""
         super().restore({name: value for name, value in saved.items() if name != STATE})
         self._state = torch.from_numpy(saved[STATE]).to(self.device).reshape(self._state.shape)
 
@@ -56,10 +56,10 @@ class RememberingEnv(QuadrotorEnv):
 
 
 class RecordingEnv(QuadrotorEnv):
-    """Aircraft whose steps are kept, for their derivatives."""
+    """Environments that record their steps, for the derivatives."""
 
     def __init__(self, *given: Any, **settings: Any) -> None:
-        """Make the environments, and compile the reverse of their flight where it is missing."""
+        """Make the environments, and compile the reverse of their dynamics if it is missing."""
         super().__init__(*given, **settings)
         vehicle = self.environment.vehicle
         kernel(min(vehicle.aerodynamics.effects, ROTOR_EFFECTS), vehicle.rotor_count)
@@ -68,7 +68,7 @@ class RecordingEnv(QuadrotorEnv):
         self._moments: list[Moment] = []
 
     def taken(self) -> list[Moment]:
-        """The steps since this was last asked for."""
+        """Return the steps since the last call."""
         moments, self._moments = self._moments, []
         return moments
 
@@ -83,11 +83,11 @@ OUTCOMES = ("over", "success", "survival")
 
 
 class EpisodeStatistics:
-    """Figures of the episodes that end, and of those that were to be over by now.
+    """Return and length of the episodes that end; success and survival of those that must be over.
 
-    Success and survival are those of episodes begun between one and two time limits ago: all of
-    them are over. Of those that end in a batch most have failed, or, where all were begun together
-    and are cut off together, none.
+    Success and survival are those of the episodes that began between one and two time limits ago,
+    all of which are over. The episodes that end in a batch are a biased sample: most of them have
+    failed, or none where all began together and reach the time limit together.
     """
 
     def __init__(self, num_envs: int, time_limit_steps: int, rollout: int) -> None:
@@ -102,10 +102,10 @@ class EpisodeStatistics:
         self.running: dict[str, np.ndarray] = {name: np.zeros(num_envs) for name in ENDED}
         ages = 2 * time_limit_steps + rollout
         self.running["outcomes"] = np.zeros((ages, len(OUTCOMES)))
-        """Of episodes that are over: how many, by the steps since they began."""
+        """Numbers (steps, 3) of the `OUTCOMES` of episodes, by the steps since they began."""
 
     def count(self, batch: Any) -> dict[str, float]:
-        """Return and length of the episodes that end in a batch; success and survival."""
+        """Include a batch, and return its metrics."""
         names = ("reward", "done", "terminated", "is_success", "error")
         columns = (batch["next", name][..., 0].cpu().numpy().T for name in names)
         reward, done, terminated, success, error = columns  # (time, aircraft)
@@ -132,7 +132,7 @@ class EpisodeStatistics:
 
 
 def make_device(name: str) -> torch.device:
-    """The device of a name.
+    """Find the device of a name.
 
     Raises:
         QuadrlError: This torch, or this machine, does not have it.
@@ -148,10 +148,10 @@ def make_device(name: str) -> torch.device:
 
 
 def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
-    """The aircraft of a training."""
+    """Make the environments of a training."""
     scenario = config.training_scenario
     if config.algo == "apg" and (late := scenario.vehicle.dead_time):
-        said = f"apg trains without the dead time of the aircraft, {late:g} s, for want of its"
+        said = f"apg trains without the dead time of the aircraft, {late:g} s, since it has no"
         warnings.warn(f"{said} derivatives; evaluations fly with it", QuadrlWarning, stacklevel=2)
         prompt = dataclasses.replace(scenario.vehicle, dead_time=0.0)
         scenario = dataclasses.replace(scenario, vehicle=prompt)
@@ -164,7 +164,7 @@ def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
 
 
 def make_collector(env: QuadrotorEnv, actor: ProbabilisticActor, frames: int) -> Collector:
-    """TorchRL's collector of batches of `frames` steps, without what a training does not use."""
+    """Make TorchRL's collector of `frames` steps a batch, without what a training does not use."""
     policy: Any = actor.module[0]
     return Collector(
         env,

@@ -21,12 +21,12 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import CONFIG, EVALUATION, FREE, METRICS
 
 ATTEMPTS = 3
-"""Times that a training is begun or continued before it counts as failed."""
+"""Times that a training is begun or continued until it counts as failed."""
 STOP_SECONDS = 30.0
-"""That a training has for its last iteration and checkpoint when the study is stopped."""
+"""Time that a training has for its last iteration and checkpoint when the study is stopped."""
 POLL_SECONDS, NEWS_SECONDS = 0.1, 10.0  # the latter between two lines of progress
 WORKER = "quadrl.learning.worker"
-"""What a process runs."""
+"""The module whose `main` a process runs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PlannedRun:
         Raises:
             QuadrlError: The folder holds a run with other settings.
         """
-        # A listing, since a shared file system remembers for a while which files are not there.
+        # A listing, since a shared file system caches for a while which files do not exist.
         files = os.listdir(self.folder) if self.folder.is_dir() else []
         if CONFIG not in files:
             return False
@@ -65,14 +65,14 @@ class PlannedRun:
 
     @property
     def share(self) -> float:
-        """How much of it is done, by the rows that it has written."""
+        """The share of it that is done, by the rows that it has written."""
         file = self.folder / METRICS
         rows = file.read_bytes().count(b"\n") - 1 if file.exists() else 0
         return max(0, rows) / self.config.iterations
 
     @property
     def log(self) -> Path:
-        """Where its process writes."""
+        """The file that its process writes to."""
         return self.folder.parent / "logs" / f"{self.name}.txt"
 
 
@@ -87,7 +87,7 @@ class End:
 
 
 def order(run: PlannedRun, episodes: int, own: Iterable[Path] = ()) -> dict[str, Any]:
-    """The order for a process: train, evaluate in `episodes`, with files that register tasks."""
+    """Make the order for a process: train and evaluate, after importing files of one's own."""
     return {
         "config": dataclasses.asdict(run.config),
         "versions": run.config.resolved()["versions"],
@@ -120,11 +120,11 @@ class Process:
             self._process.stdin.flush()
 
     def poll(self) -> End | None:
-        """How it ended; None while it works."""
+        """Return how it ended; None while it works."""
         return None if self._process.poll() is None else self.wait()
 
     def wait(self) -> End:
-        """Wait for its end."""
+        """Wait until it ends, and return how it ended."""
         code = self._process.wait()
         self.stop()
         if code < 0:
@@ -133,13 +133,13 @@ class Process:
         return End(lines[-1].strip().removeprefix("quadrl: ") if code else "")
 
     def ask(self) -> None:
-        """Ask it, once, to write a checkpoint at the end of its iteration and to end."""
+        """Ask it, once, to write a checkpoint at the end of its iteration and to stop."""
         if not self._asked:
             self._asked = True
             self._process.terminate()
 
     def stop(self) -> None:
-        """Let it end as `ask` says; kill it if it does not."""
+        """Ask it to stop, and kill it if it does not."""
         self.ask()
         try:
             self._process.wait(STOP_SECONDS)
@@ -161,7 +161,7 @@ class Local:
     own: tuple[Path, ...] = ()
 
     def slots(self) -> int:
-        """How many at the same time."""
+        """Number of trainings at a time."""
         return self.jobs or cores()
 
     def begin(self, run: PlannedRun) -> Any:
@@ -172,7 +172,7 @@ class Local:
 def train_all(
     runs: Iterable[PlannedRun], executor: Local, say: Callable[[str], None]
 ) -> dict[str, str]:
-    """Train and evaluate the runs that are not done, and continue those that are half done.
+    """Train and evaluate the runs that are not done; those that were begun are continued.
 
     Args:
         runs: The runs, each with a name of its own.
@@ -231,6 +231,6 @@ def train_all(
 
 
 def complaint(failed: dict[str, str]) -> str:
-    """What failed, in one line."""
+    """Say in one line which trainings failed."""
     each = "; ".join(f"{name}: {why}" for name, why in failed.items())
     return f"{len(failed)} of the trainings failed: {each}; the same command tries them again"

@@ -25,7 +25,7 @@ from quadrl.evaluation.policy_file import RUN_FORMAT
 CHECKPOINT = "checkpoint.safetensors"
 METRICS = "metrics.csv"
 EVALUATIONS = "evaluations.csv"
-"""What the policy reached along the training; where it was asked for."""
+"""Evaluations of the policy during the training, if any were asked for."""
 EVENTS = "events"
 EVALUATION = "evaluation.json"
 """A run with this file is trained and evaluated."""
@@ -33,13 +33,13 @@ LEARNING_CURVE = "learning_curve.png"
 TRAJECTORY = "trajectory.png"
 VIDEO = "flight.mp4"
 WARNINGS = "warnings.txt"
-"""MuJoCo's, of the training; where it had any."""
+"""MuJoCo's warnings during the training, if there were any."""
 LOCK = "training.lock"
-"""Host and process of the training that works here, where the file system has no locks."""
+"""Host and process of the training that works here, if the file system has no locks."""
 FREE = ("num_threads", "checkpoint_seconds", "evaluations")
-"""Settings that change no result."""
+"""Settings that do not change the result."""
 CHANGEABLE = (*FREE, "steps", "device")
-"""Settings that a run may be continued with other values of."""
+"""Settings that may have other values when a run is continued."""
 DRAWN = {"steps", "seconds", "return", "success", "error", "survival"}
 """Columns of the metrics that a plot needs."""
 
@@ -61,7 +61,7 @@ def new_folder(path: Path) -> None:
 def lock_folder(path: Path) -> Callable[[], None]:
     """Keep other trainings out of a folder until the returned function is called.
 
-    Where the file system has no locks, a file in the folder does it, with a warning.
+    If the file system has no locks, a file in the folder does it, with a warning.
 
     Raises:
         QuadrlError: Another training works in it.
@@ -87,10 +87,10 @@ _HELD: set[Path] = set()
 
 
 def _make_lock(file: Path) -> None:
-    """Write a lock file, in place of one whose process died on this host.
+    """Write a lock file, and replace one whose process died on this host.
 
     Raises:
-        QuadrlError: There is one whose process lives, or may live.
+        QuadrlError: There is one whose process is alive, or may be.
     """
     with contextlib.suppress(FileNotFoundError):
         if _is_dead(file):
@@ -109,7 +109,7 @@ def _make_lock(file: Path) -> None:
 
 
 def _is_dead(file: Path) -> bool:
-    """Whether a lock file is one of a process of this host that is no more."""
+    """Whether a lock file belongs to a process of this host that has ended."""
     text = file.read_text(errors="replace")
     host, _, process = text.strip().partition(" ")
     if host != socket.gethostname() or not process.isdecimal():
@@ -120,13 +120,13 @@ def _is_dead(file: Path) -> bool:
         os.kill(int(process), 0)
     except ProcessLookupError:
         return True
-    except (OSError, OverflowError):  # it lives, and belongs to somebody else
+    except (OSError, OverflowError):  # it is alive, and of another user
         pass
     return False
 
 
 def _remove_lock(file: Path) -> None:
-    """Remove a lock file, if it is this process's own: a child may hold a copy of this call."""
+    """Remove a lock file if this process made it; a child process may call this, too."""
     _HELD.discard(file)
     with contextlib.suppress(OSError):
         if file.read_text(errors="replace") == _owner():
@@ -138,7 +138,7 @@ def _owner() -> str:
 
 
 def run_of(config: Mapping[str, Any]) -> str:
-    """The identity of a run and its policies: a digest of all that its result depends on."""
+    """The identity of a run and its policies: a digest of all settings that decide its result."""
     free = (*CHANGEABLE, "run", "processors")
     fixed = {name: value for name, value in config.items() if name not in free}
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
@@ -150,14 +150,14 @@ def write_config(folder: Path, config: Mapping[str, Any], processors: Sequence[s
     Args:
         folder: Folder of the run.
         config: As `TrainConfig.resolved` gives it.
-        processors: Those that it was trained on before.
+        processors: Those that it was trained on earlier.
     """
     kinds = {"run": run_of(config), "processors": [*dict.fromkeys((*processors, processor_kind()))]}
     write_sealed_json(folder / CONFIG, {**config, **kinds}, RUN_FORMAT)
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The resolved configuration of a run, as it was saved.
+    """Read the resolved configuration of a run, as it was saved.
 
     Raises:
         QuadrlError: The folder holds no run, or its configuration cannot be read.
@@ -172,7 +172,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> list[list[str]]:
-    """Rows of a table, without its head and without a row that a kill cut off; none of no file."""
+    """Read the rows of a table, without its head or a row that a kill cut off; [] of no file."""
     if not path.exists():
         return []
     with open(path, newline="") as file:
@@ -180,7 +180,7 @@ def read_rows(path: Path, columns: Sequence[str]) -> list[list[str]]:
 
 
 def read_metrics(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a metrics.csv, (iterations,) each; missing values are NaN.
+    """Read the columns of a metrics.csv, (iterations,) each; missing values are NaN.
 
     Raises:
         QuadrlError: The file is missing, empty or malformed.
@@ -204,7 +204,7 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
 
 
 class Log:
-    """metrics.csv and TensorBoard events; rows after the checkpoint are written again."""
+    """metrics.csv and TensorBoard events; rows after the checkpoint are replaced."""
 
     COLUMNS = (
         "iteration", "steps", "seconds", "episodes", "return", "length", "success", "survival",

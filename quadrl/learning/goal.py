@@ -1,4 +1,4 @@
-"""The goal state of a task as a policy sees it: where policies that hold the goal stand still."""
+"""The observation at the goal of a task, where policies that hold the goal stand still."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ ROUNDING = 1e-5  # of observations in single precision
 
 
 def goal_state(config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
-    """The observation at the goal, at rest, and which of its numbers a policy may look at.
+    """Find the observation at rest at the goal, and which of its numbers a policy may look at.
 
-    It may not look at what differs between goal states and has nothing to do with the way to the
-    goal: the position in the world, which the way to the goal replaces, and the yaw where the
-    heading is free. What is left is the same however the aircraft is turned about the vertical.
+    It may not look at what differs between goal states: the position in the world, in place of
+    which it sees the way to the goal, and the yaw where the heading is free. What is left is the
+    same however the aircraft is turned about the vertical.
 
     Returns:
         The observation (size,) float32, and a mask (size,) of the numbers that are looked at.
 
     Raises:
-        QuadrlError: The observation of the task's goal states differs in anything else.
+        QuadrlError: The observations of the task's goal states differ in anything else.
     """
     calm: Any = {"weather": "calm", "randomization": "none", "observe": config.observe}
     environment = Environment(config.scenario, num_envs=DRAWN, seed=0, **calm)

@@ -24,7 +24,7 @@ STATE, BEGINS = "recurrent_state", "is_init"
 """What a policy with a memory reads beside the observation, by TorchRL's names: its state before
 the observation, and whether an episode begins with it."""
 PRIVILEGED = "privileged"
-"""What the critic alone reads, where the environment gives it."""
+"""The observation for the critic alone, if the environment gives one."""
 
 
 class Normaliser(nn.Module):
@@ -32,7 +32,7 @@ class Normaliser(nn.Module):
 
     count: torch.Tensor  # (), observations so far
     mean: torch.Tensor  # (size,), in double precision as the sum below
-    square_sum: torch.Tensor  # (size,), of the distances from the mean
+    square_sum: torch.Tensor  # (size,), of the squared distances from the mean
     shift: torch.Tensor  # (size,), the mean in single precision
     deviation: torch.Tensor  # (size,)
 
@@ -79,15 +79,15 @@ class MeanAndDeviation(nn.Module):
 
 
 class HoldsGoal(nn.Module):
-    """A network less its output at the goal: there its mean action is 0, which is hover."""
+    """A network minus its output at the goal, where the mean action is then 0, which is hover."""
 
     at_goal: torch.Tensor  # (size,), an observation
-    looks: torch.Tensor  # (size,), 1 for what the network sees, 0 for what it does not
+    looks: torch.Tensor  # (size,), 1 for numbers that the network sees, 0 for the others
 
     def __init__(
         self, normaliser: Normaliser, network: nn.Sequential, at_goal: np.ndarray, looks: np.ndarray
     ) -> None:
-        """Keep what `quadrl.learning.goal.goal_state` gives."""
+        """Keep normaliser and network, and what `quadrl.learning.goal.goal_state` returns."""
         super().__init__()
         self.normaliser, self.network = normaliser, network
         self.last = MeanAndDeviation()
@@ -100,23 +100,23 @@ class HoldsGoal(nn.Module):
         return mean - self.mean_at_goal(), deviation
 
     def seen(self, observation: torch.Tensor) -> torch.Tensor:
-        """What the network reads of observations (..., size)."""
+        """Return what the network reads of observations (..., size)."""
         return self.looks * self.normaliser(observation)
 
     def mean_at_goal(self) -> torch.Tensor:
-        """The output at the goal, which is subtracted, (k,)."""
+        """Return the mean at the goal, which is subtracted, (k,)."""
         return self.last(self.network(self.seen(self.at_goal)))[0]
 
 
 class Memory(nn.Module):
     """A gated recurrent unit beside a network: its state joins the normalised observation.
 
-    It follows TorchRL's recurrent mode. TorchRL's GRUModule, which cuts and packs the sequences in
-    which an episode begins, takes twice the time of this loop.
+    It follows TorchRL's recurrent mode. TorchRL's GRUModule, which splits and packs sequences in
+    which an episode begins, takes twice as long as this loop.
     """
 
     def __init__(self, normaliser: Normaliser, width: int, network: nn.Module) -> None:
-        """Keep a network of (normalised observation, state), and make the unit."""
+        """Keep a network that reads (normalised observation, state), and make the unit."""
         super().__init__()
         self.normaliser, self.network = normaliser, network
         self.cell = GRUCell(len(normaliser.mean), width)
@@ -124,15 +124,15 @@ class Memory(nn.Module):
     def forward(
         self, observation: torch.Tensor, state: torch.Tensor, begins: torch.Tensor | None
     ) -> tuple[torch.Tensor, ...]:
-        """What the network gives, and the next state of the unit.
+        """Return the outputs of the network, and the next state of the unit.
 
-        In TorchRL's recurrent mode it takes a sequence, of whose states it reads the first, and
-        gives no next state.
+        In TorchRL's recurrent mode it takes sequences, reads only the first state of each, and
+        returns no next state.
 
         Args:
             observation: (N, size), or (N, T, size).
             state: Before the observation, (N, width), or (N, T, width); zero as an episode begins.
-            begins: Of a sequence, whether an episode begins with the observation, (N, T, 1).
+            begins: For sequences, whether an episode begins with the observation, (N, T, 1).
         """
         seen = self.normaliser(observation)
         if not recurrent_mode():
@@ -147,10 +147,10 @@ class Memory(nn.Module):
 
 
 class Informed(nn.Module):
-    """A network of the observation and the privileged one side by side, both normalised."""
+    """A network that reads the observation and the privileged one, both normalised."""
 
     def __init__(self, normalisers: list[Normaliser], network: nn.Module) -> None:
-        """Keep the normaliser of each, and the network of both."""
+        """Keep the normaliser of each, and the network that reads both."""
         super().__init__()
         self.normalisers, self.network = nn.ModuleList(normalisers), network
 
@@ -161,14 +161,14 @@ class Informed(nn.Module):
 
 
 class Entries(TensorDictModule):
-    """A network from named entries to named entries: its output, or its tuple of outputs.
+    """A network that reads named entries, and writes its output or outputs as named entries.
 
-    At each write, tensordict 0.14 looks for other packages in a TensorDictModule's forward, which
+    At each write in a TensorDictModule's forward, tensordict 0.14 looks for other packages, which
     costs a tenth of a gradient step; this forward only writes.
     """
 
     plain: Plain | None = None
-    """What the network is made of, where it is plain layers."""
+    """The parts of the network, if it is one of plain layers."""
 
     def forward(  # pyright: ignore[reportIncompatibleVariableOverride] - the base wraps it
         self, tensordict: TensorDictBase, **_: Any
@@ -182,7 +182,7 @@ class Entries(TensorDictModule):
 
 
 def make_network(inputs: int, hidden: tuple[int, ...], outputs: int, gain: float) -> nn.Sequential:
-    """Linear layers with tanh between them.
+    """Make linear layers with tanh between them.
 
     Weights are orthogonal and biases zero; `gain` scales the last layer's weights.
     """
@@ -198,16 +198,16 @@ def make_network(inputs: int, hidden: tuple[int, ...], outputs: int, gain: float
 def make_actor_critic(
     size: int, actions: int, config: TrainConfig, privileged: int = 0
 ) -> tuple[ProbabilisticActor, Entries, dict[str, Normaliser]]:
-    """Actor, critic, and the normalisers by the entry that they are of.
+    """Make actor, critic, and their normalisers by the name of the entry.
 
-    The critic reads the observation and, where there is one, the privileged observation. It has no
-    memory: with the actor's state as an input, which changes its meaning as the actor learns, hover
-    was learned to 6 to 12 cm instead of 2 to 3.
+    The critic reads the observation and, if there is one, the privileged observation. It has no
+    memory: with the state of the actor as an input, whose meaning changes as the actor learns,
+    policies for hover ended with errors of 6 to 12 cm instead of 2 to 3.
 
     Args:
         size: Numbers in an observation.
         actions: Numbers in an action, k.
-        config: Has the widths of the layers and the deviation of the first actions.
+        config: Gives the widths of the layers and the deviation of the first actions.
         privileged: Numbers in the privileged observation; 0 for none.
     """
     remembered = config.memory_width if config.memory == "gru" else 0
@@ -245,10 +245,10 @@ def make_actor_critic(
 
 
 def check_fits(config: TrainConfig, size: int) -> None:
-    """Refuse networks and batches that do not fit, of observations of a size.
+    """Refuse networks and batches that do not fit into memory, for observations of a size.
 
-    Of a weight there are four numbers, with gradient and Adam's two; of a transition some ten
-    times its observation and 1 kB more, as was measured.
+    A weight takes four numbers, with its gradient and Adam's two. A transition takes some ten times
+    its observation and 1 kB more, as was measured.
     """
     for name, hidden in (("hidden", config.hidden), ("critic_hidden", config.critic_hidden)):
         widths = (size, *hidden, 1)
@@ -259,7 +259,7 @@ def check_fits(config: TrainConfig, size: int) -> None:
 
 
 def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Policy:
-    """The NumPy policy of an actor."""
+    """Convert an actor to a NumPy policy."""
     layers = [module for module in actor.modules() if isinstance(module, nn.Linear)]
     (normaliser,) = (module for module in actor.modules() if isinstance(module, Normaliser))
     cells = [module for module in actor.modules() if isinstance(module, GRUCell)]

@@ -14,12 +14,12 @@ from quadrl.evaluation.policy import Policy
 from quadrl.learning.folder import CHECKPOINT, read_config
 
 NETWORKS = ("hidden", "critic_hidden", "memory", "memory_width", "holds_goal")
-"""Settings that networks are made of: those of that run are the defaults, and no other fits."""
+"""Settings of the networks: those of that run are the defaults, and other values do not fit."""
 WRITTEN = re.compile(r"(.+)@([0-9a-f]{16})")
 
 
 class Origin(NamedTuple):
-    """A run at a moment; as text FOLDER@DIGEST."""
+    """A run at a moment of its training; as text FOLDER@DIGEST."""
 
     folder: Path
     digest: str
@@ -30,7 +30,7 @@ class Origin(NamedTuple):
 
     @classmethod
     def of(cls, given: Any) -> Origin:
-        """The run in a folder now, or as it was written.
+        """Make it of a folder as it is now, or of text that `str` made.
 
         Raises:
             QuadrlError: The folder holds no run with a checkpoint.
@@ -42,15 +42,15 @@ class Origin(NamedTuple):
         return cls(folder, _digest(folder))
 
     def networks(self) -> dict[str, Any]:
-        """What its networks are made of."""
+        """Return the settings of its networks."""
         config = read_config(self.folder)
         return {name: tuples(config[name]) for name in NETWORKS if name in config}
 
     def checkpoint(self, size: int, actions: int) -> Path:
-        """Its checkpoint, for a training with observations of a size and some actions.
+        """Return its checkpoint, for a training with observations and actions of these sizes.
 
         Raises:
-            QuadrlError: Its policy sees or does something else; or it has learned on, or is gone.
+            QuadrlError: Its policy has other sizes, or its checkpoint has changed or is gone.
         """
         if (now := _digest(self.folder)) != self.digest:
             reason = f"{self.folder} has another checkpoint than when this was begun"
@@ -68,10 +68,10 @@ class Origin(NamedTuple):
 
 
 def with_networks(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a training with its origin as text, and with the networks of that.
+    """Add to the settings of a training its origin as text, and the networks of that run.
 
     Raises:
-        QuadrlError: The folder holds no run, or other networks are asked for.
+        QuadrlError: The folder holds no run, or the settings ask for other networks.
     """
     given = settings.get("from_run", "")
     if not given or (WRITTEN.fullmatch(str(given)) and not {*NETWORKS} - settings.keys()):

@@ -1,4 +1,4 @@
-"""Study files: the trainings of several tasks, algorithms, settings and seeds that one asks for."""
+"""Study files, which name trainings by their tasks, algorithms, settings and seeds."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from quadrl.learning.executor import PlannedRun
 
 KEYS = ("tasks", "algorithms", "seeds", "episodes", "settings", "only", "variants")
 SOME = ("tasks", "algorithms")
-"""What a table of `only` may be limited to."""
+"""Keys by which a table of `only` limits its settings to some trainings."""
 OWN = {
     "task": "the key tasks",
     "algo": "the key algorithms",
     "seed": "the key seeds",
     "num_threads": "left out: a training of a study has one thread",
 }
-"""Settings of a training that no table of a study may hold, and what to write instead."""
+"""Settings that no table of a study may hold, and what to write instead."""
 MAX_RUNS = 10_000
 EPISODES = 100
 
@@ -63,7 +63,7 @@ def read_plan(what: str | Path | Mapping[str, Any], out: Path | None) -> Plan:
 
 
 def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
-    """The trainings of a study's content: seed by seed, so that a stopped one has whole seeds."""
+    """List the trainings of a study seed by seed, so that a stopped study has whole seeds."""
     keys("key", content, KEYS)
     if "tasks" not in content:
         raise QuadrlError('tasks is missing: name what to train, such as tasks = ["hover"]')
@@ -93,7 +93,7 @@ def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
 
 
 def _settings(key: str, given: Any) -> dict[str, Any]:
-    """A table of settings; `TrainConfig` judges their values."""
+    """Check the names in a table of settings; `TrainConfig` checks their values."""
     if not isinstance(given, dict):
         raise QuadrlError(name=key, value=given, allowed="a table of settings of a training")
     for name in OWN.keys() & given.keys():
@@ -104,7 +104,7 @@ def _settings(key: str, given: Any) -> dict[str, Any]:
 
 
 def _only(given: Any, of: dict[str, list[str]]) -> list[tuple[dict[str, list[str]], dict]]:
-    """Settings of some tasks and algorithms, each with those that it is for; by default all."""
+    """Read the settings of some trainings, each with its tasks and algorithms; by default all."""
     found = []
     for table in _tables("only", given):
         whom = {key: names(f"only.{key}", table.get(key, of[key])) for key in SOME}
@@ -117,14 +117,14 @@ def _only(given: Any, of: dict[str, list[str]]) -> list[tuple[dict[str, list[str
 
 
 def _tables(key: str, given: Any) -> list[dict[str, Any]]:
-    """A list of tables."""
+    """Check that a value is a list of tables."""
     if not isinstance(given, (list, tuple)) or not all(isinstance(one, dict) for one in given):
         raise QuadrlError(name=key, value=given, allowed=f"a list of tables: [[{key}]]")
     return [dict(one) for one in given]
 
 
 def _variants(given: Any) -> dict[str, dict[str, Any]]:
-    """Settings by the name of the variant; one without a name where there are none."""
+    """Read the settings by the name of the variant; without variants, one without a name."""
     variants: dict[str, dict[str, Any]] = {}
     for one in _tables("variants", given):
         name: Any = one.get("name")

@@ -22,7 +22,7 @@ class PPO(Algorithm):
         """Make the loss and the optimisers.
 
         Raises:
-            QuadrlError: The fused gradients are asked for, and do not know the networks.
+            QuadrlError: The settings ask for the fused gradients, which do not fit the networks.
         """
         super().__init__(actor, critic, config)
         policy: Any = actor.module[0]
@@ -34,7 +34,7 @@ class PPO(Algorithm):
             entropy_coeff=config.entropy,
             critic_coeff=config.critic,
             loss_critic_type="l2",
-            # Without what costs time: a figure for the log, and the parameters as arguments.
+            # Without two things that cost time: a figure for the log, and parameters as arguments.
             log_explained_variance=False,
             functional=False,
         )
@@ -49,7 +49,7 @@ class PPO(Algorithm):
         self.add_optimiser("critic", critic, config.learning_rate, **adam)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Epochs over minibatches."""
+        """Take gradient steps on the minibatches of several epochs."""
         batch, fused = batch.exclude("loc", "scale"), self._fused
         if fused is not None:
             batch = fused.prepare(batch)
@@ -65,6 +65,6 @@ class PPO(Algorithm):
         if fused is not None:
             found = fused.figures(*found)
         logged = {"critic_loss": "loss_critic", "kl": "kl_approx", "clip_fraction": "clip_fraction"}
-        # A critic that weighs nothing has no loss.
+        # A critic with weight 0 has no loss.
         known = {name: found[key].item() for name, key in logged.items() if key in found.keys()}
         return dict.fromkeys(logged, 0.0) | known

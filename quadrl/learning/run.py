@@ -38,10 +38,10 @@ COLUMNS = {
     "error": "position_error_m",
     "return": "return_mean",
 }
-"""Of evaluations.csv beside steps and seconds, as metrics.csv has them, and figures of each."""
+"""Columns of evaluations.csv after steps and seconds, and the metric of each."""
 DEAD_TIMES = (0.01, 0.02)
-"""With which the policy of an aircraft that has a dead time flies, beside its own [s]: those of
-Crazyflies, and what a radio adds."""
+"""Dead times [s] with which the policy of an aircraft that has one also flies: those of Crazyflies,
+and what a radio adds."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -59,7 +59,7 @@ class Run:
     seconds: float
     """Wall clock of the training [s], without imports and evaluation."""
     late: dict[float, float] = dataclasses.field(default_factory=dict)
-    """Share of the flights that succeed, by the dead time of the aircraft [s]; empty where it has
+    """Share of the flights that succeed, by the dead time of the aircraft [s]; empty if it has
     none."""
 
     def __repr__(self) -> str:
@@ -139,7 +139,7 @@ def train_in(
     show: Callable[[Progress], None],
     heed: Callable[[Callable[..., None]], AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> Run:
-    """Train as `train` does, with settings and folder prepared, within `heed(training.ask)`."""
+    """Train as `train` does, with prepared settings and folder, within `heed(training.ask)`."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = config.scenario
     asked = scenario.randomization, scenario.control_mode, scenario.mean_wind
@@ -162,10 +162,10 @@ def train_in(
 
 
 def _evaluating(training: Training, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
-    """Evaluate the policy of the moment as often as the settings say; then `show` the progress.
+    """Make a function that evaluates the policy when it is due, then shows the progress.
 
-    A success is that of the mean action in episodes of their own. metrics.csv has that of sampled
-    actions in episodes that began up to two time limits of every aircraft ago.
+    It counts the success of the mean action, in episodes of its own. metrics.csv has the success of
+    sampled actions, in episodes that began up to two time limits ago.
     """
     config, file = training.config, training.folder / EVALUATIONS
     head = ("steps", "seconds", *COLUMNS)

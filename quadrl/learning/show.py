@@ -54,14 +54,14 @@ def render(
         task: A task or its name, or a whole scenario; by default the task that the (first) policy
             was trained for.
         seed: Seed of the episode.
-        kind: "mp4", "gif", or "png" or "jpg" for moments of the flight in one picture.
+        kind: "mp4" or "gif"; or "png" or "jpg" for moments of the flight in one picture.
         camera: "follow" keeps the goal in view, "chase" is behind the aircraft; or a camera of the
             model.
         width: Width of a picture [pixels]; by default 848, 640 for gif, 480 for png and jpg. Each
             of several flights has a picture of this size.
         height: Height of a picture [pixels]; by default 480, 360 for gif, 270 for png and jpg.
         fps: Frames a second; by default 20, and 12.5 for gif.
-        speed_trail: Show the whole way so far, in the colours of its speeds.
+        speed_trail: Whether to show the whole path so far, coloured by speed.
         progress: Whether to show a progress bar.
         **conditions: As `quadrl.evaluate` takes them.
 
@@ -127,10 +127,10 @@ def plot(*what: Any, kind: str = "png") -> Media:
 
 
 def curve(folder: Path) -> Figure:
-    """The learning curve of a run.
+    """Draw the learning curve of a run.
 
     Raises:
-        QuadrlError: The folder holds no run that has begun.
+        QuadrlError: The folder holds no run with metrics.
     """
     from quadrl.evaluation import plotting
 
@@ -143,12 +143,12 @@ def curves(
     folders: Iterable[Path] | Mapping[Path, str],
     on_missing: Callable[[QuadrlError], None] | None = None,
 ) -> dict[str, Figure]:
-    """The learning curves of several runs: a figure for each task, a curve for each label.
+    """Draw the learning curves of several runs: a figure for each task, a curve for each label.
 
     Args:
-        folders: Folders of the runs, maybe with a label each; by default that is the algorithm.
-        on_missing: Called with a folder without a run that has begun, and for a task of which no
-            episode has ended; they are then left out.
+        folders: Folders of the runs, perhaps with a label each; by default that is the algorithm.
+        on_missing: Called with the error about a folder without metrics, or about a task of which
+            no episode has ended; they are then left out.
 
     Raises:
         QuadrlError: There is such a folder or task, and `on_missing` is None.

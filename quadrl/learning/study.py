@@ -1,6 +1,6 @@
 """Studies: trainings of several tasks, algorithms, settings and seeds, and what they reached.
 
-A study goes on where it was stopped, since each of its trainings does: see `executor`.
+A study continues where it was stopped, since each of its trainings does: see `executor`.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ FIGURES = {
     "circling_m_s": math.inf,
     "training_s": math.inf,
 }
-"""What is compared, and its largest value; the least is zero."""
+"""Figures of the table, and the largest value of each; the least is zero."""
 TABLE, STUDY = "table.csv", "study.json"
 GROUP = ("task", "algo", "variant")
 CONFIDENCE = 0.95
 SOLVED = 0.95
-"""The success of a policy from which on its figure `solved_after_steps` counts."""
+"""The success from which on a policy counts as solving its task, for `solved_after_steps`."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -63,7 +63,7 @@ class StudyResult:
 
     @property
     def table(self) -> list[tuple[str, ...]]:
-        """Rows of text, the head first."""
+        """The rows as text, the head first."""
         known = (*GROUP, "seeds")
         head = (*known, "successful", "error over the last 2 s", "turning", "circling", "training")
         figures = ([_text(row, name) for name in FIGURES] for row in self.rows)
@@ -80,8 +80,8 @@ class StudyResult:
     def compare(self, figure: str) -> list[Comparison]:
         """Compare a metric of `runs` for every two algorithms and variants, within each task.
 
-        A verdict is that of `quadrl.learning.comparison`; one of all of them is false with a
-        chance of 5 % at most.
+        The verdicts are those of `quadrl.learning.comparison`; the probability that any of them is
+        false is 5 % at most.
 
         Raises:
             QuadrlError: There is no such metric, or fewer than two seeds.
@@ -108,11 +108,11 @@ class StudyResult:
         return [self.folder / TABLE, self.folder / STUDY, *self._draw(on_line)]
 
     def _draw(self, on_line: Callable[[str], None]) -> list[Path]:
-        """A picture for each task, with a curve for each algorithm and variant."""
+        """Draw a picture for each task, with a curve for each algorithm and variant."""
         from quadrl.evaluation.plotting import save
 
         labels = {self.folder / run["name"]: arm(run) for run in self.runs}
-        # In the shortest trainings no episode ends: there is no curve to draw.
+        # In very short trainings no episode ends, so there is no curve to draw.
         figures = curves(labels, on_missing=lambda error: on_line(f"left out: {error}"))
         return [
             save(figure, self.folder / f"learning_curves_{task}.png")
@@ -132,8 +132,8 @@ def study(
     """Carry out all trainings of a study, or those that are missing; `quadrl study` in Python.
 
     Each training has a process and a run folder of its own, and ends with the same policy, bit for
-    bit, as `quadrl.train` with the same settings. A training whose process or machine dies goes on
-    from its last checkpoint. A study that is stopped goes on when it is called again.
+    bit, as `quadrl.train` with the same settings. If its process or machine dies, it continues from
+    its last checkpoint. A study that is stopped continues when it is called again.
 
     Args:
         what: A study file (.toml or .json), or a dict with the same keys: `tasks`, `algorithms`,
@@ -148,11 +148,11 @@ def study(
         on_line: Called with a line about each event.
 
     Returns:
-        What the trainings reached. One that failed is in its `failed`.
+        What the trainings reached; those that failed are in its `failed`.
 
     Raises:
         QuadrlError: The study cannot be read, a folder holds a run with other settings, or Ray
-            cannot be used; nothing was begun.
+            cannot be used, before anything was begun; or all trainings failed.
     """
     plan = read_plan(what, None if out is None else Path(out))
     if jobs is not None:
@@ -192,12 +192,12 @@ def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
 
 
 def along(folder: Path) -> dict[str, float | None]:
-    """Figures without a ceiling of a run that was evaluated along the way; none of another.
+    """Compute figures without a ceiling of a run that was evaluated during its training.
 
     Returns:
         solved_after_steps: control steps after which its success stays at 95 % or above, None
         where it ends below; success_area: its mean over the training; success_lost: the largest
-        of it less the last.
+        of it minus the last. Of a run without evaluations there are no figures.
     """
     if not (folder / EVALUATIONS).exists():
         return {}
@@ -214,9 +214,9 @@ def along(folder: Path) -> dict[str, float | None]:
 def interval(
     values: Sequence[float | None], low: float = -math.inf, high: float = math.inf
 ) -> tuple[float | None, float | None, float | None]:
-    """The mean of the seeds and its 95 % interval by Student's t, within a range.
+    """Compute the mean of the seeds and its 95 % interval by Student's t, within a range.
 
-    Values that are missing or not finite are left out; with a single one there is no interval.
+    Values that are missing or not finite are left out; a single value has no interval.
     """
     from scipy.stats import t
 
@@ -233,7 +233,7 @@ def _columns(name: str) -> list[str]:
 
 
 def _text(row: dict[str, Any], name: str) -> str:
-    """A mean and its interval."""
+    """Write a mean and its interval."""
     mean, low, high = (row[column] for column in _columns(name))
     if mean is None:
         return "none"

@@ -1,8 +1,8 @@
-"""The training loop: collect, estimate advantages, let the algorithm learn, write it down.
+"""The training loop: collect, estimate advantages, let the algorithm learn, log.
 
-A run is a folder. Everything that the next iteration depends on (networks, optimisers, normaliser,
-generators, the simulated aircraft) stands in its checkpoint, so a run that was killed at any
-moment continues and ends with the same policy, bit for bit.
+A run is a folder. Its checkpoint holds everything that the next iteration depends on (networks,
+optimisers, normalisers, generators, the simulated aircraft), so a run that was killed at any moment
+can be continued, and ends with the same policy, bit for bit.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
 
 LEARNED_FROM = ("action", "action_log_prob", "loc", "scale", "advantage", "value_target")
-"""Of a batch, beside what actor and critic read."""
+"""Entries of a batch that algorithms learn from, beside those that actor and critic read."""
 ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "vpg": VPG}
 
 
 def make_algorithm(config: TrainConfig, env: QuadrotorEnv, actor: Any, critic: Any) -> Algorithm:
-    """The algorithm of a training."""
+    """Make the algorithm of a training."""
     own = getattr(config, config.algo)
     if isinstance(env, RecordingEnv):
         return APG(actor, critic, own, env, config.gamma, config.reward_scale)
@@ -70,11 +70,11 @@ def make_algorithm(config: TrainConfig, env: QuadrotorEnv, actor: Any, critic: A
 
 
 class Training:
-    """A training in its folder."""
+    """A training, and the folder of its run."""
 
-    @one_thread()  # the first weights are numbers, too
+    @one_thread()  # for the bits of the first weights
     def __init__(self, config: TrainConfig, folder: Path, *, resume: bool = False) -> None:
-        """Make everything that learns; then make the folder, or load its checkpoint.
+        """Make environments, networks and algorithm; then make the folder, or load its checkpoint.
 
         A run may be continued with more steps than it was begun with.
 
@@ -113,14 +113,14 @@ class Training:
         if not resume:
             new_folder(folder)
         self._unlock = weakref.finalize(self, lock_folder(folder))
-        for left in folder.glob(f"*{PART}") if resume else ():  # by a kill
+        for left in folder.glob(f"*{PART}") if resume else ():  # when it was killed
             left.unlink(missing_ok=True)
         resolved = config.resolved()
         self._known_as = run_of(resolved)
         if not resume:
             write_config(folder, resolved)
         elif begun:
-            # Without either, it was stopped before the first checkpoint.
+            # Otherwise it was stopped before the first checkpoint.
             try:
                 self._restore()
             except QuadrlError:
@@ -154,7 +154,7 @@ class Training:
         with contextlib.ExitStack() as stack:
             stack.callback(self._unlock)
             if self.iteration >= config.iterations:
-                policy = self.policy()  # a kill may have come between the checkpoint and its policy
+                policy = self.policy()  # it may have been killed between checkpoint and policy
                 policy.save(self.folder / POLICY_FILE)
                 return policy
             collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
@@ -163,7 +163,7 @@ class Training:
             log = Log(self.folder, self.iteration)
             stack.callback(log.close)
             stack.enter_context(native.warnings_in(self.folder / WARNINGS))
-            # All that the imports made is no garbage, and to look through it takes 5 % of the time.
+            # What the imports made is no garbage, and searching it would take 5 % of the time.
             gc.freeze()
             stack.callback(gc.unfreeze)
             started = saved = time.perf_counter()
@@ -183,7 +183,7 @@ class Training:
                 on_progress(Progress(*progress))
                 over = self.iteration == config.iterations or self._stopping
                 if over or self._asked or now - saved > config.checkpoint_seconds:
-                    self._asked = False  # what is asked from here on, the next iteration does
+                    self._asked = False  # requests from here on are for the next iteration
                     self.save()
                     saved = time.perf_counter()
                 if over:
@@ -192,15 +192,15 @@ class Training:
         return self.policy()
 
     def ask(self, *, stop: bool = False) -> None:
-        """Ask for a checkpoint at the end of this iteration, and maybe to stop after it.
+        """Ask for a checkpoint at the end of this iteration, and perhaps to stop after it.
 
-        It may be called at any moment, by the handler of a signal or another thread.
+        It may be called at any moment, by a signal handler or another thread.
         """
         self._stopping |= stop
         self._asked = True
 
     def policy(self) -> Policy:
-        """The policy at this moment."""
+        """Export the present policy."""
         config = self.config
         metadata = {
             "algo": config.algo,
@@ -214,13 +214,13 @@ class Training:
         return networks.export(self.actor, config.task, metadata)
 
     def _learn(self, batch: Any) -> dict[str, float]:
-        """One iteration on a batch (aircraft, time)."""
+        """Do one iteration with a batch (aircraft, time)."""
         metrics = self._episodes.count(batch)
         with torch.no_grad():
             if self.config.memory != "none":
                 done, state = (batch["next", name] for name in ("done", STATE))
                 batch[BEGINS] = torch.roll(done, 1, dims=1)
-                batch[BEGINS][:, 0] = False  # the state before it says so
+                batch[BEGINS][:, 0] = False  # a state with which an episode begins is zero
                 self._remembered = {STATE: state[:, -1].masked_fill(done[:, -1], 0.0).cpu().numpy()}
             fresh = self.iteration == 0 and not self.config.from_run
             first = fresh and not self.algorithm.whole
@@ -241,9 +241,9 @@ class Training:
         return metrics | {"deviation": float(batch["scale"].mean())}
 
     def _evaluate(self, batch: Any) -> None:
-        """Add the critic's values of all states and of those after them.
+        """Add the critic's values of all states and of the states after them.
 
-        Within an episode the state after one is the next one, whose value is there already.
+        Within an episode the state after a step is the next one of the batch, whose value is known.
         """
         value = self.critic(batch)["state_value"]
         ends = batch["next", "done"][..., 0].clone()
@@ -253,7 +253,7 @@ class Training:
         batch["next", "state_value"] = after
 
     def save(self) -> None:
-        """Write the checkpoint, and the policy of this moment."""
+        """Write the checkpoint and the present policy."""
         tensors = {
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),

@@ -22,10 +22,10 @@ SAFETY = 0.95
 def conjugate_gradients(
     product: Callable[[Tensor], Tensor], target: Tensor, iterations: int, tolerance: float = 1e-10
 ) -> Tensor:
-    """Solve A x = b for a symmetric positive definite A that is only known by its products.
+    """Solve A x = b for a symmetric positive definite A of which only products are known.
 
     Args:
-        product: x (n,) to A x (n,).
+        product: Maps x (n,) to A x (n,).
         target: b (n,), float64.
         iterations: Largest number of iterations.
         tolerance: On the squared residual over that of b.
@@ -52,10 +52,10 @@ def conjugate_gradients(
 def fisher_product(
     kl: Tensor, parameters: Sequence[Tensor], damping: float
 ) -> Callable[[Tensor], Tensor]:
-    """Products with the Fisher matrix: the Hessian of the mean KL divergence, plus damping.
+    """Make products with the Fisher matrix: the Hessian of the mean KL divergence, plus damping.
 
     Args:
-        kl: Scalar with a graph, at the policy that acted.
+        kl: Scalar with a graph, for the policy that acted.
         parameters: Parameters of the policy, n numbers in all.
         damping: Added to the diagonal.
 
@@ -73,7 +73,7 @@ def fisher_product(
 
 
 def flat(tensors: Sequence[Tensor]) -> Tensor:
-    """All tensors in one vector."""
+    """Join tensors to one vector."""
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
@@ -90,15 +90,14 @@ class TRPO(Algorithm):
         self.add_optimiser("critic", critic, config.critic_rate)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """The policy's step, then the critic's epochs."""
+        """Take the step of the policy, then fit the critic."""
         return self.natural_step(batch) | self.fit_critic(batch)
 
     def natural_step(self, batch: TensorDictBase) -> dict[str, float]:
-        """The policy's step: natural gradient, then a line search under the KL bound.
+        """Take the step of the policy: natural gradient, then a line search under the KL bound.
 
-        Takes the first of the tried steps, each shorter than the last, with which the surrogate
-        rises and the mean KL divergence stays within the bound; without any, the policy stays as
-        it is, bit for bit.
+        The step is the first of ever shorter ones with which the surrogate rises and the mean KL
+        divergence stays within the bound. If there is none, the policy stays as it is, bit for bit.
         """
         config = self.config
         surrogate, kl = self.loss.surrogate_and_kl(batch)
@@ -109,7 +108,7 @@ class TRPO(Algorithm):
         start = flat([p.detach() for p in self.policy])
         before = surrogate.item()
         full = direction * torch.sqrt(2 * config.max_kl / curvature)
-        curved = 0 < curvature.item() < math.inf  # otherwise no step has a length
+        curved = 0 < curvature.item() < math.inf  # otherwise the step has no length
         share = 1.0
         for _ in range(config.backtracks if curved else 0):
             self._set(start + (share * full).to(start.dtype))
@@ -122,10 +121,10 @@ class TRPO(Algorithm):
         return {"kl": 0.0, "step": 0.0, "surrogate_gain": 0.0}
 
     def shorter(self, divergence: float) -> float:
-        """Factor from a refused step to the next, by the divergence of the refused one.
+        """Choose the factor from a refused step to the next by the divergence of the refused one.
 
-        The divergence of a short step grows with the square of its length. After a step beyond
-        the bound the next one goes to where that meets the bound, or a little less.
+        The divergence of a short step grows with the square of its length. After a step beyond the
+        bound, the next one is a little shorter than the one that would meet the bound by that rule.
         """
         if self.config.max_kl < divergence < math.inf:
             return SAFETY * math.sqrt(self.config.max_kl / divergence)

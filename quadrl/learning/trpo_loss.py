@@ -1,6 +1,6 @@
-"""The loss of TRPO (Schulman et al. 2015) in the manner of TorchRL's losses, which have none.
+"""The loss of TRPO (Schulman et al. 2015) in the style of TorchRL, which has no loss for it.
 
-It uses nothing of quadrl.
+This module uses nothing of quadrl.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class TRPOLoss(PPOLoss):
             actor_network: The policy.
             critic_network: Without it there is no `loss_critic`, and the input must hold the
                 advantage.
-            **settings: Those of PPOLoss but `delay_actor`, since the divergence is from the policy
-                that acted, and the entropy bonus.
+            **settings: Those of PPOLoss, except `delay_actor`, since the divergence is from the
+                policy that acted, and `entropy_bonus`.
 
         Raises:
-            ValueError: One of these two is asked for.
+            ValueError: One of these two is given.
         """
         for name in ("delay_actor", "entropy_bonus"):
             if settings.get(name):
@@ -66,7 +66,7 @@ class TRPOLoss(PPOLoss):
         super()._set_in_keys()
         keys, names = sorted(self._in_keys, key=str), self.tensor_keys
         _maybe_add_or_extend_key(keys, self.actor_network.dist_params_keys)
-        # Last, since a call with positional arguments may leave them out.
+        # At the end, since a call with positional arguments may leave them out.
         _maybe_add_or_extend_key(keys, names.advantage)
         if self.critic_network is not None:
             _maybe_add_or_extend_key(keys, names.value_target)
@@ -74,7 +74,7 @@ class TRPOLoss(PPOLoss):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The terms by name, reduced as `reduction` says."""
+        """Compute the terms by name, reduced as `reduction` says."""
         tensordict = self._with_advantage(tensordict)
         surrogate, kl = self._policy_terms(tensordict)
         terms = {"loss_objective": -surrogate, "kl": kl}
@@ -84,11 +84,11 @@ class TRPOLoss(PPOLoss):
         return TensorDict(terms)
 
     def surrogate_and_kl(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The surrogate and the divergence alone, reduced, for each trial of a line search."""
+        """Compute the reduced surrogate and divergence alone, for each trial of a line search."""
         return self._policy_terms(self._with_advantage(tensordict))
 
     def _with_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """A copy of the input that holds the advantage, normalised if that is asked for."""
+        """Copy the input, with the advantage, which is normalised if the settings say so."""
         tensordict, key = tensordict.clone(False), self.tensor_keys.advantage
         absent = tensordict.get(key, None) is None
         if absent:
@@ -105,7 +105,7 @@ class TRPOLoss(PPOLoss):
         return tensordict.set(key, advantage)
 
     def _policy_terms(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Surrogate and divergence, reduced."""
+        """Compute surrogate and divergence, reduced."""
         needed = self.actor_network.dist_params_keys
         absent = [key for key in needed if tensordict.get(key, None) is None]
         if absent:
@@ -131,11 +131,11 @@ class TRPOLoss(PPOLoss):
 
 
 def _divergence(acting: Distribution, present: Distribution, action: Tensor, dims: int) -> Tensor:
-    """KL divergence of one policy from another, summed over what is beyond the batch's `dims`."""
+    """Compute the KL divergence of two policies, summed over dimensions after the first `dims`."""
     if has_analytic_kl(acting, present):
         each = kl_divergence(acting, present)
         return each.flatten(dims).sum(-1) if each.ndim > dims else each
-    # Scored by both in the same way, so that what rounding does to an action cancels out.
+    # Both score the action in the same way, so that its rounding errors cancel out.
     log_ratio = present.log_prob(action) - acting.log_prob(action)
     log_ratio = log_ratio.flatten(dims).sum(-1) if log_ratio.ndim > dims else log_ratio
     return log_ratio.expm1() - log_ratio

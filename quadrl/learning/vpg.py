@@ -22,13 +22,13 @@ class VPG(Algorithm):
     ) -> None:
         """Make the loss and the optimisers."""
         super().__init__(actor, critic, config)
-        # Of the policy alone: the critic has epochs of its own.
+        # The loss of the policy alone, since the critic has epochs of its own.
         own = {"critic_coeff": None, "entropy_bonus": False, "functional": False}
         self.loss = A2CLoss(actor, critic, **own)
         self.add_optimiser("policy", actor, config.learning_rate)
         self.add_optimiser("critic", critic, config.critic_rate)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """The policy's step, then the critic's epochs."""
+        """Take the step of the policy, then fit the critic."""
         self.step(self.loss(batch)["loss_objective"], "policy")
         return self.fit_critic(batch)

@@ -1,9 +1,9 @@
 """A window of flight, and the derivatives of its return by its actions.
 
-The task's own functions give rewards and observations once more, with tensors, for all steps of the
-window at once; the derivatives of the flight between are those of `quadrl.engines.adjoint`, and
-those of the loops of a control mode of `quadrl.control.autopilot`. They are joined backwards in
-time.
+The task's own functions compute rewards and observations once more, with tensors, for all steps of
+the window at once. The derivatives of the flight between the steps come from
+`quadrl.engines.adjoint`, those of the loops of a control mode from `quadrl.control.autopilot`. They
+are combined backwards in time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from quadrl.engines.state import State
 
 FLAGS = ("terminated", "truncated")
 LEAVES = ("was", "end", "command", "before.rotor_command", "action")
-"""Of a `Moment`, what the derivatives are taken by."""
+"""Attributes of a `Moment` by which the derivatives are taken."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Moment:
 
 
 def fly(environment: Environment, action: np.ndarray) -> tuple[Moment, Transition]:
-    """Take an `Environment.step`, and record what its derivatives need."""
+    """Do an `Environment.step`, and record what its derivatives need."""
     assert not environment.randomizer.late  # late commands have no derivatives here
     was, engine = coordinates(environment.engine), environment.engine
     begun = records.copied(environment.snapshot), records.copied(environment.episode)
@@ -72,13 +72,13 @@ def coordinates(engine: Engine) -> np.ndarray:
 
 
 class Window:
-    """T control steps of N aircraft; tensors (T * N, ...), a step after the other."""
+    """T control steps of N aircraft; tensors (T * N, ...), one step after another."""
 
     def __init__(self, environment: Environment, moments: list[Moment]) -> None:
-        """Run the task's functions once more.
+        """Compute rewards and observations of the recorded steps with tensors.
 
         Raises:
-            QuadrlError: They cannot be run with tensors.
+            QuadrlError: The functions of the task cannot be run with tensors.
         """
         self.moments, task = moments, environment.task
         self.shape = len(moments), environment.num_envs  # (T, N)
@@ -97,29 +97,29 @@ class Window:
             before.potentials = task.measure(before)
             done = finish(task, clock, steps, before, *flown)[2]
             self.observation = torch.cat(list(task.observe(before).values()), -1)
-            """What was seen before each step, (T * N, size)."""
+            """The observation before each step, (T * N, size)."""
         except (AttributeError, RuntimeError, TypeError, ValueError) as error:
             reason = f"its functions cannot be run with tensors: {error}"
             allowed = "a task of functions in the array API"
             raise QuadrlError(reason, name="task", value=task.name, allowed=allowed) from error
         self.next_observation = torch.cat(list(done.observation.values()), -1)
-        """What was seen after each step."""
+        """The observation after each step, (T * N, size)."""
         self.reward = torch.where(diverged, 0.0, done.reward)
-        """Of each step, (T * N,); none where the simulation broke down."""
+        """The reward of each step, (T * N,); 0 where the simulation diverged."""
 
     @property
     def goes_on(self) -> np.ndarray:
-        """Where something comes after the step that the window does not hold, (T * N,) bool."""
+        """Where the flight goes on after the step, but not in the window, (T * N,) bool."""
         terminated, truncated = (np.array([getattr(m, n) for m in self.moments]) for n in FLAGS)
         truncated[-1] = ~terminated[-1]
         return truncated.ravel()
 
     def vector_jacobian_product(self, earned: Tensor, action: Tensor, gamma: float) -> np.ndarray:
-        """Derivatives of the return from each step on by its action, (T, N, k).
+        """Compute the derivatives of the return from each step on by its action, (T, N, k).
 
         Args:
-            earned: A sum over the steps, (): of their rewards, and of what comes after the window.
-            action: The actions as they follow from `observation`, (T * N, k).
+            earned: The sum, (), of the rewards of the steps and of the values after the window.
+            action: The actions as functions of `observation`, (T * N, k).
             gamma: Discount per control step.
         """
         leaves = self._leaves
@@ -150,12 +150,12 @@ class Window:
     def _through(
         self, moment: Moment, by: np.ndarray, by_command: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of a number by the motion before a step and by its action.
+        """Compute the derivatives of a number by the motion before a step and by its action.
 
         Args:
             moment: The step.
-            by: Those by the motion after it, (N, 13 + R).
-            by_command: Those by the mean command, (N, R).
+            by: Derivatives by the motion after it, (N, 13 + R).
+            by_command: Derivatives by the mean command, (N, R).
         """
         if self._pilot is None:
             assert isinstance(self._control, Rotor)
@@ -171,12 +171,12 @@ class Window:
         return by + by_motion, by_action
 
     def _steps(self, gradient: Tensor) -> np.ndarray:
-        """A gradient by a leaf as (T, N, ...)."""
+        """Reshape a gradient by a leaf to (T, N, ...)."""
         return gradient.numpy().reshape(*self.shape, -1)
 
 
 def _joined(moments: list[Moment], name: str) -> Any:
-    """What moments have by a name, arrays (N, ...) or records, as one of tensors (T * N, ...)."""
+    """Join an attribute of all moments, arrays (N, ...) or records, to tensors (T * N, ...)."""
     parts = [operator.attrgetter(name)(moment) for moment in moments]
     if isinstance(parts[0], np.ndarray):
         return torch.from_numpy(np.concatenate(parts))
@@ -186,7 +186,7 @@ def _joined(moments: list[Moment], name: str) -> Any:
 
 
 def _state(motion: Tensor, origin: np.ndarray) -> State:
-    """The state of motions (n, 13 + R)."""
+    """Make the state of motions (n, 13 + R)."""
     position = motion[:, :3] - torch.from_numpy(origin)
     parts = motion[:, 3:7], motion[:, 7:10], motion[:, 10:13], motion[:, 13:]
     return State.of_coordinates(position, *parts, float(origin[2]))

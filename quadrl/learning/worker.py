@@ -1,7 +1,7 @@
 """A process that carries out one training of a study.
 
-It reads its order, a line of JSON, from standard input, and ends as soon as standard input ends:
-whoever ordered it is gone. A run that is killed at any moment can be continued.
+It reads its order, a line of JSON, from standard input, and ends as soon as standard input ends,
+since then the study is gone. A run that is killed at any moment can be continued.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from quadrl.learning.executor import POLL_SECONDS, PlannedRun
 from quadrl.learning.folder import CONFIG, EVALUATION, lock_folder
 
 LOCKED_SECONDS = 120.0
-"""For which a training waits until a lost one has left its folder, as a shared file system sees."""
+"""Time that a training waits until a shared file system says that a lost one left its folder."""
 FAILED = 2
-"""Exit code of a process: the training ended with an error that the log tells."""
+"""Exit code of a process whose training ended with an error, which is in its log."""
 
 
 def carry_out(what: dict[str, Any]) -> None:
-    """Begin or continue a training, evaluate it, draw its curve and its flights.
+    """Begin or continue a training, evaluate its policy, and draw its curve and flights.
 
     Raises:
-        QuadrlError: It cannot be trained, or other versions are installed here than where it was
-            ordered.
+        QuadrlError: It cannot be trained, or other versions are installed here than where the study
+            was started.
     """
     from quadrl.learning.run import train_in  # which takes seconds
 
@@ -46,7 +46,7 @@ def carry_out(what: dict[str, Any]) -> None:
         raise QuadrlError(name=f"version of {name}", value=here[name], allowed=allowed)
     folder.mkdir(parents=True, exist_ok=True)
     until = time.monotonic() + LOCKED_SECONDS
-    while True:  # a training that is lost may work here for a while
+    while True:  # a lost training may go on here for a while
         try:
             lock_folder(folder)()
             break
@@ -54,7 +54,7 @@ def carry_out(what: dict[str, Any]) -> None:
             if time.monotonic() > until:
                 raise
         time.sleep(POLL_SECONDS)
-    if PlannedRun(config, folder).done:  # by the one that was lost
+    if PlannedRun(config, folder).done:  # by the lost one
         return
     given: Any = {"resume": (folder / CONFIG).exists(), "episodes": what["episodes"]}
     finished = train_in(folder, config, **given, show=lambda progress: None, heed=heeded)
@@ -77,9 +77,9 @@ def main() -> None:
     except (QuadrlError, OSError) as error:
         sys.stdout.write(f"quadrl: {error}\n")
         sys.exit(FAILED)
-    except Stopped as stop:  # its run can be continued, as that of a process that was killed
+    except Stopped as stop:  # end like a killed process, whose run can be continued
         signal.signal(stop.number, signal.SIG_DFL)
         signal.raise_signal(stop.number)
-    # What hangs at the end of the interpreter must not turn a finished training into a lost one.
+    # A hang at the exit of the interpreter must not turn a finished training into a lost one.
     sys.stdout.flush()
     os._exit(0 if (Path(what["folder"]) / EVALUATION).exists() else FAILED)
