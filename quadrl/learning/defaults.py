@@ -101,7 +101,7 @@ OF_VEHICLE: dict[tuple[str, str], dict[str, Any]] = {
 }
 """Settings of a variant for one aircraft."""
 WITH_MEMORY: dict[str, Any] = {
-    "holds_goal": False,  # at the goal, too, the memory differs
+    "holds_goal": False,  # the state of the memory differs at the goal
     "ppo": {"fused": False},
 }
 """Settings of a policy with a memory, over all layers."""

@@ -28,7 +28,7 @@ with warnings.catch_warnings():
     from torchrl.collectors import Collector
 
 SEED_STRIDE = 1 << 20
-"""Distance between the first seeds of the aircraft of two trainings, for as many aircraft."""
+"""Distance between the seeds of two trainings: as many as there can be aircraft in one."""
 
 
 class RememberingEnv(QuadrotorEnv):
@@ -151,7 +151,7 @@ def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
     """Make the environments of a training."""
     scenario = config.training_scenario
     if config.algo == "apg" and (late := scenario.vehicle.dead_time):
-        said = f"apg trains without the dead time of the aircraft, {late:g} s, since it has no"
+        said = f"apg trains without the dead time of the aircraft, {late:g} s, which has no"
         warnings.warn(f"{said} derivatives; evaluations fly with it", QuadrlWarning, stacklevel=2)
         prompt = dataclasses.replace(scenario.vehicle, dead_time=0.0)
         scenario = dataclasses.replace(scenario, vehicle=prompt)

@@ -29,17 +29,10 @@ from quadrl.engines import native
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE as POLICY_FILE
-from quadrl.learning import checkpoint, networks
+from quadrl.learning import checkpoint, environments, networks
 from quadrl.learning.algorithm import Algorithm, generators, one_thread, set_generators
 from quadrl.learning.apg import APG
 from quadrl.learning.config import TrainConfig, as_saved
-from quadrl.learning.environments import (
-    EpisodeStatistics,
-    RecordingEnv,
-    make_collector,
-    make_device,
-    make_env,
-)
 from quadrl.learning.folder import (
     EVALUATION,
     WARNINGS,
@@ -64,7 +57,7 @@ ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "vpg": VPG}
 def make_algorithm(config: TrainConfig, env: QuadrotorEnv, actor: Any, critic: Any) -> Algorithm:
     """Make the algorithm of a training."""
     own = getattr(config, config.algo)
-    if isinstance(env, RecordingEnv):
+    if isinstance(env, environments.RecordingEnv):
         return APG(actor, critic, own, env, config.gamma, config.reward_scale)
     return ALGORITHMS[config.algo](actor, critic, own)
 
@@ -82,9 +75,9 @@ class Training:
             QuadrlError: The folder or the device cannot be used.
         """
         self.config, self.folder = config, folder
-        device = make_device(config.device)
+        device = environments.make_device(config.device)
         torch.manual_seed(config.seed)
-        self.env = make_env(config, device)
+        self.env = environments.make_env(config, device)
         size, actions = self.env.environment.size, self.env.environment.action_size
         networks.check_fits(config, size)
         given = self.env.observation_spec.get(PRIVILEGED, None)
@@ -104,7 +97,7 @@ class Training:
         )
         self.iteration = 0
         self.seconds = 0.0  # of training, in all processes that worked on it
-        self._episodes = EpisodeStatistics(
+        self._episodes = environments.EpisodeStatistics(
             config.num_envs, self.env.environment.time_limit_steps, config.rollout
         )
         self._generators: dict[str, torch.Tensor] = {}
@@ -157,7 +150,9 @@ class Training:
                 policy = self.policy()  # it may have been killed between checkpoint and policy
                 policy.save(self.folder / POLICY_FILE)
                 return policy
-            collector = make_collector(self.env, self.actor, config.num_envs * config.rollout)
+            collector = environments.make_collector(
+                self.env, self.actor, config.num_envs * config.rollout
+            )
             stack.callback(collector.shutdown, close_env=False)
             set_generators(self._generators, self.env.device)
             log = Log(self.folder, self.iteration)
