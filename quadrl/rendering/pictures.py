@@ -108,14 +108,12 @@ class LiveFlight:
         time, qpos = float(environment.snapshot.time[row]), environment.engine.qpos[row]
         goal, markers = environment.goals()[row], environment.markers(row)
         position, camera = np.array(qpos[:3]), self._camera
-        seconds = time - self._time
-        begins = seconds < 0 or time == 0  # an episode may end before its second picture
         rotor_speed = environment.snapshot.state.rotor_speed[row]
-        if begins:
-            self._trail, self._angles = [], np.zeros(len(rotor_speed))
-            self._drift = np.zeros(3)
-        else:
-            self._angles = self._angles + renderer.spins * rotor_speed * seconds
+        seconds = time - self._time
+        if begins := seconds < 0 or time == 0:  # an episode may end before its second picture
+            seconds, self._trail, self._drift = 0.0, [], np.zeros(3)
+            self._angles = np.zeros(len(rotor_speed))
+        self._angles = self._angles + renderer.spins * rotor_speed * seconds
         if not self._trail or seconds > 0:
             self._trail.append((time, position))
         self._trail = [point for point in self._trail if point[0] >= time - TRAIL_SECONDS]
@@ -128,7 +126,7 @@ class LiveFlight:
             shown = moving_camera(keeping(self._view[None], position[None], *size)[0])
         if not environment.weather.calm:
             wind = environment.engine.wind[row]  # since the last picture
-            self._drift = self._drift + wind * max(seconds, 0.0)
+            self._drift = self._drift + wind * seconds
             markers = (*markers, *streaks(position, wind, self._drift, renderer.scale))
         self._time = time
         return renderer.frame(

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
-from quadrl.base.primitives import Primitive
 from quadrl.base.validation import number
 from quadrl.core.trajectory import Trajectory
 from quadrl.rendering import drawing
@@ -100,15 +99,17 @@ def render_trajectory(
     speed = np.zeros(len(position))
     if len(position) > 1:
         speed = np.linalg.norm(np.gradient(position, flight.time, axis=0), axis=1)
-    wind = drift = np.zeros_like(position)
-    if windy := flight.wind is not None:
-        wind, drift = flight.wind, cumulative_trapezoid(flight.wind, flight.time, axis=0, initial=0)
+    windy = flight.wind is not None
+    wind = np.zeros_like(position) if flight.wind is None else flight.wind
+    drift, turned = (
+        cumulative_trapezoid(each, flight.time, axis=0, initial=0)
+        for each in (wind, flight.rotor_speed)
+    )
     strength = np.linalg.norm(wind, axis=1)
     markers = flight.markers
     if len(markers) == 1:
         markers = [markers[0]] * len(position)
     with Renderer(model, width, height, fine=fine) as renderer:
-        turned = cumulative_trapezoid(flight.rotor_speed, flight.time, axis=0, initial=0)
         angles = renderer.spins * turned
         cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
         if camera in MOVING:
@@ -121,34 +122,28 @@ def render_trajectory(
         if overlay:
             colours = [model.mat(f"rotor_{k + 1}_paint").rgba[:3] for k in range(model.nu)]
             panel = Panel(height, label or task_title(flight.task), colours, windy)
-        before, picture = -1, np.empty(0, np.uint8)
-        for k in map(int, drawn):
-            if k != before:
-                first = max(0, k - round(TRAIL_SECONDS * rate))
-                own: tuple[Primitive, ...] = ()
-                if speed_trail:
-                    way = position[: k + 1], speed[: k + 1]
-                    own, first = (drawing.speed_trail(*way, speed.max(), renderer.scale),), k
-                picture = renderer.frame(
-                    flight.qpos[k],
-                    camera=cameras[k],
-                    rotor_angles=angles[k],
-                    goal=flight.goal[k],
-                    trail=position[first : k + 1],
-                    markers=(
-                        *markers[k],
-                        *own,
-                        *streaks(position[k], wind[k], drift[k], renderer.scale),
-                    ),
-                )
-                if panel is not None:
-                    moment = flight.time[k], flight.error[k], speed[k], flight.reward[k]
-                    values = flight_lines(*moment, strength[k] if windy else None)
-                    shares = flight.rotor_speed[k] / flight.max_rotor_speed
-                    end = flight.outcome if k == last else ""
-                    panel.draw(picture, [*values.values()], shares, flight.qpos[k, 3:], end)
-                before = k
-            yield picture
+        for k, same in itertools.groupby(map(int, drawn)):
+            first = max(0, k - round(TRAIL_SECONDS * rate))
+            shown = streaks(position[k], wind[k], drift[k], renderer.scale)
+            if speed_trail:
+                way = position[: k + 1], speed[: k + 1], speed.max()
+                shown = (drawing.speed_trail(*way, renderer.scale), *shown)
+            picture = renderer.frame(
+                flight.qpos[k],
+                camera=cameras[k],
+                rotor_angles=angles[k],
+                goal=flight.goal[k],
+                trail=None if speed_trail else position[first : k + 1],
+                markers=(*markers[k], *shown),
+            )
+            if panel is not None:
+                moment = flight.time[k], flight.error[k], speed[k], flight.reward[k]
+                values = flight_lines(*moment, strength[k] if windy else None)
+                shares = flight.rotor_speed[k] / flight.max_rotor_speed
+                end = flight.outcome if k == last else ""
+                panel.draw(picture, [*values.values()], shares, flight.qpos[k, 3:], end)
+            for _ in same:
+                yield picture
 
 
 def write_video(
