@@ -91,8 +91,8 @@ def unit_name(one: Primitive) -> str:
     return f"{lit}_{one.shape}" + ("" if one.shape in _units(True) else f"_{own}")
 
 
-def placed(one: Primitive, offset: Array | float = 0.0) -> tuple[Array, Array, Array]:
-    """Position (3,) [m], attitude (4,) and scale (3,) of a `unit`, shifted by an offset (3,)."""
+def placed(one: Primitive) -> tuple[Array, Array, Array]:
+    """Position (3,) [m], attitude (4,) and scale (3,) of the `unit` that shows a primitive."""
     place, attitude = np.asarray(one.position, dtype=float), np.asarray(one.quaternion, dtype=float)
     size = np.broadcast_to(np.asarray(one.size, dtype=float), 3)
     scale = np.ones(3)
@@ -104,7 +104,7 @@ def placed(one: Primitive, offset: Array | float = 0.0) -> tuple[Array, Array, A
     elif one.shape in _units(True):
         order = {"sphere": [0, 0, 0], "cylinder": [0, 0, 1]}.get(one.shape, [0, 1, 2])
         scale = size[order]
-    return place + offset, attitude, scale
+    return place, attitude, scale
 
 
 def _pose(one: Primitive) -> Array:

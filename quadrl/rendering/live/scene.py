@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import math
 import warnings
@@ -96,28 +97,22 @@ class Scene:
     def draw_paths(self, apart: float, markers: bool, trails: bool) -> None:
         """Send goals, markers and trails."""
         flight, offsets = self._flight, self.offsets(apart)
-        shown = [
-            (one, offset)
-            for row, offset in enumerate(offsets if markers else ())
-            for one in drawing.markers(flight.markers(row))
-        ]
-        self._send_lines([pair for pair in shown if pair[0].shape == "line"])
-        self._send_labels([pair for pair in shown if pair[0].shape == "label"])
-        batches: dict[str, list[tuple[Primitive, Array]]] = {name: [] for name in self._batches}
-        for one, offset in shown:
-            if one.shape not in ("line", "label"):
-                batches.setdefault(meshes.unit_name(one), []).append((one, offset))
-        for name, batch in batches.items():
-            self._send_batch(name, batch)
+        shown: dict[str, list[Primitive]] = collections.defaultdict(list)
+        for row, offset in enumerate(offsets if markers else ()):
+            for one in drawing.markers(each.moved(offset) for each in flight.markers(row)):
+                flat = one.shape in ("line", "label")
+                shown[one.shape if flat else meshes.unit_name(one)].append(one)
+        self._send_lines(shown.pop("line", []))
+        self._send_labels(shown.pop("label", []))
+        for name in {*shown, *self._batches}:
+            self._send_batch(name, shown[name])
         self._trails.visible = trails
         trail = flight.trail[::-1][:: self._every][::-1]
         # As many segments as ever: viser's client draws no more than it was sent first.
         trail = np.where(np.isfinite(trail), trail, flight.pose[:, :3]) + offsets
         colours = drawing.trail_colours(len(trail))[:, None, :3]
-        for name, values in (("points", trail), ("colors", np.broadcast_to(colours, trail.shape))):
-            pairs = np.stack([values[:-1], values[1:]], axis=2).reshape(-1, 2, 3)
-            sent = pairs.astype(np.float32) if name == "points" else _bytes(pairs)
-            setattr(self._trails, name, sent)
+        self._trails.points = _segments(trail).astype(np.float32)
+        self._trails.colors = _bytes(_segments(np.broadcast_to(colours, trail.shape)))
 
     def offsets(self, apart: float) -> Array:
         """Where each aircraft's world stands in the picture, (N, 3) [m]: on a square grid."""
@@ -181,19 +176,19 @@ class Scene:
         attitudes, places = np.repeat(UPRIGHT, count, axis=0), np.zeros((count, 3))
         return self._scene.add_batched_glb(f"/world/{name}", glb, attitudes, places)
 
-    def _send_lines(self, lines: Sequence[tuple[Primitive, Array]]) -> None:
+    def _send_lines(self, lines: Sequence[Primitive]) -> None:
         points, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3))]
-        for line, offset in lines:
-            corners = np.asarray(line.points, dtype=float) + offset
+        for line in lines:
+            corners = np.asarray(line.points, dtype=float)
             rgba = np.broadcast_to(line.rgba, (len(corners), 4))[:-1, None, :3]
-            points.append(np.stack([corners[:-1], corners[1:]], axis=1))
+            points.append(_segments(corners))
             colours.append(np.repeat(rgba, 2, axis=1))
         sent = np.concatenate(points).astype(np.float32)
         if len(self._marks.points) != len(sent):
             self._marks = self._add_lines("marks", len(sent), 2.0)
         self._marks.points, self._marks.colors = sent, _bytes(np.concatenate(colours))
 
-    def _send_batch(self, name: str, batch: Sequence[tuple[Primitive, Array]]) -> None:
+    def _send_batch(self, name: str, batch: Sequence[Primitive]) -> None:
         """Show copies of one mesh, as many as there are primitives."""
         node = self._batches.pop(name, None)
         if node is not None and len(node.batched_positions) != len(batch):
@@ -201,11 +196,11 @@ class Scene:
             node = None
         if not batch:
             return
-        placed = [meshes.placed(one, offset) for one, offset in batch]
+        placed = map(meshes.placed, batch)
         places, attitudes, scales = (np.array(part) for part in zip(*placed, strict=True))
-        rgba = np.array([one.rgba for one, _ in batch], dtype=float)
+        rgba = np.array([one.rgba for one in batch], dtype=float)
         if node is None:
-            mesh, lit = meshes.unit(batch[0][0]), batch[0][0].glow < 1.0
+            mesh, lit = meshes.unit(batch[0]), batch[0].glow < 1.0
             node = self._scene.add_batched_meshes_simple(
                 f"/world/{name}", mesh.vertices, mesh.faces, attitudes, places,
                 batched_scales=scales, batched_colors=_bytes(rgba[:, :3]),
@@ -215,10 +210,10 @@ class Scene:
         node.batched_positions, node.batched_wxyzs, node.batched_scales = places, attitudes, scales
         node.batched_opacities, node.batched_colors = rgba[:, 3], _bytes(rgba[:, :3])
 
-    def _send_labels(self, labels: Sequence[tuple[Primitive, Array]]) -> None:
+    def _send_labels(self, labels: Sequence[Primitive]) -> None:
         shown = [
-            (one.name, tuple(one.position + offset + (0.0, 0.0, 1.5 * float(np.max(one.size)))))
-            for one, offset in labels
+            (one.name, tuple(np.add(one.position, (0.0, 0.0, 1.5 * float(np.max(one.size))))))
+            for one in labels
         ]
         if shown == self._labelled:
             return
@@ -229,6 +224,11 @@ class Scene:
             self._scene.add_label(f"/world/label_{k}", text, position=place)
             for k, (text, place) in enumerate(shown)
         ]
+
+
+def _segments(points: Array) -> Array:
+    """Both ends (n, 2, 3) of the pieces of paths (T, 3) or (T, N, 3)."""
+    return np.stack([points[:-1], points[1:]], axis=-2).reshape(-1, 2, 3)
 
 
 def _bytes(colours: Any) -> Array:
