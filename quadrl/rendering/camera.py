@@ -32,24 +32,22 @@ def aircraft_scale(model: mujoco.MjModel) -> float:
 
 
 def in_view(goal: Array, markers: Sequence[Marker | Primitive] = ()) -> Array:
-    """What a camera should keep in view, (n, 3) [m]: the goal, spheres, rings, pads and paths.
+    """Points (n, 3) [m] to keep in view: of the goal, and of spheres, rings, pads and paths.
 
-    Of a primitive, which does not say what it is for, nothing has to be in view.
+    A primitive adds none, since it does not say what it is for.
     """
     return np.vstack([np.asarray(goal, dtype=float)[None], *map(_extent, markers)])
 
 
 def _extent(marker: Marker | Primitive) -> Array:
-    """Points (n, 3) [m] that are in view where the marker is."""
-    if isinstance(marker, Primitive):
+    """Points (n, 3) [m] of a marker to keep in view."""
+    if isinstance(marker, Primitive) or marker.kind in ("goal", "line", "arrow"):
         return np.empty((0, 3))
     centre = np.asarray(marker.position, dtype=float)
     if marker.kind == "path":
         return np.asarray(marker.points, dtype=float).reshape(-1, 3)
     if marker.kind == "sphere":
         return centre[None]
-    if marker.kind not in ("ring", "pad"):
-        return np.empty((0, 3))
     axis = np.array([0.0, 0.0, 1.0])
     if marker.end is not None:
         way = np.asarray(marker.end, dtype=float) - centre
@@ -68,12 +66,12 @@ def moving_views(
     scale: float = 1.0,
     aspect: float = WIDE,
 ) -> Array:
-    """Where a camera of MOVING looks, which steps back to keep some points in view.
+    """Compute the views of a moving camera, which steps back to keep goal and markers in view.
 
-    The markers count up to a distance that suits the aircraft's size.
+    A marker far away, for the size of the aircraft, counts as if it stood nearer.
 
     Args:
-        camera: Its name; "chase" stays nearer, and keeps the goal alone in view.
+        camera: One of MOVING; "chase" stays nearer, and keeps the goal alone in view.
         qpos: (T, 7) position [m] and attitude (w, x, y, z) of the aircraft, world frame.
         goals: (T, 3) [m], world frame.
         markers: What else is drawn in each of the T pictures, world frame.
@@ -86,7 +84,7 @@ def moving_views(
     """
     position, (nearest, farthest) = qpos[:, :3], DISTANCE
     chase = camera == CHASE
-    # Else a small aircraft would be a dot before a long path. Of the goal no part is left out.
+    # Otherwise a small aircraft would be a dot beside a long path. The goal is always in view.
     reach = farthest / 2 * math.sqrt(scale)
     boxes = []
     for at, goal, also in zip(position, goals, markers, strict=True):
@@ -107,20 +105,20 @@ def moving_views(
 
 
 def keeping(views: Array, position: Array, scale: float, aspect: float) -> Array:
-    """Views (T, 6) that step back where the aircraft, at (T, 3) [m], has left them in haste."""
+    """Step back the views (T, 6) that the aircraft, at (T, 3) [m], flew out of."""
     back = _back(np.abs(position - views[:, :3]), scale, aspect)[:, 0]
     return np.column_stack([views[:, :3], np.maximum(views[:, 3], back), views[:, 4:]])
 
 
 def _back(half: Array, scale: float, aspect: float) -> Array:
-    """Distance (T, 1) [m] that shows a box with half the edges (T, 3) and an aircraft in it."""
+    """Distance (T, 1) [m] from which a box, half as long as (T, 3) [m], and an aircraft fit."""
     # Pictures are wider than high, and depth takes little of either.
     level = max(1.0, WIDE / aspect)
     return 0.75 * scale + np.linalg.norm(half * ROOM * (level, level, 1.0), axis=-1, keepdims=True)
 
 
 def _drawn_near(position: Array, points: Array, reach: float) -> Array:
-    """Points (n, 3) [m], all but the first no farther away than `reach`."""
+    """Pull points (n, 3) [m], all but the first, to within `reach` [m] of a position (3,)."""
     ways = points[1:] - position
     away = np.linalg.norm(ways, axis=1, keepdims=True)
     pulled = position + ways * np.minimum(1.0, reach / np.maximum(away, 1e-9))
@@ -128,9 +126,9 @@ def _drawn_near(position: Array, points: Array, reach: float) -> Array:
 
 
 def smoothed(views: Array, deviation: float) -> Array:
-    """Views (T, 6) of a whole flight through a low pass, which looks both ways: nothing lags.
+    """Smooth the views (T, 6) of a whole flight with a Gaussian, which adds no lag.
 
-    Its standard deviation is in views.
+    Its standard deviation is a number of views.
     """
     from scipy.ndimage import gaussian_filter1d
 
@@ -146,7 +144,7 @@ def moving_camera(view: Array) -> mujoco.MjvCamera:
 
 
 def eased(view: Array, last: Array, seconds: float) -> Array:
-    """The view (6,) of a flight in progress, which lags: the last one, and some seconds later."""
+    """Follow a view (6,) of a flight in progress with a lag, some seconds after the last view."""
     turn = (view[4] - last[4] + 180.0) % 360.0 - 180.0  # the short way round
     way = np.array([*(view[:4] - last[:4]), turn, view[5] - last[5]])
     return last + (1 - math.exp(-seconds / LAG)) * way

@@ -45,13 +45,13 @@ TRAIL_OLD, TRAIL_NEW = np.array([0.35, 0.55, 0.80, 1.0]), np.array([1.0, 0.72, 0
 
 STREAKS = 60
 STREAK_BOX = np.array([2.3, 2.3, 1.7])  # [m], around an aircraft with scale 1, that they fill
-STREAK_SECONDS = 0.05  # of the wind's way, that a streak is long
+STREAK_SECONDS = 0.05  # [s], for which the wind blows from one end of a streak to the other
 STREAK_LONGEST = 0.8  # [m]
 STREAK_WIDTH = 0.0017  # [m]
 STREAK_RGBA = np.array([0.92, 0.97, 1.0, 0.8])
 STREAK_TAIL = np.array([0.25, 0.55, 1.0, 1.0])  # opacity from the tail to the head, which leads
 STILL = 0.1  # [m/s], under which nothing is shown
-# Evenly in the unit cube: multiples of the powers of the root of x^4 = x + 1 (Roberts 2018).
+# Spread evenly over the unit cube: multiples of powers of the root of x^4 = x + 1 (Roberts 2018).
 PLACES = np.arange(1, STREAKS + 1)[:, None] * 1.2207440846057596 ** -np.arange(1.0, 4.0) % 1.0
 
 
@@ -96,7 +96,7 @@ def _mesh(model: mujoco.MjModel, number: int) -> Mesh:
 
 
 def markers(shown: Iterable[Marker | Primitive]) -> Iterator[Primitive]:
-    """What markers are made of, world frame. A primitive is drawn as it is."""
+    """Split markers into primitives, world frame; a primitive stays as it is."""
     for one in shown:
         if isinstance(one, Primitive):
             yield one
@@ -149,7 +149,7 @@ def _marker(marker: Marker) -> Iterator[Primitive]:
 
 
 def goal(place: Array, position: Array, scale: float) -> Marker:
-    """The goal (3,) of an aircraft at a position (3,) [m], which it must not veil when near."""
+    """The marker of a goal (3,) [m], clearer where the aircraft, at (3,) [m], would be hidden."""
     away = float(np.linalg.norm(place - position)) / scale
     opacity = GOAL_RGBA[3] * min(max(away / 0.4, 0.1), 1.0)
     return Marker("goal", tuple(place), GOAL_RADIUS * scale, (*GOAL_RGBA[:3], opacity))
@@ -161,14 +161,14 @@ def trail_colours(count: int) -> Array:
 
 
 def trail(points: Array, scale: float) -> Primitive:
-    """Where an aircraft has been, (n, 3) [m], oldest first."""
+    """The line through the last positions of an aircraft, (n, 3) [m], oldest first."""
     kept = np.unique(np.linspace(0, len(points) - 1, TRAIL_PIECES + 1).astype(int))
     width = scale * TRAIL_WIDTH * np.linspace(0, 1, len(kept)) ** 0.7
     return Primitive("line", width, rgba=trail_colours(len(kept)), points=points[kept])
 
 
 def speed_trail(points: Array, speed: Array, fastest: float, scale: float) -> Primitive:
-    """Where an aircraft has been, (n, 3) [m], in the colours of its speeds there, (n,) [m/s]."""
+    """The line through positions (n, 3) [m], in the colours of the speeds there, (n,) [m/s]."""
     kept = np.unique(np.linspace(0, len(points) - 1, SPEED_PIECES + 1).astype(int))
     share = (speed[kept] / max(fastest, STILL))[:, None]
     colours = SLOW + share * (FAST - SLOW)
@@ -176,12 +176,12 @@ def speed_trail(points: Array, speed: Array, fastest: float, scale: float) -> Pr
 
 
 def streaks(position: Array, wind: Array, drift: Array, scale: float) -> tuple[Primitive, ...]:
-    """Lines around an aircraft that drift with the air.
+    """Draw lines around an aircraft that drift with the air.
 
     Args:
         position: (3,) [m], of the aircraft, world frame.
         wind: (3,) [m/s], world frame.
-        drift: (3,) [m], how far the air has come since the flight began.
+        drift: (3,) [m], how far the air has moved since the flight began.
         scale: Scale of the aircraft, see `quadrl.rendering.camera.aircraft_scale`.
     """
     speed = float(np.linalg.norm(wind))

@@ -91,8 +91,8 @@ def _set_up() -> None:
         sys.modules[mujoco.Renderer.__module__].gl_context.GLContext = chosen.GLContext
     egl: Any = sys.modules.get("mujoco.egl")
     if egl and egl.EGL_DISPLAY is None:
-        # Opened in mujoco's place, which would close it at exit: dm_control shares the display, and
-        # could no longer free its own contexts.
+        # mujoco would open it itself, and close it at exit: dm_control, which shares the display,
+        # could then no longer free its own contexts.
         display = egl.create_initialized_egl_device_display()
         egl.EGL_DISPLAY = display if display != egl.EGL.EGL_NO_DISPLAY else None
 
@@ -102,17 +102,17 @@ def close(renderer: mujoco.Renderer) -> None:
     context = renderer._gl_context
     try:
         with current_context_kept():
-            context.make_current()  # what is freed is freed in the current one
+            context.make_current()  # MuJoCo frees what belongs to the current context
             renderer.close()
-    except Exception:  # at exit dm_control may have closed the display before, with all in it
+    except Exception:  # at exit dm_control may have closed the display, and all in it, before
         context._context = None
 
 
 @contextlib.contextmanager
 def current_context_kept() -> Generator[None]:
-    """Leave the thread with the EGL context that it had.
+    """Give the thread back the EGL context that it had.
 
-    dm_control makes its own current once and relies on it; it would go on to draw in ours.
+    dm_control makes its context current only once; without this it would go on to draw in ours.
     """
     egl: Any = sys.modules.get("mujoco.egl")
     before = egl and egl.EGL_DISPLAY and egl.EGL.eglGetCurrentContext()

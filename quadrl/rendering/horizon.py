@@ -44,7 +44,7 @@ def horizon(size: int, attitude: Array) -> tuple[NDArray[np.uint8], NDArray[np.u
 
 @functools.lru_cache(maxsize=8)
 def _dial(size: int) -> tuple[Array, Array, list[tuple[tuple[int, ...], Array]], Array]:
-    """Coordinates of the pixels to the right and up, -1 to 1, and what does not move."""
+    """Coordinates of the pixels to the right and up, -1 to 1; colours and masks that stay."""
     place = (2 * np.arange(size) + 1) / size - 1
     across, up = np.meshgrid(place, -place)
     radius, soft = np.hypot(across, up), functools.partial(_soft, pixel=2.0 / size)

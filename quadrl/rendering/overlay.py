@@ -62,7 +62,7 @@ class Panel:
             self._write(draw, BARS + BAR * rotor + 6, 109, str(rotor + 1), 13, GREY, "ma")
 
     def fits(self, width: int, height: int) -> bool:
-        """Whether it leaves room for something else in a picture."""
+        """Whether it is small enough for a picture."""
         own_width, own_height = self._background.size
         return own_width <= ROOM * width and own_height <= ROOM * height / 2
 
@@ -115,7 +115,7 @@ class Panel:
         fill: tuple[int, ...] = (13, 18, 26),
         opacity: int = 165,
     ) -> None:
-        """Write a line on a rounded ground into a picture, in place."""
+        """Write a line of text, on a rounded background, into a picture in place."""
         x, y = self._at(left, top)
         font = self._fonts[18]
         ground = self._rounded(font.getlength(text) / self._scale + 32, 34, 17, fill, opacity)
@@ -134,7 +134,7 @@ class Panel:
     def _rounded(
         self, width: float, height: float, radius: float, fill: tuple[int, ...], opacity: int = 165
     ) -> Any:
-        """A rectangle with round corners; it is drawn larger, for a smooth edge."""
+        """A rectangle with round corners; drawn larger and then reduced, for a smooth edge."""
         width, height = self._at(width, height)
         large = self._image.new("RGBA", (4 * width, 4 * height), (*fill, 0))
         box, corner = (0, 0, 4 * width - 1, 4 * height - 1), round(4 * radius * self._scale)
@@ -152,9 +152,9 @@ def flight_lines(
     reward: float = 0.0,
     wind: float | None = None,
 ) -> dict[str, str]:
-    """What the panel shows of a moment of a flight: [s], [m], [m/s] and the reward of a step.
+    """Lines of the panel, by label: time [s], error [m], speed [m/s] and reward of the last step.
 
-    The wind [m/s] has a line where it is not None.
+    There is one for the wind [m/s] where that is not None.
     """
     return {
         "time": f"{time:.2f} s",
@@ -171,7 +171,7 @@ def task_title(task: str) -> str:
 
 
 def bearing(attitude: ArrayLike) -> float:
-    """Where the nose points, as a compass shows it: 0 north, 90 east [deg]."""
+    """Heading as a compass shows it: 0 north, 90 east [deg]."""
     yaw = roll_pitch_yaw(np.asarray(attitude, dtype=float))[2]
     return round(90.0 - math.degrees(yaw)) % 360
 

@@ -67,7 +67,7 @@ class Pictures:
         return renderer
 
     def _values(self, row: int) -> tuple[Any, ...]:
-        """What the panel shows of a row: values, rotor speeds, attitude, outcome."""
+        """Arguments of `Panel.draw` for a row: values, rotor speeds, attitude, outcome."""
         environment = self._environment
         now, done, reward, end = environment.snapshot, environment.transition, 0.0, ""
         time, error = float(now.time[row]), environment.task.error(now)[row]
@@ -89,10 +89,10 @@ class Pictures:
 
 
 class LiveFlight:
-    """What is kept between two pictures of a flight: camera, trail, angles of the rotors."""
+    """Draws a flight in progress; keeps camera, trail and rotor angles between two pictures."""
 
     def __init__(self, camera: str) -> None:
-        """Nothing has been seen yet."""
+        """Begin with nothing drawn yet."""
         self._camera = camera
         self._time = math.inf
         self._view = np.zeros(6)

@@ -16,12 +16,12 @@ from quadrl.core.scenario import Scenario, as_saved
 from quadrl.rendering.overlay import require
 
 COMMENT = "comment"
-"""What the text is called in a file."""
+"""The name of the text in a file."""
 LONGEST_BLOCK = 255  # [bytes], of a GIF
 
 
 def comment(scenarios: Iterable[Mapping[str, Any]]) -> str:
-    """The text for a file: the scenario of each flight, as `Scenario.to_json` gives it."""
+    """Text for a file: a list of the scenarios of its flights, as `Scenario.to_json` gives them."""
     return json.dumps([*scenarios])
 
 

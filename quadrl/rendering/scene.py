@@ -1,4 +1,4 @@
-"""One picture: the aircraft in any pose, and what else there is to see."""
+"""Draw one picture with MuJoCo: the aircraft in any pose, and what else there is to see."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ class Renderer(contextlib.AbstractContextManager):
 
 
 def place(model: mujoco.MjModel, data: mujoco.MjData, rotor_angles: ArrayLike) -> None:
-    """Move what is to be drawn to the pose of the data, with the blades turned.
+    """Place all that is drawn for the pose of the data, with the blades turned.
 
     Args:
         model: A drawn model.
@@ -240,7 +240,7 @@ def _add_line(scene: mujoco.MjvScene, line: Primitive, pixel: float) -> None:
 
 
 def _thinnest(scene: mujoco.MjvScene, start: Array, way: Array, pixel: float) -> float:
-    """Half of the least width [m] that a line can be seen with, where it is nearest."""
+    """Half of the least width [m] at which a line is visible, where it is nearest."""
     eye = scene.camera[0].pos - start
     nearest = eye - way * np.clip(eye @ way / (way @ way), 0.0, 1.0)
     return THINNEST * pixel * math.sqrt(nearest @ nearest)

@@ -17,7 +17,7 @@ from quadrl.rendering.scenarios import COMMENT, comment
 from quadrl.rendering.video import OneOrMore, OnFrame, checked, listed, render_trajectory
 
 SHEETS = ("png", "jpg", "jpeg")
-"""What their names end in."""
+"""Endings of the names of contact sheets."""
 COLUMNS, PICTURES = 4, 12
 
 
@@ -32,7 +32,7 @@ def write_contact_sheet(
     on_frame: OnFrame = lambda done, total: None,
     **options: Any,
 ) -> Path:
-    """Write moments of a flight, with their times, as one picture; of several, a row for each.
+    """Write moments of a flight, with their times, as one picture; several have a row each.
 
     `quadrl.rendering.read_scenarios` reads from it what was flown.
 

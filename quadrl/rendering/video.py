@@ -37,14 +37,14 @@ from quadrl.rendering.scene import Renderer
 T = TypeVar("T")
 OneOrMore = T | Sequence[T]
 OnFrame = Callable[[int, int], object]
-"""Is told how many pictures are drawn, and how many there will be."""
+"""Called with the number of pictures that are drawn, and of all."""
 MAX_FPS = 240
 LARGEST = {"width": 1920, "height": 1080}  # pixels, as assets/scene.xml makes room for
 FFMPEG = ("-preset", "veryfast", "-movflags", "+faststart")
-LEAST_RATE = 20.0  # [1/s], at which a flight is followed
-HOLD = 1.0  # [s], for which a video stays at its end, for the outcome to be read
+LEAST_RATE = 20.0  # [1/s], at which the states of a flight are interpolated
+HOLD = 1.0  # [s] that a video shows its last picture, for the outcome to be read
 VIDEOS = ("mp4", "gif")
-"""What the names of videos end in."""
+"""Endings of the names of videos."""
 
 
 def render_trajectory(
@@ -245,7 +245,7 @@ def _together(
 
 
 def listed(one_or_more: Any, count: int = 1) -> list[Any]:
-    """Several as they are, and one as often as it is needed."""
+    """A list of several, or of one repeated as often as it is needed."""
     several = isinstance(one_or_more, Iterable) and not isinstance(one_or_more, str)
     return list(one_or_more) if several else [one_or_more] * count
 
@@ -261,7 +261,7 @@ def checked(path: str | os.PathLike[str], kinds: Sequence[str]) -> tuple[Path, s
 
 
 def _mediapy() -> Any:
-    """Mediapy with an ffmpeg that there is."""
+    """Import mediapy and tell it where ffmpeg is."""
     mediapy = require("mediapy", "mediapy")
     mediapy.set_ffmpeg(ffmpeg())
     return mediapy
