@@ -1,8 +1,8 @@
-"""Who may steer the page: a browser that shows it, and only by what its controls send.
+"""Access control of the page: only a browser that shows it may steer, and only with its controls.
 
 Any web page may connect to a port of this machine. Its browser says in the header Origin where the
-page came from, and in Host by which name it reached the port. A domain of a stranger's that was
-turned to this machine (DNS rebinding) gives itself away by its name.
+page came from, and in Host by which name it reached the port. A stranger's domain that was made to
+point to this machine (DNS rebinding) is recognized by its name.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Update(msgspec.Struct):
     value: bool | Number | Text
 
 
-# The messages of viser's that the page needs, by their names. Others let a client open a tunnel to
-# the internet, upload files, or have things kept for ever.
+# The messages of viser that the page needs, by their names. Others let a client open a tunnel to
+# the internet, upload files, or fill the memory.
 class GuiUpdateMessage(msgspec.Struct, tag=True):
     """The message that a control was moved, with its new value."""
 
@@ -71,7 +71,7 @@ class Connection(server.ServerConnection):
     """A client's connection, of which only the messages above arrive."""
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message that the page needs, and nothing in it that it does not."""
+        """Receive the next message that the page needs, reduced to the fields that it needs."""
         while True:
             message = await super().recv(decode=False)
             with contextlib.suppress(msgspec.MsgspecError):
@@ -79,7 +79,7 @@ class Connection(server.ServerConnection):
 
 
 def refusal(headers: Headers, host: str) -> str | None:
-    """Why a request does not come from the page itself.
+    """Say why a request is refused: it does not come from the page itself.
 
     Args:
         headers: Headers of the request.
@@ -102,12 +102,13 @@ def refusal(headers: Headers, host: str) -> str | None:
 
 
 def serve(host: str, port: int) -> viser.ViserServer:
-    """Start viser's server, which answers to its own page alone.
+    """Start viser's server so that it answers to its own page alone.
 
-    viser has no option for that. So it gets, while it starts, a server of websockets that checks.
+    viser has no option for that, so the server of websockets that it starts is replaced by one that
+    checks.
 
     Raises:
-        QuadrlError: It did not take that; it is stopped then.
+        QuadrlError: viser did not use that server; it is stopped then.
     """
     unchecked, guarded = server.serve, []
 

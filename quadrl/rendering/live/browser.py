@@ -1,7 +1,7 @@
 """The page: a flight drawn in the browser with viser, and the controls beside it.
 
-The flight belongs to one thread, which calls `Page.frame`. Sliders and boxes are read there; what
-buttons and keys ask for is put into a queue and done there. viser's own threads talk to browsers.
+The flight belongs to one thread, which calls `Page.frame`. It reads sliders and boxes, and does
+what buttons and keys have put into a queue. viser's own threads talk to browsers.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from quadrl.base.validation import number
 from quadrl.evaluation.rollout import Controller
 from quadrl.rendering.live import access, readout
 from quadrl.rendering.live.flight import KEYS, Flight, Keyboard
-from quadrl.rendering.live.scene import CAMERAS, Scene, telling
+from quadrl.rendering.live.scene import CAMERAS, Scene, departures_ignored
 
 FRAME = 1 / 30  # [s]
 READOUT = 0.1  # [s] between two updates of the numbers
@@ -31,7 +31,7 @@ HISTORY = 200  # updates in the plot
 PUSHES = {"west": (-1, 0, 0), "east": (1, 0, 0), "south": (0, -1, 0), "north": (0, 1, 0),
           "down": (0, 0, -1), "up": (0, 0, 1)}  # fmt: skip
 KEYBOARD = "keyboard"
-MOST_ASKED = 32  # actions that wait for the next frame; what a client asks for beyond is dropped
+MOST_ASKED = 32  # actions that wait for the next frame; further ones are dropped
 
 
 class Control:
@@ -77,13 +77,13 @@ class Page:
 
         Args:
             flight: What is shown.
-            controllers: What the page lets choose from, made when it is chosen; the first is the
-                one that flies now.
+            controllers: Functions that make the controllers to choose from, by name; the first is
+                the one that flies now.
             host: Address to listen at.
             port: Port to listen at; 0 for any that is free.
 
         Raises:
-            QuadrlError: Nothing can listen at that address, or any web page could steer it.
+            QuadrlError: Nothing can listen at that address, or any web page could steer the flight.
         """
         _check_address(host, port)
         self.flight, self.keyboard = flight, Keyboard()
@@ -112,7 +112,7 @@ class Page:
             time.sleep(max(0.0, FRAME - (time.perf_counter() - now)))
 
     def frame(self, seconds: float) -> None:
-        """Do what was asked for, fly on for some seconds of the wall clock, and draw."""
+        """Do what was asked for, fly for some seconds of the wall clock, and draw."""
         flight = self.flight
         for _ in range(self._asked.qsize()):
             self._asked.get_nowait()()
@@ -160,7 +160,7 @@ class Page:
             self._flown_by = chosen
         except QuadrlError as error:
             self.flown_by.value = self._flown_by
-            with telling():
+            with departures_ignored():
                 for client in self.server.get_clients().values():
                     client.add_notification(f"{chosen} cannot fly this", str(error))
 
@@ -214,9 +214,9 @@ class Page:
     def _asks(
         self, find: Callable[[Any], Callable[[], None] | None]
     ) -> Callable[[Any], Coroutine[Any, Any, None]]:
-        """What viser calls on a click or key: the action found for it waits for the next frame.
+        """Make the callback of a click or a key: the action found for it waits for the next frame.
 
-        A coroutine, since viser lets any number of plain functions wait for a thread.
+        It is a coroutine, since viser lets any number of plain functions wait for a thread.
         """
 
         async def ask(event: Any) -> None:
@@ -260,7 +260,7 @@ class Page:
 
 
 def _check_address(host: str, port: int) -> None:
-    """Refuse an address at which nothing can listen: viser would take another one.
+    """Refuse an address at which nothing can listen; viser would choose another one.
 
     Raises:
         QuadrlError: The port is taken or not allowed, or the host is none of this machine's.

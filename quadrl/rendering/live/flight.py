@@ -1,4 +1,4 @@
-"""A flight that goes on in real time, and what its spectator may do to it."""
+"""A flight in real time, and what its spectator may do to it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Keyboard:
         self.action = np.zeros(4)  # forward, left, up, turn; within [-1, 1]
 
     def press(self, key: str) -> None:
-        """One of KEYS makes it faster by a step; any other stops."""
+        """Change the velocity by a step with one of KEYS; set it to zero with any other key."""
         if key not in KEYS:
             self.action[:] = 0.0
             return
@@ -59,9 +59,9 @@ class Keyboard:
 
 
 class Flight:
-    """N aircraft that fly a task in the time of the spectator; an episode that ends begins anew.
+    """N aircraft that fly a task in real time; where an episode ends, the next one begins.
 
-    Where it is `endless`, only flying into the ground ends one.
+    If it is `endless`, only flying into the ground ends one.
     """
 
     environment: Environment  # where it flies; another one after a change of the control mode
@@ -81,7 +81,7 @@ class Flight:
 
         Args:
             controller: A `Policy`, or any function of observations.
-            scenario: What is flown. In a weather of its own the spectator's wind does not blow.
+            scenario: What is flown. Where its weather is not calm, the spectator's wind is ignored.
             num_envs: N, at most MAX_AIRCRAFT.
             seed: Row i has the seed `seed + i`.
 
@@ -158,7 +158,7 @@ class Flight:
             self._before[ended] = self.pose[ended]
 
     def advance(self, seconds: float) -> int:
-        """Fly on for some seconds of the wall clock; the number of control steps flown."""
+        """Fly for some seconds of the wall clock; returns the number of control steps flown."""
         if self.paused:
             return 0
         timestep, steps = self.vehicle.control_timestep, 0
@@ -182,7 +182,7 @@ class Flight:
         """Poses (N, 7 + R) at this moment, between the last two control steps."""
         share = min(1.0, self._due / self.vehicle.control_timestep)
         before, now = self._before.copy(), self.pose
-        # Of the two quaternions of an attitude the nearer one.
+        # An attitude has two quaternions: take the nearer one.
         same = (before[:, 3:7] * now[:, 3:7]).sum(1, keepdims=True) >= 0
         before[:, 3:7] *= np.where(same, 1.0, -1.0)
         pose = before + share * (now - before)

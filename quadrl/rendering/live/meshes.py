@@ -33,7 +33,7 @@ class Meshes(NamedTuple):
 
 
 def of_model(model: mujoco.MjModel) -> Meshes:
-    """Meshes of all that is drawn but the ground: the page has a grid, each aircraft its place."""
+    """Make the meshes of all that is drawn but the ground, for which the page has a grid."""
     blades: list[list[Primitive]] = [[] for _ in range(model.nu)]
     hubs, solid = np.tile(np.eye(4), (model.nu, 1, 1)), []
     clear: dict[tuple[float, ...], list[trimesh.Trimesh]] = {}
@@ -74,7 +74,7 @@ def _units(fine: bool) -> dict[str, Any]:
 
 
 def unit(one: Primitive, fine: bool = True) -> trimesh.Trimesh:
-    """The mesh whose copies, `placed`, are primitives like this one."""
+    """The mesh that shows a primitive where it is scaled and placed as `placed` says."""
     mesh = _units(fine).get(one.shape)
     if mesh is not None:
         return mesh
@@ -85,7 +85,7 @@ def unit(one: Primitive, fine: bool = True) -> trimesh.Trimesh:
 
 
 def unit_name(one: Primitive) -> str:
-    """The same for primitives with the same `unit`, lit alike."""
+    """A name that primitives share if they have the same `unit` and are lit alike."""
     lit = "lit" if one.glow < 1.0 else "glowing"
     own = one.mesh.name if one.mesh else "_".join(f"{x:g}" for x in np.atleast_1d(one.size))
     return f"{lit}_{one.shape}" + ("" if one.shape in _units(True) else f"_{own}")
@@ -116,7 +116,7 @@ def _pose(one: Primitive) -> Array:
 
 
 def _mesh(one: Primitive) -> trimesh.Trimesh:
-    """A primitive as it stands, round where its edges are blunt."""
+    """The mesh of a primitive at its place, shaded smoothly but for sharp edges."""
     shape = unit(one, fine=False).copy().apply_transform(np.diag([*placed(one)[2], 1.0]))
     return trimesh.graph.smooth_shade(shape, angle=SHARPEST, facet_minarea=None).apply_transform(
         _pose(one)

@@ -38,7 +38,7 @@ def check_screen() -> None:
 def run(flight: Flight) -> None:
     """Fly and draw until the window is closed; space pauses, R begins anew.
 
-    What the mouse pulls (double click, then Ctrl and the right button) is pulled in the flight.
+    The mouse pulls the aircraft in flight (double click, then Ctrl and the right button).
 
     Raises:
         RenderingUnavailable: MuJoCo cannot open a window on the screen.

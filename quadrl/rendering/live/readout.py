@@ -22,7 +22,7 @@ BAR = (
 
 
 def html(flight: Flight, row: int) -> str:
-    """What one aircraft does, and how the episodes of all have ended."""
+    """The state of one aircraft, and how the episodes of all have ended."""
     engine = flight.environment.engine
     position, velocity = flight.pose[row, :3], engine.qvel[row, :3]
     lines = {

@@ -32,8 +32,8 @@ UPRIGHT = np.array([(1.0, 0.0, 0.0, 0.0)])
 
 
 @contextlib.contextmanager
-def telling() -> Iterator[None]:
-    """Say nothing of a browser that leaves while it is told something."""
+def departures_ignored() -> Iterator[None]:
+    """Silence the warning about a browser that leaves while something is sent to it."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         yield
@@ -69,14 +69,14 @@ class Scene:
         ]
 
     def view(self, camera: str, apart: float) -> None:
-        """Place every browser's camera, and that of those to come."""
+        """Place the cameras of all browsers, also of those that connect later."""
         field = 2.5 + 0.95 * apart * (self._columns - 1)
         size = field if camera == "free" else max(0.7 * self._flight.vehicle.scale, 0.05)
         stand = self._home + size * np.array(VIEWS[camera])
         cameras = [client.camera for client in self._server.get_clients().values()]
         for one in (self._server.initial_camera, *cameras):
-            # A browser may have told of an impossible one.
-            with telling(), contextlib.suppress(ValueError):
+            # A browser may have sent an impossible one.
+            with departures_ignored(), contextlib.suppress(ValueError):
                 one.position, one.look_at, one.fov = stand, self._home, FOV
 
     def draw(self, seconds: float, row: int, camera: str, apart: float) -> None:
@@ -108,21 +108,21 @@ class Scene:
             self._send_batch(name, shown[name])
         self._trails.visible = trails
         trail = flight.trail[::-1][:: self._every][::-1]
-        # As many segments as ever: viser's client draws no more than it was sent first.
+        # Always as many segments: viser's client draws no more of them than it was sent first.
         trail = np.where(np.isfinite(trail), trail, flight.pose[:, :3]) + offsets
         colours = drawing.trail_colours(len(trail))[:, None, :3]
         self._trails.points = _segments(trail).astype(np.float32)
         self._trails.colors = _bytes(_segments(np.broadcast_to(colours, trail.shape)))
 
     def offsets(self, apart: float) -> Array:
-        """Where each aircraft's world stands in the picture, (N, 3) [m]: on a square grid."""
+        """Offsets (N, 3) [m] that put the worlds of the aircraft on a square grid."""
         numbers = np.arange(self._flight.environment.num_envs)
         across, along = numbers % self._columns, numbers // self._columns
         grid = np.stack([across, -along, 0 * numbers], axis=1).astype(float)
         return apart * (grid - (grid.min(0) + grid.max(0)) / 2)
 
     def _move_world(self, seconds: float, camera: str, place: Array, ahead: Array) -> None:
-        """Follow an aircraft: the browser's camera stays its user's, the world moves under it."""
+        """Follow an aircraft by moving the world: the camera is left to the browser's user."""
         share = 1 - math.exp(-seconds / LAG)
         if camera == "free":
             place = self._home
@@ -232,5 +232,5 @@ def _segments(points: Array) -> Array:
 
 
 def _bytes(colours: Any) -> Array:
-    """Colours of the screen, 0 to 1, as bytes of light, which the browser takes for them."""
+    """Convert colours of the screen, 0 to 1, to bytes of linear light, as the browser expects."""
     return np.round(255 * np.asarray(colours, dtype=float) ** 2.2).astype(np.uint8)

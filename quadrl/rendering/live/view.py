@@ -31,7 +31,7 @@ def view(
 ) -> None:
     """Fly and draw until interrupted, or until the window is closed.
 
-    The air is calm unless it is asked for: there the wind is the spectator's.
+    The air is calm unless a weather is given; in calm air the spectator sets the wind.
 
     Args:
         controller: A policy or a controller, as `quadrl.evaluate` takes it.
@@ -42,7 +42,7 @@ def view(
         host: Address that the page is served at.
         port: Port that the page is served at; 0 for any that is free.
         native: Whether to open MuJoCo's own viewer, on this machine's screen, in place of the page.
-        on_open: Is told where the page is.
+        on_open: Called with a line that says where the page is.
         **conditions: As `quadrl.evaluate` takes them.
 
     Raises:
@@ -78,7 +78,7 @@ def others(scenario: Scenario) -> dict[str, Callable[[], Controller]]:
     task, vehicle, policies = scenario.task, scenario.aircraft, {}
     for file in shipped():
         policy = Policy.load(file)
-        # The aircraft stays the same, so that its commands have to mean what they did in training.
+        # The aircraft stays the same, so a policy's actions must mean what they did in training.
         scale = policy.scenario.aircraft.action_scale
         if policy.task == task.name and scale == vehicle.action_scale:
             policies[file.stem] = lambda policy=policy: policy
