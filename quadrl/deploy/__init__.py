@@ -1,1 +1,1 @@
-"""What carries a policy elsewhere: the page that flies in the browser."""
+"""Ways out of quadrl: exports to MuJoCo, ONNX and torch, the page in the browser, wheels."""

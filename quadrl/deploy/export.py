@@ -1,4 +1,4 @@
-"""Carry an aircraft or a policy out of quadrl: to MuJoCo alone, to ONNX, to torch."""
+"""Export an aircraft or a policy: to MuJoCo alone, to ONNX, to torch."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
 
 
 def _found(what: Any) -> Vehicle | Policy:
-    """The aircraft or the policy that is meant.
+    """Find the aircraft or load the policy to export.
 
     Raises:
         QuadrlError: It is neither.
@@ -88,7 +88,7 @@ def _found(what: Any) -> Vehicle | Policy:
 
 
 def described(policy: Policy) -> dict[str, str]:
-    """What the numbers of a policy mean, each entry in JSON.
+    """Describe what the numbers of a policy mean, each entry in JSON.
 
     Returns:
         scenario, as `Scenario.of` takes it; observation, as `describe_observation` gives it;

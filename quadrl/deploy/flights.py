@@ -12,9 +12,9 @@ the compiled step of `quadrl.core.compiled` is, and become C functions per task 
     rest       the disturbance that is felt at the start of an episode
     feel       that after a control step
 
-Each takes the memory of one flight, an array of doubles whose parts are named in `LAYOUT`. What
-is observed follows from the rotor speeds in `modelled`: JavaScript puts the true ones there where
-it does not call `follow`.
+Each takes the memory of one flight, an array of doubles whose parts are named in `LAYOUT`. The
+observation is computed from the rotor speeds in `modelled`: JavaScript puts the true ones there
+where it does not call `follow`.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ PARTS = {
     "episodes": 1,
     "near": 1,  # a byte: as in `Rows` of free_flight.c
     "solids": 1,  # of which there are none
-    "nearby": 1,  # what would be known of them
+    "nearby": 1,  # data of those near by, of which there are none either
     "flight_rows": 10,  # that `Rows`, for pointers of 32 bits
     "state_rows": 8,  # `Rows` of state.c
 }
@@ -114,12 +114,12 @@ class _Memory:
         return records.mapped(lambda numbers: self.read("state", numbers), places)
 
     def estimate(self) -> State:
-        """The same with the rotor speeds that are seen."""
+        """The same state with the rotor speeds that are observed."""
         seen = self.read("modelled", self._rotors)
         return dataclasses.replace(self.state(), rotor_speed=seen)
 
     def aim(self, now: Snapshot, seen: Observation, *, begins: bool) -> dict[str, Any]:
-        """What the sensor of that name remembers and gives with an observation."""
+        """What the sensor "aim" remembers and gives with an observation."""
         state, sensor = now.state, Aim()
         nothing: Any = None  # of a batch
         given = state.rotor_speed, self.read("wind", 3), now.action, now.parameters
@@ -129,7 +129,7 @@ class _Memory:
         return {"aim_sum": moment.memory["sum"], "aim": sensor.sense(moment)}
 
     def kept(self, *like: Any) -> list[Any]:
-        """Records of the same shapes as those before, read from `kept` one after the other."""
+        """Records of the same shapes as the given ones, read from `kept` one after the other."""
         columns = records.Columns(0, [array for one in like for array in records.leaves(one)])
         places = iter(columns.views(np.arange(columns.end)[:, None]))
         placed = [records.filled(record, places) for record in like]
@@ -175,7 +175,7 @@ def write(environment: Environment) -> tuple[str, int]:
         functions.append(FUNCTION.format(name=name, constants=constants, body=body))
 
     def given(now: Snapshot, episode: Episode, done: Transition | None = None) -> dict[str, Any]:
-        """Where everything goes that a first observation or a step gives."""
+        """The results of a first observation or of a step, by the part they are written to."""
         goal, seen, error = task.goal(now) + origin, task.observe(now), task.error(now)
         reward, *flags = [0.0] * 4
         if done:

@@ -1,9 +1,9 @@
-"""An aircraft for MuJoCo without quadrl: one file of what MuJoCo itself has, without callbacks.
+"""Export an aircraft to MuJoCo without quadrl: one file, with no callbacks.
 
-The control is thrust over the rotor's largest, the square of its speed over that of the largest.
-MuJoCo has no thrust that goes with the square of a state, so that what lags is the square. Its
-first-order filter has one time constant; rotors that slow down otherwise than they speed up get the
-dynamics that MuJoCo calls a muscle's, which have two.
+The control is a rotor's thrust over its largest thrust, which is the square of its speed over its
+largest speed. MuJoCo has no thrust that grows with the square of a state, so here the square lags.
+Its first-order filter has one time constant; rotors that slow down at another rate than they speed
+up get MuJoCo's muscle dynamics, which have two.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def content(policy: Policy, metadata: Mapping[str, str]) -> bytes:
 
     Args:
         policy: The policy.
-        metadata: What the file says of itself.
+        metadata: Entries of the file's metadata.
     """
     arrays = {"mean": policy.mean, "deviation": policy.deviation}
     bounds = {"nearest": -CLIP, "farthest": CLIP, "least": -1, "most": 1}

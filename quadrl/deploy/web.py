@@ -56,7 +56,7 @@ KERNELS = {
 MODULES = ("flight", "policy", "episode", "link", "scene", "plot", "main")
 """Of docs/fly, each after those that it imports."""
 FLOWN = tuple(name for name, task in TASKS.items() if not (task.contact or name == "lsy_race"))
-"""Tasks of the page: contact is MuJoCo's, and what is drawn about stays where it is."""
+"""Tasks of the page: without contact, which MuJoCo computes, and with a scene that stays."""
 MEMORY = """// Written by quadrl/deploy/flights.py.
 #include <math.h>
 #include <stdint.h>
@@ -141,7 +141,7 @@ def surroundings(task: Task) -> dict[str, Any]:
 
 
 def beside_aim(environment: Environment, aim: Aim) -> list[int]:
-    """Which numbers of an observation are seen where there is an aim."""
+    """Places of the numbers of an observation that stay visible beside the sensor `aim`."""
     shown = (part for name, part in environment.layout.items() if name not in aim.hides)
     return [place for part in shown for place in range(part.start, part.stop)]
 
@@ -248,7 +248,7 @@ def _encoded(content: bytes) -> str:
 
 
 def _rounded(values: Any) -> Any:
-    """Numbers that are only drawn, with six digits."""
+    """Numbers that are only drawn, rounded to six digits."""
     rounded = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[float])
     return rounded(np.asarray(values, dtype=float)).tolist()
 

@@ -43,11 +43,11 @@ def tag(machine: str) -> str:
 
 
 def steps(tasks: Iterable[str]) -> list[str]:
-    """C of the steps of tasks: of all their options, for the vehicles and conditions that ship.
+    """Write the C of the steps of tasks and of the loops of control modes.
 
-    With it is that of the loops of control modes. What changes the code, not only its constants:
-    the number of rotors and of actions, whether what is observed is an estimate, a weight of zero,
-    and the number of waypoints.
+    It covers all options of the tasks, for the vehicles and conditions that ship. The code, not
+    only its constants, depends on the numbers of rotors and actions, on whether the observation is
+    an estimate, on a weight being zero, and on the number of waypoints.
     """
     many = range(1, MAX_WAYPOINTS + 1)
     routes = [{"waypoints": [[1.0, 1.0, 0.5]] * count} for count in many]
