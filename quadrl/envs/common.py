@@ -53,13 +53,13 @@ def episode_info(environment: Environment) -> dict[str, np.ndarray]:
     values: dict[str, np.ndarray] = {}
     if environment.randomizer.active and (shown := environment.randomizer.shown()):
         values["drawn"] = Named(shown)
-    if environment.observer and (privileged := environment.privileged) is not None:
+    if (privileged := environment.privileged) is not None:
         values["privileged"] = privileged.astype(np.float32)
     return values
 
 
 class Named(np.ndarray):
-    """Numbers (k,) or (N, k): an array whose last axis has names, as the terms of the reward.
+    """Numbers (k,) or (N, k) in an array whose last axis has names, such as terms of a reward.
 
     `terms["progress"]` and `terms.items()` work as in a dict; clients that read numbers alone, as
     TorchRL's, see the array.

@@ -46,7 +46,7 @@ class Physics(mujoco.Physics):
     """The goal (3,) [m] and the markers that "follow" keeps in view; None before an episode."""
 
     def __getstate__(self) -> Any:
-        """For pickle and deepcopy."""
+        """Copy for pickle and deepcopy."""
         return super().__getstate__(), self.engine, self.legacy_step, self.in_view
 
     def __setstate__(self, state: Any) -> None:
@@ -83,7 +83,7 @@ class Physics(mujoco.Physics):
 
     @contextlib.contextmanager
     def check_invalid_state(self) -> Generator[None]:
-        """Nothing: a divergence ends the episode, which is the task's to report."""
+        """Check nothing: a divergence ends the episode, and the task reports it."""
         yield
 
 
@@ -123,20 +123,20 @@ class QuadrotorTask(base.Task):
         super().after_step(physics)  # colours the reward
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
-        """Hand the action to the rotors, or to the loops."""
+        """Give the action to the rotors or to the control loops."""
         self.environment.begin(np.asarray(action)[None])
         if self.environment.stepwise:
             physics.inner_loop = self.environment.control
 
     def after_step(self, physics: Physics) -> None:
-        """Work out the transition."""
+        """Compute the transition."""
         physics.inner_loop = None  # outside of a control step there is no setpoint
         now = self.transition = self.environment.finish()
         self._observation = now.observation
         super().after_step(physics)
 
     def in_view(self) -> tuple[np.ndarray, Sequence[Any]]:
-        """The goal (3,) [m] and the markers, which a camera should keep in view, world frame."""
+        """The goal (3,) [m] and the markers that a camera should keep in view, world frame."""
         return self.environment.goals()[0], self.environment.markers()
 
     def get_observation(self, physics: Physics) -> dict[str, np.ndarray]:
@@ -165,7 +165,7 @@ def make(
 ) -> control.Environment:
     """Build the dm_control environment of a task.
 
-    `task.environment.randomizer.shown()` has what a randomization drew, and
+    `task.environment.randomizer.shown()` gives what a randomization drew, and
     `task.environment.privileged` the observation for the critic alone.
 
     Args:

@@ -120,7 +120,7 @@ class QuadrotorVecEnv(VecEnv):
         self._lengths[rows] = 0
 
     def _groups(self) -> TensorDict:
-        """What is observed now, copied."""
+        """The groups of observations now, copied."""
         groups = {"policy": self._tensor(self._observation.copy())}
         if (privileged := self.environment.privileged) is not None:
             groups["critic"] = self._tensor(privileged.astype(np.float32))

@@ -88,7 +88,7 @@ class QuadrotorEnv(EnvBase):
         self._restored = False
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Go on where `environment.save` was called: the next full reset returns that moment."""
+        """Restore what `environment.save` returned: the next full reset returns that moment."""
         self._observation = self.environment.flatten(self.environment.restore(saved))
         self._restored = True
 
@@ -148,7 +148,7 @@ class QuadrotorEnv(EnvBase):
         self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
 
     def _seen(self) -> dict[str, torch.Tensor]:
-        """What is observed now."""
+        """Entries of the observation now."""
         seen = {"observation": torch.from_numpy(self._observation.copy())}
         if (privileged := self.environment.privileged) is not None:
             seen["privileged"] = torch.from_numpy(privileged.astype(np.float32))
