@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import itertools
 import math
 import os
@@ -222,9 +221,8 @@ def write_video(
 
 def help_notebooks() -> None:
     """Let `mediapy.show_video` find an ffmpeg, where mediapy is imported or a notebook runs."""
-    notebook = "IPython" in sys.modules and importlib.util.find_spec("mediapy")
-    if "mediapy" in sys.modules or notebook:
-        with contextlib.suppress(RenderingUnavailable):  # there is none to find
+    if {"mediapy", "IPython"} & sys.modules.keys():
+        with contextlib.suppress(RenderingUnavailable):  # there is no mediapy, or no ffmpeg
             _mediapy()
 
 

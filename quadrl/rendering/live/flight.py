@@ -107,11 +107,10 @@ class Flight:
         mode = getattr(controller, "control_mode", "rotor")
         seen = resolve(getattr(controller, "conditions", {}).get("observe"))
         scenario = dataclasses.replace(self.scenario, control_mode=mode, observe=seen)
-        before = environment = getattr(self, "environment", None)  # at first there is none
-        if environment is None or environment.scenario != scenario:
-            environment = Environment(scenario, **self._rows)
+        goes_on = hasattr(self, "environment") and self.environment.scenario == scenario
+        environment = self.environment if goes_on else Environment(scenario, **self._rows)
         self._act, self.controller = begun(controller, environment), controller
-        if environment is not before:
+        if not goes_on:
             self.environment = environment
             self.reset()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Unpack
 
 from quadrl.base.errors import RenderingUnavailable
@@ -82,6 +83,4 @@ def others(scenario: Scenario) -> dict[str, Callable[[], Controller]]:
         scale = policy.scenario.aircraft.action_scale
         if policy.task == task.name and scale == vehicle.action_scale:
             policies[file.stem] = lambda policy=policy: policy
-    return policies | {
-        name: lambda name=name: make_controller(name, task, vehicle) for name in CONTROLLERS
-    }
+    return policies | {name: partial(make_controller, name, task, vehicle) for name in CONTROLLERS}
