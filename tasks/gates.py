@@ -134,15 +134,15 @@ class GateRace(Task):
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Nearer to the next gate and through it, without turning more than it takes."""
         passes, _, missed, _ = self._crossed(now)
-        xp, zero = namespace(missed), 0.0 * missed
+        below = namespace(missed).clip(LOW - now.state.height, 0.0, LOW)
         time = rewards.time_share(now.parameters)
         return {
             "progress": rewards.progress(self.progress_weight, before, now),
             "turn": -self.turn_weight * time * now.potentials.angular_speed,
-            "pass": xp.where(passes, zero + self.pass_weight, zero),
+            "pass": rewards.once(self.pass_weight, passes, now),
             "miss": -self.miss_weight * missed,
-            "low": -self.low_weight * time * xp.clip(LOW - now.state.height, 0.0, LOW),
-            "crash": xp.where(end.failed, zero - self.crash_weight, zero),
+            "low": -self.low_weight * time * below,
+            "crash": rewards.once(-self.crash_weight, end.failed, now),
         }
 
     def terminated(self, now: Snapshot) -> Array:

@@ -10,15 +10,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.task import (
-    STILL,
-    EpisodeEnd,
-    Snapshot,
-    Target,
-    Task,
-    TaskState,
-    heads_east,
-)
+from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
@@ -115,15 +107,8 @@ class Hover(Task):
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Nearer to the waypoint, level and heading east, slower, at little effort, in the air."""
-        return {
-            "progress": rewards.progress(self.progress_weight, before, now),
-            "attitude": rewards.attitude(self.attitude_weight, before, now),
-            "speed": rewards.speed(self.speed_weight, before, now),
-            "spin": rewards.spin(self.spin_weight, before, now),
-            "control": rewards.control(self.control_weight, now),
-            "survival": rewards.survival(self.survival_weight, now),
-            **rewards.smoothness(self.smoothness_weight, before, now),
-        }
+        terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
+        return rewards.weighted(self, terms, before, now)
 
     def terminated(self, now: Snapshot) -> Array:
         """Away, on the ground or on its back."""

@@ -163,23 +163,17 @@ class Landing(Task):
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Down to the pad, level and heading east, without haste, and what the end is worth."""
         height, last = (abs(shot.potentials.to_goal[..., 2]) for shot in (now, before))
-        xp, zero = namespace(height), 0.0 * height
         # Not the speed: exploration gives some in every direction, which would cost most near the
         # ground and keep it in the air.
         sink = (last - height) / now.parameters.control_timestep
         haste = sink - (self.gentle_speed + self.gentle_rate * height)
-        haste_cost = self.haste_weight * rewards.time_share(now.parameters)
+        cost = self.haste_weight * rewards.time_share(now.parameters)
+        terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
         return {
-            "progress": rewards.progress(self.progress_weight, before, now),
-            "attitude": rewards.attitude(self.attitude_weight, before, now),
-            "speed": rewards.speed(self.speed_weight, before, now),
-            "spin": rewards.spin(self.spin_weight, before, now),
-            "control": rewards.control(self.control_weight, now),
-            "survival": rewards.survival(self.survival_weight, now),
-            **rewards.smoothness(self.smoothness_weight, before, now),
-            "haste": -haste_cost * xp.where(haste > 0, haste, zero),
-            "success": xp.where(end.succeeded, zero + self.success_weight, zero),
-            "failure": xp.where(end.failed, zero - self.failure_weight, zero),
+            **rewards.weighted(self, terms, before, now),
+            "haste": -cost * namespace(haste).where(haste > 0, haste, 0.0 * height),
+            "success": rewards.once(self.success_weight, end.succeeded, now),
+            "failure": rewards.once(-self.failure_weight, end.failed, now),
         }
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:

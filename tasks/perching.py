@@ -202,19 +202,14 @@ class Perching(Task):
         shares = (xp.clip(share - 1, 0, WORST) for share in self._shares(now))
         excess = xp.where(now.held & ~before.held, functools.reduce(operator.add, shares), none)
         excess = xp.where(self._struck(now), xp.clip(now.touch_speed, 0, WORST), excess)
+        cost = self.time_weight * rewards.time_share(now.parameters)
+        terms = "progress", "attitude", "speed", "spin", "control", "smoothness"
         return {
-            "progress": rewards.progress(self.progress_weight, before, now),
-            "attitude": rewards.attitude(self.attitude_weight, before, now),
-            "speed": rewards.speed(self.speed_weight, before, now),
-            "spin": rewards.spin(self.spin_weight, before, now),
-            "control": rewards.control(self.control_weight, now),
-            **rewards.smoothness(self.smoothness_weight, before, now),
-            "time": xp.where(
-                now.held, none, none - self.time_weight * rewards.time_share(now.parameters)
-            ),
+            **rewards.weighted(self, terms, before, now),
+            "time": rewards.once(-cost, ~now.held, now),
             "touch": -self.touch_weight * excess,
-            "success": xp.where(end.succeeded, none + self.success_weight, none),
-            "failure": xp.where(end.failed, none - self.failure_weight, none),
+            "success": rewards.once(self.success_weight, end.succeeded, now),
+            "failure": rewards.once(-self.failure_weight, end.failed, now),
         }
 
     def terminated(self, now: Snapshot) -> Array:

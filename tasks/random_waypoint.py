@@ -8,15 +8,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.rotation import Array, namespace
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
-from quadrl.core.task import (
-    STILL,
-    EpisodeEnd,
-    Potentials,
-    Snapshot,
-    Target,
-    Task,
-    TaskState,
-)
+from quadrl.core.task import STILL, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 from quadrl.tasks.hover import IN_GUSTS
@@ -95,15 +87,8 @@ class RandomWaypoint(Task):
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Nearer to the waypoint, level, slower, at little effort, in the air."""
-        return {
-            "progress": rewards.progress(self.progress_weight, before, now),
-            "attitude": rewards.attitude(self.attitude_weight, before, now),
-            "speed": rewards.speed(self.speed_weight, before, now),
-            "spin": rewards.spin(self.spin_weight, before, now),
-            "control": rewards.control(self.control_weight, now),
-            "survival": rewards.survival(self.survival_weight, now),
-            **rewards.smoothness(self.smoothness_weight, before, now),
-        }
+        terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
+        return rewards.weighted(self, terms, before, now)
 
     def terminated(self, now: Snapshot) -> Array:
         """Far away or on the ground."""

@@ -109,15 +109,8 @@ class Recovery(Task):
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Upright, slower, nearer to the origin, at little effort, in the air."""
-        return {
-            "progress": rewards.progress(self.progress_weight, before, now),
-            "attitude": rewards.attitude(self.attitude_weight, before, now),
-            "speed": rewards.speed(self.speed_weight, before, now),
-            "spin": rewards.spin(self.spin_weight, before, now),
-            "control": rewards.control(self.control_weight, now),
-            "survival": rewards.survival(self.survival_weight, now),
-            **rewards.smoothness(self.smoothness_weight, before, now),
-        }
+        terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
+        return rewards.weighted(self, terms, before, now)
 
     def terminated(self, now: Snapshot) -> Array:
         """Far away or on the ground."""

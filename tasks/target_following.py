@@ -131,15 +131,8 @@ class TargetFollowing(Task):
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Nearer to the distance to keep, level, with the target, at little effort, in the air."""
-        return {
-            "progress": rewards.progress(self.progress_weight, before, now),
-            "attitude": rewards.attitude(self.attitude_weight, before, now),
-            "speed": rewards.speed(self.speed_weight, before, now),
-            "spin": rewards.spin(self.spin_weight, before, now),
-            "control": rewards.control(self.control_weight, now),
-            "survival": rewards.survival(self.survival_weight, now),
-            **rewards.smoothness(self.smoothness_weight, before, now),
-        }
+        terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
+        return rewards.weighted(self, terms, before, now)
 
     def terminated(self, now: Snapshot) -> Array:
         """Too far from the target, or on the ground."""

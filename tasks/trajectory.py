@@ -158,15 +158,11 @@ class Trajectory(Task):
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Near the reference and with it, heading east, at little effort, in the air."""
         cost = self.distance_weight * rewards.time_share(now.parameters)
+        terms = "attitude", "speed", "spin", "control", "survival", "smoothness"
         return {
             "progress": rewards.progress(self.progress_weight, before, now),
             "distance": -cost * now.potentials.distance,
-            "attitude": rewards.attitude(self.attitude_weight, before, now),
-            "speed": rewards.speed(self.speed_weight, before, now),
-            "spin": rewards.spin(self.spin_weight, before, now),
-            "control": rewards.control(self.control_weight, now),
-            "survival": rewards.survival(self.survival_weight, now),
-            **rewards.smoothness(self.smoothness_weight, before, now),
+            **rewards.weighted(self, terms, before, now),
         }
 
     def terminated(self, now: Snapshot) -> Array:

@@ -9,12 +9,33 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Iterable
+from typing import Any, Literal
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.base.rotation import Array, square_norm
+from quadrl.base.rotation import Array, namespace, square_norm
 from quadrl.core.snapshot import Snapshot
 
 REWARD_TIME = 0.05  # [s], the control step of the paper's aircraft
+Name = Literal["progress", "attitude", "speed", "spin", "control", "survival", "smoothness"]
+
+
+def weighted(task: Any, names: Iterable[Name], before: Snapshot, now: Snapshot) -> dict[str, Array]:
+    """Terms by their names, in their order, weighted by the task's options `NAME_weight`.
+
+    Where the weight of smoothness is 0, it is left out.
+    """
+    terms = {
+        "progress": progress(task.progress_weight, before, now),
+        "attitude": attitude(task.attitude_weight, before, now),
+        "speed": speed(task.speed_weight, before, now),
+        "spin": spin(task.spin_weight, before, now),
+        "control": control(task.control_weight, now),
+        "survival": survival(task.survival_weight, now),
+        **smoothness(task.smoothness_weight, before, now),
+    }
+    asked = (name for name in names if name != "smoothness" or task.smoothness_weight != 0)
+    return {name: terms[name] for name in asked}
 
 
 def progress(weight: float, before: Snapshot, now: Snapshot) -> Array:
@@ -59,6 +80,12 @@ def smoothness(weight: float, before: Snapshot, now: Snapshot) -> dict[str, Arra
         return {}
     change = (now.rotor_command - before.rotor_command) / now.parameters.rotor.max_speed
     return {"smoothness": (-weight * time_share(now.parameters)) * square_norm(change)}
+
+
+def once(weight: float, happens: Array, now: Snapshot) -> Array:
+    """What happens (N,) bool in this control step, the end of the episode for example."""
+    zero = 0.0 * now.time
+    return namespace(zero).where(happens, zero + weight, zero)
 
 
 def time_share(parameters: Parameters) -> float:

@@ -201,15 +201,8 @@ class Task(abc.ABC):
 
         Those of a flight to a goal, for tasks that have none of their own.
         """
-        return {
-            "progress": rewards.progress(self.progress_weight, before, now),
-            "attitude": rewards.attitude(self.attitude_weight, before, now),
-            "speed": rewards.speed(self.speed_weight, before, now),
-            "spin": rewards.spin(self.spin_weight, before, now),
-            "control": rewards.control(self.control_weight, now),
-            "survival": rewards.survival(self.survival_weight, now),
-            **rewards.smoothness(self.smoothness_weight, before, now),
-        }
+        terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
+        return rewards.weighted(self, terms, before, now)
 
     @abc.abstractmethod
     def terminated(self, now: Snapshot) -> Array:
