@@ -1,15 +1,22 @@
-"""Approaches to a surface: states on the way to a touch, and before it at rest."""
+"""Approaches to a surface: how controllers come down to a pad, and states on the way to a touch."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY
-from quadrl.base.rotation import Array, namespace, stack
+from quadrl.base.rotation import Array, namespace, norm, stack
+from quadrl.control.reading import Reading
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
+# How the yardstick controllers come down.
+DESCENT_RATE = 0.8  # [1/s], sink speed over the height
+TOUCHDOWN_SPEED = 0.2  # [m/s]
+MAX_DESCENT_SPEED = 1.2  # [m/s]
+WAITING_HEIGHT = 0.5  # [m], where they wait for the heading
 RATE, THRUST, DIVE = (1.5, 3.5), (0.75, 1.1), 0.5  # [rad/s], [weights], [rad]: ways to a touch
 
 
@@ -31,6 +38,22 @@ class Way(NamedTuple):
             body_rate=stack(none, -self.rate, none),
             rotor_speed=hovering(self.position, parameters),
         )
+
+
+def descent(reading: Reading, heading: float) -> tuple[Array, Array]:
+    """Down to a pad, as `Task.guide` gives it; it lands heading at most so far off east [rad]."""
+    xp = namespace(reading.to_goal)
+    height = xp.clip(-reading.to_goal[..., 2], 0.0, None)
+    aside = norm(reading.to_goal[..., :2])
+    sink = xp.clip(DESCENT_RATE * height + TOUCHDOWN_SPEED, None, MAX_DESCENT_SPEED)
+    sink = sink * xp.clip(1.5 - aside / (0.2 + 0.2 * height), 0.0, 1.0)  # within a cone
+    wide, narrow = math.cos(2 * heading), math.cos(heading)
+    east = reading.rotation[..., 0, 0]  # of the unit vector along body x
+    turned = xp.clip((east - wide) / (narrow - wide), 0.0, 1.0)
+    sink = xp.where(height > WAITING_HEIGHT, sink, sink * turned)
+    zero = xp.zeros_like(sink)
+    offset = stack(reading.to_goal[..., 0], reading.to_goal[..., 1], zero)
+    return offset, stack(zero, zero, -sink)
 
 
 def on_the_way(rng: Rng, incline: Array, into: tuple[float, float]) -> Way:

@@ -14,20 +14,18 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, dot, namespace, norm, stack, to_body, to_world
 from quadrl.base.validation import number
-from quadrl.conditions.solids import Box, Pose, Solid
+from quadrl.conditions.solids import Pose, Solid
 from quadrl.control.reading import Reading
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY, ObservationTerm
-from quadrl.core.task import EpisodeEnd, Rollout, Snapshot, Target, TaskState, heads_east
+from quadrl.core.snapshot import Rollout, statistic
+from quadrl.core.task import EpisodeEnd, Snapshot, Target, TaskState, heads_east
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import REST_SPEED, REST_TURN, Start
 from quadrl.tasks import sea
-from quadrl.tasks.landing import Landing
-from quadrl.tasks.sea import Waves
+from quadrl.tasks.landing import PAD, Landing
+from quadrl.tasks.sea import DECK, Waves
 
-DECK = Box("deck", length=4.0, width=4.0, height=0.2, rgba=(0.38, 0.42, 0.46, 1.0))
-FREEBOARD = 1.5  # [m], of the deck over the water
-HULL = (0.24, 0.26, 0.30, 1.0)
 WASH_MARGIN = 0.3  # [m/s], which the yardstick controllers keep from the fastest sinking
 NORMAL = ObservationTerm(3, "1", "unit vector out of the deck, body frame")
 
@@ -145,7 +143,7 @@ class DeckLanding(Landing):
         """Crashed, in its own wash, in the water, away, or at rest for long enough."""
         sinks = (now.state.body_velocity[..., 2] < -self.max_sink) & ~now.landed
         away = now.potentials.distance > self.max_distance
-        wet = now.potentials.to_goal[..., 2] > FREEBOARD
+        wet = now.potentials.to_goal[..., 2] > sea.FREEBOARD
         return self._crashed(now) | sinks | away | wet | self._rested(now)
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
@@ -179,35 +177,24 @@ class DeckLanding(Landing):
     def markers(self, now: Snapshot) -> Sequence[Marker | Primitive]:
         """The pad, as it lies on the deck."""
         deck = sea.deck(now.task, now.time)
-        place, above = (deck.position[0] + k * deck.normal[0] for k in (0.002, 1.0))
-        pad = Marker("pad", tuple(place), self.pad_radius, (0.95, 0.95, 0.95, 1.0), tuple(above))
-        hull = Primitive(
-            "box",
-            (self.boat_length / 2, self.boat_beam / 2, FREEBOARD / 2),
-            deck.position[0] - (DECK.height + FREEBOARD / 2) * deck.normal[0],
-            sea.upright(deck.normal)[0],
-            HULL,
-            glow=0.0,
-        )
-        return [pad, hull, *sea.water(now.task, now.time, -FREEBOARD)]
+        place, above = (tuple(deck.position[0] + k * deck.normal[0]) for k in (0.002, 1.0))
+        pad = Marker("pad", place, self.pad_radius, PAD, above)
+        hull = sea.hull(deck, (self.boat_length, self.boat_beam))
+        return [pad, hull, *sea.water(now.task, now.time)]
 
     def metrics(self, rollout: Rollout) -> dict[str, float]:
-        """The touchdowns, the crashes, and the time that a landing takes."""
+        """The touchdowns, and the time that a landing takes."""
         last = rollout.length - 1, np.arange(len(rollout.length))
         names = "down", "speed", "upright", "miss"
         down, *numbers = (rollout.remembered[name][last] for name in names)
         speed, upright, miss = (each[down > 0] for each in numbers)
-        landed = rollout.length[rollout.is_success] * rollout.control_timestep
-
-        def median(values: np.ndarray) -> float:
-            return float(np.median(values)) if len(values) else math.nan
-
+        tilt = statistic(np.median, np.arccos(np.clip(upright, -1, 1)))
         return {
-            "touchdown_speed_median_m_s": median(speed),
-            "touchdown_speed_max_m_s": float(speed.max()) if len(speed) else math.nan,
-            "touchdown_tilt_median_deg": math.degrees(median(np.arccos(np.clip(upright, -1, 1)))),
-            "miss_median_m": median(miss),
-            "landing_time_mean_s": float(landed.mean()) if len(landed) else math.nan,
+            "touchdown_speed_median_m_s": statistic(np.median, speed),
+            "touchdown_speed_max_m_s": statistic(np.max, speed),
+            "touchdown_tilt_median_deg": math.degrees(tilt),
+            "miss_median_m": statistic(np.median, miss),
+            "landing_time_mean_s": statistic(np.mean, rollout.success_time),
         }
 
     def _crashed(self, now: Snapshot) -> Array:
@@ -220,11 +207,10 @@ class DeckLanding(Landing):
         tipped = now.landed & (hard | (cosine < least) | (upright < least))
         return tipped | (now.touched[..., 0] & ~now.landed)
 
-    def _rest(self, now: Snapshot) -> Array:
-        """Control steps at rest on the pad, this one included, (N,)."""
+    def _rests(self, now: Snapshot) -> Array:
+        """Whether it is at rest on the pad, (N,) bool."""
         state, rate = now.state, sea.deck(now.task, now.time).rate
         turn = norm(to_world(state.rotation, state.body_rate) - rate)
         still = (now.potentials.speed < REST_SPEED) & (turn < REST_TURN)
         over_pad = now.potentials.distance < self.pad_radius
-        rests = now.touched[..., 0] & now.landed & still & over_pad
-        return namespace(now.task.rest).where(rests, now.task.rest + 1, 0 * now.task.rest)
+        return now.touched[..., 0] & now.landed & still & over_pad

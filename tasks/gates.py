@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,8 @@ from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.observation import MOTION, ROTATION, ObservationTerm, observed_motion
-from quadrl.core.task import EpisodeEnd, Rollout, Snapshot, Task, TaskState
+from quadrl.core.snapshot import Rollout, statistic
+from quadrl.core.task import EpisodeEnd, Snapshot, Task, TaskState
 from quadrl.tasks.tracks import Track, crossing
 
 # How the yardstick controllers fly: to a place so far behind a gate [m], and so fast there [m/s].
@@ -167,14 +167,13 @@ class GateRace(Task):
         ends = range(count, int(self.laps) * count + 1, count)
         at = [np.nanmin(np.where(passed == end, time, np.inf), 0) for end in ends]
         laps = np.diff([np.zeros(done.sum()), *at], axis=0)  # (laps, successful flights)
-        found = {
-            "race_time_mean_s": at[-1].mean() if done.any() else math.nan,
-            "race_time_best_s": at[-1].min() if done.any() else math.nan,
-            "gates_passed_mean": np.nanmax(rollout.remembered["passed"], 0).mean(),
+        flying = {"flying_lap_mean_s": statistic(np.mean, laps[1:])} if len(laps) > 1 else {}
+        return {
+            "race_time_mean_s": statistic(np.mean, at[-1]),
+            "race_time_best_s": statistic(np.min, at[-1]),
+            "gates_passed_mean": float(np.nanmax(rollout.remembered["passed"], 0).mean()),
+            **flying,
         }
-        if len(laps) > 1:
-            found["flying_lap_mean_s"] = laps[1:].mean() if done.any() else math.nan
-        return {name: float(value) for name, value in found.items()}
 
     def _following(self, gate: Array) -> Array:
         """Numbers (N,) of the gates after some."""

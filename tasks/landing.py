@@ -15,16 +15,13 @@ from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import stands, strikes_ground
 from quadrl.core.markers import Marker
-from quadrl.core.snapshot import Rollout
+from quadrl.core.snapshot import Rollout, statistic
 from quadrl.core.task import TURNING, EpisodeEnd, Snapshot, Target, Task, TaskState, heads_east
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import REST_SPEED, Start
+from quadrl.tasks.approach import descent
 
-# How the yardstick controllers come down.
-DESCENT_RATE = 0.8  # [1/s], sink speed over the height
-TOUCHDOWN_SPEED = 0.2  # [m/s]
-MAX_DESCENT_SPEED = 1.2  # [m/s]
-WAITING_HEIGHT = 0.5  # [m], where they wait for the heading
+PAD = (0.95, 0.95, 0.95, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,22 +175,11 @@ class Landing(Task):
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """Over the pad, then down, slower the lower, once it heads east; then it presses on."""
-        xp = namespace(reading.to_goal)
-        height = xp.clip(-reading.to_goal[..., 2], 0.0, None)
-        aside = norm(reading.to_goal[..., :2])
-        sink = xp.clip(DESCENT_RATE * height + TOUCHDOWN_SPEED, None, MAX_DESCENT_SPEED)
-        sink = sink * xp.clip(1.5 - aside / (0.2 + 0.2 * height), 0.0, 1.0)  # within a cone
-        wide, narrow = math.cos(2 * self.heading_tolerance), math.cos(self.heading_tolerance)
-        east = reading.rotation[..., 0, 0]  # of the unit vector along body x
-        turned = xp.clip((east - wide) / (narrow - wide), 0.0, 1.0)
-        sink = xp.where(height > WAITING_HEIGHT, sink, sink * turned)
-        zero = xp.zeros_like(sink)
-        offset = stack(reading.to_goal[..., 0], reading.to_goal[..., 1], zero)
-        return offset, stack(zero, zero, -sink)
+        return descent(reading, self.heading_tolerance)
 
     def markers(self, now: Snapshot) -> Sequence[Marker | Primitive]:
         """The pad."""
-        return [Marker("pad", size=self.pad_radius, rgba=(0.95, 0.95, 0.95, 1.0))]
+        return [Marker("pad", size=self.pad_radius, rgba=PAD)]
 
     def metrics(self, rollout: Rollout) -> dict[str, float]:
         """Speed of the touchdowns, the crashes, and the time that a landing takes."""
@@ -204,19 +190,23 @@ class Landing(Task):
         last = rollout.length - 1, np.arange(len(rollout.length))
         still = norm(rollout.velocity[last]) < REST_SPEED
         crashed = rollout.terminated & ~rollout.is_success & ~(still & down[last])
-        landed = rollout.length[rollout.is_success] * rollout.control_timestep
         return {
-            "touchdown_speed_median_m_s": float(np.median(speed)) if len(speed) else math.nan,
-            "touchdown_speed_max_m_s": float(speed.max()) if len(speed) else math.nan,
+            "touchdown_speed_median_m_s": statistic(np.median, speed),
+            "touchdown_speed_max_m_s": statistic(np.max, speed),
             "crash_rate": float(crashed.mean()),
-            "landing_time_mean_s": float(landed.mean()) if len(landed) else math.nan,
+            "landing_time_mean_s": statistic(np.mean, rollout.success_time),
         }
 
     def _rest(self, now: Snapshot) -> Array:
         """Control steps at rest on the pad, this one included, (N,)."""
+        return namespace(now.task.rest).where(
+            self._rests(now), now.task.rest + 1, 0 * now.task.rest
+        )
+
+    def _rests(self, now: Snapshot) -> Array:
+        """Whether it is at rest on the pad, (N,) bool."""
         over_pad = square_norm(now.state.position[..., :2]) < self.pad_radius**2
-        rests = stands(now) & now.state.at_rest & over_pad
-        return namespace(now.task.rest).where(rests, now.task.rest + 1, 0 * now.task.rest)
+        return stands(now) & now.state.at_rest & over_pad
 
     def _rested(self, now: Snapshot) -> Array:
         """Whether it has been at rest on the pad for long enough, (N,) bool."""

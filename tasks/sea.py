@@ -1,4 +1,4 @@
-"""The sea: waves that the wind has raised, how a boat on it moves, and how it looks."""
+"""The sea: waves that the wind has raised, how a boat on it moves, and how both look."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, namespace, norm, stack
+from quadrl.conditions.solids import Box
 from quadrl.core.task import TaskState
 from quadrl.engines.rng import FULL_TURN, Rng
 
@@ -20,6 +21,9 @@ WAVES = 12  # that the sea is made of
 RAREST = 1e-6  # of the share of the energy in longer waves: those are endless
 TILES, FARTHEST = 20, math.asinh(50.0)  # of the water that is drawn, along and across
 WATER = np.array([0.10, 0.34, 0.48, 1.0])
+DECK = Box("deck", length=4.0, width=4.0, height=0.2, rgba=(0.38, 0.42, 0.46, 1.0))
+FREEBOARD = 1.5  # [m], of the deck over the water
+HULL = (0.24, 0.26, 0.30, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,8 +111,15 @@ def upright(normal: Array) -> Array:
     return turn / norm(turn)[..., None]
 
 
-def water(waves: Waves, time: np.ndarray, level: float) -> list[Primitive]:
-    """Tiles of the water about the boat of one episode (N = 1), mean at a level [m]."""
+def hull(deck: Motion, size: tuple[float, float]) -> Primitive:
+    """The first boat below its deck, its length and beam given [m]."""
+    below = deck.position[0] - (DECK.height + FREEBOARD / 2) * deck.normal[0]
+    half = size[0] / 2, size[1] / 2, FREEBOARD / 2
+    return Primitive("box", half, below, upright(deck.normal)[0], HULL, glow=0.0)
+
+
+def water(waves: Waves, time: np.ndarray) -> list[Primitive]:
+    """Tiles of the water about the boat of one episode (N = 1)."""
     edges = 3 * np.sinh(np.linspace(-FARTHEST, FARTHEST, TILES + 1))  # the nearer, the smaller
     grids = (edges[1:] + edges[:-1]) / 2, 0.52 * np.diff(edges)
     place, half = (np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) for grid in grids)
@@ -118,7 +129,7 @@ def water(waves: Waves, time: np.ndarray, level: float) -> list[Primitive]:
     colour = WATER + np.clip(0.08 * height, -0.08, 0.2) * (1.0, 1.0, 1.0, 0.0)
     tiles = (
         np.concatenate([half, 0 * height + 0.15], axis=-1),
-        np.concatenate([place, height + level], axis=-1),
+        np.concatenate([place, height - FREEBOARD], axis=-1),
         upright(there.normal),
         colour,
     )

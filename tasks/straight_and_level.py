@@ -15,7 +15,7 @@ from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY
-from quadrl.core.snapshot import Rollout
+from quadrl.core.snapshot import Rollout, statistic
 from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
@@ -139,5 +139,5 @@ class StraightAndLevel(Task):
         return {
             "altitude_rms_m": float(np.sqrt(np.nanmean(rollout.position[..., 2] ** 2))),
             "cross_track_rms_m": float(np.sqrt(np.nanmean(across**2))),
-            "speed_error_share": float(off.mean()) if len(off) else np.nan,
+            "speed_error_share": statistic(np.mean, off),
         }

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -158,6 +159,11 @@ class Rollout:
         steps, flights = self.error.shape
         return f"Rollout of {self.task.name}: {flights} flights, {steps} control steps at most"
 
+    @property
+    def success_time(self) -> np.ndarray:
+        """How long each successful flight took, (n,) [s]."""
+        return self.length[self.is_success] * self.control_timestep
+
     def trajectory(self, vehicle: Vehicle, episode: int = 0) -> Trajectory:
         """The flight of one aircraft, to be drawn; the markers are those of the first."""
         steps = slice(0, int(self.length[episode]))
@@ -176,3 +182,8 @@ class Rollout:
             outcome=outcome(self.terminated[episode], True, self.is_success[episode]),
             wind=wind if wind.any() else None,
         )
+
+
+def statistic(of: Callable[[np.ndarray], Any], values: np.ndarray) -> float:
+    """A statistic of values, such as `np.mean`; NaN if there are none."""
+    return float(of(values)) if values.size else math.nan
