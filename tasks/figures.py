@@ -31,21 +31,50 @@ CLIMB = 0.3  # share of the largest acceleration with which it climbs and sinks
 
 
 @dataclasses.dataclass(frozen=True)
-class Figure:
+class Figure(Table):
     """A figure, the curve of a file, or random curves."""
 
     name: str  # one of FIGURES, or the path of a file
-    table: Table
     cycle: float  # [s], a period, for which it is looked at
     acceleration: float  # [m/s^2], the largest of a random curve
     extent: float  # [m], its largest distance from its middle along each axis
+
+    @classmethod
+    def of(cls, figure: str, seconds: float, name: str, *others: float) -> Figure:
+        """Make the curves of a figure, or the one of a csv file.
+
+        Args:
+            figure: One of FIGURES, or a path.
+            seconds: For which it is flown.
+            name: What a refusal calls the figure.
+            *others: Cycle, acceleration and extent.
+
+        Raises:
+            QuadrlError: There is no such figure or file, or the file has a gap or a jump.
+        """
+        made, count, turns = np.zeros((1, 4, AXES)), 1, None
+        if figure in ("zigzag", "pentagram"):
+            points = _drawn(1.0, 1.5, 0.0, seconds) if figure == "zigzag" else _star(seconds)
+            made, count = pieces(*points, 1, seconds)
+        elif figure == "polynomial":
+            made, count = pieces(*_drawn(1.5, 4.0, 0.5, seconds), 5, seconds)
+        elif figure not in FIGURES:
+            if not figure.endswith(".csv"):
+                choice(name, figure, [*FIGURES, "the path of a .csv file"])
+            times, rows = read(name, figure)
+            made, count = pieces(times, rows[..., :AXES], 3, seconds)
+            if rows.shape[-1] > AXES:
+                turns = pieces(times, np.unwrap(rows[..., AXES:], axis=1), 3, seconds)[0][..., 0]
+                turns.flags.writeable = False
+        made.flags.writeable = False
+        return cls(made, count, turns, figure, *others)
 
     def reference(self, rng: Rng, like: Array) -> Reference:
         """The references of episodes, rows as in an array (N, 3)."""
         if self.name == "random":
             return self._random(rng)
         zero, track = 0 * like[..., 0], 0 * like[..., 0]
-        if (tracks := len(self.table.pieces) // self.table.count) > 1:
+        if (tracks := len(self.pieces) // self.count) > 1:
             track = namespace(like).floor(rng.uniform(0.0, tracks))
         return Reference(0 * like, *_sines(self.name, self.cycle, zero), track)
 
@@ -57,8 +86,8 @@ class Figure:
         if self.name in SINES:
             none = np.zeros(1, dtype=int)
             one = self.reference(Rng(none, none), np.zeros((1, AXES)))
-            return self.table.at(one, np.linspace(0.0, self.cycle, 400), order)
-        return self.table.pieces[:, order] * math.factorial(order)
+            return self.at(one, np.linspace(0.0, self.cycle, 400), order)
+        return self.pieces[:, order] * math.factorial(order)
 
     def check_room(self, name: str, box: float, lowest: float) -> None:
         """Refuse what leaves the box [m] or sinks below a height [m].
@@ -103,35 +132,6 @@ class Figure:
             phase=rng.uniform(0.0, FULL_TURN, AXES * WAVES),
             track=0 * bearing,
         )
-
-
-def tabulated(figure: str, seconds: float, name: str) -> Table:
-    """Make the curves of a figure, or the one of a csv file.
-
-    Args:
-        figure: One of FIGURES, or a path.
-        seconds: For which it is flown.
-        name: What a refusal calls the figure.
-
-    Raises:
-        QuadrlError: There is no such figure or file, or the file has a gap or a jump.
-    """
-    made, count, turns = np.zeros((1, 4, AXES)), 1, None
-    if figure in ("zigzag", "pentagram"):
-        points = _drawn(1.0, 1.5, 0.0, seconds) if figure == "zigzag" else _star(seconds)
-        made, count = pieces(*points, 1, seconds)
-    elif figure == "polynomial":
-        made, count = pieces(*_drawn(1.5, 4.0, 0.5, seconds), 5, seconds)
-    elif figure not in FIGURES:
-        if not figure.endswith(".csv"):
-            choice(name, figure, [*FIGURES, "the path of a .csv file"])
-        times, rows = read(name, figure)
-        made, count = pieces(times, rows[..., :AXES], 3, seconds)
-        if rows.shape[-1] > AXES:
-            turns = pieces(times, np.unwrap(rows[..., AXES:], axis=1), 3, seconds)[0][..., 0]
-            turns.flags.writeable = False
-    made.flags.writeable = False
-    return Table(made, count, turns)
 
 
 def _sines(figure: str, period: float, zero: Array) -> tuple[Array, Array, Array]:

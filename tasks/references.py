@@ -41,8 +41,8 @@ class Table:
     """Curves in cubic pieces of PIECE seconds; a sum of sines needs none, and has a single one."""
 
     pieces: np.ndarray  # (tracks * count, 4, AXES) [m/s^k], factors of t^0 to t^3; read-only
-    count: int = 1  # pieces of a track; in the last one it stands still
-    turns: np.ndarray | None = None  # (count, 4) [rad/s^k], of a heading other than east
+    count: int  # pieces of a track; in the last one it stands still
+    turns: np.ndarray | None  # (count, 4) [rad/s^k], of a heading other than east; None for east
 
     def at(self, reference: Reference, time: Array, order: int = 0) -> Array:
         """References at times (N,) [s], or derivatives of an order to 3, (N, 3) [m/s^order]."""

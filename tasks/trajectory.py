@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -16,11 +15,12 @@ from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
 from quadrl.core.observation import OBSERVATION, TARGET_MOTION, TARGET_VELOCITY, ObservationTerm
-from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Rollout, Snapshot, Target, Task
+from quadrl.core.snapshot import Rollout, statistic
+from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.figures import LOWEST, SHORTEST, SINES, Figure, tabulated
-from quadrl.tasks.references import AXES, Reference, Table
+from quadrl.tasks.figures import LOWEST, SHORTEST, SINES, Figure
+from quadrl.tasks.references import AXES, Reference
 
 AHEAD, EVERY = 10, 0.1  # samples of the reference, and the time between them [s]
 MEANING = "from the aircraft to the reference in 0.1 s, 0.2 s and so on to 1 s, body frame"
@@ -32,8 +32,7 @@ LINE: tuple[float, float, float, float] = (0.95, 0.55, 0.20, 0.35)
 class Trajectory(Task):
     """Be where the reference is, at every moment, heading east."""
 
-    table: ClassVar[Table]  # each task has its own
-    curve: ClassVar[Figure]
+    curve: ClassVar[Figure]  # each task has its own
 
     name = "trajectory"
     asks = "follow a reference in time, heading east: a random curve, a figure or a file"
@@ -96,9 +95,8 @@ class Trajectory(Task):
             allowed = f"0, or at least {SHORTEST:g} s with the figures {', '.join(SINES)}"
             raise QuadrlError(name=f"{self.name} period", value=self.period, allowed=allowed)
         name, seconds = f"{self.name} figure", self.time_limit + AHEAD * EVERY
-        object.__setattr__(self, "table", tabulated(self.figure, seconds, name))
-        known = self.table, self.cycle, self.acceleration, self.extent
-        object.__setattr__(self, "curve", Figure(self.figure, *known))
+        known = self.cycle, self.acceleration, self.extent
+        object.__setattr__(self, "curve", Figure.of(self.figure, seconds, name, *known))
         self.curve.check_room(name, self.box, LOWEST - self.altitude)
 
     def check(self, parameters: Parameters) -> None:
@@ -114,10 +112,10 @@ class Trajectory(Task):
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Reference]:
         """At rest in the first point, heading east, slightly disturbed."""
         velocity = rng.vector(self.disturbance)
-        quaternion = self.table.headed(rng.attitude(self.disturbance, heading=0.0))
+        quaternion = self.curve.headed(rng.attitude(self.disturbance, heading=0.0))
         body_rate = rng.vector(self.disturbance)
         reference = self.curve.reference(rng, velocity)
-        position = self.table.at(reference, 0 * velocity[..., 0])
+        position = self.curve.at(reference, 0 * velocity[..., 0])
         start = Start(
             position=position,
             quaternion=quaternion,
@@ -129,28 +127,28 @@ class Trajectory(Task):
 
     def goal(self, now: Snapshot) -> Array:
         """Where the reference is."""
-        return self.table.at(now.task, now.time)
+        return self.curve.at(now.task, now.time)
 
     def target_velocity(self, now: Snapshot) -> Array:
         """How fast it moves."""
-        return self.table.at(now.task, now.time, 1)
+        return self.curve.at(now.task, now.time, 1)
 
     def target_motion(self, now: Snapshot) -> tuple[Array, Array]:
         """Its acceleration and jerk."""
-        return self.table.at(now.task, now.time, 2), self.table.at(now.task, now.time, 3)
+        return self.curve.at(now.task, now.time, 2), self.curve.at(now.task, now.time, 3)
 
     def measure(self, now: Snapshot) -> Potentials:
         """Of the attitude only the heading counts, since a curve asks for tilts."""
-        sine, cosine = self.table.off(now.state, now.time)
+        sine, cosine = self.curve.off(now.state, now.time)
         return dataclasses.replace(super().measure(now), attitude=abs(sine) + abs(cosine - 1))
 
     def observe(self, now: Snapshot) -> dict[str, Array]:
         """The reference of the next second, too."""
-        later = (self.table.at(now.task, now.time + EVERY * k) for k in range(1, AHEAD + 1))
+        later = (self.curve.at(now.task, now.time + EVERY * k) for k in range(1, AHEAD + 1))
         seen = [to_body(now.state.rotation, place - now.state.position) for place in later]
         terms = super().observe(now) | {"ahead": namespace(seen[0]).concat(seen, axis=-1)}
-        if self.table.turns is not None:  # as one that heads east sees itself
-            off = self.table.off(now.state, now.time)
+        if self.curve.turns is not None:  # as one that heads east sees itself
+            off = self.curve.off(now.state, now.time)
             for name, own in zip(("sin_attitude", "cos_attitude"), off, strict=True):
                 terms[name] = stack(terms[name][..., 0], terms[name][..., 1], own)
         return terms
@@ -175,12 +173,11 @@ class Trajectory(Task):
 
     def markers(self, now: Snapshot) -> Sequence[Marker]:
         """The reference."""
-        points = self.table.at(now.task, np.linspace(0.0, self.time_limit, 400))
+        points = self.curve.at(now.task, np.linspace(0.0, self.time_limit, 400))
         return [Marker("path", size=0.006, rgba=LINE, points=points)]
 
     def metrics(self, rollout: Rollout) -> dict[str, float]:
         """Mean distance over whole flights from rest, and from the second period on."""
         settled = rollout.error[round(self.cycle / rollout.control_timestep) :]
         parts = {"distance_m": rollout.error, "settled_m": settled}
-        known = {name: part[np.isfinite(part)] for name, part in parts.items()}
-        return {name: float(part.mean()) if part.size else math.nan for name, part in known.items()}
+        return {name: statistic(np.mean, part[np.isfinite(part)]) for name, part in parts.items()}

@@ -158,7 +158,7 @@ def test_a_file_may_have_headings_which_a_policy_follows_that_knows_only_east(tm
     rows = np.stack([time, np.sin(time), np.cos(time), 0.1 * time, wrapped], axis=-1)
     figure = write(tmp_path / "own.csv", rows)
     environment, at = flown(figure=figure)
-    np.testing.assert_allclose(environment.task.table.heading(np.array([7.77])), 5.885, atol=1e-6)
+    np.testing.assert_allclose(environment.task.curve.heading(np.array([7.77])), 5.885, atol=1e-6)
     seen = environment.task.observe(environment.snapshot)
     assert np.abs(seen["sin_attitude"]).max() < 0.1 and not environment.not_compiled
     # A heading of 2 rad, of what a controller for the east is 2 rad off.
