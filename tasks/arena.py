@@ -12,12 +12,13 @@ from quadrl.base.rotation import Array, cross, dot, namespace, norm, stack, to_b
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import State
 from quadrl.tasks.gates import Course
-from quadrl.tasks.tracks import POLE, Track, attitude
+from quadrl.tasks.tracks import OTHER, Track, attitude
 
 NEAR = 0.7  # [m], from how far on it is seen where a gate or a pole truly stands
 ASIDE = 0.15, 0.15, 0.1  # [m], by how much gates may be elsewhere along x, y and z
 ASIDE_POLE = 0.15, 0.15, 0.05  # [m], the same of poles, whose tops are higher or lower
 LEANING = 0.05, 0.1, 0.2  # [rad], by how much gates roll, pitch and turn at most
+POLE = 0.015  # [m], radius of a pole
 WOOD = (0.55, 0.45, 0.35, 1.0)
 STAND, DEPTH = 0.05, 0.01  # [m], of stands and frames, half their width
 
@@ -81,16 +82,17 @@ class Arena(Course):
     def drawn(self, track: Track) -> list[Primitive]:
         """Gates with their stands and poles, as the first row has them."""
         gates = [[vector[0] for vector in gate] for gate in self.frames]
+        centre = [gate[0] for gate in gates]
         axes = [(through, left, np.cross(through, left)) for _, through, left in gates]
-        poles = [[float(x[0]) for x in pole] for pole in self.tops]
-        stands: list[Primitive] = []
-        for (centre, *_), turned in zip(gates, axes, strict=True):
-            frame = track.frame / 2
-            high = centre[2] - frame
-            place = centre - (frame + high / 2) * turned[2]
+        shown = [*track.drawn(int(self.gate[0]), centre, axes)]
+        for x, y, top in ([float(part[0]) for part in pole] for pole in self.tops):
+            shown.append(Primitive("cylinder", (POLE, top / 2, 0.0), (x, y, top / 2), rgba=OTHER))
+        for middle, turned in zip(centre, axes, strict=True):
+            high = middle[2] - track.frame / 2
+            place = middle - (track.frame / 2 + high / 2) * turned[2]
             size = STAND, STAND, high / 2
-            stands.append(Primitive("box", size, place, attitude(turned), WOOD, glow=0.2))
-        return [*track.drawn(int(self.gate[0]), [gate[0] for gate in gates], axes, poles), *stands]
+            shown.append(Primitive("box", size, place, attitude(turned), WOOD, glow=0.2))
+        return shown
 
     def room(self, place: Array, track: Track) -> Array:
         """Distance of the nearest pole, frame or stand from a place (N, 3), (N,) [m]."""

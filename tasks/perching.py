@@ -131,10 +131,8 @@ class Perching(Task):
         ):
             number(f"{self.name} {most}", getattr(self, most), getattr(self, least), limit)
         if self.most_touch == self.least_touch:
-            allowed = f"above least_touch, {self.least_touch:g}"
-            raise QuadrlError(
-                name=f"{self.name} most_touch", value=self.most_touch, allowed=allowed
-            )
+            name, allowed = f"{self.name} most_touch", f"above least_touch, {self.least_touch:g}"
+            raise QuadrlError(name=name, value=self.most_touch, allowed=allowed)
         for name in ("most_slip", "most_slant", "most_spin"):
             number(f"{self.name} {name}", getattr(self, name), positive=True)
 
@@ -240,9 +238,7 @@ class Perching(Task):
     def _shares(self, now: Snapshot) -> list[Array]:
         """How hard the touch is, as shares of what is allowed, (N,): 1 is the limit."""
         into, along, cosine, rate = (now.touch[..., k] for k in range(4))
-        middle, half = (
-            (self.most_touch + self.least_touch) / 2,
-            (self.most_touch - self.least_touch) / 2,
-        )
+        middle = (self.most_touch + self.least_touch) / 2
+        half = (self.most_touch - self.least_touch) / 2
         slant = (1 - cosine) / (1 - math.cos(self.most_slant))
         return [abs(into - middle) / half, along / self.most_slip, slant, rate / self.most_spin]

@@ -101,7 +101,8 @@ class Race(GateRace):
 
     def markers(self, now: Snapshot) -> Sequence[Primitive]:
         """The gates; the next one in another colour."""
-        return [*self.course.drawn(int(now.task.gate[0]))]
+        track = self.course
+        return [*track.drawn(int(now.task.gate[0]), track.centre, track.axes)]
 
     def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
         """Gates with some numbers (N,): centres [m], and unit vectors through them and left."""

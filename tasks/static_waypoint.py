@@ -10,7 +10,7 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import Array, namespace
+from quadrl.base.rotation import Array, namespace, stack
 from quadrl.base.validation import MAX_OPTION, numbers
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
@@ -70,11 +70,8 @@ class StaticWaypoint(Task):
     def __post_init__(self) -> None:
         """Validate the route."""
         name, route = f"{self.name} waypoints", self.waypoints
-        if (
-            not isinstance(route, (Sequence, np.ndarray))
-            or isinstance(route, str)
-            or not len(route)
-        ):
+        listed = isinstance(route, (Sequence, np.ndarray)) and not isinstance(route, str)
+        if not listed or not len(route):
             raise QuadrlError(name=name, value=route, allowed="at least one point (x, y, z)")
         points = tuple(numbers(name, point, 3, -MAX_OPTION, MAX_OPTION) for point in route)
         object.__setattr__(self, "waypoints", points)
@@ -129,6 +126,4 @@ class StaticWaypoint(Task):
 
     def _waypoint(self, number: int, like: Array) -> Array:
         """A waypoint, a row per row of another array (N, 3)."""
-        x, y, z = self.waypoints[number]
-        zero = 0 * like[..., 0]
-        return namespace(like).stack([zero + x, zero + y, zero + z], axis=-1)
+        return stack(*(0 * like[..., 0] + x for x in self.waypoints[number]))

@@ -24,7 +24,6 @@ from quadrl.base.validation import MAX_OPTION, choice, number, numbers
 RUN_IN = 5.0
 """Distance of the start before the first gate of a track that names no start [m]."""
 DEPTH = 0.03  # of the frames that are drawn, of their outer edge
-POLE = 0.015  # [m], radius of a pole
 NEXT, OTHER = (1.0, 0.55, 0.15, 1.0), (0.25, 0.45, 0.80, 1.0)
 
 
@@ -107,31 +106,22 @@ class Track:
         left = np.array([-np.sin(heading), np.cos(heading), zero])
         return _fixed(np.stack([through.T, left.T, np.cross(through.T, left.T)], axis=1))
 
-    def drawn(
-        self, following: int, centre: Any = None, axes: Any = None, poles: Any = None
-    ) -> Iterator[Primitive]:
-        """The frames, that of the gate with a number in another colour, and the poles.
+    def drawn(self, following: int, centre: Any, axes: Any) -> Iterator[Primitive]:
+        """The frames, that of the gate with a number in another colour.
 
         Args:
             following: The number.
-            centre: Where gates stand, as `Track.centre`; by default where they should.
+            centre: Where gates stand, as `Track.centre`.
             axes: The same of `Track.axes`.
-            poles: The same of the poles.
         """
         deep = DEPTH * self.frame / 2
         wide = max((self.frame - self.opening) / 4, deep / 2)
-        centre, axes = (
-            self.centre if centre is None else centre,
-            self.axes if axes is None else axes,
-        )
         for k, (middle, turned) in enumerate(zip(centre, axes, strict=True)):
             rgba, turn = NEXT if k == following else OTHER, attitude(turned)
             for across, size in ((1, (wide, self.frame / 2)), (2, (self.opening / 2, wide))):
                 for side in (-1, 1):
                     place = middle + side * (self.opening / 2 + wide) * turned[across]
                     yield Primitive("box", (deep, *size), place, turn, rgba)
-        for x, y, top in self.poles if poles is None else poles:
-            yield Primitive("cylinder", (POLE, top / 2, 0.0), (x, y, top / 2), rgba=OTHER)
 
 
 @functools.cache
