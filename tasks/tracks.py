@@ -1,6 +1,6 @@
-"""Race tracks: gates as arrays, and what an aircraft crosses between two moments.
+"""Race tracks: gates as arrays, and how an aircraft crosses their planes.
 
-The known ones stand in assets/tracks, each with its source and licence.
+Known tracks are in assets/tracks, each with its source and licence.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.resources
+import itertools
 import json
 import math
 from collections.abc import Iterator
@@ -55,20 +56,17 @@ class Track:
             raise QuadrlError(name=f"{self.name} gates", value=self.gates, allowed=allowed)
         number(f"{self.name} opening", self.opening, positive=True)
         number(f"{self.name} frame", self.frame, self.opening)
-        for k, gate in enumerate(self.gates):
-            for other in range(k):
-                apart = math.dist(gate[:3], self.gates[other][:3])
-                if apart < self.frame:
-                    reason = f"gates {other + 1} and {k + 1} overlap: their frames are as wide"
-                    allowed = f"centres at least {self.frame:g} m apart"
-                    what = f"{self.name} gates"
-                    raise QuadrlError(reason, name=what, value=round(apart, 3), allowed=allowed)
+        for (k, gate), (n, other) in itertools.combinations(enumerate(self.gates, 1), 2):
+            if (apart := math.dist(gate[:3], other[:3])) < self.frame:
+                reason = f"gates {k} and {n} overlap: their frames are as wide"
+                what, allowed = f"{self.name} gates", f"centres at least {self.frame:g} m apart"
+                raise QuadrlError(reason, name=what, value=round(apart, 3), allowed=allowed)
 
     @classmethod
     def of(
         cls, name: str, gates: Any = (), start: Any = (), opening: float = 0, frame: float = 0
     ) -> Track:
-        """The track of a name, or of gates of one's own, with what differs from it.
+        """Make a known track, or one of own gates, with what differs from it.
 
         Args:
             name: A name of `NAMES`.
