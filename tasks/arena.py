@@ -1,4 +1,4 @@
-"""What stands about in the LSY race: its gates and poles, elsewhere in each episode."""
+"""The gates and poles of the LSY race, which stand elsewhere in each episode."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from quadrl.engines.state import State
 from quadrl.tasks.gates import Course
 from quadrl.tasks.tracks import OTHER, Track, attitude
 
-NEAR = 0.7  # [m], from how far on it is seen where a gate or a pole truly stands
+NEAR = 0.7  # [m], within which it is seen where a gate or a pole truly stands
 ASIDE = 0.15, 0.15, 0.1  # [m], by how much gates may be elsewhere along x, y and z
 ASIDE_POLE = 0.15, 0.15, 0.05  # [m], the same of poles, whose tops are higher or lower
 LEANING = 0.05, 0.1, 0.2  # [rad], by how much gates roll, pitch and turn at most
@@ -25,7 +25,7 @@ STAND, DEPTH = 0.05, 0.01  # [m], of stands and frames, half their width
 
 @dataclasses.dataclass(frozen=True)
 class Arena(Course):
-    """The race, and where G gates and P poles truly stand."""
+    """The progress of the race, and where G gates and P poles truly stand."""
 
     gates: Array  # (N, 9 G) centre [m], unit vectors through each gate and to its left
     poles: Array  # (N, 3 P) x, y and height of the top [m] of each pole
@@ -56,7 +56,7 @@ class Arena(Course):
         return centre, through, left
 
     def seen_from(self, place: Array) -> Array:
-        """What has been near, with what is near a place (N, 3)."""
+        """`seen`, with what is near a place (N, 3) added."""
         xp, seen = namespace(place), list[Array]()
         gates = [(centre[..., 0], centre[..., 1]) for centre, *_ in self.frames]
         for k, (x, y) in enumerate([*gates, *(top[:2] for top in self.tops)]):
@@ -65,7 +65,7 @@ class Arena(Course):
         return stack(*seen)
 
     def guessed(self, track: Track) -> Arena:
-        """Everything where it has been seen, or else where it should be."""
+        """The arena as the aircraft knows it: what has not been near stands where it should."""
         xp, (gates, poles) = namespace(self.ball), nominal(track)
         near = [self.seen[..., k] > 0 for k in range(self.seen.shape[-1])]
         places = [xp.where(near[k // 9], self.gates[..., k], gates[k]) for k in range(len(gates))]

@@ -61,8 +61,8 @@ class DeckLanding(Landing):
     training = {"gamma": 0.98, "steps": 8_192_000}
     training_with = {
         "ppo": {
-            # As for landing, it comes down before it has turned; and a deck that sinks draws it
-            # into its own wash.
+            # As in landing, it would come down before it has turned; and following a deck that
+            # sinks, it would fall into its own wash.
             "training_options": {"attitude_weight": 100.0, "max_sink": 1.7},
             "ppo": {"beta2": 0.99},
         },

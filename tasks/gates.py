@@ -1,4 +1,4 @@
-"""What races through gates have in common: how far one is, what is seen, what a gate is worth."""
+"""What races through gates share: their state, the observation, and what a gate is worth."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FARTHEST_MISS = 1.0  # [m], from the edge of the opening, up to which a miss cos
 
 @dataclasses.dataclass(frozen=True)
 class Course(TaskState):
-    """How far a race is; the goal is the centre of the next gate."""
+    """The progress of a race; the goal is the centre of the next gate."""
 
     gate: Array  # (N,) number of the next gate, from 0
     through: Array  # (N, 3) unit vector through it
@@ -181,7 +181,7 @@ class GateRace(Task):
         return namespace(gate).where(gate == last, 0.0 * gate, gate + 1)
 
     def _crossed(self, now: Snapshot) -> tuple[Array, Array, Array, Array]:
-        """What becomes of the next gate in this control step, (N,).
+        """Whether this control step passes, hits or misses the next gate, (N,).
 
         Returns:
             Whether it is passed, and whether its frame is hit, bool; by how much the opening is

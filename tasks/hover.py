@@ -22,10 +22,10 @@ IN_GUSTS: dict[str, Any] = {
 """Settings of the variant `robust` of this task and of random_waypoint, whose place gusts move the
 aircraft from: enough neurons and steps to learn how to answer them. static_waypoint gains nothing
 by these: docs/robustness.md."""
-# Flights from the edge of what was trained on fail more often; and with the task's own weight of
-# the attitude who begins nearly west turns too late now and then.
+# Flights from the edge of what was trained on fail more often. With the task's own attitude weight,
+# aircraft that begin heading nearly west sometimes turn too late.
 FARTHER = {"tilt": 0.3, "spin": 0.6, "radius": 0.75, "speed": 0.5, "attitude_weight": 60.0}
-# An uncertain aircraft in wind is far from the goal and in motion anyway.
+# Wind brings an uncertain aircraft far from the goal and into motion anyway.
 AS_ASKED = {"tilt": 0.2, "spin": 0.3, "radius": 0.5, "speed": 0.3, "attitude_weight": 75.0}
 
 

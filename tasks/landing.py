@@ -54,9 +54,9 @@ class Landing(Task):
     )
     training = {"gamma": 0.98, "steps": 2_621_440}
     training_with = {
-        # With the task's own weight, two of four policies come down before they have turned east.
+        # With the task's own weight, two of four policies came down before they had turned east.
         "ppo": {"training_options": {"attitude_weight": 100.0}, "ppo": {"beta2": 0.99}},
-        # With the task's own weights it settles on hanging in the air.
+        # With the task's own weights it learns to stay in the air.
         "trpo": {"training_options": {"attitude_weight": 60.0, "progress_weight": 200.0}},
         # Chosen by a search: docs/paper.md.
         "vpg": {
@@ -72,7 +72,7 @@ class Landing(Task):
         "robust": {
             "gamma": 0.97,
             "initial_deviation": 0.4,
-            # Else it turns without end on aircraft whose rotors have no inertia to turn against.
+            # Otherwise it keeps turning on aircraft whose rotors have no inertia to turn against.
             "randomization": {"rotor_inertia": (0.01, 1.2)},
             "task_options": {"progress_weight": 200.0, "attitude_weight": 60.0},
             "training_options": {"attitude_weight": 60.0},
@@ -160,8 +160,8 @@ class Landing(Task):
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Down to the pad, level and heading east, without haste, and what the end is worth."""
         height, last = (abs(shot.potentials.to_goal[..., 2]) for shot in (now, before))
-        # Not the speed: exploration gives some in every direction, which would cost most near the
-        # ground and keep it in the air.
+        # Not the speed: exploration adds some in every direction, which would cost most near the
+        # ground, and the aircraft would stay in the air.
         sink = (last - height) / now.parameters.control_timestep
         haste = sink - (self.gentle_speed + self.gentle_rate * height)
         cost = self.haste_weight * rewards.time_share(now.parameters)

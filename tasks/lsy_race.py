@@ -28,8 +28,9 @@ from quadrl.tasks.gates import GateRace
 from quadrl.tasks.tracks import Track, known
 
 BOX = (-2.5, 2.5), (-1.5, 1.5), (0.0, 2.0)  # [m], along x, y and z, which ends a race
-STRAIGHT, LEAD = 0.05, 0.3  # [m]: who is farther aside of a gate than this flies by a place so far
-# before it at most
+# From farther aside of a gate than STRAIGHT [m], the way to it leads through a place before it, by
+# LEAD [m] at most.
+STRAIGHT, LEAD = 0.05, 0.3
 ROOM = 0.15  # [m], about the ball, in which a flight costs more
 
 
@@ -64,9 +65,9 @@ class LsyRace(GateRace):
         "ppo": {
             "steps": 6_400_000,
             "gamma": 0.963,
-            # From the start alone the last gates are hardly seen, and who seldom gets through
-            # one learns to wait before it: some episodes have a smaller ball. Where time costs
-            # nothing, trainings differ by a second in how fast they fly.
+            # From the start alone the last gates are hardly seen, and a policy that seldom gets
+            # through a gate learns to wait before it: some episodes have a smaller ball. Where
+            # time costs nothing, the race times of trainings differ by a second.
             "training_options": {"flying": 0.7, "least_ball": 0.02, "time_weight": 0.5},
         }
     }
@@ -121,7 +122,7 @@ class LsyRace(GateRace):
         return known("lsy")
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Arena]:
-        """At rest at the start; or in practice in flight, in the middle of a gate."""
+        """At rest at the start; or, in training, in flight, in the middle of a gate."""
         size = 1.0 if self.level == 2 else 0.0
         arena = furnished(rng, self.course, size, (self.least_ball, self.ball))
         where, u = namespace(arena.gates), [rng.uniform(-1.0, 1.0) for _ in range(5)]
@@ -154,13 +155,13 @@ class LsyRace(GateRace):
         return dataclasses.replace(arena, seen=arena.seen_from(now.state.position))
 
     def observe(self, now: Snapshot) -> dict[str, Array]:
-        """The race, as far as it has been seen, and the poles."""
+        """Gates and poles, where they were seen or else where they should be."""
         state, arena = now.state, now.task.guessed(self.course)
         seen = super().observe(dataclasses.replace(now, task=arena))
         return seen | {"poles": arena.ways_to_poles(state)}
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
-        """As in a race, and away from what stands about."""
+        """As in a race, and away from poles and frames."""
         time, xp = rewards.time_share(now.parameters), namespace(now.time)
         close = xp.clip(1 - (self._room(now) - now.task.ball) / ROOM, 0.0, 1.0)
         nearer = self._way_left(now.task, before.state.position)

@@ -60,8 +60,8 @@ class Perching(Task):
         "gamma": 0.98,
         "steps": 8_192_000,
         "vehicle_options": {"action_scale": 90.0},  # 35 rad/s cannot brake and turn at once
-        # Most flights begin on the way, or no first one would ever touch as it is asked; and some
-        # inclines lie beyond those that are asked.
+        # Most flights begin on the way: otherwise none would ever make a good touch. Some inclines
+        # lie beyond those that are asked.
         "training_options": {
             "approach": 0.7,
             "least_incline": -0.1,
@@ -177,8 +177,8 @@ class Perching(Task):
     def measure(self, now: Snapshot) -> Potentials:
         """The attitude error is the chord from the body's z axis to the normal, at most 2.
 
-        It and the speeds count where the surface is near: an aircraft that turns to a wall from
-        afar falls, and a slow one never gets there with its feet ahead.
+        It and the speeds count near the surface: an aircraft that turns to a wall from afar falls,
+        and a slow one never gets there with its feet ahead.
         """
         usual, chord = super().measure(now), norm(now.state.rotation[..., :, 2] - now.task.normal)
         near = 1 / (1 + (usual.distance / NEAR) * (usual.distance / NEAR))

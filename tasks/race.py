@@ -36,7 +36,7 @@ class Race(GateRace):
         Target("success_rate", "successful", 0.95, True),
         Target("race_time_mean_s", "to the last gate", 6.0),
     )
-    # With its usual actions no aircraft has the thrust for it.
+    # No aircraft has the thrust for it within its usual action scale.
     trained_on = "racer"
     # Gradients through the physics find the way in minutes; PPO does not in millions of steps.
     trained_by = "apg"
@@ -44,10 +44,10 @@ class Race(GateRace):
     training_with = {
         "apg": {
             "steps": 640_000,
-            # What learns with more noise saturates its actions: its mean action alone flies
-            # otherwise, and fails.
+            # A policy that learns with more noise saturates its actions: its mean action flies
+            # differently, and fails.
             "initial_deviation": 0.1,
-            # Seen from rest at the start alone, later gates and second laps are learned late.
+            # From starts at rest alone, later gates and second laps are learned late.
             "training_options": {"laps": 3, "flying": 0.5, "margin": 0.2},
         },
     }
@@ -74,7 +74,7 @@ class Race(GateRace):
         return Track.of(self.track, self.gates, self.start, self.opening, self.frame)
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Course]:
-        """At rest at the start, tilted; or in practice on the way to a gate drawn anew."""
+        """At rest at the start, tilted; or, in training, on the way to a gate drawn anew."""
         track, count = self.course, len(self.course.gates)
         gate = rng.uniform(0.0, float(count))
         xp = namespace(gate)

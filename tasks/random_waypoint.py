@@ -13,11 +13,11 @@ from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 from quadrl.tasks.hover import IN_GUSTS
 
-# Practised from rest alone, some policies begin to swing on the way to a far waypoint, with the
-# rotors at their ends, and sink to the ground: in 0 to 28 of 30,000 flights, by the seed.
+# Trained from rest alone, some policies begin to swing on the way to a far waypoint, with the
+# rotors at their limits, and sink to the ground: in 0 to 28 of 30,000 flights, by the seed.
 IN_MOTION = {"tilt": 0.5, "speed": 1.0, "spin": 1.0, "smoothness_weight": 1.0}
-# An uncertain aircraft in wind is in motion anyway: with robust policies that began so, too, up to
-# four of a hundred uncertain flights failed, with those that begin at rest up to two.
+# An uncertain aircraft in wind is in motion anyway: of a hundred uncertain flights, up to four
+# failed with robust policies that were trained like that, and up to two with those from rest.
 AT_REST = {"tilt": 0.0, "speed": 0.0, "spin": 0.0, "smoothness_weight": 10.0}
 
 

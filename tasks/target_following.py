@@ -38,15 +38,15 @@ class TargetFollowing(Task):
         Target("survival_rate", "flown to the end", 0.99, True),
         Target("distance_rms_m", "distance off 1 m, RMS", 0.15),
         TURNING,
-        # The target turns, and who follows lags: the geometric controller has 0.07 m/s.
+        # The target turns and the aircraft lags: the geometric controller has 0.07 m/s.
         Target("circling_m_s", "circling over the last 2 s", 0.1),
     )
     training_with = {
         # With the task's own weights a lasting turn of 0.5 rad/s costs next to nothing, and it
         # circles around the place to keep.
         "ppo": {"training_options": {"spin_weight": 10.0, "speed_weight": 40.0}},
-        # With the task's own weight it speeds up after the target with its rotors at their ends,
-        # where the physics have no derivative, and tips over in up to 9 of 100 flights.
+        # With the task's own weight it chases the target with its rotors at their limits, where
+        # the physics have no derivative, and tips over in up to 9 of 100 flights.
         "apg": {"training_options": {"speed_weight": 10.0, "spin_weight": 10.0}},
     }
     # With 10 for the spin one of five policies turned at half a radian per second all the time, and

@@ -37,11 +37,11 @@ from quadrl.engines.state import State, padded
 METHODS = ("measure", "terminated", "error", "succeeded", "reward", "update", "observe")
 """Functions of a task that a step calls."""
 _REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
-"""Tasks of which was said that they are not compiled."""
+"""Tasks that were reported as not compiled."""
 
 
 def compiled(step: WrittenStep, now: Snapshot, episode: Episode, parameters: np.ndarray) -> Step:
-    """The step of a task, compiled if it can be; a task that cannot is reported once.
+    """Compile the step of a task if that is possible; report a task once for which it is not.
 
     Args:
         step: The step as it is written.
@@ -59,7 +59,7 @@ def compiled(step: WrittenStep, now: Snapshot, episode: Episode, parameters: np.
 
 
 def _reported(step: WrittenStep, reason: str) -> WrittenStep:
-    """A step that runs as it is written; the first of a task says why."""
+    """Return the step as it is written; warn of the reason, once for each task."""
     step.not_compiled, task = reason, type(step.task)
     if task not in _REPORTED:
         _REPORTED.add(task)
@@ -92,9 +92,9 @@ class _Page:
 class CompiledStep(Step):
     """A task's step for N rows, in C.
 
-    What is live stands in one of two tables in turn, as an engine's state does. The rest of a
-    transition has a table of its own: a row for each term of the reward, for their sum, for the
-    error, and one for the flags, a byte each.
+    The snapshot, the episode and the observation stand in two tables in turn, as an engine's state
+    does. The rest of a transition has a table of its own: a row for each term of the reward, for
+    their sum, for the error, and one for the flags, a byte each.
     """
 
     def __init__(
@@ -103,7 +103,8 @@ class CompiledStep(Step):
         """Trace and compile.
 
         Args:
-            written: The same step as it is written, to go on with where it must be.
+            written: The same step as it is written, which takes over when a number that was read
+                in tracing changes.
             now: Any snapshot of the task, with those parameters.
             episode: Any of its episodes.
             parameters: Rows that the task sees, (N,) or (1,), read live.
@@ -116,13 +117,13 @@ class CompiledStep(Step):
         super().__init__(written.task, written.clock, *world)
         self._written, self._parameters = written, now.parameters
         self.count, self.columns = self.engine.num_envs, padded(self.engine.num_envs)
-        # These have tables of their own.
+        # State, parameters and surroundings have tables of their own.
         like = dataclasses.replace(now, state=None, parameters=None, around=None)
         kept = [*records.leaves(like), *records.leaves(episode)]
         if any(array.dtype != np.float64 for array in kept):
             raise NotCompilable("what it remembers is not all float64")
         self.kept = records.Columns(0, kept)
-        # Others do not show themselves to the task.
+        # Some sensors give what only policies see.
         self._shown = [name for name in self.task.sensors if name in now.sensed]
         self._around = now.around
         around = records.leaves(now.around) if now.around else []
@@ -139,7 +140,7 @@ class CompiledStep(Step):
             raise NotCompilable(str(error).partition("\n")[0]) from error
         self._call.argtypes, self._call.restype = [ctypes.c_void_p, ctypes.c_int64], None
         self._constants = np.array([*trace.constants, 0.0])
-        # Of a hundred solids a task may look at one.
+        # Only what the body reads is copied: of a hundred solids a task may look at one.
         self._wanted = [
             (places[0], np.array([k for k in places if f"sensed[{k} * columns" in body], int))
             for numbers in self.sensed.views(np.arange(self.sensed.end)[:, None])
@@ -204,13 +205,13 @@ class CompiledStep(Step):
             return trace, trace.body(self._outputs(kept, done))
 
     def given(self, arrays: Iterable[Any]) -> tuple[dict[str, Any], Surroundings | None]:
-        """What the sensors give that the task asks for and sees, and the solids about aircraft."""
+        """Arrange arrays as what the task sees: sensors by name, and the solids about aircraft."""
         rest = iter(arrays)
         sensed = {name: next(rest) for name in self._shown}
         return sensed, records.filled(self._around, rest) if self._around else None
 
     def _outputs(self, kept: list[Array], done: Transition) -> dict[str, Any]:
-        """What is computed, by where it is written to."""
+        """Map the places in the tables to what is written there."""
         self.observed, self._rewarded = list(done.observation), list(done.reward_terms)
         seen = [*done.observation.values(), *(done.truth.values() if self.estimate else ())]
         rest = [*done.reward_terms.values(), done.reward, done.error]
@@ -229,7 +230,7 @@ class CompiledStep(Step):
         return outputs
 
     def begin(self, now: Snapshot, episode: Episode) -> None:
-        """Take a snapshot of all rows as the present one."""
+        """Make a snapshot of all rows the present one."""
         moment = dataclasses.replace(now, state=None, parameters=None, around=None)
         arrays = [*records.leaves(moment), *records.leaves(episode)]
         for into, array in zip(self._pages[0].kept, arrays, strict=True):
@@ -281,7 +282,7 @@ class CompiledStep(Step):
         self.snapshot, self.episode = page.now, page.episode
 
     def renewed(self) -> Step:
-        """The step as it is written, once a number that was read in tracing is another one."""
+        """The step as it is written, once a number that was read in tracing has changed."""
         if not (name := self._reads.changed):
             return self
         self._written.begin(self.snapshot, self.episode)

@@ -9,7 +9,7 @@ CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts a
 
 
 def touches_ground(now: Snapshot) -> Array:
-    """Whether an aircraft that should fly has come down to the ground, (N,) bool."""
+    """Whether an aircraft that should fly has touched the ground, (N,) bool."""
     return now.state.height < now.parameters.ground_clearance
 
 

@@ -141,12 +141,12 @@ class Environment(saving.Copied):
         self.seed(seed)
 
     def seed(self, seed: Seed = None, rows: np.ndarray | None = None) -> Seed:
-        """Begin with the first episode of a seed at the next reset; returns the seed.
+        """Let the next reset begin the first episode of a seed; return the seed.
 
         Args:
-            seed: Row i gets seed + i or, of a sequence, seed[i], where None leaves a row its own;
-                None alone for one from the system.
-            rows: Numbers (n,) or mask (N,) of the aircraft that it is for; None for all.
+            seed: A number: row i gets seed + i. A sequence: row i gets seed[i], or keeps its own
+                where that is None. None: a number from the operating system.
+            rows: Numbers (n,) or mask (N,) of the aircraft that are seeded; None for all.
 
         Raises:
             QuadrlError: A seed is not a whole number from 0 on, or there are not N of them.
@@ -165,20 +165,20 @@ class Environment(saving.Copied):
     ) -> Observation:
         """Begin an episode.
 
-        Where the mean wind blows, a start at rest and level is one in trim, with the same heading.
+        In a mean wind, a start at rest and level becomes one in trim with the same heading.
 
         Args:
             rows: Numbers (n,) or mask (N,) of the aircraft that begin one; None for all.
             start: Arrays (N, k) or (k,) by names of `engines.state.Start`, in place of the task's.
-            seed: Seeds those aircraft anew first, as `seed` does; None to go on with their seeds.
+            seed: A new seed for those aircraft, as `seed` takes it; None to keep their seeds.
 
         Returns:
             The observation of those aircraft, terms (n, k).
 
         Raises:
-            QuadrlError: A number of an aircraft that is not there, or one twice; or the task gives
-                arrays of the wrong shape, or the start is one that no aircraft can have. Nothing
-                has changed then.
+            QuadrlError: A number of an aircraft is out of range or occurs twice, the task gives
+                arrays of the wrong shape, or no aircraft can have that start. Nothing has changed
+                then.
         """
         if self.engine.forked:
             self.make_anew()
@@ -258,7 +258,7 @@ class Environment(saving.Copied):
         return self._begun.not_compiled
 
     def _take(self, now: Snapshot, episode: Episode) -> None:
-        """Take a snapshot of all rows as the present one."""
+        """Make a snapshot of all rows the present one."""
         # What a task remembers must not be a view of buffers that the next steps write.
         now.task, now.parameters = records.owned(now.task), self._parameters
         now.sensed = self.sensed
@@ -273,7 +273,7 @@ class Environment(saving.Copied):
         """Fly one control step.
 
         Args:
-            action: (N, k), clipped to [-1, 1]; the control mode says what it means.
+            action: (N, k), clipped to [-1, 1]; the control mode defines its meaning.
 
         Returns:
             The transition. An aircraft whose episode is over flies on until it is reset.
@@ -301,7 +301,7 @@ class Environment(saving.Copied):
             left -= steps
 
     def begin(self, action: Array) -> None:
-        """First half of a step: the commands to the rotors, or the setpoint of the loops."""
+        """Do the first half of a step: command the rotors, or set the setpoint of the loops."""
         if self.engine.forked:
             self.make_anew()
         self._step = self._begun.renewed()
@@ -325,7 +325,7 @@ class Environment(saving.Copied):
                 self.observer.follow(command, self.vehicle.control_timestep)
 
     def control(self, most: int) -> int:
-        """Command the rotors and move solids, where that happens within a control step.
+        """Command the rotors and move the solids, where that happens within a control step.
 
         Returns:
             For how many physics steps, of `most` that are left.
@@ -353,7 +353,7 @@ class Environment(saving.Copied):
         engine.solids.move(made, vehicle.physics_timestep)
 
     def finish(self) -> Transition:
-        """Second half of a step, after the engine has advanced."""
+        """Do the second half of a step, after the engine has advanced."""
         self._read()
         if self.observer:
             self.observer.sense(self._inputs.action)
@@ -393,7 +393,7 @@ class Environment(saving.Copied):
         return self.task.goal(self.snapshot) + self.origin
 
     def markers(self, row: int = 0) -> tuple[Marker | Primitive, ...]:
-        """What is drawn beside an aircraft, world frame: what its task asks for, and solids."""
+        """What is drawn beside an aircraft, world frame: its task's markers, and the solids."""
         alone = records.mapped(lambda array: array[row : row + 1], self.snapshot)
         asked = (marker.moved(self.origin) for marker in self.task.markers(alone))
         return (*asked, *self.scene.primitives(self.engine, row))
@@ -403,18 +403,18 @@ class Environment(saving.Copied):
         return saving.Memory(self.engine, self.seeds, begun.snapshot, begun.episode, *parts)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Everything that the next steps depend on, as arrays: `restore` continues bit for bit."""
+        """Return all that the next steps depend on, as arrays: `restore` continues bit for bit."""
         return self._memory().save()
 
     def restore(self, saved: Mapping[str, np.ndarray]) -> Observation:
-        """Restore a state that `save` gave; returns the observation of that moment.
+        """Restore a state that `save` returned; return the observation of that moment.
 
         Raises:
-            QuadrlError: It is not of such an environment; nothing has changed then.
+            QuadrlError: It is the state of another environment; nothing has changed then.
         """
         if fresh := not self.has_begun:
             self.reset()  # makes the records, which are filled below
-            self.seeds.episodes[:] = 0  # this episode does not count
+            self.seeds.episodes[:] = 0  # that episode does not count
         try:
             self._memory().check(saved)
         except QuadrlError:
@@ -430,7 +430,7 @@ class Environment(saving.Copied):
 
 
 def row_memory(task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Observing) -> float:
-    """Memory that one more aircraft takes at least [bytes]; measured, and the histories counted."""
+    """Least memory that one more aircraft takes [bytes], as measured, plus that of histories."""
     rotors, (command, *ages) = vehicle.rotor_count, (most for _, most in sampler.delays.values())
     aged, late = max(ages), command + round(vehicle.dead_time / vehicle.physics_timestep)
     single = sum(term.width(rotors) for term in task.observation.values())

@@ -66,7 +66,7 @@ class Observer:
         others = [c for c in channels if c.sensor.shown and c.sensor.name != "state"]
         self._early = [channel for channel in channels if not channel.sensor.last]
         late = [channel for channel in channels if channel.sensor.last]
-        # The task's entries come first; what is measured is told to the others.
+        # The task's entries come first; the other sensors are given what is measured.
         self._last = sorted(late, key=lambda channel: not channel.sensor.measured)
         self._measured = [self._channels["state"], *(c for c in others if c.sensor.measured)]
         self._known = [channel for channel in others if not channel.sensor.measured]
@@ -94,12 +94,12 @@ class Observer:
         return channel and channel.seen
 
     def follow(self, command: Array, seconds: float) -> None:
-        """Let what is modelled follow commands (N, R) [rad/s] for a time [s]."""
+        """Let modelled rotors follow commands (N, R) [rad/s] for a time [s]."""
         for channel in self._early:
             channel.follow(self._specified, command, seconds)
 
     def begin(self, rows: np.ndarray, now: Snapshot) -> dict[str, Array]:
-        """The first observation of episodes (n,), from their snapshot (n, ...)."""
+        """Begin episodes (n,) and return their first observation, from their snapshot (n, ...)."""
         moment = self._moment(now.state, self._engine.wind[rows], now.action, rows)
         for channel in self._early:
             channel.begin(moment)
@@ -119,12 +119,12 @@ class Observer:
         self._show_sensed()
 
     def observe(self, done: Transition) -> dict[str, Array]:
-        """The observation of all, from the transition that followed `sense`."""
+        """Return the observation of all rows, from the transition that followed `sense`."""
         self._look(Channel.step, self._now, done.observation, done.truth)
         return self.again()
 
     def again(self) -> dict[str, Array]:
-        """The present observation of all once more."""
+        """Return the present observation of all rows again."""
         self.flat = flat = self._present()
         self.observation = {name: flat[:, part] for name, part in self.layout.items()}
         return self.observation

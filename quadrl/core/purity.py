@@ -1,8 +1,8 @@
 """What functions read besides their arguments, found by a look at their code.
 
-A step that is compiled keeps what its functions read when they were traced. Functions, classes and
-modules count as what they are. A number or a text that a name stands for is watched, since anybody
-may give the name another value. Everything else may change where nobody sees it.
+A compiled step keeps what its functions read when they were traced. Functions, classes and modules
+are taken as fixed. A number or a text is watched, since its name may be given another value.
+Everything else may change unnoticed, and a step that reads it is not compiled.
 """
 
 # pyright: standard
@@ -38,7 +38,7 @@ class Reads:
     """All that some methods of an object look up, and the functions that they call."""
 
     def __init__(self, owner: Any, methods: Iterable[str], kinds: Iterable[type] = ()) -> None:
-        """Look it up.
+        """Look everything up.
 
         Args:
             owner: A frozen dataclass.
@@ -56,7 +56,7 @@ class Reads:
 
     @property
     def changed(self) -> str:
-        """The first name that stands for something else by now; empty where none does."""
+        """The first name that has another value by now; empty where none has."""
         for name, read, key, value in self._watched:
             if read(key) is not value:
                 return name

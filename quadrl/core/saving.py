@@ -44,7 +44,7 @@ class Seeds:
 
 
 class Copied:
-    """An environment that is pickled and copied: made anew, it continues where the other was."""
+    """An environment that can be pickled and copied: the copy is made anew and continues."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Keep the arguments: copies are made with them too."""
@@ -66,7 +66,7 @@ class Copied:
         self.seeds = seeds
 
     def make_anew(self) -> None:
-        """Take the place of itself: all that is live, such as `engine.wind`, is another array."""
+        """Make itself anew and continue; live arrays such as `engine.wind` are other ones then."""
         self.__setstate__(self.__getstate__())
 
 
@@ -83,7 +83,7 @@ class Memory:
     weather: WeatherProcess | None
 
     def _parts(self) -> dict[str, Any]:
-        """What saves arrays of its own, by the name that these begin with."""
+        """Parts that save arrays of their own, by the name that these begin with."""
         drawn = self.randomizer if self.randomizer.active else None
         parts = {"engine": self.engine, "randomizer": drawn}
         parts |= {"observer": self.observer, "weather": self.weather}
@@ -100,7 +100,7 @@ class Memory:
         return saved
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Refuse what was saved of another environment, or what none can be in.
+        """Refuse the state of another environment, or one that no environment can be in.
 
         Raises:
             QuadrlError: The message names the array.
@@ -127,7 +127,7 @@ class Memory:
             raise QuadrlError(reason, name="weather", value=None, allowed="the saved one's")
 
     def _check_counters(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Refuse seeds and numbers that no environment counts to, or that contradict each other.
+        """Refuse seeds and counters that are out of range or contradict each other.
 
         Raises:
             QuadrlError: The message names the array.
@@ -147,7 +147,7 @@ class Memory:
                 raise QuadrlError(name=name, value=saved[name], allowed=allowed)
 
     def restore(self, saved: Mapping[str, np.ndarray]) -> tuple[Snapshot, Episode]:
-        """Restore what `save` gave, which `check` has seen.
+        """Restore what `save` returned and `check` has accepted.
 
         Returns:
             The snapshot of that moment, without its potentials, and how far its episodes are.

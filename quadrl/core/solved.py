@@ -29,5 +29,5 @@ class Target:
 
 TURNING = Target("yaw_rate_rad_s", "turning over the last 2 s", 0.3)
 STILL = (TURNING, Target("circling_m_s", "circling over the last 2 s", 0.05))
-"""What is asked of who should stand, beside the place: one that turns or circles has not solved
-its task."""
+"""Targets of tasks that end at rest, beside the position: an aircraft that turns or circles has not
+solved the task."""

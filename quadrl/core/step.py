@@ -49,7 +49,7 @@ class Step(abc.ABC):
 
     @abc.abstractmethod
     def begin(self, now: Snapshot, episode: Episode) -> None:
-        """Take a snapshot of all rows as the present one."""
+        """Make a snapshot of all rows the present one."""
 
     @abc.abstractmethod
     def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
@@ -60,7 +60,7 @@ class Step(abc.ABC):
         """
 
     def renewed(self) -> Step:
-        """The step to go on with: itself, unless something that it is made from has changed."""
+        """The step to continue with: itself, unless something that it was made from has changed."""
         return self
 
     def flatten(self, observation: Observation) -> np.ndarray:
@@ -72,7 +72,7 @@ class WrittenStep(Step):
     """Calls the functions of the task."""
 
     def begin(self, now: Snapshot, episode: Episode) -> None:
-        """Take a snapshot of all rows as the present one."""
+        """Make a snapshot of all rows the present one."""
         self.snapshot, self.episode = now, episode
 
     def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
