@@ -81,7 +81,7 @@ class LsyRace(GateRace):
     progress_weight: float = 20.0
     """Reward per metre by which the way to the next gate gets shorter."""
     paid_speed: float = 2.0
-    """Speed up to which progress is rewarded [m/s]: who is paid for more hits more."""
+    """Speed up to which progress is rewarded [m/s]; a higher one brings more collisions."""
     pass_weight: float = 20.0
     """Reward for each gate."""
     crash_weight: float = 20.0
@@ -89,17 +89,17 @@ class LsyRace(GateRace):
     low_weight: float = 0.0
     """Cost per metre below 0.8 m above the ground, for each 0.05 s."""
     room_weight: float = 1.0
-    """Cost of a flight as near to a pole or a frame as may be, for each 0.05 s; none from 0.15 m
-    on."""
+    """Cost, for each 0.05 s, of flying so near to a pole or a frame that the ball touches it; it
+    falls to nothing 0.15 m away."""
     time_weight: float = 0.0
     """Cost of each 0.05 s."""
     ball: float = 0.07
     """Radius of the ball that the aircraft is taken for [m]."""
     least_ball: float = 0.07
-    """Radius of the smallest; each episode has another."""
+    """Radius of the smallest ball [m]; each episode has another."""
     level: int = 2
-    """Level of the competition: at 2 gates and poles stand up to 0.15 m elsewhere, gates lean by
-    up to 0.1 rad, and where is seen within 0.7 m of them; at 0 and 1 they stand as they should."""
+    """Level of the competition. At 2, gates and poles stand up to 0.15 m off their places, gates
+    lean by up to 0.1 rad, and that is seen within 0.7 m of them; at 0 and 1 they do not."""
     radius: float = 0.1
     """Largest distance from the start [m], along x and y."""
     tilt: float = 0.1
@@ -107,8 +107,8 @@ class LsyRace(GateRace):
     flying: float = 0.0
     """Share of the episodes that begin in the middle of one of the first gates."""
     flying_speed: float = 1.0
-    """Largest speed of those, through the gate [m/s]; much faster none gets around the pole behind
-    the third."""
+    """Largest speed of those, through the gate [m/s]; much faster aircraft do not get around the
+    pole behind the third gate."""
 
     def __post_init__(self) -> None:
         """Validate the level."""
