@@ -215,7 +215,7 @@ class Perching(Task):
         return self._rested(now) | self._failed(now)
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
-        """At rest on the surface for long enough, after a touch as it is asked."""
+        """At rest on the surface for long enough, after a good touch."""
         return end.terminated & self._rested(now) & now.state.at_rest & ~self._failed(now)
 
     def _rested(self, now: Snapshot) -> Array:

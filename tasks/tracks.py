@@ -43,7 +43,7 @@ class Track:
     frame: float
     """Outer edge of the frames [m]."""
     poles: tuple[tuple[float, ...], ...] = ()
-    """Poles that stand about: x, y and the height of the top [m]."""
+    """Poles beside the gates: x, y and the height of the top [m]."""
 
     def __post_init__(self) -> None:
         """Refuse a track that cannot be flown.

@@ -1,4 +1,4 @@
-"""The catalogue of tasks: every task by its name, whoever registered it."""
+"""The catalogue of tasks: every registered task by its name."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The core of every API: a task and an engine make transitions.
 
 An environment owns N rows: seeds, episodes, and the snapshot that the engine and the pure
-functions of `core/transition.py` bring forward. It resets what it is told to and never by itself.
+functions of `core/transition.py` bring forward. It never resets a row by itself.
 Row i of a batch seeded with s is the single environment seeded with s + i.
 """
 

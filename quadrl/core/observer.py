@@ -130,8 +130,8 @@ class Observer:
         return self.observation
 
     def _moment(self, true: State, wind: Array, action: Array, rows: np.ndarray | None) -> Moment:
-        who = self._specified, self._randomizer, rows, self.frame
-        return Moment(true, true, true.rotor_speed, wind, action, *who)
+        known = self._specified, self._randomizer, rows, self.frame
+        return Moment(true, true, true.rotor_speed, wind, action, *known)
 
     def _look(
         self,

@@ -57,7 +57,7 @@ def import_own(path: Path) -> None:
 
 @contextlib.contextmanager
 def _located(path: Path, line: int | None = None) -> Generator[None]:
-    """Report a failure with the last line of the user's file that led to it, or a given one."""
+    """Report a failure with the last line of the user's file that led to it, or a given line."""
     try:
         yield
     except Exception as error:

@@ -1,7 +1,7 @@
 """A scenario: what is flown, with which aircraft and in which conditions, as one record.
 
 Names, JSON and options become a scenario once, where they come in: at the three APIs, in the
-functions of Python and on the command line. From there on it is carried alone.
+functions of Python and on the command line. From there on only the scenario is passed on.
 """
 
 from __future__ import annotations
@@ -128,18 +128,18 @@ class Scenario:
     ) -> Scenario:
         """Make a scenario of what a caller gives, or change one.
 
-        The name of the task or of the aircraft that is there already keeps its options. Another
-        aircraft by its name flies in the air that was asked for; a Vehicle brings its own, and one
-        without any keeps wind that acts by drag alone.
+        If the name of the task or the aircraft stays the same, its options stay, too. Another
+        aircraft, given by its name, flies in the air that was asked for. A Vehicle brings its own
+        air; with one that has none, wind that acted by drag alone goes on doing so.
 
         Args:
             given: The name of a task, a task, a scenario, or a mapping as `to_json` has it.
-            also: Keywords that the caller takes itself, for the refusal of an unknown one.
+            also: Further keywords of the caller, listed when an unknown one is refused.
             task: Another task, or its name; None for the one that is given.
             **keywords: What differs from it.
 
         Raises:
-            QuadrlError: A name is unknown, a value impossible, or a keyword of nobody.
+            QuadrlError: A name or a keyword is unknown, or a value is impossible.
         """
         if isinstance(given, Scenario):
             if task is None and not keywords:
@@ -224,9 +224,9 @@ KEYWORDS = ("task", *Conditions.__annotations__)
 def as_saved(conditions: Mapping[str, Any]) -> dict[str, Any]:
     """Conditions from a file, as `Scenario.of` takes them.
 
-    Where the air acts on the rotors in wind, `Scenario.to_json` says so. Files that do not are of
-    versions in which wind acted by drag alone, and go on flying like that. So do those with a
-    control mode whose actions meant something else.
+    Where the air acts on the rotors in wind, `Scenario.to_json` writes that down. Files without it
+    are of versions in which wind acted by drag alone, and keep that. A control mode whose actions
+    had another meaning in an older version keeps that meaning, too.
     """
     found = dict(conditions)
     if "control_mode" in found:

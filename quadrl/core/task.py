@@ -1,4 +1,4 @@
-"""What a task is: where an episode begins, what is seen, what is rewarded and what ends it.
+"""The base class of tasks: where an episode begins, what is seen and rewarded, and what ends it.
 
 A task is a frozen dataclass: its fields are its options, its methods are pure functions of arrays
 with a leading axis N, in any array namespace (NumPy, torch) and on any device. It knows no API, no
@@ -54,8 +54,8 @@ class Task(abc.ABC):
     solved: ClassVar[str]
     """What counts as success, in a line."""
     targets: ClassVar[tuple[Target, ...]] = (Target("success_rate", "successful", 0.99, True),)
-    """What a trained policy has to reach over many episodes that nothing disturbs; wind alone moves
-    an aircraft that holds its place at more than `STILL` allows."""
+    """What a trained policy has to reach over many undisturbed episodes; in wind, an aircraft that
+    holds its place moves more than `STILL` allows."""
     trained_on: ClassVar[str] = "paper"
     """The aircraft of a training where none is named."""
     trained_by: ClassVar[str] = "ppo"
@@ -64,7 +64,7 @@ class Task(abc.ABC):
     """Training settings that differ from the defaults of `quadrl.learning.config.TrainConfig`;
     `vehicle_options` are those of that aircraft, and no other's."""
     training_with: ClassVar[dict[str, dict[str, Any]]] = {}
-    """What is different again with an algorithm, by its name."""
+    """What is different with an algorithm, by its name."""
     gains: ClassVar[dict[str, float]] = {}
     """Gains of the geometric controller that differ from its defaults."""
     observation: ClassVar[dict[str, ObservationTerm]] = OBSERVATION
@@ -84,7 +84,7 @@ class Task(abc.ABC):
     """Sensors that it reads in `Snapshot.sensed`, by name, with their options; policies see what
     they give."""
     variants: ClassVar[dict[str, dict[str, Any]]] = {}
-    """Settings of other trainings than the usual one that differ from it, by variant."""
+    """Settings of other trainings, by variant: what differs from the usual one."""
     signed: ClassVar[tuple[str, ...]] = ()
     """Options that may be negative although their default is positive."""
 
