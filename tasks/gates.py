@@ -137,7 +137,7 @@ class GateRace(Task):
         below = namespace(missed).clip(LOW - now.state.height, 0.0, LOW)
         time = rewards.time_share(now.parameters)
         return {
-            "progress": rewards.progress(self.progress_weight, before, now),
+            **rewards.weighted(self, ["progress"], before, now),
             "turn": -self.turn_weight * time * now.potentials.angular_speed,
             "pass": rewards.once(self.pass_weight, passes, now),
             "miss": -self.miss_weight * missed,

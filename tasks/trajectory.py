@@ -158,7 +158,7 @@ class Trajectory(Task):
         cost = self.distance_weight * rewards.time_share(now.parameters)
         terms = "attitude", "speed", "spin", "control", "survival", "smoothness"
         return {
-            "progress": rewards.progress(self.progress_weight, before, now),
+            **rewards.weighted(self, ["progress"], before, now),
             "distance": -cost * now.potentials.distance,
             **rewards.weighted(self, terms, before, now),
         }

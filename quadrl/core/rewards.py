@@ -21,69 +21,31 @@ Name = Literal["progress", "attitude", "speed", "spin", "control", "survival", "
 
 
 def weighted(task: Any, names: Iterable[Name], before: Snapshot, now: Snapshot) -> dict[str, Array]:
-    """Terms by their names, in their order, weighted by the task's options `NAME_weight`.
+    """Shared terms by their names, in their order, weighted by the task's options `NAME_weight`.
 
     Where the weight of smoothness is 0, it is left out.
     """
+    was, is_, rotor = before.potentials, now.potentials, now.parameters.rotor
+    share, command = time_share(now.parameters), now.rotor_command
+
+    def cost(weight: float, change: Array) -> Array:
+        return (-weight * share) * square_norm(change / rotor.max_speed)
+
     terms = {
-        "progress": progress(task.progress_weight, before, now),
-        "attitude": attitude(task.attitude_weight, before, now),
-        "speed": speed(task.speed_weight, before, now),
-        "spin": spin(task.spin_weight, before, now),
-        "control": control(task.control_weight, now),
-        "survival": survival(task.survival_weight, now),
-        **smoothness(task.smoothness_weight, before, now),
+        "progress": lambda: task.progress_weight * (was.distance - is_.distance),
+        "attitude": lambda: task.attitude_weight * (was.attitude - is_.attitude),
+        "speed": lambda: task.speed_weight * (was.speed - is_.speed),
+        "spin": lambda: task.spin_weight * (was.angular_speed - is_.angular_speed),
+        "control": lambda: cost(task.control_weight, command - rotor.hover_speed),
+        "survival": lambda: 0.0 * now.time + task.survival_weight * share,
+        "smoothness": lambda: cost(task.smoothness_weight, command - before.rotor_command),
     }
     asked = (name for name in names if name != "smoothness" or task.smoothness_weight != 0)
-    return {name: terms[name] for name in asked}
-
-
-def progress(weight: float, before: Snapshot, now: Snapshot) -> Array:
-    """The distance to the goal [m] falls."""
-    return weight * (before.potentials.distance - now.potentials.distance)
-
-
-def attitude(weight: float, before: Snapshot, now: Snapshot) -> Array:
-    """The attitude error falls."""
-    return weight * (before.potentials.attitude - now.potentials.attitude)
-
-
-def speed(weight: float, before: Snapshot, now: Snapshot) -> Array:
-    """The speed [m/s] falls, relative to the target where there is one."""
-    return weight * (before.potentials.speed - now.potentials.speed)
-
-
-def spin(weight: float, before: Snapshot, now: Snapshot) -> Array:
-    """The body rate [rad/s] falls."""
-    return weight * (before.potentials.angular_speed - now.potentials.angular_speed)
-
-
-def control(weight: float, now: Snapshot) -> Array:
-    """The cost of commands off the hover speed: sum((Omega_c - Omega_hover)^2) / Omega_max^2."""
-    rotor = now.parameters.rotor
-    effort = square_norm((now.rotor_command - rotor.hover_speed) / rotor.max_speed)
-    return (-weight * time_share(now.parameters)) * effort
-
-
-def survival(weight: float, now: Snapshot) -> Array:
-    """The time in the air."""
-    return 0.0 * now.time + weight * time_share(now.parameters)
-
-
-def smoothness(weight: float, before: Snapshot, now: Snapshot) -> dict[str, Array]:
-    """The cost of commands that change: sum((Omega_c - Omega_c before)^2) / Omega_max^2.
-
-    Returns:
-        The term by its name; none where its weight is 0.
-    """
-    if weight == 0:
-        return {}
-    change = (now.rotor_command - before.rotor_command) / now.parameters.rotor.max_speed
-    return {"smoothness": (-weight * time_share(now.parameters)) * square_norm(change)}
+    return {name: terms[name]() for name in asked}
 
 
 def once(weight: float, happens: Array, now: Snapshot) -> Array:
-    """What happens (N,) bool in this control step, the end of the episode for example."""
+    """The worth of what happens (N,) bool in this control step, such as the end of an episode."""
     zero = 0.0 * now.time
     return namespace(zero).where(happens, zero + weight, zero)
 
