@@ -1,4 +1,4 @@
-"""The domain `quadrotor` in the way of dm_control's suite.
+"""The domain `quadrotor` in the style of dm_control's suite.
 
 `load` has the signature of `dm_control.suite.load`; `register` adds the domain to dm_control's own,
 so that `dm_control.suite.load("quadrotor", "hover")` and TorchRL's `DMControlEnv` find it.

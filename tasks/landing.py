@@ -199,9 +199,8 @@ class Landing(Task):
 
     def _rest(self, now: Snapshot) -> Array:
         """Control steps at rest on the pad, this one included, (N,)."""
-        return namespace(now.task.rest).where(
-            self._rests(now), now.task.rest + 1, 0 * now.task.rest
-        )
+        rest = now.task.rest
+        return namespace(rest).where(self._rests(now), rest + 1, 0 * rest)
 
     def _rests(self, now: Snapshot) -> Array:
         """Whether it is at rest on the pad, (N,) bool."""

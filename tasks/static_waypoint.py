@@ -19,7 +19,7 @@ from quadrl.core.task import STILL, EpisodeEnd, Snapshot, Target, Task, TaskStat
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 
-WAITING: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.30)
+WAITING = (0.25, 0.55, 0.95, 0.30)
 
 
 @dataclasses.dataclass(frozen=True)

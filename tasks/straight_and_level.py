@@ -20,7 +20,7 @@ from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, 
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
 
-LINE: tuple[float, float, float, float] = (0.25, 0.55, 0.95, 0.45)
+LINE = (0.25, 0.55, 0.95, 0.45)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from quadrl.engines.state import Start
 from quadrl.tasks.references import AXES, WAVES, Sines, by_axis
 
 SLOWEST = 1e-6  # [rad/s]; the slower, the longer the waves, and the fewer digits are left
-PATH: tuple[float, float, float, float] = (0.95, 0.55, 0.20, 0.35)
+PATH = (0.95, 0.55, 0.20, 0.35)
 
 
 @dataclasses.dataclass(frozen=True)

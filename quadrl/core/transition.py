@@ -208,7 +208,7 @@ def check_reward(task: Task, done: Transition) -> None:
 def check_task(
     task: Task, parameters: Parameters, actions: int, origin_height: float
 ) -> tuple[str, ...]:
-    """Begin a few episodes, and refuse a task whose functions give what no task may.
+    """Begin a few episodes, and refuse a task whose functions return what no task may return.
 
     Args:
         task: The task.
