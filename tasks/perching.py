@@ -124,12 +124,9 @@ class Perching(Task):
     def __post_init__(self) -> None:
         """Validate the ranges."""
         super().__post_init__()
-        for least, most, limit in (
-            ("least_incline", "most_incline", math.pi),
-            ("nearest", "farthest", self.max_distance),
-            ("least_touch", "most_touch", math.inf),
-        ):
-            number(f"{self.name} {most}", getattr(self, most), getattr(self, least), limit)
+        number(f"{self.name} most_incline", self.most_incline, self.least_incline, math.pi)
+        number(f"{self.name} farthest", self.farthest, self.nearest, self.max_distance)
+        number(f"{self.name} most_touch", self.most_touch, self.least_touch)
         if self.most_touch == self.least_touch:
             name, allowed = f"{self.name} most_touch", f"above least_touch, {self.least_touch:g}"
             raise QuadrlError(name=name, value=self.most_touch, allowed=allowed)
