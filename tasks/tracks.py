@@ -20,7 +20,7 @@ import numpy as np
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, cross, dot, namespace
-from quadrl.base.validation import MAX_OPTION, choice, number, numbers
+from quadrl.base.validation import MAX_OPTION, choice, number, numbers, tuples
 
 RUN_IN = 5.0
 """Distance of the start before the first gate of a track that names no start [m]."""
@@ -125,10 +125,9 @@ class Track:
 @functools.cache
 def known(name: str) -> Track:
     """A track of assets/tracks."""
-    read = json.loads((TRACKS / f"{name}.json").read_text())
-    rows = tuple(map(tuple, read["gates"]))
-    poles = tuple(map(tuple, read.get("poles", ())))
-    return Track(name, rows, tuple(read["start"]), read["opening"], read["frame"], poles)
+    read = tuples(json.loads((TRACKS / f"{name}.json").read_text()))
+    size = read["opening"], read["frame"]
+    return Track(name, read["gates"], read["start"], *size, read.get("poles", ()))
 
 
 def attitude(axes: Any) -> tuple[float, ...]:
