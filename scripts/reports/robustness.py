@@ -93,7 +93,7 @@ def tuned(task: str, name: str, condition: Conditions) -> Integrating:
     """The controller with the gains that were found for a task in a condition; for one flight."""
     gains = report.load("tuning")["tasks"][task]
     bandwidth, integral = gains.get(name) or gains["all together"]  # where none were
-    scenario = Scenario.of(task, **condition)
+    scenario = Scenario.of(task, **UNDISTURBED | condition)
     own = Gains(**{**scenario.task.gains, "level": bandwidth, "height": bandwidth})
     return Integrating(scenario.aircraft, scenario.task, own, integral)
 
