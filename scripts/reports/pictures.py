@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from quadrl import tasks
 from quadrl.base.progress import Progress
 from quadrl.core.scenario import Scenario
+from quadrl.core.trajectory import Trajectory
 from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import fly
 from quadrl.learning.config import TrainConfig
@@ -26,7 +27,7 @@ from quadrl.rendering import render_trajectory
 from quadrl.rendering.overlay import grid
 from scripts.reports.report import IMAGES
 
-SHOWN = (360, 203)  # [pixels]; drawn twice as large, for smooth edges
+SIZE = (360, 203)  # [pixels]
 SETTLED = 0.05  # of the largest distance from the last position: little happens after that
 LONGEST = 6.0  # [s] of a task's flight that are shown
 OPTIONS: dict[str, dict[str, float]] = {  # of the task as it is shown: a wall, sea state 4
@@ -55,57 +56,35 @@ def pictures(only: tuple[str, ...] = (*FLOWN, "learning")) -> None:
         only: What to draw.
     """
     (IMAGES / "tasks").mkdir(exist_ok=True)
+    moving: Any = {"save_all": True, "duration": round(1000 / FPS), "loop": 0}  # for ever
     for name in only:
-        frames = learning() if name == "learning" else flight(name)
-        save(frames, IMAGES / ("learning.webp" if name == "learning" else f"tasks/{name}.webp"))
-
-
-def save(frames: Iterable[Image.Image], file: Path) -> None:
-    """Write frames as a picture that moves for ever."""
-    first, *others = frames
-    moving: Any = {"save_all": True, "append_images": others, "duration": round(1000 / FPS)}
-    first.save(file, loop=0, quality=QUALITY, method=6, **moving)
+        first, *others = learning() if name == "learning" else flight(name)
+        file = IMAGES / ("learning.webp" if name == "learning" else f"tasks/{name}.webp")
+        first.save(file, append_images=others, quality=QUALITY, method=6, **moving)
 
 
 def learning() -> Iterator[Image.Image]:
     """Frames of four policies of one training of hover, from the same start, side by side."""
-    config = TrainConfig("hover", seed=SEED)
+    config, scenario = TrainConfig("hover", seed=SEED), Scenario.of("hover", **RELEASED)
     wanted = [max(1, round(share * config.iterations)) for share in SHARES]
-    policies: list[Policy] = []
+    panels: list[list[np.ndarray]] = []
 
-    def keep(progress: Progress) -> None:
-        if progress.iteration in wanted:
-            policies.append(training.policy())
+    def show(progress: Progress) -> None:
+        if progress.iteration not in wanted:
+            return
+        flown = fly(training.policy(), scenario, episodes=1, seed=5)
+        name = f"after {progress.iteration * config.num_envs * config.rollout:,} control steps"
+        pictures = drawn(flown.trajectory(scenario.aircraft), scenario, PANEL, name)
+        frames = [np.asarray(picture) for picture in pictures]
+        if flown.terminated[0]:
+            frames.append((frames[-1] * 0.45).astype(np.uint8))
+        panels.append(frames)
 
     with tempfile.TemporaryDirectory() as folder:
         training = Training(config, Path(folder, "run"))
-        training.run(keep)
-    batch = config.num_envs * config.rollout
-    names = [f"after {number * batch:,} control steps" for number in wanted]
-    panels = [panel(*each) for each in zip(policies, names, strict=True)]
-    count = max(map(len, panels)) + round(LAST * FPS)
-    for k in range(count):
+        training.run(show)
+    for k in range(max(map(len, panels)) + round(LAST * FPS)):
         yield Image.fromarray(grid([frames[min(k, len(frames) - 1)] for frames in panels]))
-
-
-def panel(policy: Policy, name: str) -> list[np.ndarray]:
-    """A flight of a policy until its end, with a name in the corner."""
-    scenario = Scenario.of("hover", **RELEASED)
-    rollout = fly(policy, scenario, episodes=1, seed=5)
-    flight, model = rollout.trajectory(scenario.aircraft), scenario.compile_model()
-    width, height = PANEL
-    drawn = render_trajectory(flight, model, fps=FPS, width=width, height=height, overlay=False)
-    frames = [np.asarray(named(Image.fromarray(frame), name)) for frame in drawn]
-    early = rollout.terminated[0]
-    return [*frames, (frames[-1] * 0.45).astype(np.uint8)] if early else frames
-
-
-def named(image: Image.Image, name: str) -> Image.Image:
-    """A picture with a name in its corner."""
-    outline = {"stroke_width": 2, "stroke_fill": (20, 30, 45)}
-    font = ImageFont.load_default(15)
-    ImageDraw.Draw(image).text((10, 8), name, (255, 255, 255), font, **outline)
-    return image
 
 
 def flight(name: str) -> Iterator[Image.Image]:
@@ -115,17 +94,28 @@ def flight(name: str) -> Iterator[Image.Image]:
     scenario = dataclasses.replace(scenario, task=shown)
     raced = fly(policy, scenario, episodes=RACED if name in FASTEST else 1)
     fastest = int(np.where(raced.is_success, raced.length, np.inf).argmin())
-    flight, model = raced.trajectory(scenario.aircraft, fastest), scenario.compile_model()
-    away = np.linalg.norm(flight.qpos[:, :3] - flight.qpos[-1, :3], axis=1)
-    settled = flight.time[np.flatnonzero(away > SETTLED * away.max())[-1]]
+    flown = raced.trajectory(scenario.aircraft, fastest)
+    away = np.linalg.norm(flown.qpos[:, :3] - flown.qpos[-1, :3], axis=1)
+    settled = flown.time[np.flatnonzero(away > SETTLED * away.max())[-1]]
     end = settled + LAST
     first = max(end - LONGEST, 0.0) if shown.contact else 0.0  # the touch is what counts
-    times = np.arange(first, min(end, first + LONGEST), 1.0 / FPS)
-    width, height = (2 * size for size in SHOWN)
-    how: Any = {"width": width, "height": height, "overlay": False}
+    how: Any = {"times": np.arange(first, min(end, first + LONGEST), 1.0 / FPS)}
     if name == "race":  # other cameras have gates before the aircraft
-        how |= {"camera": "chase"}
+        how["camera"] = "chase"
     how["speed_trail"] = name in ("lsy_race", "race")
-    for frame in render_trajectory(flight, model, fps=FPS, times=times, **how):
-        small = Image.fromarray(frame).resize(SHOWN, Image.Resampling.LANCZOS)
-        yield named(small, name.replace("_", " "))
+    yield from drawn(flown, scenario, SIZE, name.replace("_", " "), enlarged=2, **how)
+
+
+def drawn(
+    flown: Trajectory, scenario: Scenario, size: tuple[int, int], name: str,
+    enlarged: int = 1, **how: Any,
+) -> Iterator[Image.Image]:  # fmt: skip
+    """Pictures of a flight with a name in the corner; drawn larger they have smooth edges."""
+    width, height = (enlarged * pixels for pixels in size)
+    how |= {"fps": FPS, "width": width, "height": height, "overlay": False}
+    font = ImageFont.load_default(15)
+    for frame in render_trajectory(flown, scenario.compile_model(), **how):
+        picture = Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS)
+        outline = {"stroke_width": 2, "stroke_fill": (20, 30, 45)}
+        ImageDraw.Draw(picture).text((10, 8), name, (255, 255, 255), font, **outline)
+        yield picture
