@@ -6,8 +6,7 @@ from scripts.reports.measure import speed, training
 from scripts.reports.pages import pages
 from scripts.reports.pictures import pictures
 from scripts.reports.robustness import robust, robustness
-from scripts.reports.shipping import ship
-from scripts.reports.task_pages import shipped
+from scripts.reports.shipping import ship, shipped
 
 REPORTS = (training, speed, robust, robustness, ship, shipped, pictures, pages)
 

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from quadrl.learning.benchmark import ALL_CORES, ONE_CORE
-from scripts.reports import code, measure, report, robustness, task_pages
+from scripts.reports import code, measure, report, robustness, shipping, task_pages
 from scripts.reports.report import DOCS, REPOSITORY, Parts, table
 
 
@@ -20,7 +20,7 @@ def pages(check: bool = False) -> None:
         check: Write nothing; exit with 1 and a message if a page would change.
     """
     parts: dict = {"figures": figures, "claim": claim}
-    for module in (code, measure, robustness, task_pages):
+    for module in (code, measure, robustness, shipping, task_pages):
         parts |= module.PARTS
     stale = [page for page in all_pages() if written(page, parts) != page.read_text()]
     if check and stale:

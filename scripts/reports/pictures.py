@@ -38,7 +38,7 @@ FASTEST = ("deck_landing", "lsy_race", "perching", "race")
 RACED = 300  # flights of those, the fastest of which is shown
 # The training: four policies fly the same start.
 SEED, SHARES = 225, (0.0, 0.12, 0.3, 1.0)  # of the training
-RELEASED = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
+RELEASED: dict[str, Any] = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "time_limit": 6.0}
 PANEL = (400, 225)  # [pixels]
 FPS, LAST = 12.5, 1.5  # [1/s], [s] that the end is shown
 QUALITY = 30  # a task is then under 250 kB

@@ -1,4 +1,4 @@
-"""Copy trained policies into the assets: `ship`."""
+"""Copy trained policies into the assets, and fly those that are there: `ship` and `shipped`."""
 
 from __future__ import annotations
 
@@ -15,14 +15,24 @@ from quadrl.base.files import write_json
 from quadrl.base.units import quantity
 from quadrl.cli.tasks import settings
 from quadrl.core.task import Target
+from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED, SHIPPED_AS, Policy
 from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import FREE
-from scripts.reports.report import Result, say
+from scripts.reports import report
+from scripts.reports.report import FIGURES, Result, asked, say, table
 
 EPISODES = 2000
+SHIPS = """`quadrl.Policy.pretrained("{name}", algo="{by}")` and `quadrl render {name}` fly them. A
+policy is a safetensors file, with a .json of all its settings beside it, in
+`quadrl/assets/policies`.
+
+"""
+POLICIES = """The mean action in {flown} fresh episodes, in the conditions of the training. The last
+column is what the task asks and the policy misses in as many episodes where nothing disturbs it.
+{source}"""
 CALM: Any = {"weather": "calm", "randomization": "none"}
 
 
@@ -66,23 +76,22 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     free = {name: getattr(usual, name) for name in named}
     if dataclasses.replace(config, **free) != usual:
         return f"left out, {run} has other settings than `quadrl train` gives"
-    policy, given = Policy.load(run), {"vehicle": config.scenario.aircraft}
-    metrics = summarize(fly(policy, config.scenario.task, episodes=EPISODES, **given))
+    policy = Policy.load(run)
+    metrics = summarize(fly(policy, episodes=EPISODES))
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES}"
-    still = summarize(fly(policy, config.scenario.task, episodes=EPISODES, **given, **CALM))
+    still = summarize(fly(policy, episodes=EPISODES, **CALM))
     missed = unmet(config.task, still)
     ways = "".join(f", {x.words} {quantity(x.metric, still[x.metric])}" for x in missed)
     if missed:
         for old in (file, file.with_suffix(".json")):
             old.unlink(missing_ok=True)
         return f"left out, misses what its task asks: {said} successful{ways}"
-    drawn = config.randomization
     told = {
         "algo": (config.algo, None),
         "seed": (config.seed, None),
         "vehicle": (config.vehicle, TrainConfig.vehicle),
         "from": (config.from_run.partition("@")[0], ""),
-        "randomization": (f"'{json.dumps(drawn)}'", f"'{json.dumps(usual.randomization)}'"),
+        "randomization": (config.randomization, usual.randomization),
         "training_options": (config.training_options, usual.training_options),
         "engine": (config.engine, usual.engine),
         "variant": (config.variant, "ideal"),
@@ -94,3 +103,47 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     beside = {"command": command, "evaluation": metrics, "config": config.resolved()}
     write_json(file.with_suffix(".json"), beside)
     return f"{said} successful"
+
+
+def shipped(episodes: int = 300, only: tuple[str, ...] = ()) -> None:
+    """Fly every policy that comes with quadrl, as it was trained and where nothing disturbs it.
+
+    Args:
+        episodes: Flights of each in each of the two conditions.
+        only: Names of tasks, beside what was measured of the others; by default all.
+    """
+    rows = []
+    files = (file for task in only or [""] for file in SHIPPED.glob(f"{task}*.safetensors"))
+    for name in sorted(file.stem for file in files):
+        found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, CALM))
+        rows.append({"policy": name} | found | {"undisturbed": still})
+        say(f"{name}: {[x.words for x in unmet(found['task'], still)]}")
+    rows = report.beside("shipped", {"rows": rows}, only)["rows"]
+    report.save("shipped", {"rows": sorted(rows, key=lambda row: row["policy"])})
+
+
+def policies(name: str = "") -> str:
+    """The policies that ship for a task, or for every one: how they fly and what they miss."""
+    result = report.load("shipped")
+    targets = tasks.TASKS[name].targets if name else ()
+    own, rows = [x for x in targets if x.metric not in FIGURES], []
+    flown = [row for row in result["rows"] if name in ("", row["task"])]
+    for row in flown:
+        made = json.loads((SHIPPED / f"{row['policy']}.json").read_text())["command"]
+        cells = [quantity(x, row[x]) if x in row else "" for x in FIGURES]
+        cells += [quantity(x.metric, row[x.metric]) for x in own]
+        still = row["undisturbed"]
+        missed = (
+            f"{x.words}: {quantity(x.metric, still[x.metric])}, asked {asked(x)}"
+            for x in unmet(row["task"], still)
+        )
+        rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "nothing"))
+    if not rows:
+        return "None comes with quadrl."
+    head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "asked and missed")
+    note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result, flown))
+    how = SHIPS.format(name=name, by=tasks.TASKS[name].trained_by) if name else ""
+    return f"{how}{table(head, rows)}\n\n{note}"
+
+
+PARTS: report.Parts = {"shipped": policies}

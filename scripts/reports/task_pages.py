@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import functools
-import json
 from typing import Any
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.units import quantity
 from quadrl.cli.tasks import settings
 from quadrl.core.task import Task
-from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED
 from quadrl.learning.defaults import own_settings
 from quadrl.learning.description import describe, describe_action
 from scripts.reports import measure, report, shipping
 from scripts.reports.code import shown
-from scripts.reports.report import FIGURES, Parts, asked, table
+from scripts.reports.report import Parts, table
 
 PAGE = """{asks}
 
@@ -78,14 +75,6 @@ counts as successful when the mean action reaches this in {episodes} fresh episo
 ## Policies
 
 {policies}"""
-SHIPS = """`quadrl.Policy.pretrained("{name}", algo="{by}")` and `quadrl render {name}` fly them. A
-policy is a safetensors file, with a .json of all its settings beside it, in
-`quadrl/assets/policies`.
-
-"""
-POLICIES = """The mean action in {flown} fresh episodes, in the conditions of the training. The last
-column is what the task asks and the policy misses in as many episodes where nothing disturbs it.
-{source}"""
 SEEDS = "Median and range over the seeds of `scripts/report training`."
 PAPER = "The three algorithms in [the paper's experiments](paper.md)."
 PICTURES = {
@@ -149,7 +138,7 @@ def page(name: str) -> str:
             for pattern, (about, words) in PICTURES.items()
             for picture in report.IMAGES.glob(pattern.format(name=name))
         ),
-        policies=policies(name),
+        policies=shipping.policies(name),
     )
 
 
@@ -169,52 +158,9 @@ def observations(task: Task, known: dict[str, Any]) -> str:
     return table(("number", "term", "entry", "unit", "meaning and frame"), rows)
 
 
-def shipped(episodes: int = 300, only: tuple[str, ...] = ()) -> None:
-    """Fly every policy that comes with quadrl, as it was trained and where nothing disturbs it.
-
-    Args:
-        episodes: Flights of each in each of the two conditions.
-        only: Names of tasks, beside what was measured of the others; by default all.
-    """
-    rows = []
-    files = (file for task in only or [""] for file in SHIPPED.glob(f"{task}*.safetensors"))
-    for name in sorted(file.stem for file in files):
-        found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, shipping.CALM))
-        rows.append({"policy": name} | found | {"undisturbed": still})
-        report.say(f"{name}: {[x.words for x in shipping.unmet(found['task'], still)]}")
-    rows = report.beside("shipped", {"rows": rows}, only)["rows"]
-    report.save("shipped", {"rows": sorted(rows, key=lambda row: row["policy"])})
-
-
-def policies(name: str = "") -> str:
-    """The policies that ship for a task, or for every one: how they fly and what they miss."""
-    result = report.load("shipped")
-    targets = tasks.TASKS[name].targets if name else ()
-    own, rows = [x for x in targets if x.metric not in FIGURES], []
-    flown = [row for row in result["rows"] if name in ("", row["task"])]
-    for row in flown:
-        made = json.loads((SHIPPED / f"{row['policy']}.json").read_text())["command"]
-        cells = [quantity(x, row[x]) if x in row else "" for x in FIGURES]
-        cells += [quantity(x.metric, row[x.metric]) for x in own]
-        still = row["undisturbed"]
-        missed = (
-            f"{x.words}: {quantity(x.metric, still[x.metric])}, asked {asked(x)}"
-            for x in shipping.unmet(row["task"], still)
-        )
-        rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "nothing"))
-    if not rows:
-        return "None comes with quadrl."
-    head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "asked and missed")
-    note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result, flown))
-    how = SHIPS.format(name=name, by=tasks.TASKS[name].trained_by) if name else ""
-    return f"{how}{table(head, rows)}\n\n{note}"
-
-
 def line(text: str) -> str:
     """With a capital and a full stop."""
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-PARTS: Parts = {"shipped": policies} | {
-    f"task-{name}": functools.partial(page, name) for name in tasks.TASKS
-}
+PARTS: Parts = {f"task-{name}": functools.partial(page, name) for name in tasks.TASKS}

@@ -25,7 +25,6 @@ from scripts.reports import (
     report,
     robustness,
     shipping,
-    task_pages,
 )
 
 
@@ -183,8 +182,8 @@ def test_policies_that_ship_are_judged_where_nothing_disturbs_them(tmp_path, mon
     for name in ("hover_ppo", "random_waypoint_robust"):
         for end in (".json", ".safetensors"):
             shutil.copy(SHIPPED / f"{name}{end}", tmp_path)
-    monkeypatch.setattr(task_pages, "SHIPPED", tmp_path)
-    task_pages.shipped(episodes=4)
+    monkeypatch.setattr(shipping, "SHIPPED", tmp_path)
+    shipping.shipped(episodes=4)
     hover, robust = report.load("shipped")["rows"]
     assert hover["undisturbed"]["episodes"] == 4
     flown = quadrl.evaluate("random_waypoint_robust", episodes=4).metrics  # as it was trained
@@ -192,11 +191,11 @@ def test_policies_that_ship_are_judged_where_nothing_disturbs_them(tmp_path, mon
     assert robust["undisturbed"]["circling_m_s"] < 0.05 < robust["circling_m_s"]  # in wind
     asked = Target("yaw_rate_rad_s", "turning over the last 2 s", 1e-6)
     monkeypatch.setattr(RandomWaypoint, "targets", (asked,))
-    head, _, first, second = task_pages.policies().splitlines()[:4]
+    head, _, first, second = shipping.policies().splitlines()[:4]
     assert "| circling over the last 2 s |" in head and first.endswith("| nothing |")
     assert "turning over the last 2 s: 0.0" in second and "rad/s, asked at most" in second
-    assert "hover" not in task_pages.policies("random_waypoint")
-    assert "None comes" in task_pages.policies("landing")
+    assert "hover" not in shipping.policies("random_waypoint")
+    assert "None comes" in shipping.policies("landing")
 
 
 def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch, capsys):
