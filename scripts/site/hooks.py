@@ -1,4 +1,4 @@
-"""Extend mkdocs: patterns in the navigation, and pages of the source files that pages link to."""
+"""Extend mkdocs: a link to the page that flies, and pages of the sources that pages link to."""
 
 from __future__ import annotations
 
@@ -30,26 +30,6 @@ hide:
 ````
 """
 LANGUAGES = {".py": "python", ".c": "c", ".h": "c", ".xml": "xml", ".md": "markdown"}
-
-
-def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Write out the patterns of the navigation."""
-    config.nav = _written_out(config.nav, Path(config.docs_dir))
-    return config
-
-
-def _written_out(items: list[Any], docs: Path) -> list[Any]:
-    written: list[Any] = []
-    for item in items:
-        title, value = next(iter(item.items())) if isinstance(item, dict) else (None, item)
-        if isinstance(value, list):
-            written.append({title: _written_out(value, docs)})
-        elif "*" in value:
-            found = [path.relative_to(docs).as_posix() for path in sorted(docs.glob(value))]
-            written += [{title: found}] if title else found
-        else:
-            written.append(item)
-    return written
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
