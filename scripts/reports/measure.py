@@ -9,16 +9,15 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from quadrl import VEHICLES, tasks
 from quadrl.base.units import length, quantity
-from quadrl.control import GeometricController
-from quadrl.core.scenario import Scenario
 from quadrl.engines.engine import ENGINES
+from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.plotting import learning_curves, save
-from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import BEHAVIOUR, Controller, fly, scenario_of, summarize
+from quadrl.evaluation.rollout import BEHAVIOUR, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
@@ -33,16 +32,20 @@ LONGEST = {"race": 3600, "lsy_race": 3600} | dict.fromkeys(
     ("recovery", "trajectory", "perching", "deck_landing"), 600
 )
 """Seconds that a training may take; 300 of any other task."""
-AIRBORNE = ("hover", "static_waypoint", "random_waypoint", "straight_and_level", "target_following")
 
 
 def trained(run: PlannedRun) -> Result:
-    """What a finished run was: task, vehicle, engine, algorithm, seed, steps, seconds."""
+    """What a finished run was: its settings, steps and seconds; and what it reached."""
     config = run.config
     known = {name: getattr(config, name) for name in ("task", "vehicle", "engine", "algo", "seed")}
     took = json.loads((run.folder / EVALUATION).read_text())["training_s"]
     steps = config.iterations * config.num_envs * config.rollout
-    return known | {"steps": steps, "training_s": took}
+    return known | {"steps": steps, "training_s": took, "metrics": flown(run.folder, config)}
+
+
+def flown(flyer: str | Path, config: TrainConfig) -> Result:
+    """What a controller, or the mean action of a run's policy, reaches where a training aims."""
+    return summarize(evaluate(flyer, config.scenario, episodes=EPISODES).rollout)
 
 
 def runs_of(where: str, configs: Iterable[TrainConfig], jobs: int, episodes: int) -> list[Any]:
@@ -65,25 +68,17 @@ def training(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
     hovers = "hover" in wanted
     both = itertools.product(ENGINES, HOVER_SEEDS if hovers else ())
     alone = [TrainConfig("hover", engine=engine, seed=seed) for engine, seed in both]
-    kinds = [("hover", vehicle) for vehicle in VEHICLES if hovers and vehicle != "paper"]
-    kinds += [(task, tasks.TASKS[task].trained_on) for task in wanted if task != "hover"]
-    together = [
-        TrainConfig(task, vehicle=vehicle, algo=tasks.TASKS[task].trained_by, seed=seed,
-                    num_threads=1)
-        for (task, vehicle), seed in itertools.product(kinds, SEEDS)
-    ]  # fmt: skip
+    kinds = [{"vehicle": name} for name in VEHICLES if hovers and name != "paper"]
+    kinds += [{"task": task} for task in wanted if task != "hover"]
+    each = itertools.product(kinds, SEEDS)
+    together = [TrainConfig(**kind, seed=seed, num_threads=1) for kind, seed in each]
     runs = runs_of("training", alone, 1, EPISODES) + runs_of("training", together, jobs, EPISODES)
-    found: list[Result] = []
     yardstick: dict[tuple[str, str], Result] = {}
     for run in runs:
-        policy = Policy.load(run.folder)
-        scenario = scenario_of(policy, engine="mujoco")
-        found.append(trained(run) | {"metrics": flown(policy, scenario)})
-        kind = task, vehicle = run.config.task, run.config.vehicle
-        if kind not in yardstick:
-            controller = GeometricController(scenario.aircraft, scenario.task)
-            metrics = flown(controller, scenario)
-            yardstick[kind] = {"task": task, "vehicle": vehicle, "metrics": metrics}
+        task, vehicle = run.config.task, run.config.vehicle
+        if (task, vehicle) not in yardstick:
+            metrics = flown("geometric", run.config)
+            yardstick[task, vehicle] = {"task": task, "vehicle": vehicle, "metrics": metrics}
     for name in wanted:
         task = tasks.TASKS[name]
         folders = f"{name}-{task.trained_on}-free_flight-{task.trained_by}-*"
@@ -91,13 +86,8 @@ def training(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
         metrics = {task.trained_by: [read_metrics(folder / METRICS) for folder in own]}
         path = report.IMAGES / "curves" / f"{name}.png"
         save(learning_curves(metrics, name, clocks=("steps",)), path)
-    rows = report.beside("training", {"yardstick": [*yardstick.values()], "runs": found}, only)
-    report.save("training", {"episodes": EPISODES} | rows)
-
-
-def flown(controller: Controller, scenario: Scenario) -> Result:
-    """What a controller, or the mean action of a policy, reaches."""
-    return summarize(fly(controller, scenario, episodes=EPISODES))
+    rows = {"yardstick": [*yardstick.values()], "runs": [trained(run) for run in runs]}
+    report.save("training", {"episodes": EPISODES} | report.beside("training", rows, only))
 
 
 def speed() -> None:

@@ -29,7 +29,7 @@ from quadrl.evaluation.rollout import BEHAVIOUR, flights, fly, means_of_behaviou
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import WIDE
 from scripts.reports import report
-from scripts.reports.measure import AIRBORNE, runs_of
+from scripts.reports.measure import runs_of
 from scripts.reports.report import FIGURES, Result, say, table
 
 UNCERTAIN = Randomization(
@@ -40,7 +40,8 @@ NEAR, MOST = 0.5, 1.0  # [m]: errors within are summed up, a long way is none; t
 NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
 FRESH = 100_300  # first episode, beyond those that the gains were chosen by
 ALL_TOGETHER: Conditions = {"weather": "light", "randomization": "full", "aerodynamics": "full"}
-SEEDS = range(645, 650)  # not used for tuning
+TRAINED = ("hover", "static_waypoint", "random_waypoint", "straight_and_level", "target_following",
+           "landing")  # fmt: skip
 WAYS_OF = ("nothing", "50 ms of delay", "twice the lag", "uncertain", "all together")
 """Of which `ways_table` says how they fly."""
 
@@ -79,14 +80,15 @@ UNSURE: dict[str, Conditions] = {  # in which the policies for uncertain aircraf
 
 def conditions() -> dict[str, Conditions]:
     """The disturbances by name: each alone, and all together."""
-    found: dict[str, Conditions] = {"nothing": {}}
-    found |= {f"aerodynamics {e}": {"aerodynamics": e} for e in (*EFFECTS, "full")}
-    found |= {f"weather {w}": {"weather": w} for w in WEATHERS if w != "calm"}
-    for name, value in RANDOMIZATIONS["full"].given().items():
-        if name not in NEEDS_AIR:
-            found[f"{name} as in `full`"] = {"randomization": {name: value}}
-    found |= {f"randomization {n}": {"randomization": n} for n in ("light", "full")}
-    return found | {"all together": ALL_TOGETHER}
+    drawn = RANDOMIZATIONS["full"].given().items()
+    return {
+        "nothing": {},
+        **{f"aerodynamics {e}": {"aerodynamics": e} for e in (*EFFECTS, "full")},
+        **{f"weather {w}": {"weather": w} for w in WEATHERS if w != "calm"},
+        **{f"{k} as in `full`": {"randomization": {k: v}} for k, v in drawn if k not in NEEDS_AIR},
+        **{f"randomization {n}": {"randomization": n} for n in ("light", "full")},
+        "all together": ALL_TOGETHER,
+    }
 
 
 def tuned(task: str, name: str, condition: Conditions) -> Integrating:
@@ -113,7 +115,7 @@ def flown(flyer: Any, task: str, condition: Conditions, episodes: int) -> Result
 
 def robust(
     only: tuple[str, ...] = (),
-    seeds: tuple[int, ...] = tuple(SEEDS),
+    seeds: tuple[int, ...] = (645, 646, 647, 648, 649),
     episodes: int = 1000,
     jobs: int = 2,
 ) -> None:
@@ -121,21 +123,21 @@ def robust(
 
     Args:
         only: Names of tasks, beside what was measured of the others; by default all.
-        seeds: Of the trainings.
+        seeds: Of the trainings; by default those that nothing was tuned with.
         episodes: Flights of each seed in each condition.
         jobs: Trainings at the same time.
     """
     rows = []
-    for task in only or (*AIRBORNE, "landing"):
+    for task in only or TRAINED:
         configs = [TrainConfig(task, variant="robust", seed=seed, num_threads=1) for seed in seeds]
         runs = runs_of("robust", configs, jobs, 100)
-        flyers: dict[int, Any] = {run.config.seed: Policy.load(run.folder) for run in runs}
+        flyers: dict[str, Any] = {str(run.config.seed): Policy.load(run.folder) for run in runs}
         for seed in (*flyers, "controller"):
             for name, condition in UNSURE.items():
                 condition = WIDER | {"aerodynamics": "full"} | condition
                 flyer = flyers.get(seed) or tuned(task, "uncertain", condition)
                 found = flown(flyer, task, condition, episodes)
-                rows.append({"task": task, "seed": str(seed), "condition": name} | found)
+                rows.append({"task": task, "seed": seed, "condition": name} | found)
             say(f"{task}, {seed}: {rows[-1]}")
     report.save("robust", {"episodes": episodes} | report.beside("robust", {"rows": rows}, only))
 
@@ -152,15 +154,17 @@ def robustness(only: tuple[str, ...] = (), episodes: int = 100) -> None:
     alone, half = [], []
     for task in only or report.load("tuning")["tasks"]:
         say(task)
-        flyers = {"policy": task, "robust policy": f"{task}_robust", "controller": "geometric"}
+        flyers: Result = {
+            "policy": task,
+            "robust policy": f"{task}_robust",
+            "controller": "geometric",
+        }
         for name, condition in conditions().items():
-            row: Result = {"task": task, "condition": name}
-            for label, flyer in flyers.items():
-                row[label] = flown(flyer, task, condition, episodes)["success"]
+            shares = {k: flown(flyer, task, condition, episodes) for k, flyer in flyers.items()}
             wider = WIDER | condition  # as the robust policy commands
-            controller = tuned(task, name, wider)
-            row["tuned controller"] = flown(controller, task, wider, episodes)["success"]
-            alone.append(row)
+            shares["tuned controller"] = flown(tuned(task, name, wider), task, wider, episodes)
+            shares = {label: found["success"] for label, found in shares.items()}
+            alone.append({"task": task, "condition": name} | shares)
         card = quadrl.robustness(flyers, task, episodes=episodes)
         (pictures := report.IMAGES / "robustness").mkdir(parents=True, exist_ok=True)
         card.figure.save(pictures / f"{task}.png")
@@ -176,8 +180,7 @@ def half_table() -> str:
     """Where half of the flights fail, for each task."""
     result = report.load("robustness")
     rows = [{k: x for k, x in row.items() if k != "commit"} for row in result["half"]]
-    note = f"{result['episodes']} flights a level. "
-    note += report.source(result, result["half"])
+    note = f"{result['episodes']} flights a level. {report.source(result, result['half'])}"
     return f"{table(rows[0], (row.values() for row in rows))}\n\n{note}"
 
 
@@ -197,51 +200,50 @@ def alone_table() -> str:
     return f"{table(('disturbed by', *known), rows)}\n\n{note}"
 
 
+def over_seeds(result: Result) -> dict[tuple[str, bool, str], list[Result]]:
+    """Rows of all seeds, by task, whether the tuned controller flew, and condition."""
+    groups: dict[tuple[str, bool, str], list[Result]] = {}
+    for row in result["rows"]:
+        key = row["task"], row["seed"] == "controller", row["condition"]
+        groups.setdefault(key, []).append(row)
+    return groups
+
+
 def robust_table() -> str:
     """Success and error of the policies for uncertain aircraft, over the seeds."""
-    result, groups = report.load("robust"), {}
-    for row in result["rows"]:
-        who = "geometric controller, tuned" if row["seed"] == "controller" else "robust policies"
-        of = groups.setdefault((f"`{row['task']}`", who), {})
-        figures = row["success"], row["position_error_m"], row["yaw_rate_rad_s"]
-        of.setdefault(row["condition"], []).append(figures)
-    rows = []
-    for key, of in groups.items():
-        cells = []
-        for found in of.values():
-            shares, errors, turning = zip(*found, strict=True)
-            words = f"{100 * np.mean(shares):.1f}"
-            if len(shares) > 1:
-                words += f" [{100 * min(shares):.1f}, {100 * max(shares):.1f}]"
-            cells.append(f"{words}, {length(np.median(errors))}, {np.median(turning):.2f} rad/s")
-        rows.append((*key, *cells))
+    result, cells = report.load("robust"), {}
+    for (task, controller, _), rows in over_seeds(result).items():
+        names = ("success", "position_error_m", "yaw_rate_rad_s")
+        shares, errors, turning = ([row[name] for row in rows] for name in names)
+        words = f"{100 * np.mean(shares):.1f}"
+        if len(shares) > 1:
+            words += f" [{100 * min(shares):.1f}, {100 * max(shares):.1f}]"
+        words += f", {length(np.median(errors))}, {np.median(turning):.2f} rad/s"
+        who = "geometric controller, tuned" if controller else "robust policies"
+        cells.setdefault((f"`{task}`", who), []).append(words)
     note = (
         "Successful flights [%] of all seeds, in brackets the worst and the best; medians of the "
-        "error and of the yaw rate over the last 2 s. "
-        f"{result['episodes']} flights for each seed and condition. "
-        f"{report.source(result, result['rows'])}"
     )
+    note += "error and of the yaw rate over the last 2 s. "
+    note += f"{result['episodes']} flights for each seed and condition. "
+    note += report.source(result, result["rows"])
+    rows = ((*key, *own) for key, own in cells.items())
     return f"{table(('task', 'flown by', *UNSURE), rows)}\n\n{note}"
 
 
 def ways_table() -> str:
     """How the policies for uncertain aircraft and the controller fly, beside where."""
-    result, groups = report.load("robust"), {}
-    for row in result["rows"]:
-        who = "tuned controller" if row["seed"] == "controller" else "robust policies"
-        if row["condition"] in WAYS_OF:
-            groups.setdefault((f"`{row['task']}`", who, row["condition"]), []).append(row)
     rows = []
-    for key, found in groups.items():
-        values = {name: [row[name] for row in found if row.get(name) is not None]
-                  for name in BEHAVIOUR}  # fmt: skip
-        middle = {name: np.median(each) for name, each in values.items() if each}
-        if values["least_height_m"]:
-            middle["least_height_m"] = min(values["least_height_m"])
-        cells = (quantity(name, middle[name]) if name in middle else "" for name in BEHAVIOUR)
-        rows.append((*key, *cells))
-    head = ("task", "flown by", "flown in", *(FIGURES[name] for name in BEHAVIOUR))
-    return table(head, rows)
+    for (task, controller, condition), found in over_seeds(report.load("robust")).items():
+        if condition not in WAYS_OF:
+            continue
+        cells = [f"`{task}`", "tuned controller" if controller else "robust policies", condition]
+        for name in BEHAVIOUR:
+            values = [row[name] for row in found if row.get(name) is not None]
+            whole = min if name == "least_height_m" else np.median
+            cells.append(quantity(name, whole(values)) if values else "")
+        rows.append(cells)
+    return table(("task", "flown by", "flown in", *map(FIGURES.get, BEHAVIOUR)), rows)
 
 
 PARTS: report.Parts = {"robust": robust_table, "robust-ways": ways_table,
