@@ -10,7 +10,6 @@ import itertools
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from quadrl import VEHICLES, tasks
 from quadrl.base.units import length, quantity
@@ -48,11 +47,11 @@ def flown(flyer: str | Path, config: TrainConfig) -> Result:
     return summarize(evaluate(flyer, config.scenario, episodes=EPISODES).rollout)
 
 
-def runs_of(where: str, configs: Iterable[TrainConfig], jobs: int, episodes: int) -> list[Any]:
-    """The trainings in a folder of runs/; those that are missing are made."""
+def runs_of(configs: Iterable[TrainConfig], jobs: int) -> list[PlannedRun]:
+    """The trainings in runs/training; those that are missing are made."""
     name = "{0.task}-{0.vehicle}-{0.engine}-{0.algo}-{0.seed}".format
-    runs = [PlannedRun(config, report.RUNS / where / name(config)) for config in configs]
-    if failed := train_all(runs, Local(episodes, jobs), say):
+    runs = [PlannedRun(config, report.RUNS / "training" / name(config)) for config in configs]
+    if failed := train_all(runs, Local(EPISODES, jobs), say):
         raise SystemExit(complaint(failed))
     return runs
 
@@ -72,7 +71,7 @@ def training(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
     kinds += [{"task": task} for task in wanted if task != "hover"]
     each = itertools.product(kinds, SEEDS)
     together = [TrainConfig(**kind, seed=seed, num_threads=1) for kind, seed in each]
-    runs = runs_of("training", alone, 1, EPISODES) + runs_of("training", together, jobs, EPISODES)
+    runs = runs_of(alone, 1) + runs_of(together, jobs)
     yardstick: dict[tuple[str, str], Result] = {}
     for run in runs:
         task, vehicle = run.config.task, run.config.vehicle

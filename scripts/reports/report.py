@@ -9,7 +9,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from quadrl import tasks
 from quadrl.base.machine import in_a_line, machine
@@ -33,6 +35,7 @@ FIGURES = {
 """Of flights, and what tables call them."""
 
 Result = dict[str, Any]
+Runs = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Parts = Mapping[str, Callable[[], str]]
 """Parts of pages by name; a part that raises FileNotFoundError has not been measured yet."""
 

@@ -25,12 +25,11 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import setting
 from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import BEHAVIOUR, flights, fly, means_of_behaviour
-from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import WIDE
 from scripts.reports import report
-from scripts.reports.measure import runs_of
-from scripts.reports.report import FIGURES, Result, say, table
+from scripts.reports.report import FIGURES, Result, Runs, say, table
 
 UNCERTAIN = Randomization(
     mass=(0.8, 1.2), command_delay=(0.02, 0.02), noise=Errors(1e-3, 1e-3, 2e-3, 2e-3)
@@ -40,8 +39,6 @@ NEAR, MOST = 0.5, 1.0  # [m]: errors within are summed up, a long way is none; t
 NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
 FRESH = 100_300  # first episode, beyond those that the gains were chosen by
 ALL_TOGETHER: Conditions = {"weather": "light", "randomization": "full", "aerodynamics": "full"}
-TRAINED = ("hover", "static_waypoint", "random_waypoint", "straight_and_level", "target_following",
-           "landing")  # fmt: skip
 WAYS_OF = ("nothing", "50 ms of delay", "twice the lag", "uncertain", "all together")
 """Of which `ways_table` says how they fly."""
 
@@ -113,29 +110,23 @@ def flown(flyer: Any, task: str, condition: Conditions, episodes: int) -> Result
     return reached | {"least_height_m": means_of_behaviour(each)["least_height_m"]}
 
 
-def robust(
-    only: tuple[str, ...] = (),
-    seeds: tuple[int, ...] = (645, 646, 647, 648, 649),
-    episodes: int = 1000,
-    jobs: int = 2,
-) -> None:
-    """Train policies for uncertain aircraft in wind, and fly them beside the tuned controller.
+def robust(runs: Runs, episodes: int = 1000) -> None:
+    """Fly policies for uncertain aircraft, of several seeds, beside the tuned controller.
+
+    `quadrl train TASK --variant robust --seeds 645:650 --out runs/robust` trains those of a task.
 
     Args:
-        only: Names of tasks, beside what was measured of the others; by default all.
-        seeds: Of the trainings; by default those that nothing was tuned with.
+        runs: Run folders; what was measured of tasks that none of them has is kept.
         episodes: Flights of each seed in each condition.
-        jobs: Trainings at the same time.
     """
-    rows = []
-    for task in only or TRAINED:
-        configs = [TrainConfig(task, variant="robust", seed=seed, num_threads=1) for seed in seeds]
-        runs = runs_of("robust", configs, jobs, 100)
-        flyers: dict[str, Any] = {str(run.config.seed): Policy.load(run.folder) for run in runs}
-        for seed in (*flyers, "controller"):
+    rows, trained = [], [Policy.load(run) for run in runs if (run / FILE).is_file()]
+    only = [*dict.fromkeys(policy.task for policy in trained)]
+    for task in only:
+        seeds: Result = {str(x.metadata["seed"]): x for x in trained if x.task == task}
+        for seed in (*seeds, "controller"):
             for name, condition in UNSURE.items():
                 condition = WIDER | {"aerodynamics": "full"} | condition
-                flyer = flyers.get(seed) or tuned(task, "uncertain", condition)
+                flyer = seeds.get(seed) or tuned(task, "uncertain", condition)
                 found = flown(flyer, task, condition, episodes)
                 rows.append({"task": task, "seed": seed, "condition": name} | found)
             say(f"{task}, {seed}: {rows[-1]}")

@@ -6,9 +6,7 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from quadrl import tasks
 from quadrl.base.files import write_json
@@ -22,7 +20,7 @@ from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import FREE
 from scripts.reports import report
-from scripts.reports.report import FIGURES, Result, asked, say, table
+from scripts.reports.report import FIGURES, Result, Runs, asked, say, table
 
 EPISODES = 2000
 SHIPS = """`quadrl.Policy.pretrained("{name}", algo="{by}")` and `quadrl render {name}` fly them. A
@@ -36,7 +34,7 @@ column is what the task asks and the policy misses in as many episodes where not
 CALM: Any = {"weather": "calm", "randomization": "none"}
 
 
-def ship(runs: Annotated[tuple[Path, ...], tyro.conf.Positional], out: Path = SHIPPED) -> None:
+def ship(runs: Runs, out: Path = SHIPPED) -> None:
     """Copy trained policies into assets/policies, where they come with the package.
 
     For each task, algorithm and variant it takes the run with the lowest seed, never the best one,

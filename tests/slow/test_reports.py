@@ -100,7 +100,6 @@ def test_shares_of_the_benchmark_are_within_one_turn():
 def short(monkeypatch):
     """Trainings of one batch, and few episodes."""
     monkeypatch.setattr(measure, "TrainConfig", functools.partial(TrainConfig, steps=4096))
-    monkeypatch.setattr(robustness, "TrainConfig", functools.partial(TrainConfig, steps=8192))
     monkeypatch.setattr(measure, "EPISODES", 2)
 
 
@@ -122,10 +121,13 @@ def test_trainings_are_evaluated_beside_the_controller_and_drawn(short, monkeypa
     assert (report.IMAGES / "curves" / "hover.png").stat().st_size > 0
 
 
-def test_policies_for_uncertain_aircraft_fly_beside_the_controller(short):
+def test_policies_for_uncertain_aircraft_fly_beside_the_controller():
     report.save("tuning", {"tasks": {"hover": {"uncertain": [1.6, 1.0]}}})
     report.save("robust", {"rows": []})
-    robustness.robust(("hover",), seeds=(645, 646), episodes=3)
+    what = {"variant": "robust", "steps": 8192}
+    study = {"tasks": ["hover"], "seeds": [645, 646], "episodes": 2, "settings": what}
+    quadrl.study(study, out=report.RUNS)
+    robustness.robust((*report.RUNS.iterdir(),), episodes=3)
     rows = report.load("robust")["rows"]
     assert len(rows) == 3 * len(robustness.UNSURE)
     calm = {row["seed"]: row["success"] for row in rows if row["condition"] == "nothing"}
