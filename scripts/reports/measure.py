@@ -1,31 +1,23 @@
-"""Train every task and fly the policies: `training` and `speed`.
-
-Run them on a machine that does nothing else. Interrupted at any moment, they continue at the next
-start.
-"""
+"""Fly the policies of trainings, and measure the speed of each layer: `training` and `speed`."""
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from quadrl import VEHICLES, tasks
 from quadrl.base.units import length, quantity
-from quadrl.engines.engine import ENGINES
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.plotting import learning_curves, save
 from quadrl.evaluation.rollout import BEHAVIOUR, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.executor import Local, PlannedRun, complaint, train_all
 from quadrl.learning.folder import EVALUATION, METRICS, read_metrics
 from scripts.reports import report
-from scripts.reports.report import FIGURES, Result, asked, say, table
+from scripts.reports.report import FIGURES, Result, Runs, asked, table
 
-# Seeds are not those that settings were chosen with.
-HOVER_SEEDS, SEEDS = (225, 226, 227, 228, 229), (385, 386, 387)
+SEEDS = 3  # of a task in its table
 EPISODES = 100  # of an evaluation
 LONGEST = {"race": 3600, "lsy_race": 3600} | dict.fromkeys(
     ("recovery", "trajectory", "perching", "deck_landing"), 600
@@ -33,60 +25,43 @@ LONGEST = {"race": 3600, "lsy_race": 3600} | dict.fromkeys(
 """Seconds that a training may take; 300 of any other task."""
 
 
-def trained(run: PlannedRun) -> Result:
-    """What a finished run was: its settings, steps and seconds; and what it reached."""
-    config = run.config
-    known = {name: getattr(config, name) for name in ("task", "vehicle", "engine", "algo", "seed")}
-    took = json.loads((run.folder / EVALUATION).read_text())["training_s"]
-    steps = config.iterations * config.num_envs * config.rollout
-    return known | {"steps": steps, "training_s": took, "metrics": flown(run.folder, config)}
+def training(runs: Runs) -> None:
+    """Fly the policies of trainings beside the geometric controller, and draw the trainings.
+
+    docs/studies/training.sh makes those of the pages: `scripts/report training runs/training/*/*`.
+
+    Args:
+        runs: Run folders; what was measured of tasks that none of them has is kept.
+    """
+    configs = {run: TrainConfig.of_folder(run) for run in runs if (run / EVALUATION).is_file()}
+    found: list[Result] = []
+    yardstick: dict[tuple[str, str], Result] = {}
+    curves: dict[str, list[Any]] = {}
+    for run, config in configs.items():
+        names = ("task", "vehicle", "engine", "algo", "seed")
+        known = {name: getattr(config, name) for name in names}
+        took = json.loads((run / EVALUATION).read_text())["training_s"]
+        steps = config.iterations * config.num_envs * config.rollout
+        found.append(known | {"steps": steps, "training_s": took, "metrics": flown(run, config)})
+        task, vehicle = config.task, config.vehicle
+        if (task, vehicle) not in yardstick:
+            metrics = flown("geometric", config)
+            yardstick[task, vehicle] = {"task": task, "vehicle": vehicle, "metrics": metrics}
+        if (vehicle, config.engine) == (tasks.TASKS[task].trained_on, "free_flight"):
+            curves.setdefault(task, []).append(read_metrics(run / METRICS))
+    for task, metrics in curves.items():
+        by = {tasks.TASKS[task].trained_by: metrics}
+        picture = report.IMAGES / "curves" / f"{task}.png"
+        save(learning_curves(by, task, clocks=("steps",)), picture)
+    found.sort(key=lambda row: ([*VEHICLES].index(row["vehicle"]), row["engine"], row["seed"]))
+    rows = {"yardstick": [*yardstick.values()], "runs": found}
+    only = {config.task for config in configs.values()}
+    report.save("training", {"episodes": EPISODES} | report.beside("training", rows, only))
 
 
 def flown(flyer: str | Path, config: TrainConfig) -> Result:
     """What a controller, or the mean action of a run's policy, reaches where a training aims."""
     return summarize(evaluate(flyer, config.scenario, episodes=EPISODES).rollout)
-
-
-def runs_of(configs: Iterable[TrainConfig], jobs: int) -> list[PlannedRun]:
-    """The trainings in runs/training; those that are missing are made."""
-    name = "{0.task}-{0.vehicle}-{0.engine}-{0.algo}-{0.seed}".format
-    runs = [PlannedRun(config, report.RUNS / "training" / name(config)) for config in configs]
-    if failed := train_all(runs, Local(EPISODES, jobs), say):
-        raise SystemExit(complaint(failed))
-    return runs
-
-
-def training(jobs: int = 2, only: tuple[str, ...] = ()) -> None:
-    """Train every task with its defaults, hover in both engines and on every aircraft; draw.
-
-    Args:
-        jobs: Trainings at the same time, of those whose wall clock is not compared.
-        only: Names of tasks, beside what was measured of the others; by default all.
-    """
-    wanted = [task for task in tasks.TASKS if not only or task in only]
-    hovers = "hover" in wanted
-    both = itertools.product(ENGINES, HOVER_SEEDS if hovers else ())
-    alone = [TrainConfig("hover", engine=engine, seed=seed) for engine, seed in both]
-    kinds = [{"vehicle": name} for name in VEHICLES if hovers and name != "paper"]
-    kinds += [{"task": task} for task in wanted if task != "hover"]
-    each = itertools.product(kinds, SEEDS)
-    together = [TrainConfig(**kind, seed=seed, num_threads=1) for kind, seed in each]
-    runs = runs_of(alone, 1) + runs_of(together, jobs)
-    yardstick: dict[tuple[str, str], Result] = {}
-    for run in runs:
-        task, vehicle = run.config.task, run.config.vehicle
-        if (task, vehicle) not in yardstick:
-            metrics = flown("geometric", run.config)
-            yardstick[task, vehicle] = {"task": task, "vehicle": vehicle, "metrics": metrics}
-    for name in wanted:
-        task = tasks.TASKS[name]
-        folders = f"{name}-{task.trained_on}-free_flight-{task.trained_by}-*"
-        own = sorted((report.RUNS / "training").glob(folders))
-        metrics = {task.trained_by: [read_metrics(folder / METRICS) for folder in own]}
-        path = report.IMAGES / "curves" / f"{name}.png"
-        save(learning_curves(metrics, name, clocks=("steps",)), path)
-    rows = {"yardstick": [*yardstick.values()], "runs": [trained(run) for run in runs]}
-    report.save("training", {"episodes": EPISODES} | report.beside("training", rows, only))
 
 
 def speed() -> None:
@@ -141,7 +116,7 @@ def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
         [row for row in result[part] if (row["task"], row["vehicle"]) == (name, task.trained_on)]
         for part in ("runs", "yardstick")
     )
-    runs = [run for run in runs if run["engine"] == "free_flight"][: len(SEEDS)]
+    runs = [run for run in runs if run["engine"] == "free_flight"][:SEEDS]
     rows = []
     for target in task.targets:
         cells = []

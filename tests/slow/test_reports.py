@@ -1,7 +1,6 @@
 """The reports: their bookkeeping by hand, and each measurement in a small version."""
 
 import dataclasses
-import functools
 import json
 import math
 import shutil
@@ -12,6 +11,7 @@ import pytest
 
 import quadrl
 from quadrl.core.task import Target
+from quadrl.engines.engine import ENGINES
 from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning import benchmark
@@ -96,21 +96,17 @@ def test_shares_of_the_benchmark_are_within_one_turn():
     assert len(benchmark.rows(measured)) == 1 + len(measured["rates"])
 
 
-@pytest.fixture
-def short(monkeypatch):
-    """Trainings of one batch, and few episodes."""
-    monkeypatch.setattr(measure, "TrainConfig", functools.partial(TrainConfig, steps=4096))
+def test_trainings_are_evaluated_beside_the_controller_and_drawn(monkeypatch):
     monkeypatch.setattr(measure, "EPISODES", 2)
-
-
-def test_trainings_are_evaluated_beside_the_controller_and_drawn(short, monkeypatch):
-    monkeypatch.setattr(measure, "HOVER_SEEDS", (1, 2))
-    monkeypatch.setattr(measure, "VEHICLES", {"paper": None})
+    for engine in ENGINES:
+        settings = {"steps": 4096, "engine": engine}
+        study = {"tasks": ["hover"], "seeds": [1, 2], "episodes": 2, "settings": settings}
+        quadrl.study(study, out=report.RUNS / engine)
     report.save("training", report.beside("training", {"yardstick": [], "runs": []}, ()))
-    measure.training(only=("hover",))
+    measure.training((*report.RUNS.glob("*/*"),))
     result = report.load("training")
     assert [(run["engine"], run["seed"]) for run in result["runs"]] == [
-        (engine, seed) for engine in measure.ENGINES for seed in (1, 2)
+        (engine, seed) for engine in sorted(ENGINES) for seed in (1, 2)
     ]
     assert all(run["metrics"]["success_rate"] == 0 for run in result["runs"])
     (own,) = result["yardstick"]
