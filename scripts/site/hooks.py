@@ -5,13 +5,11 @@ from __future__ import annotations
 import posixpath
 import re
 from pathlib import Path
-from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.nav import Link, Navigation
 from mkdocs.structure.pages import Page
-from mkdocs.utils.templates import TemplateContext
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FLY = "fly/index.html"
@@ -56,13 +54,6 @@ def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
     link.parent = start
     start.children.insert(2, link)
     return nav
-
-
-def on_template_context(context: TemplateContext, template_name: str, **_: Any) -> TemplateContext:
-    """Make the links of the page of missing pages relative; theme/404.html says to what."""
-    if template_name == "404.html":
-        context["base_url"] = "."
-    return context
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -57,7 +57,9 @@ def test_links_lead_somewhere(site, pages):
             if ":" in link.partition("/")[0]:  # https:, mailto:
                 continue
             path, _, anchor = unquote(link).partition("#")
-            there = (page.parent / path).resolve() if path else page
+            # Of the page for missing ones, from the root of the server.
+            folder = site if path.startswith("/") else page.parent
+            there = (folder / path.lstrip("/")).resolve() if path else page
             if there.is_relative_to(site / "fly"):  # scripts/web makes it afterwards
                 continue
             assert there.exists(), f"{page.relative_to(site)}: {link}"
