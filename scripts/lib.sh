@@ -32,18 +32,15 @@ install_packages() {
 
 # find_python: prints the command of a Python that the dependencies have wheels for; $PYTHON overrules the choice.
 find_python() {
-    local candidate
-    if [ -n "${PYTHON:-}" ]; then
-        "$PYTHON" -c "$SUPPORTED" 2>/dev/null || die "PYTHON=$PYTHON is not a Python 3.11 or 3.12"
-        echo "$PYTHON"
-        return
-    fi
-    for candidate in python3 python3.12 python3.11 python; do
+    local candidate candidates=(python3 python3.12 python3.11 python)
+    [ -z "${PYTHON:-}" ] || candidates=("$PYTHON")
+    for candidate in "${candidates[@]}"; do
         if "$candidate" -c "$SUPPORTED" 2>/dev/null; then
             echo "$candidate"
             return
         fi
     done
+    [ -z "${PYTHON:-}" ] || die "PYTHON=$PYTHON is not a Python 3.11 or 3.12"
     die "needs Python 3.11 or 3.12, and found $(python3 --version 2>/dev/null || echo none)." \
         "(labmaze, which dm-control needs, has no wheels for later versions.)" \
         "Install one, or name it: PYTHON=/path/to/python3.12 $0"
@@ -52,14 +49,10 @@ find_python() {
 # has_compiler: whether the C compiler that quadrl.native will pick makes a shared library; C's headers belong to it.
 has_compiler() {
     local compiler library works=1
+    compiler="$(command -v ${CC:+"$CC"} cc gcc clang | head -n 1)"
     library="$(mktemp)"
-    for compiler in ${CC:+"$CC"} cc gcc clang; do
-        if command -v "$compiler" >/dev/null; then
-            printf '#include <math.h>\ndouble f(double x) { return sqrt(x); }\n' |
-                "$compiler" -shared -fPIC -x c -o "$library" - 2>/dev/null && works=0
-            break
-        fi
-    done
+    printf '#include <math.h>\ndouble f(double x) { return sqrt(x); }\n' |
+        "${compiler:-false}" -shared -fPIC -x c -o "$library" - 2>/dev/null && works=0
     rm -f "$library"
     return "$works"
 }
