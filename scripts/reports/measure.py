@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from quadrl.learning.folder import EVALUATION, METRICS, read_metrics
 from scripts.reports import report
 from scripts.reports.report import FIGURES, Result, Runs, asked, table
 
-SEEDS = 3  # of a task in its table
 EPISODES = 100  # of an evaluation
 LONGEST = {"race": 3600, "lsy_race": 3600} | dict.fromkeys(
     ("recovery", "trajectory", "perching", "deck_landing"), 600
@@ -116,14 +116,11 @@ def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
         [row for row in result[part] if (row["task"], row["vehicle"]) == (name, task.trained_on)]
         for part in ("runs", "yardstick")
     )
-    runs = [run for run in runs if run["engine"] == "free_flight"][:SEEDS]
+    runs = [run for run in runs if run["engine"] == "free_flight"][:3]  # of hover there are five
     rows = []
-    for target in task.targets:
-        cells = []
-        for metrics in (each["metrics"] for each in (*runs, *known)):
-            # Older trainings were not asked for all.
-            value = metrics.get(target.metric, "not measured")
-            cells.append(quantity(target.metric, value))
+    for target in task.targets:  # older trainings were not asked for all
+        values = (x["metrics"].get(target.metric, "not measured") for x in (*runs, *known))
+        cells = (quantity(target.metric, value) for value in values)
         rows.append((target.words, asked(target), *cells))
     seeds = [run["seed"] for run in runs]
     if runs:
@@ -140,5 +137,36 @@ def speed_table() -> str:
     return f"{table(head, rows)}\n\n{report.source(result)}"
 
 
-PARTS: report.Parts = {"training-hover": hover_table, "training-suite": suite_table,
+def figures() -> str:
+    """The figures of the README besides that of `claim`."""
+    measured, rows = report.load("speed"), []
+    for row in measured["rates"]:
+        if row["target"] and row["of"] in (benchmark.ALL_CORES, benchmark.ONE_CORE):
+            share = f"{row['share']:.2f} times bare `mj_step` on {row['of']}"
+            rows.append((row["what"], f"{row['rate']:,.0f} control steps/s; {share}"))
+    return f"{table(('`quadrl benchmark`', 'figure'), rows)}\n\n{report.source(measured)}"
+
+
+def claim() -> str:
+    """What hover takes and reaches, beside the command that shows it."""
+    result = report.load("training")
+    usual = {"task": "hover", "vehicle": "paper", "engine": "free_flight"}
+    runs = [run for run in result["runs"] if usual.items() <= run.items()]
+    took = [run["training_s"] for run in runs]
+    error = [1000 * run["metrics"]["position_error_m"] for run in runs]
+    solved = sum(run["metrics"]["success_rate"] == 1 for run in runs)
+    cells = (
+        "`quadrl train hover`",
+        f"{statistics.median(took):.1f} s ({min(took):.1f} to {max(took):.1f} s)",
+        f"100 % of {result['episodes']} fresh episodes with {solved} of {len(took)} seeds",
+        f"{min(error):.1g} to {max(error):.1g} mm",
+    )
+    head = ("command", "from nothing to the policy", "success", "error over the last 2 s")
+    where = f"{result['machine']['cores']} CPU cores without a GPU, in free flight"
+    words = f"*Median and range of the seeds, on {where}. [All trainings](results.md).*"
+    return f"{table(head, [cells])}\n\n{words}"
+
+
+PARTS: report.Parts = {"claim": claim, "figures": figures,
+                       "training-hover": hover_table, "training-suite": suite_table,
                        "speed": speed_table}  # fmt: skip

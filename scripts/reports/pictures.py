@@ -19,7 +19,7 @@ from quadrl import tasks
 from quadrl.base.progress import Progress
 from quadrl.core.scenario import Scenario
 from quadrl.core.trajectory import Trajectory
-from quadrl.evaluation.policy import SHIPPED, Policy
+from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import fly
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training
@@ -42,14 +42,9 @@ RELEASED: dict[str, Any] = {"radius": 1.2, "tilt": 0.3, "max_distance": 6.0, "ti
 PANEL = (400, 225)  # [pixels]
 FPS, LAST = 12.5, 1.5  # [1/s], [s] that the end is shown
 QUALITY = 30  # a task is then under 250 kB
-FLOWN = tuple(
-    name
-    for name, task in tasks.TASKS.items()
-    if (SHIPPED / f"{name}_{task.trained_by}.safetensors").exists()
-)
 
 
-def pictures(only: tuple[str, ...] = (*FLOWN, "learning")) -> None:
+def pictures(only: tuple[str, ...] = (*tasks.TASKS, "learning")) -> None:
     """Draw the tasks and a training in motion.
 
     Args:

@@ -37,7 +37,7 @@ FIGURES = {
 Result = dict[str, Any]
 Runs = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Parts = Mapping[str, Callable[[], str]]
-"""Parts of pages by name; a part that raises FileNotFoundError has not been measured yet."""
+"""Parts of pages by name."""
 
 
 def say(text: object) -> None:
@@ -46,11 +46,7 @@ def say(text: object) -> None:
 
 
 def load(name: str) -> Result:
-    """What was measured last.
-
-    Raises:
-        FileNotFoundError: Nothing was.
-    """
+    """What was measured last."""
 
     def unpack(found: Result) -> Any:
         if found.keys() == {"columns", "rows"}:

@@ -17,7 +17,7 @@ from quadrl.aircraft.aerodynamics import EFFECTS
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm
 from quadrl.base.units import length, quantity
-from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Randomization
+from quadrl.conditions.randomization import RANDOMIZATIONS
 from quadrl.conditions.weather import WEATHERS
 from quadrl.control import Gains, GeometricController
 from quadrl.control.reading import Reading
@@ -31,10 +31,7 @@ from quadrl.learning.defaults import WIDE
 from scripts.reports import report
 from scripts.reports.report import FIGURES, Result, Runs, say, table
 
-UNCERTAIN = Randomization(
-    mass=(0.8, 1.2), command_delay=(0.02, 0.02), noise=Errors(1e-3, 1e-3, 2e-3, 2e-3)
-)
-"""Unknown mass, late commands, and an estimate with the noise of the preset "light"."""
+NOISE = RANDOMIZATIONS["light"].noise
 NEAR, MOST = 0.5, 1.0  # [m]: errors within are summed up, a long way is none; the largest sum
 NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
 FRESH = 100_300  # first episode, beyond those that the gains were chosen by
@@ -61,18 +58,20 @@ class Integrating(GeometricController):
 
 UNDISTURBED: Conditions = {"weather": "calm", "randomization": "none", "aerodynamics": "none"}
 WIDER: Conditions = {"vehicle_options": {"action_scale": WIDE}}  # as the policies command
+UNCERTAIN: Conditions = {
+    "weather": "light",
+    "randomization": {"mass": (0.8, 1.2), "command_delay": 0.02, "noise": NOISE},
+}
 UNSURE: dict[str, Conditions] = {  # in which the policies for uncertain aircraft are flown
-    "uncertain": {"weather": "light", "randomization": UNCERTAIN},
-    "uncertain, drag only": {
-        "weather": "light", "randomization": UNCERTAIN, "aerodynamics": "none"
-    },
+    "uncertain": UNCERTAIN,
+    "uncertain, drag only": {**UNCERTAIN, "aerodynamics": "none"},
     "nothing": {},
     "50 ms of delay": {"randomization": {"command_delay": 0.05}},
     "half the lag": {"randomization": {"lag": 0.5}},
     "twice the lag": {"randomization": {"lag": 2.0}},
     "moderate weather": {"weather": "moderate"},
     "all together": ALL_TOGETHER,
-}  # fmt: skip
+}
 
 
 def conditions() -> dict[str, Conditions]:
@@ -157,9 +156,8 @@ def robustness(only: tuple[str, ...] = (), episodes: int = 100) -> None:
             shares = {label: found["success"] for label, found in shares.items()}
             alone.append({"task": task, "condition": name} | shares)
         card = quadrl.robustness(flyers, task, episodes=episodes)
-        (pictures := report.IMAGES / "robustness").mkdir(parents=True, exist_ok=True)
-        card.figure.save(pictures / f"{task}.png")
-        card.maps.save(pictures / f"{task}_recovery.png")
+        card.figure.save(report.IMAGES / "robustness" / f"{task}.png")
+        card.maps.save(report.IMAGES / "robustness" / f"{task}_recovery.png")
         (_, *names), *levels = card.table
         half += [{"task": task, "flown": x} | {row[0]: row[k + 1] for row in levels}
                  for k, x in enumerate(names)]  # fmt: skip
