@@ -93,22 +93,19 @@ def digest(thing: Any) -> str:
         TypeError: It is a function or an object whose content does not tell what it does.
         OSError: The source of a task cannot be read.
     """
-    return hashlib.sha256(json.dumps(_content(thing), sort_keys=True).encode()).hexdigest()
+    text = json.dumps(thing, sort_keys=True, default=_content)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _content(thing: Any) -> Any:
-    """The content of a thing as JSON."""
+    """The content of a thing that JSON does not know."""
     if isinstance(thing, np.generic):
         return thing.item()
-    if thing is None or isinstance(thing, (bool, int, float, str)):
-        return thing
     if isinstance(thing, np.ndarray):
         data = hashlib.sha256(thing.tobytes()).hexdigest()
         return [thing.dtype.str, list(thing.shape), data]
     if isinstance(thing, Mapping):
-        return {str(name): _content(value) for name, value in thing.items()}
-    if isinstance(thing, (list, tuple)):
-        return [_content(item) for item in thing]
+        return dict(thing)
     kind = thing if isinstance(thing, FunctionType) else type(thing)
     content: list[Any] = [kind.__module__, kind.__qualname__]
     own = kind.__module__.startswith("quadrl.") and "<" not in kind.__qualname__  # no closures
@@ -120,5 +117,5 @@ def _content(thing: Any) -> Any:
         # What an object of a dataclass has beside its fields it has computed from them.
         data_only = dataclasses.is_dataclass(thing)
         names = [f.name for f in dataclasses.fields(thing)] if data_only else vars(thing)
-        content.append({name: _content(getattr(thing, name)) for name in names})
+        content.append({name: getattr(thing, name) for name in names})
     return content

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, Unpack
 
@@ -27,8 +26,7 @@ EVALUATION_SEED = 1 << 53
 """Beyond the seeds of every training (2^32 * 2^20), so that evaluation episodes are fresh ones."""
 MAX_SEED, MAX_EPISODES = (1 << 32) - 1, 100_000
 FINAL_STRETCH = 2.0  # [s], over which position_error_m is the mean
-HISTORY = ("position", "quaternion", "velocity", "body_rate", "rotor_speed", "goal",
-           "target_velocity", "action", "rotor_command", "error", "reward", "wind")  # fmt: skip
+MOTION = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
 BEHAVIOUR = ("yaw_rate_rad_s", "circling_m_s", "command_change_rate", "saturated_rate",
              "least_height_m")  # fmt: skip
 """How an aircraft flies beside where: what `flights` says of it, in this order."""
@@ -60,48 +58,48 @@ def fly(
     scenario = scenario_of(controller, task, **conditions)
     environment = Environment(scenario, num_envs=episodes, seed=seed)
     controller = begun(controller, environment)
-    flown, timestep = environment.task, environment.vehicle.control_timestep
+    flown = environment.task
     observation = environment.flatten(environment.reset())
     steps, own = environment.time_limit_steps, records.leaves(environment.snapshot.task)
     numbers = 24 + 2 * len(environment.vehicle.rotors) + sum(a.size for a in own) // episodes
     machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
-    history: dict[str, list[np.ndarray]] = {name: [] for name in HISTORY}
-    remembered: dict[str, list[np.ndarray]] = {
-        field.name: [] for field in dataclasses.fields(environment.snapshot.task)
-    }
+    moments: list[dict[str, np.ndarray]] = []
+    remembered: list[dict[str, np.ndarray]] = []
+    markers = []
     alive = np.ones(episodes, dtype=bool)
     shape = episodes, environment.action_size
     length = np.zeros(episodes, dtype=int)
     ends = {name: np.zeros(episodes, bool) for name in ("terminated", "is_success", "diverged")}
-    markers = []
     while alive.any():
         taken = np.clip(action(controller(observation), shape), -1.0, 1.0)
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         markers.append(environment.markers())
-        state, goal = environment.snapshot.state, flown.goal(environment.snapshot)
-        moment = {"goal": goal, "action": taken, "error": now.error, "reward": now.reward}
-        moment["wind"] = environment.engine.wind
-        velocity = flown.target_velocity(environment.snapshot)
-        moment["target_velocity"] = np.zeros_like(goal) if velocity is None else velocity
-        moment["rotor_command"] = environment.snapshot.rotor_command / environment.vehicle.max_speed
-        for name, values in history.items():
-            value = moment[name] if name in moment else getattr(state, name)
-            values.append(_while(alive, value))
-        for name, values in remembered.items():
-            values.append(_while(alive, getattr(environment.snapshot.task, name)))
+        snapshot, goal = environment.snapshot, flown.goal(environment.snapshot)
+        velocity = flown.target_velocity(snapshot)
+        moment = {name: getattr(snapshot.state, name) for name in MOTION} | {
+            "goal": goal,
+            "target_velocity": np.zeros_like(goal) if velocity is None else velocity,
+            "action": taken,
+            "rotor_command": snapshot.rotor_command / environment.vehicle.max_speed,
+            "error": now.error,
+            "reward": now.reward,
+            "wind": environment.engine.wind,
+        }
+        moments.append(_while(alive, moment))
+        remembered.append(_while(alive, vars(snapshot.task)))
         length += alive
         for name, flag in ends.items():
             flag |= alive & getattr(now, name)
         alive &= ~(now.terminated | now.truncated)
     return Rollout(
-        **{name: np.stack(values) for name, values in history.items()},
-        remembered={name: np.stack(values) for name, values in remembered.items()},
+        **_stacked(moments),
+        remembered=_stacked(remembered),
         length=length,
         **ends,
         markers=tuple(markers),
         origin=np.array(environment.origin),
-        control_timestep=timestep,
+        control_timestep=environment.vehicle.control_timestep,
         task=flown,
     )
 
@@ -222,11 +220,17 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
     } | rollout.task.metrics(rollout)
 
 
-def _while(alive: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """A copy of values (N, ...) as numbers, NaN where an aircraft's episode is over."""
-    kept = np.array(values, dtype=float)
-    kept[~alive] = np.nan
+def _while(alive: np.ndarray, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Copies of values (N, ...) as numbers, NaN where an aircraft's episode is over."""
+    kept = {name: np.array(value, dtype=float) for name, value in values.items()}
+    for value in kept.values():
+        value[~alive] = np.nan
     return kept
+
+
+def _stacked(moments: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The values (N, ...) of every moment as one array (T, N, ...) each."""
+    return {name: np.stack([moment[name] for moment in moments]) for name in moments[0]}
 
 
 def _means(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
