@@ -63,7 +63,7 @@ def settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
         word = prefix + name.replace("_", "-")
         if name in PAIRS:
             yield " ".join((word, *(f"{option}={given}" for option, given in value.items())))
-        elif name == "randomization":
+        elif name in ("weather", "randomization") and isinstance(value, dict):
             yield f"{word} '{json.dumps(value)}'"
         elif isinstance(value, dict):
             yield from settings(value, f"{word}.")
