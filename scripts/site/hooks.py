@@ -12,8 +12,6 @@ from mkdocs.structure.nav import Link, Navigation
 from mkdocs.structure.pages import Page
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-FLY = "fly/index.html"
-"""Made by scripts/web after mkdocs, which therefore does not know it."""
 LINK = re.compile(r"\]\(([^)#\s]+)")
 SOURCE_PAGE = """---
 search:
@@ -50,7 +48,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
     """Link to the page that flies in the browser."""
-    link, start = Link("Fly it in the browser", FLY), nav.items[0]
+    # Made by scripts/web after mkdocs, which therefore does not know it.
+    link, start = Link("Fly it in the browser", "fly/index.html"), nav.items[0]
     link.parent = start
     start.children.insert(2, link)
     return nav
