@@ -50,20 +50,8 @@ class Completion:
             parse(["--tyro-print-completion", self.shell])
 
 
-Command = (
-    Tasks
-    | Train
-    | Study
-    | Evaluate
-    | Robustness
-    | Render
-    | View
-    | Plot
-    | Check
-    | Export
-    | Benchmark
-    | Completion
-)
+Command = (Tasks | Train | Study | Evaluate | Robustness | Render | View | Plot | Check | Export
+           | Benchmark | Completion)  # fmt: skip
 COMMANDS = {kind.__name__.lower(): kind for kind in typing.get_args(Command)}
 
 

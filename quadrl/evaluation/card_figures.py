@@ -76,7 +76,8 @@ def _panels(upper: Any, lower: Any, axis: Mapping[str, Any], flown: list[str]) -
         for half in (level for level in reached["half"] if level is not None):
             ring = {"marker": "o", "ms": 8, "mfc": "none", "mew": 1.6, "color": colour}
             upper.plot([half], [50], ls="none", zorder=5, **ring)
-        for panel, span in itertools.product((upper, lower), _unknown(levels, known)):
+        unknown = _outside(levels[0], levels[-1], x[0], x[-1])
+        for panel, span in itertools.product((upper, lower), unknown):
             panel.axvspan(*span, color=GREY, alpha=0.18, lw=0)
     _hatch((upper, lower), axis, flown)
     upper.axhline(50, color=GREY, lw=0.7, zorder=0)
@@ -106,8 +107,7 @@ def _view(axis: Mapping[str, Any]) -> tuple[float, float]:
 def _beyond(axis: Mapping[str, Any], name: str) -> list[tuple[float, float]]:
     """Stretches of the view that the actions of one that flew do not reach."""
     (start, end), (low, high) = _view(axis), axis.get("reach", {}).get(name, (None, None))
-    spans = [(start, start if low is None else low), (end if high is None else high, end)]
-    return [(first, last) for first, last in spans if first < last]
+    return _outside(start, end, start if low is None else low, end if high is None else high)
 
 
 def _hatch(panels: tuple[Any, Any], axis: Mapping[str, Any], flown: list[str]) -> None:
@@ -122,11 +122,9 @@ def _hatch(panels: tuple[Any, Any], axis: Mapping[str, Any], flown: list[str]) -
             panel.axvspan(start, end, **HATCHED, ec=colour, zorder=0)
 
 
-def _unknown(levels: np.ndarray, known: np.ndarray) -> list[tuple[float, float]]:
-    """Stretches of levels beyond the known ones."""
-    first, last = levels[known][0], levels[known][-1]
-    spans = [(levels[0], first), (last, levels[-1])]
-    return [(start, end) for start, end in spans if end > start]
+def _outside(start: float, end: float, low: float, high: float) -> list[tuple[float, float]]:
+    """The parts of a stretch that lie below and above two levels."""
+    return [(first, last) for first, last in ((start, low), (high, end)) if first < last]
 
 
 @styled

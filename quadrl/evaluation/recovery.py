@@ -84,24 +84,16 @@ def _falling(x: np.ndarray, y: np.ndarray, own: State, height: float, draw: Draw
 
 
 TILT = Scale("tilt", "deg", tuple(np.arange(0.0, 181.0, 15.0)))
+BODY_RATE = Scale("body rate", "rad/s", tuple(np.arange(0.0, 10.1)))
+LEVEL_SPEED = Scale("level speed", "m/s", tuple(np.arange(0.0, 12.1)))
+DESCENT_SPEED = Scale("descent speed", "m/s", tuple(np.arange(0.0, 6.1, 0.5)))
+HEIGHT = Scale("height above the ground", "m", tuple(np.arange(0.5, 6.1, 0.5)))
 MAPS = {
     one.name: one
     for one in (
-        RecoveryMap(
-            "tumbling",
-            TILT,
-            Scale("body rate", "rad/s", tuple(np.arange(0.0, 10.1))),
-            _tumbling,
-        ),
-        RecoveryMap(
-            "sideways", TILT, Scale("level speed", "m/s", tuple(np.arange(0.0, 12.1))), _sideways
-        ),
-        RecoveryMap(
-            "falling",
-            Scale("descent speed", "m/s", tuple(np.arange(0.0, 6.1, 0.5))),
-            Scale("height above the ground", "m", tuple(np.arange(0.5, 6.1, 0.5))),
-            _falling,
-        ),
+        RecoveryMap("tumbling", TILT, BODY_RATE, _tumbling),
+        RecoveryMap("sideways", TILT, LEVEL_SPEED, _sideways),
+        RecoveryMap("falling", DESCENT_SPEED, HEIGHT, _falling),
     )
 }
 """By name: tumbling thrown starts, flung sideways, and falling near the ground."""
