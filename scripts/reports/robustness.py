@@ -31,7 +31,7 @@ from quadrl.learning.defaults import WIDE
 from scripts.reports import report
 from scripts.reports.report import FIGURES, Result, Runs, say, table
 
-NOISE = RANDOMIZATIONS["light"].noise
+NOISE = RANDOMIZATIONS["light"].noise  # of the state estimate
 NEAR, MOST = 0.5, 1.0  # [m]: errors within are summed up, a long way is none; the largest sum
 NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
 FRESH = 100_300  # first episode, beyond those that the gains were chosen by
@@ -58,7 +58,7 @@ class Integrating(GeometricController):
 
 UNDISTURBED: Conditions = {"weather": "calm", "randomization": "none", "aerodynamics": "none"}
 WIDER: Conditions = {"vehicle_options": {"action_scale": WIDE}}  # as the policies command
-UNCERTAIN: Conditions = {
+UNCERTAIN: Conditions = {  # unknown mass, late commands, an estimate with noise
     "weather": "light",
     "randomization": {"mass": (0.8, 1.2), "command_delay": 0.02, "noise": NOISE},
 }
