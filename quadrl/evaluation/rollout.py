@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Unpack
 
@@ -60,9 +61,10 @@ def fly(
     controller = begun(controller, environment)
     flown = environment.task
     observation = environment.flatten(environment.reset())
-    steps, own = environment.time_limit_steps, records.leaves(environment.snapshot.task)
-    numbers = 24 + 2 * len(environment.vehicle.rotors) + sum(a.size for a in own) // episodes
+    steps, known = environment.time_limit_steps, records.leaves(environment.snapshot.task)
+    numbers = 24 + 2 * len(environment.vehicle.rotors) + sum(a.size for a in known) // episodes
     machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
+    own_fields = [field.name for field in dataclasses.fields(environment.snapshot.task)]
     moments: list[dict[str, np.ndarray]] = []
     remembered: list[dict[str, np.ndarray]] = []
     markers = []
@@ -87,7 +89,8 @@ def fly(
             "wind": environment.engine.wind,
         }
         moments.append(_while(alive, moment))
-        remembered.append(_while(alive, vars(snapshot.task)))
+        own = {name: getattr(snapshot.task, name) for name in own_fields}
+        remembered.append(_while(alive, own))
         length += alive
         for name, flag in ends.items():
             flag |= alive & getattr(now, name)
