@@ -1,7 +1,7 @@
 """Feasibility: whether actions can carry an aircraft, turn it, and respond in time.
 
-Commands stay within hover plus and minus `Vehicle.action_scale` in every control mode
-(`Vehicle.rotor_command`), with the hover speeds of the specified aircraft. One that a randomization
+Commands stay within hover plus and minus `Vehicle.action_scale` in most control modes
+(`ControlMode.reach`), with the hover speeds of the specified aircraft. One that a randomization
 draws may need more than that to hover level and still; no policy then holds it in the air.
 """
 
@@ -185,10 +185,11 @@ def warn_of_unreached(
         QuadrlError: The randomization does not fit the aircraft.
     """
     reach, scale = Reach(vehicle), vehicle.action_scale
+    vehicle = modes.kind(control_mode).reach(vehicle)
     if 2 * reach.room < scale:
         said = f"action_scale = {scale:g}: actions over {reach.room / scale:.2g} change nothing"
         _warn(f"{said}, since the rotors turn no faster; quadrl check suggests another")
-    carries = float(reach.loads(scale)[1][0])
+    carries = float(reach.loads(vehicle.action_scale)[1][0])
     if wind and wind > (held := min(held_wind(vehicle, carries), trim.fastest_held(vehicle))):
         said = f"the mean wind of {wind:.3g} m/s carries every aircraft off, whatever the policy"
         _warn(f"{said}: the rotors hold it in {held:.3g} m/s at most; ask for weaker weather")

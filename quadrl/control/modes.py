@@ -3,8 +3,8 @@
 An action is k numbers in [-1, 1]; each has a unit, a value at 0 and a scale that follow from the
 vehicle. `rotor` is the paper's, and holds for a control step. The others are flown by inner loops
 (`quadrl.control.loops`) that see the true state and command the rotors at every physics step, as
-an autopilot does. They stay within what `rotor` can command, hover plus and minus
-`Vehicle.action_scale`, so modes differ in their meaning and not in their power.
+an autopilot does. `thrust_body_rate` spans all that the rotors can do; the others stay within what
+`rotor` can command, hover plus and minus `Vehicle.action_scale`.
 
 Velocities and offsets are along the level heading: forward, left, up, as in the Crazyflie's hover
 setpoint and MAVLink's SET_POSITION_TARGET_LOCAL_NED with MAV_FRAME_BODY_OFFSET_NED (forward,
@@ -75,6 +75,11 @@ class ControlMode(abc.ABC):
         share = within(np.asanyarray(action, order="F"), -1.0, 1.0)
         return self.centre + np.where(share > 0.0, self.scale, self.scale_down) * share
 
+    @classmethod
+    def reach(cls, vehicle: Vehicle) -> Vehicle:
+        """The aircraft with the action scale that the mode has of the rotors."""
+        return vehicle
+
     def setpoint(self, state: State, action: Array) -> Array:
         """The setpoint (N, n) held for a control step, from the state in which the step begins."""
         return self.values(action)
@@ -130,7 +135,7 @@ class _Looped(ControlMode):
         """Place the poles for the physics step."""
         super().__init__(vehicle)
         timestep = vehicle.physics_timestep
-        self._loops = Loops(vehicle, timestep, self.controlled, share=self.share)
+        self._loops = Loops(self.reach(vehicle), timestep, self.controlled, share=self.share)
         self.centre = np.zeros(4)
 
 
@@ -155,14 +160,30 @@ class ThrustBodyRate(_Looped):
         self.scale = np.array([largest / weight - 1.0, *rates])
         self.scale_down = np.array([1.0 - least / weight, *rates])
 
+    @classmethod
+    def reach(cls, vehicle: Vehicle) -> Vehicle:
+        """All that the rotors can do, as rate controllers have it."""
+        return dataclasses.replace(vehicle, action_scale=float(np.max(vehicle.max_speed)))
+
     def rotor_command(self, state: State, setpoint: Array) -> Array:
         """The body rate loop alone."""
         thrust = self.vehicle.mass * GRAVITY * setpoint[:, :1]
         return self._loops.body_rate_command(state, thrust, setpoint[:, 1:])
 
 
-class EvenThrustBodyRate(ThrustBodyRate):
-    """The same with as much thrust to add as to take away, as it was: for what was saved then."""
+class ScaledThrustBodyRate(ThrustBodyRate):
+    """An earlier version within what `rotor` can command, for policies that were saved then."""
+
+    name = "thrust_body_rate-v1"
+
+    @classmethod
+    def reach(cls, vehicle: Vehicle) -> Vehicle:
+        """Hover plus and minus the vehicle's action scale."""
+        return vehicle
+
+
+class EvenThrustBodyRate(ScaledThrustBodyRate):
+    """The one before, with as much thrust to add as to take away."""
 
     name = "thrust_body_rate-v0"
 
@@ -240,9 +261,11 @@ CONTROL_MODES: dict[str, type[ControlMode]] = {
     mode.name: mode for mode in (Rotor, ThrustBodyRate, Velocity, Position)
 }
 """Every control mode by name."""
-RENAMED = {ThrustBodyRate.name: (EvenThrustBodyRate.name, "thrust_body_rate-v1")}
-"""Modes whose actions meant something else before: what files call them that were saved then, and
-what files call them now."""
+EARLIER = {mode.name: mode for mode in (EvenThrustBodyRate, ScaledThrustBodyRate)}
+"""Earlier versions of modes, which files name."""
+RENAMED = {ThrustBodyRate.name: (EvenThrustBodyRate.name, "thrust_body_rate-v2")}
+"""Modes whose actions meant something else before: what their bare names mean in files, and what
+files call them now."""
 
 
 def named(given: Any) -> str:
@@ -251,10 +274,10 @@ def named(given: Any) -> str:
     Raises:
         QuadrlError: Unknown name; the message lists the choices.
     """
-    for name, (before, saved) in RENAMED.items():
-        if given in (before, saved):
-            return before if given == before else name
-    return choice("control_mode", given, CONTROL_MODES)
+    for name, (_, saved) in RENAMED.items():
+        if given == saved:
+            return name
+    return given if given in [*EARLIER] else choice("control_mode", given, CONTROL_MODES)
 
 
 def to_save(name: str) -> str:
@@ -273,5 +296,4 @@ def kind(name: str) -> type[ControlMode]:
     Raises:
         QuadrlError: Unknown name; the message lists the choices.
     """
-    name = named(name)
-    return EvenThrustBodyRate if name == EvenThrustBodyRate.name else CONTROL_MODES[name]
+    return (EARLIER | CONTROL_MODES)[named(name)]
