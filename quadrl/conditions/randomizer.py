@@ -187,9 +187,7 @@ class Randomizer:
         arrays = *place, true, true[:, 7:], rotor_speed, noise, bias, found
         strides = (array.strides[0] // 8 for array in (true, rotor_speed, bias, found))
         # As `Rows` in native/disturbances.c.
-        noisy = given.noise != NONE.noise
-        addresses = (array.ctypes.data for array in arrays)
-        where = np.array([*addresses, *strides, rotors, noisy, NOISE])
+        where = native.struct(*arrays, *strides, rotors, given.noise != NONE.noise, NOISE)
         native.library().quadrl_estimate(where.ctypes.data, count)
         return found
 

@@ -248,11 +248,10 @@ class EstimatedState(Frame):
         super().__init__(count, rotors)
         self._coordinates = np.zeros((count, 13 + rotors))
         self._limits = parameters.limits(parameters.rows(engine.vehicle))
-        first = self._coordinates.ctypes.data
-        places = [first, first + 7 * 8, first + 13 * 8, engine.origin.ctypes.data]
-        places += [self._limits.ctypes.data, engine.air.ctypes.data]
-        places += [self._coordinates.shape[1], 0, self.columns, rotors]
-        self._rows = np.array(places)  # as `Rows` in native/state.c
+        motion = np.split(self._coordinates, [7, 13], axis=1)
+        arrays = (*motion, engine.origin, self._limits, engine.air)
+        # As `Rows` in native/state.c.
+        self._rows = native.struct(*arrays, 13 + rotors, 0, self.columns, rotors)
 
     def fill(self, coordinates: np.ndarray, rows: np.ndarray | None) -> State:
         """The state of some aircraft (n,), or of all.

@@ -15,7 +15,6 @@ stands in the aircraft's row of air (`engine.air`) meanwhile.
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -93,16 +92,6 @@ Weathered = str | Weather | Mapping[str, Any] | None
 """What `Weather.of` takes."""
 
 
-class _Rows(ctypes.Structure):
-    """`Rows` of native/weather.c."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("table", "keys", "episodes", "height", "air")),
-        *((name, ctypes.c_int64) for name in ("columns", "stride", "rotors")),
-        *((name, ctypes.c_double) for name in ("per_roughness", "timestep", "per_gust_time")),
-    ]
-
-
 def noise_time_of(vehicle: Vehicle) -> float:
     """Correlation time of the noise of the rotors' lift in the vortex ring state [s]; 0 for none.
 
@@ -146,17 +135,12 @@ class WeatherProcess:
         self._write(slice(None), fixed_of(weather.wind_speed, *self._setting))
         self._engine = engine  # its buffers stay where they are
         arrays = (self._whole, *self._streams, engine.qpos[:, 2], engine.air)
-        pointers = [array.ctypes.data for array in arrays]
-        self._rows = _Rows(
-            *pointers,
-            columns=self._whole.shape[1],
-            stride=engine.qpos.strides[0] // 8,
-            rotors=engine.vehicle.rotor_count if noise_time else 0,
-            per_roughness=1 / weather.roughness,
-            timestep=step,
-            per_gust_time=1 / weather.gust_time,
-        )
-        self._address = ctypes.addressof(self._rows)
+        rotors = engine.vehicle.rotor_count if noise_time else 0
+        sizes = self._whole.shape[1], engine.qpos.strides[0] // 8, rotors
+        scales = 1 / weather.roughness, float(step), 1 / weather.gust_time
+        # As `Rows` in native/weather.c.
+        self._rows = native.struct(*arrays, *sizes, *scales)
+        self._address = self._rows.ctypes.data
         self._kernel = native.library().quadrl_weather
 
     @classmethod

@@ -24,7 +24,7 @@ from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR
 from quadrl.aircraft.parameters import AIR, AIRCRAFT, MAX_ROTORS, ROW_SIZE, Parameters
 from quadrl.base.rotation import Array
 from quadrl.base.trace import Trace
-from quadrl.engines import dynamics
+from quadrl.engines import dynamics, native
 from quadrl.engines.native import compiling
 from quadrl.engines.threads import LANES
 
@@ -130,10 +130,7 @@ class Leg:
         filled = (self.world, end, from_start, from_command, path, left)
         block = self.parameters[0].size if self.parameters.ndim > 1 else 0
         # As `Legs` in native/adjoint.c.
-        legs = np.array(
-            [*(array.ctypes.data for array in taken), 0 if given is None else given.ctypes.data,
-             *(array.ctypes.data for array in filled), block]
-        )  # fmt: skip
+        legs = native.struct(*taken, given, *filled, block)
         column = int(PLACES["effects"][0])
         own = self.parameters[:, column] if block else self.parameters["effects"]
         # A row that names another number is a damaged one, and not a number afterwards.

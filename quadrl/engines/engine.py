@@ -100,11 +100,9 @@ class Engine(abc.ABC):
         self._limits = parameters.limits(self.parameters)
         arrays = (self.qpos, self.qvel, self.act, self.origin, self._limits, self.air)
         stride = self._limits.shape[1] if len(self._limits) > 1 else 0
+        sizes = self.frames[0].columns, self.vehicle.rotor_count
         # As `Rows` in native/state.c.
-        self._rows = np.array(
-            [*(array.ctypes.data for array in arrays), self.qpos.strides[0] // 8, stride,
-             self.frames[0].columns, self.vehicle.rotor_count]
-        )  # fmt: skip
+        self._rows = native.struct(*arrays, self.qpos.strides[0] // 8, stride, *sizes)
         self._address = self._rows.ctypes.data
 
     def write_parameters(self, rows: np.ndarray, table: np.ndarray) -> None:

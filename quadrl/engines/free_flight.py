@@ -44,12 +44,9 @@ class FreeFlight:
         """
         _check(model)
         self._kernel = native.library().quadrl_free_flight
-        count, stride = len(fields["qpos"]), fields["qpos"].strides[0] // 8
         self._fields = fields  # kept alive: the kernel knows their addresses
-        self._addresses = [fields[name].ctypes.data for name in FIELDS]
-        self._stride = stride
         self.world, self._solids = world(model), solids
-        self._near = np.zeros(count, dtype=np.int8)
+        self._near = np.zeros(len(fields["qpos"]), dtype=np.int8)
         self._threads = threads
 
     def use(self, table: np.ndarray) -> None:
@@ -61,11 +58,11 @@ class FreeFlight:
             self.parameters = np.empty((-(-len(table) // LANES), block // LANES, LANES))
             self.parameters[:] = numbers(table[:1])[0, : block // LANES, None]
             self.write(np.arange(len(table)), table)
-        about = (self._solids.table, self._solids.nearby)
-        last = (self.parameters, self.world, self._near, *about)
-        sizes = (self._stride, block, rotors, len(self._solids.geoms))
+        live, about = [self._fields[k] for k in FIELDS], (self._solids.table, self._solids.nearby)
+        arrays = (*live, self.parameters, self.world, self._near, *about)
+        sizes = (live[0].strides[0] // 8, block, rotors, len(self._solids.geoms))
         # As `Rows` in native/free_flight.c.
-        self._rows = np.array([*self._addresses, *(array.ctypes.data for array in last), *sizes])
+        self._rows = native.struct(*arrays, *sizes)
         self._address = self._rows.ctypes.data
 
     def write(self, rows: np.ndarray, table: np.ndarray) -> None:

@@ -154,10 +154,7 @@ class Solids:
             row = parameters.strides[0] // 8 if len(parameters) > 1 else 0
             arrays = (qpos, parameters, self.table, self.nearby)
             # As `Rows` in native/solids.c.
-            where = np.array(
-                [*(array.ctypes.data for array in arrays), qpos.strides[0] // 8, row,
-                 len(self.geoms), rotors]
-            )  # fmt: skip
+            where = native.struct(*arrays, qpos.strides[0] // 8, row, len(self.geoms), rotors)
             measure, about, into = self._kernel, where.ctypes.data, out.ctypes.data
             if rows is None:
                 self._threads.call(lambda first, end: measure(about, first, end, None, into))
