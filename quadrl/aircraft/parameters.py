@@ -110,10 +110,8 @@ def hover_thrust(table: np.ndarray) -> np.ndarray:
 def refresh(table: np.ndarray, timestep: float) -> None:
     """Recompute, in place, the parameters of rows that follow from the others."""
     count = int(table["rotor_count"][0])
-    rotor = table["rotor"][:, :count]
-    names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")
-    rows = mixer(*(rotor[name] for name in names))
-    squares = hover_squares(rows, hover_thrust(table), table["steady_moment"])
+    matrix = mixer(table["rotor"][:, :count])
+    squares = hover_squares(matrix, hover_thrust(table), table["steady_moment"])
     table["rotor"]["hover_speed"][:, :count] = np.sqrt(np.maximum(squares, 0.0))
     table["resolved_speed"] = resolved_speed(table["mass"], table["drag_coefficient"], timestep)
     least = table["inertia"].min(axis=-1)
@@ -154,10 +152,11 @@ class Parameters:
         """The same with a function applied to every array."""
         mapped = Parameters({})
         for name, value in vars(self).items():
-            whole = isinstance(value, float)
-            inner = value.map(function) if isinstance(value, Parameters) else value
-            is_array = not whole and not isinstance(value, Parameters)
-            setattr(mapped, name, function(value) if is_array else inner)
+            if isinstance(value, Parameters):
+                value = value.map(function)
+            elif not isinstance(value, float):
+                value = function(value)
+            setattr(mapped, name, value)
         return mapped
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -100,24 +100,20 @@ def plus(arm_length: float, **rotor: Any) -> tuple[Rotor, ...]:
     return ring((0, 90, 180, 270), (1, -1, 1, -1), arm_length, **rotor)
 
 
-def mixer(
-    position: np.ndarray, axis: np.ndarray, spin: np.ndarray, thrust: np.ndarray, torque: np.ndarray
-) -> np.ndarray:
+def mixer(rotor: Mapping[str, np.ndarray] | np.ndarray) -> np.ndarray:
     """Squares of the rotor speeds to thrust along z and moments: equation 7 for any layout.
 
     moment = k_T position x axis - spin k_Q axis.
 
     Args:
-        position: (..., R, 3) [m], body frame.
-        axis: (..., R, 3) unit vectors.
-        spin: (..., R), 1 or -1.
-        thrust: k_T (..., R) [N s^2].
-        torque: k_Q (..., R) [N m s^2].
+        rotor: Arrays (..., R) or (..., R, 3) by the names of the fields of `Rotor`.
 
     Returns:
         (..., 4, R).
     """
-    moment = thrust[..., None] * np.cross(position, axis) - (spin * torque)[..., None] * axis
+    axis, thrust = rotor["axis"], rotor["thrust_coefficient"]
+    reaction = (rotor["spin"] * rotor["torque_coefficient"])[..., None] * axis
+    moment = thrust[..., None] * np.cross(rotor["position"], axis) - reaction
     lift = (thrust * axis[..., 2])[..., None]
     return np.swapaxes(np.concatenate([lift, moment], axis=-1), -1, -2) + 0.0
 

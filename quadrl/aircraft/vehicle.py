@@ -184,8 +184,8 @@ class Vehicle:
     @functools.cached_property
     def mixer(self) -> np.ndarray:
         """(4, R): squares of the rotor speeds to thrust along z [N] and moments [N m]."""
-        names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")
-        return mixer(*(np.array([getattr(rotor, name) for rotor in self.rotors]) for name in names))
+        names = (field.name for field in dataclasses.fields(Rotor))
+        return mixer({name: np.array([getattr(r, name) for r in self.rotors]) for name in names})
 
     @functools.cached_property
     def hover_speed(self) -> np.ndarray:

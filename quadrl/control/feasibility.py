@@ -56,8 +56,7 @@ class Reach:
         table = parameters.rows(vehicle) if table is None else table
         self.vehicle = vehicle
         rotor = table["rotor"][:, : vehicle.rotor_count]
-        names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")
-        rows = mixer(*(rotor[name] for name in names))  # (n, 4, R)
+        rows = mixer(rotor)  # (n, 4, R)
         size = np.abs(rows).max(axis=-1, keepdims=True)
         rows = rows / size
         triples = [*itertools.combinations(range(vehicle.rotor_count), 3)]

@@ -66,8 +66,7 @@ def test_loads_are_the_least_and_the_most_of_a_linear_program(name):
     found = np.array(reach.loads(vehicle.action_scale))
     low, high = (speed**2 for speed in reach.speeds(vehicle.action_scale))
     for k, row in enumerate(table):
-        names = ("position", "axis", "spin", "thrust_coefficient", "torque_coefficient")
-        matrix = mixer(*(row["rotor"][name][:count] for name in names))
+        matrix = mixer(row["rotor"][:count])
         scaled = matrix / np.abs(matrix).max(axis=1, keepdims=True)
         weight = vehicle.mass * GRAVITY / np.abs(matrix[0]).max()
         for end, sign in ((0, 1.0), (1, -1.0)):
