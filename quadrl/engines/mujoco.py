@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import functools
 import os
 import weakref
-from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -134,8 +132,7 @@ class DataEngine(Engine):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For pickle and deepcopy: over the copy of its data that its owner has then."""
-        copied = functools.partial(DataEngine, altitude=self.origin[2], engine=self.name)
-        return _over, (copied, self.vehicle, self.data)
+        return _over, (self.vehicle, self.data, self.origin[2], self.name)
 
     def _model_field(self, name: str) -> np.ndarray:
         return getattr(self.model, name)[None]
@@ -178,8 +175,8 @@ class DataEngine(Engine):
         mujoco.mj_setState(self.model, self.data, saved["rows"][0], spec)
 
 
-def _over(copied: Callable[..., DataEngine], vehicle: Vehicle, data: mujoco.MjData) -> DataEngine:
-    return copied(vehicle, data.model, data)
+def _over(vehicle: Vehicle, data: mujoco.MjData, altitude: float, engine: EngineName) -> DataEngine:
+    return DataEngine(vehicle, data.model, data, altitude=altitude, engine=engine)
 
 
 def make(
