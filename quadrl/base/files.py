@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, with a digest, and read with care; locks."""
+"""Atomic writes, digests and checked reading of files, and locks of folders."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ from quadrl.base.errors import QuadrlError, QuadrlWarning
 
 UNREADABLE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError,
               RecursionError)  # fmt: skip
-"""What reading a damaged safetensors file and its header can raise."""
+"""Errors that reading a damaged safetensors file and its header can raise."""
 PART = ".part"
-"""Behind the name of a file that is not whole yet."""
+"""Suffix of a file that is still being written."""
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
-"""What a file system without locks says."""
+"""Error numbers of a file system without locks."""
 HEADER = "quadrl"
-"""The one entry of the file's table, JSON: safetensors writes several in random order."""
+"""Key of the header, JSON, in a safetensors file's metadata; several keys would be written in
+random order."""
 BLANK = b"0" * 64
-"""What stands in place of a digest while it is worked out: it comes first in a file."""
+"""Placeholder of a digest while it is computed; it comes first in a file."""
 DIGEST = re.compile(rb"digest\W{1,8}([0-9a-f]{64})")
-"""In JSON, or in JSON within JSON."""
+"""Finds a digest in JSON, or in JSON within JSON."""
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -50,24 +51,24 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write what JSON can hold, whole or not at all."""
+    """Write a value as JSON, whole or not at all."""
     write_whole(path, json.dumps(content, indent=2).encode())
 
 
 def write_csv(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write rows under the names of their columns, whole or not at all."""
+    """Write a .csv file of rows under the names of their columns, whole or not at all."""
     write_whole(path, csv_content([head, *rows]))
 
 
 def csv_content(rows: Iterable[Sequence[Any]]) -> bytes:
-    """The content of a .csv file, its head first."""
+    """The content of a .csv file; the first row is its head."""
     text = io.StringIO(newline="")
     csv.writer(text).writerows(rows)
     return text.getvalue().encode()
 
 
 def put(written: Path, path: Path) -> None:
-    """Move a file within its file system once it is on the disk, and sync the folder."""
+    """Sync a file to the disk, move it within its file system, and sync the folder."""
     _sync(written)
     os.replace(written, path)
     with contextlib.suppress(OSError):  # not every file system can do that with a folder
@@ -83,9 +84,9 @@ def _sync(path: Path) -> None:
 
 
 def free_name(path: Path, holding: str = "") -> Path:
-    """The path, or the first of NAME-2, NAME-3 and so on that is not there yet.
+    """The path, or the first of NAME-2, NAME-3 and so on that does not exist yet.
 
-    A folder counts as there with a file of the name `holding` in it.
+    With `holding`, a folder exists if it has a file of that name.
     """
     names = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(2))
     return next(x for x in itertools.chain([path], names) if not (x / holding).exists())
@@ -96,7 +97,7 @@ def lock(folder: Path) -> int:
 
     Raises:
         BlockingIOError: Another one holds the lock.
-        OSError: The folder cannot be opened, or its file system has no such locks (NO_LOCKS).
+        OSError: The folder cannot be opened, or its file system has no locks (NO_LOCKS).
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -114,7 +115,7 @@ def write_sealed(path: Path, content: bytes) -> None:
 
 
 def is_sealed(content: bytes) -> bool | None:
-    """Whether the digest of a file is that of its other bytes; None where it has no digest."""
+    """Whether the digest in a file matches its other bytes; None where it has no digest."""
     if (found := DIGEST.search(content)) is None:
         return None
     blank = content[: found.start(1)] + BLANK + content[found.end(1) :]
@@ -122,15 +123,15 @@ def is_sealed(content: bytes) -> bool | None:
 
 
 def check_seal(path: Path, content: bytes, *, unsealed: bool) -> None:
-    """Refuse a file that is not as it was written.
+    """Refuse a file whose content does not match its digest.
 
     Args:
         path: Its path.
         content: Its bytes.
-        unsealed: Whether it is of an earlier format, which has no digest.
+        unsealed: Whether its format is an earlier one, which has no digest.
 
     Raises:
-        QuadrlError: A digest is missing, or another one.
+        QuadrlError: The digest is missing or does not match.
     """
     sound = is_sealed(content)
     if sound is None and unsealed:
@@ -141,7 +142,7 @@ def check_seal(path: Path, content: bytes, *, unsealed: bool) -> None:
 
 
 def write_sealed_json(path: Path, content: Mapping[str, Any], form: str) -> None:
-    """Write a table as JSON, with a format and a digest."""
+    """Write a mapping as JSON, with its format and a digest."""
     sealed = {"digest": BLANK.decode(), "format": form, **content}
     write_sealed(path, json.dumps(sealed, indent=2).encode())
 
@@ -152,10 +153,10 @@ def read_sealed_json(path: Path, form: str, *, unsealed: bool = True) -> dict[st
     Args:
         path: The file.
         form: Its format.
-        unsealed: Whether it may be a table of an earlier quadrl, without a digest.
+        unsealed: Whether it may be of an earlier quadrl, without a digest.
 
     Raises:
-        QuadrlError: The file cannot be read, is no table, of another format, or damaged.
+        QuadrlError: The file cannot be read, is damaged, holds no mapping, or has another format.
     """
     try:
         content = path.read_bytes()
@@ -179,8 +180,8 @@ def write_safetensors(
     Args:
         path: The file.
         arrays: Arrays of one framework, by name.
-        header: What JSON can hold; its `format` says what the file is.
-        to_bytes: `save` of the framework's module of safetensors.
+        header: A mapping that JSON can hold; its `format` says what the file is.
+        to_bytes: `save` of the safetensors module for that framework.
     """
     text = json.dumps({"digest": BLANK.decode(), **header})
     write_sealed(path, to_bytes(arrays, metadata={HEADER: text}))
@@ -192,16 +193,16 @@ def read_safetensors(
     unsealed: Sequence[str],
     of_bytes: Callable[[bytes], dict[str, Any]],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arrays of a safetensors file, and the header that quadrl wrote into its table.
+    """Read the arrays of a safetensors file, and the header that quadrl wrote into its metadata.
 
     Args:
         path: The file.
-        wanted: What the header's format may be.
-        unsealed: Earlier formats, of files without a digest.
-        of_bytes: `load` of a framework's module of safetensors.
+        wanted: Formats that the header may name.
+        unsealed: Earlier formats, whose files have no digest.
+        of_bytes: `load` of the safetensors module for a framework.
 
     Raises:
-        QuadrlError: The file cannot be read, is damaged, or of another format.
+        QuadrlError: The file cannot be read, is damaged, or has another format.
     """
     try:
         content = path.read_bytes()
@@ -222,14 +223,14 @@ def read_safetensors(
 
 
 def read_table(path: Path, what: str) -> dict[str, Any]:
-    """The content of a .toml or .json file that holds a table.
+    """Read a .toml or .json file that holds a mapping.
 
     Args:
         path: The file.
-        what: It is, for the refusal of another kind of file.
+        what: What the file is, for the error message about another kind of file.
 
     Raises:
-        QuadrlError: It cannot be read, or is no such file.
+        QuadrlError: It cannot be read, or is not such a file.
     """
     if path.suffix not in (".toml", ".json"):
         raise QuadrlError(name=what, value=str(path), allowed="a .toml or a .json file")

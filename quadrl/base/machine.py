@@ -1,4 +1,4 @@
-"""The machine: what a measurement was made on, and how much memory there is."""
+"""The machine: processor, cores, versions of packages, and free memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from quadrl.base.errors import QuadrlError
 
 GIB = 1 << 30
 CGROUP = Path("/sys/fs/cgroup")
-WORTH_ASKING = 1 << 26  # [bytes]: less is not looked at, since the look takes time
+WORTH_ASKING = 1 << 26  # [bytes]: smaller allocations are not checked, since that takes time
 
 
 def machine() -> dict[str, str | int]:
@@ -30,7 +30,7 @@ def machine() -> dict[str, str | int]:
 
 
 def in_a_line(known: Mapping[str, str | int]) -> str:
-    """What `machine` returned, as text."""
+    """The description that `machine` returns, as a line of text."""
     rest = dict(known)
     cpu, count, system = (rest.pop(name) for name in ("cpu", "cores", "system"))
     versions = ", ".join(f"{name} {version}" for name, version in rest.items())
@@ -38,7 +38,7 @@ def in_a_line(known: Mapping[str, str | int]) -> str:
 
 
 def _cpuinfo() -> dict[str, str]:
-    """Linux's description of the first core; empty elsewhere."""
+    """The entries of /proc/cpuinfo for the first core; empty where there is no such file."""
     try:
         lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
     except OSError:
@@ -53,7 +53,7 @@ def processor() -> str:
 
 
 def processor_kind() -> str:
-    """The kind of processor, by which torch chooses its instructions, and so the last bits."""
+    """The kind of processor, by which torch chooses its instructions and so the last bits."""
     known = _cpuinfo()
     numbers = (f"{name} {known[name]}" for name in ("cpu family", "model") if name in known)
     return ", ".join((processor(), *numbers))
@@ -67,10 +67,10 @@ def cores() -> int:
 
 
 def free_memory() -> float:
-    """Memory that this process may still take [bytes]; infinite where nothing says.
+    """Memory that this process may still allocate [bytes]; infinite where it is unknown.
 
-    The least of what Linux says is available, of what is left of the limit of its control group
-    (a container's), and of what is left of its own (`ulimit -v`).
+    The least of three: what Linux reports as available, the rest of the limit of the process's
+    control group (a container's), and the rest of its own limit (`ulimit -v`).
     """
     left = [math.inf]
     with contextlib.suppress(OSError, ValueError, StopIteration):
@@ -89,14 +89,14 @@ def free_memory() -> float:
 
 
 def check_memory(what: str, size: float) -> None:
-    """Refuse what takes more memory than there is, before any is taken.
+    """Refuse an allocation that is larger than the free memory, before it is made.
 
     Args:
-        what: It, in words.
-        size: What it takes at least [bytes].
+        what: What is to be allocated, in words.
+        size: Memory that it takes at least [bytes].
 
     Raises:
-        QuadrlError: There is not as much; the message has both numbers.
+        QuadrlError: There is less; the message has both numbers.
     """
     if size > WORTH_ASKING and size > (free := free_memory()):
         reason = f"{what} would take {size / GIB:.1f} GiB of memory, and {free / GIB:.1f} are free"

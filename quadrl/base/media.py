@@ -20,7 +20,7 @@ class Media:
     kind: str
     """The file's ending: png, mp4, gif, pdf or svg."""
     make: Callable[[str], bytes] | None = dataclasses.field(default=None, compare=False)
-    """Makes the content of a file with another ending; None for videos."""
+    """Converts to the content of a file with another ending; None for videos."""
 
     def __repr__(self) -> str:
         return f"{self.kind}, {len(self.content) // 1024} kB; save(path) writes it"

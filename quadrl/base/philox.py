@@ -1,4 +1,4 @@
-"""Keyed random numbers in any array namespace: the definition of those that `engines/rng.py` draws.
+"""Keyed random numbers in any array namespace; `engines/rng.py` draws the same ones in C.
 
 Philox4x32-10 (Salmon, Moraes, Dror and Shaw, "Parallel Random Numbers: As Easy as 1, 2, 3", SC
 2011) of a key (the seed of a row, 64 bits) and a counter (number, stream, episode).
@@ -16,31 +16,31 @@ from quadrl.base.rotation import Array, namespace
 from quadrl.base.validation import number
 
 MAX_SEED = (1 << 62) - 1
-# Streams of an episode. A new purpose takes a new number, so that the others stay as they are.
+# Streams of an episode. A new purpose takes a new number, so that the others do not change.
 START, PARAMETERS, SOLIDS = 0, 1, 2
-WEATHER, TURBULENCE = 8, 9  # numbers of an episode; blocks of its control steps
-NOISE, PUSHES = 16, 17  # blocks of its control steps
-SENSORS = 1 << 30  # and further ones: two for each sensor, its noise and its bias
+WEATHER, TURBULENCE = 8, 9  # drawn once an episode; drawn at each control step
+NOISE, PUSHES = 16, 17  # drawn at each control step
+SENSORS = 1 << 30  # the first of two for each sensor, its noise and its bias
 MASK = 0xFFFFFFFF
 """Of a 32-bit word."""
 Seed = int | Sequence[int | None] | None
-"""Of all rows, or one for each; None for one from the system, or for none."""
+"""One seed for all rows, or one for each; None for a seed from the system, or for none."""
 
 
 def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
     """Select the rows that get a seed, (m,), and the seed of each of them, (m,).
 
     Args:
-        seed: Row i gets seed + i or, of a sequence, seed[i]; None there leaves a row its own.
-        rows: Numbers (n,) of the rows that it is for.
+        seed: Row i gets seed + i or, from a sequence, seed[i]; None in it leaves a row its own.
+        rows: Numbers (n,) of the rows to seed.
         count: Number of all rows.
 
     Raises:
-        QuadrlError: The seed of a row would be no whole number from 0 to `MAX_SEED`, or there are
+        QuadrlError: The seed of a row is not a whole number from 0 to `MAX_SEED`, or there are
             not `count` seeds.
     """
     if not isinstance(seed, (list, tuple, np.ndarray)):
-        # The last row has a seed, too.
+        # The seed of the last row must not be too large either.
         return rows, number("seed", seed, 0, MAX_SEED - (count - 1), whole=True) + rows
     if len(seed) != count:
         allowed = f"a whole number, or a sequence of {count}"
@@ -51,7 +51,7 @@ def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray,
 
 
 def philox(counter: tuple[Array, ...], key: tuple[Array, Array]) -> tuple[Array, ...]:
-    """The four 32-bit words of blocks.
+    """Compute the four 32-bit words of blocks.
 
     Args:
         counter: Four arrays of 32-bit words, held as int64.
@@ -72,7 +72,7 @@ def philox(counter: tuple[Array, ...], key: tuple[Array, Array]) -> tuple[Array,
 
 
 def uniform_array_api(keys: Array, episodes: Array, stream: int, first: int, count: int) -> Array:
-    """The definition of `uniform`, in any array namespace."""
+    """Draw the numbers of `engines.rng.uniform` in any array namespace."""
     xp = namespace(keys)
     blocks = range(first // 4, (first + count - 1) // 4 + 1)
     words: list[Array] = []

@@ -1,4 +1,4 @@
-"""Progress of a training, and a progress bar for terminals, notebooks and log files."""
+"""The progress of a training, and a progress bar for terminals, notebooks and log files."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Progress:
 
 
 class TimeLeft:
-    """The time that something counted still takes, at the speed since the first look."""
+    """Estimates the time left of counted work, from its speed since the first call."""
 
     def __init__(self) -> None:
-        """Begin with the first look."""
+        """Wait for the first call."""
         self._first: tuple[float, float] | None = None  # how much was done, and when [s]
 
     def left(self, done: float, total: float) -> str:
-        """The time left as text, such as "  2:05 min left"; empty where it cannot be known."""
+        """The time left as text, such as "  2:05 min left"; empty where it is not known."""
         now = time.monotonic()
         self._first = self._first or (done, now)
         before, since = self._first
@@ -42,9 +42,9 @@ class TimeLeft:
 
 
 class ProgressBar:
-    """A progress bar for a training or any other count; use it in a `with`."""
+    """A progress bar for a training or other counted work; use it in a `with` statement."""
 
-    LINE_SECONDS = 5.0  # between two lines where nothing can be redrawn
+    LINE_SECONDS = 5.0  # between two lines where the bar cannot be redrawn
     NOTEBOOK_SECONDS = 0.2  # between two updates in a notebook
     WIDTH = 24  # characters of the bar
 

@@ -1,4 +1,4 @@
-"""Operations on records: dataclasses of arrays with a leading axis N, perhaps of such records."""
+"""Operations on records: dataclasses of arrays with a leading axis N, which may be nested."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from quadrl.base.errors import QuadrlError
 
 
 def mapped(function: Callable[[Any], Any], record: Any) -> Any:
-    """A record with a function applied to each of its arrays; what is not an array stays."""
+    """A record with a function applied to each of its arrays; other values stay."""
     values = {}
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
@@ -26,7 +26,7 @@ def mapped(function: Callable[[Any], Any], record: Any) -> Any:
 
 
 def leaves(record: Any) -> list[Any]:
-    """A record's arrays, one after the other."""
+    """A record's arrays, in the order of its fields."""
     found: list[Any] = []
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
@@ -38,17 +38,17 @@ def leaves(record: Any) -> list[Any]:
 
 
 def filled(like: Any, arrays: Iterator[Any]) -> Any:
-    """A record of the kinds of another, with the next arrays, as `leaves` gives them."""
+    """A record like another one with the next arrays of an iterator, in the order of `leaves`."""
     return mapped(lambda _: next(arrays), like)
 
 
 def copied(record: Any) -> Any:
-    """A record whose arrays are its own."""
+    """A record with copies of the arrays."""
     return mapped(np.array, record)
 
 
 def owned(record: Any) -> Any:
-    """The same record where its arrays are its own, else a copy."""
+    """The same record if its arrays are neither views nor read-only, else a copy."""
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
         if value.base is not None or not value.flags.writeable:
@@ -74,13 +74,13 @@ def arrays(prefix: str, record: Any) -> dict[str, np.ndarray]:
 
 
 def of_arrays(prefix: str, like: Any, saved: Mapping[str, np.ndarray]) -> Any:
-    """Make a record like another one from the arrays that `arrays` returned."""
+    """A record like another one, from the arrays that `arrays` returned."""
     fields = dataclasses.fields(like)
     return type(like)(**{field.name: np.array(saved[f"{prefix}.{field.name}"]) for field in fields})
 
 
 def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) -> None:
-    """Refuse saved arrays of other names, shapes or kinds than one's own.
+    """Refuse saved arrays whose names, shapes or dtypes are not the expected ones.
 
     Raises:
         QuadrlError: The message names the array.
@@ -95,10 +95,10 @@ def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) 
 
 
 class Columns:
-    """Where arrays (N, ...) stand in a table (rows, N), a row per number."""
+    """The places of arrays (N, ...) in a table (rows, N), with a row for each number."""
 
     def __init__(self, first: int, arrays: list[Any]) -> None:
-        """Lay them out from a row on, by their shapes."""
+        """Lay the arrays out by their shapes, from row `first` on."""
         self._places: list[tuple[Any, int, tuple[int, ...]]] = []
         self.end = first
         for array in arrays:
@@ -107,7 +107,7 @@ class Columns:
             self._places.append((slice(start, self.end) if tail else start, len(tail), tail))
 
     def views(self, table: np.ndarray) -> list[np.ndarray]:
-        """The arrays in a table."""
+        """The arrays as views of a table."""
         return [
             table[place]
             if not axes

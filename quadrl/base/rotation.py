@@ -18,7 +18,7 @@ Array: TypeAlias = Any
 
 
 def namespace(array: Array) -> Any:
-    """The array API namespace of an array: NumPy itself for NumPy's (the short way)."""
+    """The array API namespace of an array; for NumPy's, which is quicker, NumPy itself."""
     if isinstance(array, (np.ndarray, np.generic)):
         return np
     return array_namespace(array)
@@ -30,7 +30,7 @@ def stack(*parts: Array) -> Array:
     if not isinstance(first, np.ndarray):
         return namespace(first).stack(parts, axis=-1)
     shape = (len(parts), *cast(np.ndarray, first).shape)
-    # Each component contiguous, as in the tables of the state: NumPy's loops then run over rows.
+    # Each component is contiguous, as in the state's tables: NumPy's loops then run over rows.
     whole = np.empty_like(first, np.result_type(*parts), shape=shape)
     for k, part in enumerate(parts):
         whole[k] = part
@@ -66,7 +66,7 @@ def norm(vector: Array) -> Array:
         return np.sqrt(cast(np.ndarray, square))
     xp = namespace(square)
     positive = square > 0
-    # The root's own gradient is infinite at zero, and infinity times zero is not a number.
+    # The gradient of the square root is infinite at zero, and infinity times zero is NaN.
     return xp.where(positive, xp.sqrt(xp.where(positive, square, xp.ones_like(square))), 0 * square)
 
 

@@ -1,4 +1,4 @@
-"""Triton beside Mesa: a crash of other libraries that `import quadrl` prevents."""
+"""Triton and Mesa in one process: `import quadrl` prevents that they crash."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pathlib import Path
 
 @functools.cache
 def shield_triton() -> None:
-    """Load triton's library, if it is installed, so that it can live beside Mesa's in one process.
+    """Load triton's library, if it is installed, so that it works beside Mesa's in one process.
 
     Each brings its own LLVM. Mesa's is visible to every library that is loaded after it, and
-    triton's would call into it and crash. Opened with RTLD_DEEPBIND it keeps to its own symbols,
-    and `import triton` then finds it loaded. It takes 0.05 s. Every order of pictures, this call
-    and the import works in which this call comes before the import.
+    triton's would call into it and crash. Opened with RTLD_DEEPBIND it uses its own symbols, and
+    `import triton` then finds it loaded. This takes 0.05 s and must come before `import triton`;
+    pictures may be drawn before or after.
     """
     if "triton" in sys.modules or not hasattr(os, "RTLD_DEEPBIND"):
         return

@@ -26,7 +26,7 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def handling(handlers: Mapping[int, Handler]) -> Generator[None]:
-    """Send signals to these functions; nowhere else than in the main thread can that be done."""
+    """Handle signals with these functions; do nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -48,7 +48,7 @@ def unheeded(*_: Any) -> None:
 
 
 IN_ORDER: Mapping[int, Handler] = {signal.SIGTERM: ending, signal.SIGUSR1: unheeded}
-"""How a command takes signals."""
+"""Handlers of signals for a command."""
 
 
 @contextlib.contextmanager
@@ -56,10 +56,10 @@ def heeded(ask: Callable[..., None]) -> Generator[None]:
     """Let signals `ask` a training for a checkpoint at the end of its iteration.
 
     After SIGTERM and Ctrl-C it stops there (`ask(stop=True)`); a further Ctrl-C stops it at once.
-    After SIGUSR1 it goes on.
+    After SIGUSR1 it continues.
 
     Raises:
-        Stopped: A signal came that stops it.
+        Stopped: A signal has stopped it.
     """
     came: list[int] = []
 

@@ -1,9 +1,9 @@
-"""Symbols in place of numbers: what a pure function of arrays computes, as C.
+"""The tracer: it turns pure functions of arrays into C, and differentiates them in reverse.
 
-A function that never branches on data takes the same operations for every row. Called with
-arrays of symbols, it writes them all down, one row's worth: the body of a loop over rows. The
-operations are NumPy's own, one by one and in the same order, so that the compiled loop gives the
-same bits (but sine and its like, which are the C library's).
+A function that never branches on data does the same operations for every row. Called with arrays
+of symbols in place of numbers, it records the operations of one row, which become the body of a
+loop over rows. They are NumPy's own, in the same order, so that the compiled loop gives the same
+bits (except for sine and the like, which are the C library's).
 """
 
 # pyright: standard
@@ -35,29 +35,29 @@ C: dict[str, str] = {
     "invert": "!{}",
     "logical_not": "!{}",
 }
-"""Operations by the names of NumPy's functions."""
+"""C of each operation, by the name of NumPy's function."""
 C |= {name: f"{{}} {sign} {{}}" for name, sign in OPERATORS.items()}
 C |= {name: f"{call}({{}})" for name, call in CALLS.items()}
 SOUND = {"maximum": "{0} < {1} ? {1} : {0}", "minimum": "{0} > {1} ? {1} : {0}"}
-"""The same where each is a number: by one question, so that GCC makes vector instructions."""
+"""The same for operands that are not NaN: with one comparison, so that GCC vectorises it."""
 LOGICAL = {name for name in C if name.startswith(("bitwise_", "logical_"))} | {"invert"}
-"""Those of truth values."""
+"""Operations on truth values."""
 FLAGS = LOGICAL | {name for name in C if name.startswith(("less", "greater", "equal", "not_"))}
-"""Those that give a truth value."""
+"""Operations that give a truth value."""
 ARRANGING = {
     np.stack, np.concatenate, np.broadcast_to, np.moveaxis, np.transpose, np.reshape, np.roll,
     np.expand_dims, np.squeeze, np.swapaxes, np.take, np.flip, np.tile, np.repeat, np.split,
     np.array_split, np.zeros_like, np.ones_like, np.empty_like, np.full_like, np.copyto,
     np.result_type, np.clip, np.max, np.min, np.sum, np.prod, np.any, np.all,
 }  # fmt: skip
-"""Functions that move numbers, or call the operations above; others might look at objects."""
+"""Functions that only move numbers or call the operations above; others might inspect objects."""
 REVERSE: dict[str, Callable[..., tuple[Any, ...]]] = {
     "add": lambda by, result, x, y: (by, by),
     "subtract": lambda by, result, x, y: (by, -by),
     "multiply": lambda by, result, x, y: (by * y, by * x),
     "divide": lambda by, result, x, y: (by / y, -(by / y) * result),
     "negative": lambda by, result, x: (-by,),
-    # At zero, where its slope is infinite, nothing: so a length has a derivative everywhere.
+    # Zero where the slope is infinite, so that a length has a derivative everywhere.
     "sqrt": lambda by, result, x: (np.where(result > 0, 0.5 * by / result, 0.0),),
     "absolute": lambda by, result, x: (np.where(x < 0, -by, np.where(x > 0, by, 0.0)),),
     "maximum": lambda by, result, x, y: (np.where(x >= y, by, 0.0), np.where(x >= y, 0.0, by)),
@@ -70,22 +70,22 @@ REVERSE: dict[str, Callable[..., tuple[Any, ...]]] = {
     "log": lambda by, result, x: (by / x,),
     "tanh": lambda by, result, x: (by * (1 - result * result),),
     "arctan": lambda by, result, x: (by / (1 + x * x),),
-    "floor": lambda by, result, x: (None,),  # it has steps, and between them no slope
+    "floor": lambda by, result, x: (None,),  # constant between its steps
     "look_up": lambda by, result, index: (None,),
 }
-"""From the derivative of a number by a result, and the result and its operands, those by them."""
+"""Derivatives by the operands, from the derivative by the result, the result and the operands."""
 MAX_OPERATIONS = 2500  # more would take the C compiler longer than they save
 MAX_TABLES = 1_000_000
-"""Numbers of the tables that a function looks up in."""
+"""Largest number of entries of all tables in which a function looks up values."""
 
 
 class NotCompilable(TypeError):
-    """A traced function does more than arithmetic, or reads what may change."""
+    """A traced function does more than arithmetic, or reads a value that may change."""
 
 
 @contextlib.contextmanager
 def symbolic() -> Generator[None]:
-    """Raise `NotCompilable` for any error of a function that is called with symbols."""
+    """Turn any error of a function that is called with symbols into `NotCompilable`."""
     try:
         yield
     except NotCompilable:
@@ -96,12 +96,12 @@ def symbolic() -> Generator[None]:
 
 
 class Symbol:
-    """A number that is known when the loop runs; the same operation gives the same symbol."""
+    """A number that is known when the loop runs; equal operations give the same symbol."""
 
     def __init__(
         self, trace: Trace, text: str, operation: str, operands: tuple[Any, ...], is_flag: bool
     ) -> None:
-        """Name the result of a C expression, which is an operation on others or reads memory."""
+        """Name the value of a C expression: an operation on symbols, or a read from memory."""
         self.trace, self.text, self.is_flag = trace, text, is_flag
         self.operation, self.operands = operation, operands
         self.name = f"t{len(trace.known)}"
@@ -114,14 +114,14 @@ class Symbol:
 
 
 class Trace:
-    """The operations of one row, in their order."""
+    """The recorded operations of one row, in order."""
 
     def __init__(self, max_operations: float = MAX_OPERATIONS, sound: bool = False) -> None:
-        """Begin with none.
+        """Begin with no operations.
 
         Args:
-            max_operations: More are refused.
-            sound: Whether the larger or smaller of two may be either where one is not a number.
+            max_operations: Largest number of operations.
+            sound: Whether `maximum` and `minimum` may return either operand where one is NaN.
         """
         self._texts = C | SOUND if sound else C
         self.known: dict[tuple[str, ...], Symbol] = {}
@@ -130,7 +130,7 @@ class Trace:
         self._tables: dict[bytes, int] = {}
 
     def inputs(self, expressions: Array, is_flag: bool = False) -> Symbols:
-        """Symbols of C expressions that read memory, an array of any shape."""
+        """Symbols of C expressions that read memory, in an array of any shape."""
 
         def read(text: str) -> Symbol:
             return self.known.setdefault((text,), Symbol(self, text, "", (), is_flag))
@@ -138,14 +138,14 @@ class Trace:
         return symbols(np.frompyfunc(read, 1, 1)(expressions))
 
     def read(self, place: str, numbers: Array) -> Symbols:
-        """Symbols of numbers in memory: a C expression with {} for the place of each."""
+        """Symbols of numbers in memory, by a C expression with {} for the index of each."""
         return self.inputs(np.frompyfunc(lambda number: place.format(int(number)), 1, 1)(numbers))
 
     def operation(self, name: str, *values: Any) -> Symbol:
-        """The symbol of a result.
+        """Record an operation and return the symbol of its result.
 
         Raises:
-            NotCompilable: There is no such operation in C.
+            NotCompilable: The operation has no C, or there are too many operations.
         """
         if name == "clip":
             name, values = "minimum", (self.operation("maximum", *values[:2]), values[2])
@@ -161,7 +161,7 @@ class Trace:
         return self.known.setdefault((name, *names), symbol)
 
     def look_up(self, table: np.ndarray, index: Symbol) -> list[Symbol]:
-        """Symbols (k,) of the entry of a table (n, k) that an index names, from 0 to n - 1.
+        """Symbols (k,) of the entry of a table (n, k) at an index from 0 to n - 1.
 
         Raises:
             NotCompilable: The tables are too large.
@@ -181,7 +181,7 @@ class Trace:
         return found
 
     def name_of(self, value: Any) -> str:
-        """How C names an operand; each number is a constant, so that options change no code."""
+        """The name of an operand in C; numbers are constants, so that options change no code."""
         if isinstance(value, Symbol):
             return value.name
         if _is_flag(value):
@@ -192,14 +192,14 @@ class Trace:
     def vector_jacobian_product(
         self, results: Iterable[Any], given: Iterable[Any], arguments: Iterable[Any]
     ) -> list[Any]:
-        """The derivatives of a number by symbols of the trace.
+        """The derivatives of a scalar by symbols of the trace.
 
-        A function that is defined piece by piece has the derivative of the piece that counts.
+        A function that is defined piece by piece has the derivative of the piece in use.
 
         Args:
-            results: What depends on the arguments, symbols and numbers.
-            given: The derivatives of the number by each result.
-            arguments: Symbols, in any order.
+            results: Symbols and numbers on which the scalar depends.
+            given: The derivatives of the scalar by each result.
+            arguments: Symbols to differentiate by, in any order.
 
         Raises:
             NotCompilable: An operation has no derivative here.
@@ -222,11 +222,11 @@ class Trace:
         return [by[symbol].item() if symbol in by else 0.0 for symbol in arguments]
 
     def body(self, outputs: Mapping[str, Any]) -> str:
-        """C that computes some outputs, by the expressions that name their memory."""
+        """C that computes outputs, given by the expressions of the memory that they go to."""
         stores = {place: self.name_of(value) for place, value in outputs.items()}
         used, lines = set(stores.values()), []
         for symbol in reversed(self.known.values()):
-            if symbol.name in used:  # in the end, by an output
+            if symbol.name in used:  # directly or indirectly, by an output
                 used.update(x.name for x in symbol.operands if isinstance(x, Symbol))
                 kind = "int" if symbol.is_flag else "double"
                 lines.append(f"const {kind} {symbol.name} = {symbol.text};")
@@ -238,7 +238,7 @@ class Symbols(np.ndarray):
     """An array of symbols and numbers that NumPy's functions take as they take any array."""
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
-        """Write an operation down for each element."""
+        """Record an operation for each element."""
         if method == "__call__" and not any(x is not None for x in options.values()):
             return elementwise(ufunc.__name__, *inputs)
         if ufunc.__name__ in LOGICAL and options.get("dtype") in (bool,):
@@ -258,7 +258,7 @@ class Symbols(np.ndarray):
         raise NotCompilable(f"{ufunc.__name__}.{method} cannot be compiled")
 
     def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
-        """Choose between symbols, or arrange them."""
+        """Record `where`, or rearrange symbols."""
         if function is np.where:
             return elementwise("where", *args)
         if function not in ARRANGING:
@@ -286,15 +286,15 @@ def elementwise(name: str, *arrays: Any) -> Symbols:
 
 
 def look_up(table: np.ndarray, index: Array) -> Array:
-    """Entries of a constant table, in any array namespace, and where a step is compiled.
+    """Entries of a constant table, in any array namespace, and in a step that is compiled.
 
     Args:
         table: Numbers (n, ...), at least one entry.
-        index: Whole numbers (...) from 0 on, held as floats. The last entry stands for all that
-            would come after it, the first for what would come before, and for what is no number.
+        index: Whole numbers (...) from 0 on, held as floats. A larger index gives the last entry;
+            a smaller one, or NaN, gives the first.
 
     Returns:
-        Numbers (..., *table.shape[1:]) of the index's kind.
+        Numbers (..., *table.shape[1:]) of the index's dtype.
     """
     table, xp = np.array(table, dtype=np.float64), namespace(index)
     last = float(len(table) - 1)

@@ -1,4 +1,4 @@
-"""Quantities as text: two or three digits, and the unit that fits."""
+"""Quantities as text, with two or three digits and a fitting unit."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 
 UNITS = {"_rad_s": "rad/s", "_m_s": "m/s", "_deg": "°", "_s": "s"}
-"""Units by the end of a metric's name; lengths (`_m`) and shares choose their own."""
+"""Units by the end of a metric's name; lengths (`_m`) and shares have their own functions."""
 
 SHARES = ("_rate", "_share")
-"""Ends of the names of shares, which are shown in percent."""
+"""Ends of the names of metrics that are shown in percent."""
 
 LENGTHS = (("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("µm", 1e-6))
 """Units of length and their sizes [m], the largest first."""
@@ -20,8 +20,8 @@ def quantity(name: str, value: object) -> str:
 
     Args:
         name: The metric's name, such as `position_error_m`, `success_rate` or `yaw_rate_rad_s`.
-        value: A number in the unit of the name; None stands for no number, and
-            anything else is shown as it is.
+        value: A number in the unit of the name, or None for no number; anything but a float is
+            shown as it is.
     """
     if value is None:
         return "none"
@@ -47,7 +47,7 @@ def length(metres: float, units: Sequence[tuple[str, float]] = LENGTHS) -> str:
 
 
 def percent(share: float) -> str:
-    """A share in percent; only all is 100 % and only none is 0 %."""
+    """A share in percent; only 1 is shown as 100 %, and only 0 as 0 %."""
     if not 0.0 < share < 1.0:
         return f"{100 * share:.0f} %"
     rest = max(1e-9, round(100.0 * min(share, 1.0 - share), 9))
@@ -56,7 +56,7 @@ def percent(share: float) -> str:
 
 
 def digits(value: float) -> str:
-    """A number with two digits, or all that stand before the point; three places at most."""
+    """A number with two digits, or all those before the point; with three decimals at most."""
     if not math.isfinite(value) or value == 0.0:
         return f"{value:g}"
     if abs(value) < 0.0005:

@@ -1,4 +1,4 @@
-"""The validator of every option and parameter: values are checked once, where they come in."""
+"""Validation of options and parameters, which are checked once, where they come in."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import numpy as np
 from quadrl.base.errors import QuadrlError, UnknownKeyword
 
 MAX_SEEDS = 1000
-WHOLE = 1e-6  # of a step, within which a delay is a whole number of them
+WHOLE = 1e-6  # of a step: tolerance with which a time is a whole number of steps
 MAX_OPTION = 1e9
-"""Larger options of a task would take the digits from what is added to them."""
+"""Largest number in an option of a task; with larger ones sums would lose their digits."""
 
 
 def number(
@@ -28,7 +28,7 @@ def number(
     whole: bool = False,
     positive: bool = False,
 ) -> Any:
-    """A finite number between `low` and `high`, as a float, or as an int where `whole`.
+    """A finite number between `low` and `high`, as a float, or as an int with `whole`.
 
     Raises:
         QuadrlError: It is not a number, not finite, or out of range.
@@ -46,10 +46,10 @@ def number(
 
 
 def whole_steps(name: str, times: Sequence[float], timestep: float, kind: str) -> tuple[int, ...]:
-    """Times [s] in steps.
+    """Times [s] in numbers of steps.
 
     Raises:
-        QuadrlError: One is not a multiple of the time step.
+        QuadrlError: A time is not a multiple of the time step.
     """
     steps = tuple(round(time / timestep) for time in times)
     if any(abs(time / timestep - k) > WHOLE for time, k in zip(times, steps, strict=True)):
@@ -62,7 +62,7 @@ def whole_steps(name: str, times: Sequence[float], timestep: float, kind: str) -
 def numbers(
     name: str, value: Any, size: int | None = None, low: float = -math.inf, high: float = math.inf
 ) -> tuple[float, ...]:
-    """`size` numbers, each between `low` and `high`; of any count where `size` is None.
+    """`size` numbers, each between `low` and `high`; any number of them if `size` is None.
 
     Raises:
         QuadrlError: It is not such a sequence.
@@ -143,10 +143,10 @@ def keys(what: str, given: Iterable[str], choices: Iterable[str]) -> None:
 
 
 def record(name: str, value: Any, kind: type, word: str = "field") -> Any:
-    """What is given, or the dataclass of a kind that it has some fields of, as JSON has them.
+    """A value as it is, or the dataclass `kind` made from a mapping of some of its fields.
 
     Raises:
-        UnknownKeyword: The kind has no such field; the message lists the choices.
+        UnknownKeyword: The dataclass has no such field; the message lists the choices.
     """
     if not isinstance(value, Mapping):
         return value
@@ -158,10 +158,10 @@ def record(name: str, value: Any, kind: type, word: str = "field") -> Any:
 def resolved(
     name: str, value: Any, kind: type, known: Mapping[str, Any] | None = None, word: str = "field"
 ) -> Any:
-    """A dataclass of a kind: as it is given, by a known name, or from some of its fields.
+    """An instance of the dataclass `kind`: as given, by a known name, or from some of its fields.
 
     Raises:
-        QuadrlError: It is something else, or there is no such name or field.
+        QuadrlError: The value is something else, or there is no such name or field.
     """
     if known and isinstance(value, str):
         return known[choice(name, value, known)]
@@ -174,7 +174,7 @@ def resolved(
 
 
 def registered(what: str, kind: Any, base: type, registry: Mapping[str, Any]) -> str:
-    """The name under which a class enters a registry.
+    """The name under which a class is registered.
 
     Raises:
         QuadrlError: It is not a subclass of the base with a name, or another class has the name.
@@ -191,7 +191,7 @@ def registered(what: str, kind: Any, base: type, registry: Mapping[str, Any]) ->
 
 
 def tuples(value: Any) -> Any:
-    """Lists as JSON has them to tuples, at any depth."""
+    """A value with each list turned into a tuple, at any depth."""
     if isinstance(value, dict):
         return {name: tuples(item) for name, item in cast(dict[str, Any], value).items()}
     return (
@@ -205,7 +205,7 @@ def like(name: str, value: Any, default: Any) -> Any:
     """A value of the same kind as a default: text, flag, finite number or sequence of numbers.
 
     Raises:
-        QuadrlError: It is of another kind, not finite, or larger than `MAX_OPTION`.
+        QuadrlError: The value is of another kind, not finite, or larger than `MAX_OPTION`.
     """
     if _kind(value) != _kind(default):
         allowed = f"a {_kind(default)}, such as {default!r}"
@@ -224,10 +224,10 @@ def like(name: str, value: Any, default: Any) -> Any:
 
 
 def rows(given: Any, count: int) -> np.ndarray:
-    """Numbers of rows, in order, from different numbers (n,) or a mask (count,).
+    """Numbers of rows in ascending order, from distinct numbers (n,) or a mask (count,).
 
     Raises:
-        QuadrlError: It is neither.
+        QuadrlError: What is given is neither.
     """
     array = np.asarray(given)
     if array.dtype == bool and array.shape == (count,):
@@ -242,10 +242,11 @@ def rows(given: Any, count: int) -> np.ndarray:
 
 
 def action(given: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """An action in double precision, a copy; what would be converted with a loss is refused.
+    """A copy of an action in double precision.
 
     Raises:
-        QuadrlError: Wrong shape or kind, or a number that is not finite.
+        QuadrlError: Wrong shape, a type that does not convert without loss, or a number that is
+            not finite.
     """
     if given is None:
         reason = "does the function that flies return its action?"
