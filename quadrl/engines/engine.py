@@ -73,14 +73,22 @@ class Engine(abc.ABC):
         )
         """(N, HIT) of this control step and (N, FEET) of this episode, live; (N, 0) in a world
         without solids."""
-        flies, flown = name != "mujoco", (self.model, fields, self._threads, self.solids)
-        self._free_flight = FreeFlight(*flown) if flies else None
+        rows = self._model_field("body_user")[:, 1]
+        self.parameters = rows.view(parameters.AIRCRAFT)[:, 0]
+        flown = self.model, fields, self.parameters, self._threads, self.solids
+        self._free_flight = FreeFlight(*flown) if name == "free_flight" else None
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
         self._middle: Frame | None = None
         library = native.library()
         self._kernel, self._first_unsound = library.quadrl_state, library.quadrl_unsound_air
-        self._use_parameters()
+        self._limits = parameters.limits(self.parameters)
+        arrays = (self.qpos, self.qvel, self.act, self.origin, self._limits, self.air)
+        stride = self._limits.shape[1] if len(self._limits) > 1 else 0
+        sizes = self.frames[0].columns, vehicle.rotor_count
+        # As `Rows` in native/state.c.
+        self._rows = native.struct(*arrays, self.qpos.strides[0] // 8, stride, *sizes)
+        self._address = self._rows.ctypes.data
 
     @property
     def state(self) -> State:
@@ -90,20 +98,6 @@ class Engine(abc.ABC):
     @abc.abstractmethod
     def _model_field(self, name: str) -> np.ndarray:
         """A field of the model with a leading axis (N or 1), live."""
-
-    def _use_parameters(self) -> None:
-        """Hand the rows of parameters to what reads them."""
-        rows = self._model_field("body_user")[:, 1]
-        self.parameters = rows.view(parameters.AIRCRAFT)[:, 0]
-        if self._free_flight is not None:
-            self._free_flight.use(self.parameters)
-        self._limits = parameters.limits(self.parameters)
-        arrays = (self.qpos, self.qvel, self.act, self.origin, self._limits, self.air)
-        stride = self._limits.shape[1] if len(self._limits) > 1 else 0
-        sizes = self.frames[0].columns, self.vehicle.rotor_count
-        # As `Rows` in native/state.c.
-        self._rows = native.struct(*arrays, self.qpos.strides[0] // 8, stride, *sizes)
-        self._address = self._rows.ctypes.data
 
     def write_parameters(self, rows: np.ndarray, table: np.ndarray) -> None:
         """Give some aircraft (n,) parameters (n,) of their own; MuJoCo's own fields follow."""

@@ -29,38 +29,40 @@ class FreeFlight:
     """Advances the rows of a simulation in place."""
 
     def __init__(
-        self, model: mujoco.MjModel, fields: dict[str, np.ndarray], threads: Threads, solids: Solids
+        self,
+        model: mujoco.MjModel,
+        fields: dict[str, np.ndarray],
+        table: np.ndarray,
+        threads: Threads,
+        solids: Solids,
     ) -> None:
         """Check the model and take the addresses.
 
         Args:
             model: A model of `quadrl.engines.mjcf`.
             fields: Live arrays (N, k) of FIELDS, all with one stride between aircraft.
-            threads: To fly on.
-            solids: Those about the aircraft.
+            table: Rows of parameters (N,), or one (1,) for all, which is live.
+            threads: Threads to fly on.
+            solids: The solids about the aircraft.
 
         Raises:
-            QuadrlError: The model holds something that free flight knows nothing of.
+            QuadrlError: The model holds something that free flight does not know.
         """
         _check(model)
-        self._kernel = native.library().quadrl_free_flight
-        self._fields = fields  # kept alive: the kernel knows their addresses
-        self.world, self._solids = world(model), solids
+        self._kernel, self._threads = native.library().quadrl_free_flight, threads
+        self.world = world(model)
         self._near = np.zeros(len(fields["qpos"]), dtype=np.int8)
-        self._threads = threads
-
-    def use(self, table: np.ndarray) -> None:
-        """Take rows of parameters (N,), or one (1,) for all; that one is live."""
         # As the kernels read them: the row, or blocks of LANES rows side by side.
-        self.parameters, block, rotors = table, 0, self._fields["act"].shape[1]
+        self.parameters, block, rotors = table, 0, fields["act"].shape[1]
         if len(table) > 1:
             block = LANES * (ROW_SIZE - (MAX_ROTORS - rotors) * ROTOR.itemsize // 8)
             self.parameters = np.empty((-(-len(table) // LANES), block // LANES, LANES))
             self.parameters[:] = numbers(table[:1])[0, : block // LANES, None]
             self.write(np.arange(len(table)), table)
-        live, about = [self._fields[k] for k in FIELDS], (self._solids.table, self._solids.nearby)
+        live, about = [fields[name] for name in FIELDS], (solids.table, solids.nearby)
         arrays = (*live, self.parameters, self.world, self._near, *about)
-        sizes = (live[0].strides[0] // 8, block, rotors, len(self._solids.geoms))
+        sizes = (live[0].strides[0] // 8, block, rotors, len(solids.geoms))
+        self._alive = arrays  # the kernel knows their addresses
         # As `Rows` in native/free_flight.c.
         self._rows = native.struct(*arrays, *sizes)
         self._address = self._rows.ctypes.data

@@ -112,11 +112,7 @@ QUADRL_EXPORT void quadrl_adjoint(const Legs* legs, int64_t count, int64_t steps
   Setting s;
   Aircraft same;
   Lanes m[ROWS] = {{0}}, m_[ROWS], command_[MAX_ROTORS];
-  if (!r.block) {
-    for (int k = 0; k < ROW_SIZE; ++k) {
-      for (int i = 0; i < LANES; ++i) ((double*)&same)[k * LANES + i] = r.parameters[k];
-    }
-  }
+  if (!r.block) spread(r.parameters, &same);
   const Aircraft* a = r.block ? (const Aircraft*)r.parameters : &same;
   const int rows = SPEED + ROTORS;
   for (int64_t row = 0; row < count; row += LANES) {

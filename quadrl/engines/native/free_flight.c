@@ -129,11 +129,7 @@ QUADRL_EXPORT int64_t quadrl_free_flight(const Rows* rows, int64_t first, int64_
   Aircraft same;
   const double time = steps * world->timestep;
   int64_t marked = 0;
-  if (!r.block) {
-    for (int k = 0; k < ROW_SIZE; ++k) {
-      for (int i = 0; i < LANES; ++i) ((double*)&same)[k * LANES + i] = r.parameters[k];
-    }
-  }
+  if (!r.block) spread(r.parameters, &same);
   const Aircraft* a = r.block ? (const Aircraft*)r.parameters : &same;
   const int rotors = (int)r.rotors;
   for (int64_t row = first; row < last; row += LANES) {

@@ -31,6 +31,13 @@ typedef struct {
   Disc disc[MAX_ROTORS];
 } Setting;
 
+// Gives every lane the same row of parameters.
+static inline void spread(const double* row, Aircraft* a) {
+  for (int k = 0; k < ROW_SIZE; ++k) {
+    for (int i = 0; i < LANES; ++i) ((double*)a)[k * LANES + i] = row[k];
+  }
+}
+
 // Whether a row of parameters, which may be live, is still one that is flown with so many rotors.
 INLINE int is_sound(const Aircraft* a, int rotors, int i) {
   return a->rotor_count[i] == rotors && aero_effects(a, i) >= 0;
