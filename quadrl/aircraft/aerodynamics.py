@@ -1,8 +1,7 @@
 """Effects of the air on the rotors beyond equation 7, and which of them act on an aircraft.
 
-All of it is off by default, so that the paper's equations stay what they are. The forces stand in
-`engines/native/aero.h` and in `engines/dynamics.py`; docs/physics.md has the equations with their
-sources.
+All are off by default, which leaves the paper's equations. `engines/native/aero.h` and
+`engines/dynamics.py` have the forces, docs/physics.md the equations with their sources.
 """
 
 # pyright: reportUnnecessaryIsInstance=false
@@ -26,11 +25,11 @@ MOST_OFFSET = 0.2
 MOST_TAKEN = 0.36
 """Largest share of the flow through a disc that the ground takes: lift over 0.64."""
 WINDMILL = 1.85
-"""What the flow through a disc falls by over what a descent exceeds 2 w0 by, on the way to the
+"""By how much the flow through a disc falls for each m/s of descent beyond 2 w0, on the way to the
 windmill state: chosen for 1.58 times the thrust of hover at 2.4 w0, a Crazyflie's by Johnson's
 model (NASA/TP-2005-213477)."""
 STILL_AIR, ROTOR_EFFECTS, GROUND_EFFECT = range(3)
-"""`Aerodynamics.effects`: none, those of the air on rotors, and of the ground beside them."""
+"""Values of `Aerodynamics.effects`: none, effects on the rotors, and also that of the ground."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +118,7 @@ class Aerodynamics:
 
     @property
     def effects(self) -> int:
-        """Which variant of the kernels an aircraft needs."""
+        """The variant of the kernels that an aircraft needs."""
         if self.ground_effect:
             return GROUND_EFFECT
         return ROTOR_EFFECTS if any(getattr(self, name) for name in SWITCHES) else STILL_AIR
@@ -129,7 +128,7 @@ SWITCHES = (
     *("inflow", "ground_effect", "rotor_drag", "flapping_moment"),
     *("vortex_ring", "vortex_ring_noise", "rotor_inertia"),
 )
-"""Fields that are False or 0 where an effect is off."""
+"""Fields that switch an effect off by False or 0."""
 EFFECTS = {
     "inflow": ("inflow",),
     "rotor_drag": ("rotor_drag", "flapping_moment"),
@@ -137,7 +136,7 @@ EFFECTS = {
     "vortex_ring": ("inflow", "vortex_ring", "vortex_ring_noise"),
     "rotor_inertia": ("rotor_inertia",),
 }
-"""What can be asked for by name, and the fields that it takes from the full set."""
+"""Effects that can be asked for by name, and the fields that each takes from the full set."""
 NONE, FULL = "none", "full"
 
 
@@ -152,7 +151,7 @@ def check_air(
     """Refuse discs that make power from nothing, and effects that are too fast for the step.
 
     Args:
-        air: What the air does to the rotors of an aircraft.
+        air: Effects of the air on the rotors of an aircraft.
         rotors: Its rotors.
         mass: Its mass [kg].
         inertia: Its principal moments [kg m^2].

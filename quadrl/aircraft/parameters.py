@@ -1,6 +1,6 @@
-"""Rows of parameters: what the engines know of each aircraft, one C struct per row.
+"""Rows of parameters: the numbers of each aircraft that the engines use, one C struct per row.
 
-The struct follows from the numeric fields of `Rotor`, `Vehicle` and `Aerodynamics`: a new
+The struct is generated from the numeric fields of `Rotor`, `Vehicle` and `Aerodynamics`: a new
 parameter is a field there, and `engines/native/aero.h` and `engines/dynamics.py` find it by its
 name. A row stands in the `user` data of the aircraft's body (`body_user`), where the callbacks
 read it; free flight reads the same bytes.
@@ -28,27 +28,27 @@ from quadrl.base.rotation import Array
 
 WIND = 3
 AIR = WIND + MAX_ROTORS
-"""Numbers of a row of air, in the simulation's `userdata`: the wind [m/s], world frame, and for
-each rotor the noise of its thrust in the vortex ring state, of unit variance."""
+"""Size of a row of air, in the simulation's `userdata`: the wind [m/s], world frame, and for each
+rotor the noise of its thrust in the vortex ring state, of unit variance."""
 HIT = 2
-"""Numbers behind the air, in a world with solids: the number of the solid that was hit fastest in
-this control step, from 1 on (0 for none), and the speed of that hit [m/s]."""
+"""How many numbers follow the air in a world with solids: the number of the solid that was hit
+fastest in this control step, from 1 on (0 for none), and the speed of that hit [m/s]."""
 FEET, HELD = 6, 5
-"""Numbers behind those: 1 once a foot has touched a solid, and from the moment of that touch the
-speed into the solid and along it [m/s], the cosine of the angle between the body's z axis and the
-solid's normal, and the body rate [rad/s]; at last (`HELD`) 1 once a solid that grips holds one."""
+"""How many follow those: 1 once a foot has touched a solid; at the moment of that touch the speed
+into the solid and along it [m/s], the cosine of the angle between the body's z axis and the solid's
+normal, and the body rate [rad/s]; and, at index `HELD`, 1 once a solid grips a foot."""
 MARK = 1903518052.0
-"""Tells the actuators and bodies of quadrl from everybody else's: "quad" in ASCII."""
+"""Marks the actuators and bodies of quadrl: "quad" in ASCII."""
 SETTINGS = (
     *("name", "rotors", "action_scale", "physics_timestep", "control_timestep", "aerodynamics"),
     "dead_time",
 )
-"""Fields of `Vehicle` that are not a parameter of an aircraft's row."""
+"""Fields of `Vehicle` that are not in a row."""
 DERIVED = ("foot", "hull", "ground_clearance", "rotor_height", "resolved_speed", "resolved_turn")
-"""Properties of `Vehicle` that stand in a row."""
+"""Properties of `Vehicle` that are in a row."""
 STEADY = ("steady_force", "steady_moment")
-"""What acts on an aircraft for an episode, zero unless it is drawn: a force [N], world frame, and a
-moment [N m], body frame, (3,) each."""
+"""Force [N], world frame, and moment [N m], body frame, (3,) each, that act on an aircraft for an
+episode; zero unless they are drawn."""
 
 
 def _fields(kind: type, settings: tuple[str, ...] = ()) -> list[Any]:
@@ -61,7 +61,7 @@ ROTOR = np.dtype([*_fields(Rotor), ("hover_speed", np.float64)])
 AIRCRAFT = np.dtype(
     [
         ("mark", np.float64),
-        ("size", np.float64),  # numbers in a row, against a model of another version
+        ("size", np.float64),  # of a row, which tells a model of another version
         ("rotor_count", np.float64),
         *_fields(Vehicle, SETTINGS),
         *((name, np.float64, (3,) if name in ("foot", "hull") else ()) for name in DERIVED),
@@ -92,23 +92,23 @@ def rows(vehicle: Vehicle, count: int = 1) -> np.ndarray:
 
 
 def numbers(table: np.ndarray) -> np.ndarray:
-    """Rows (n,) as the doubles that they are, (n, ROW_SIZE)."""
+    """Rows (n,) as doubles (n, ROW_SIZE)."""
     return np.ascontiguousarray(table).view(np.float64).reshape(len(table), -1)
 
 
 def limits(table: np.ndarray) -> np.ndarray:
-    """Largest speed [m/s] and spin [rad/s] of rows (n,), (n, 2): as native/state.c has them."""
+    """Largest speed [m/s] and body rate [rad/s] of rows (n,), (n, 2), for native/state.c."""
     return np.stack([table["resolved_speed"], table["resolved_turn"]], axis=1)
 
 
 def hover_thrust(table: np.ndarray) -> np.ndarray:
-    """Thrust (n,) [N] that holds rows in place, against their weight and the steady force."""
+    """Thrust (n,) [N] with which rows hover against their weight and the steady force."""
     x, y, z = table["steady_force"].T
     return np.sqrt(x**2 + y**2 + (table["mass"] * GRAVITY - z) ** 2)
 
 
 def refresh(table: np.ndarray, timestep: float) -> None:
-    """Recompute, in place, the parameters of rows that follow from the others."""
+    """Update, in place, the parameters of rows that follow from the others."""
     count = int(table["rotor_count"][0])
     matrix = mixer(table["rotor"][:, :count])
     squares = hover_squares(matrix, hover_thrust(table), table["steady_moment"])
@@ -138,9 +138,9 @@ class Parameters:
         """Views of rows (N,).
 
         Args:
-            table: Rows, which the views show live.
-            control_timestep: Kept beside them, a float [s].
-            rotors: How many; None for what the rows say.
+            table: Rows; the views are live.
+            control_timestep: Control timestep [s], which is kept beside them.
+            rotors: Number of rotors; None for the rows' own.
         """
         count = int(table["rotor_count"][0]) if rotors is None else rotors
         rotor = table["rotor"][:, :count]

@@ -204,13 +204,13 @@ def _of_fields(given: Mapping[str, Any]) -> Vehicle:
 
 
 def in_real_air(vehicle: Vehicle) -> Vehicle:
-    """A vehicle with every effect of the air: its own set, or that of the known one of its name.
+    """A vehicle with every effect of the air: its own set, or that of the preset of its name.
 
-    With rotor drag on, the quadratic drag is what remains beside it: the presets whose
-    `drag_coefficient` stands for both keep a share.
+    Where `drag_coefficient` also stands for the drag of the rotors, as in most presets, only a
+    share of it is kept once rotor drag acts.
 
     Raises:
-        QuadrlError: It has no set of its own, and its name is not one of `REAL_AIR`.
+        QuadrlError: The vehicle has no set of its own, and its name is not one of `REAL_AIR`.
     """
     return with_effects(vehicle, FULL)
 
@@ -220,11 +220,11 @@ def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> V
 
     Args:
         vehicle: The aircraft.
-        aerodynamics: "none", "full", names of EFFECTS with commas between them (each with the
-            numbers of the full set), an Aerodynamics; None for what the vehicle has.
+        aerodynamics: "none", "full", names of EFFECTS separated by commas (each with the numbers
+            of the full set), or an Aerodynamics; None for those that the vehicle has.
 
     Raises:
-        QuadrlError: Unknown name, or a vehicle for which there is no full set.
+        QuadrlError: A name is unknown, or there is no full set for the vehicle.
     """
     if aerodynamics is None:
         return vehicle
@@ -250,10 +250,10 @@ def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> V
 
 
 def at_air_density(vehicle: Vehicle, air_density: float) -> Vehicle:
-    """A vehicle in thinner or denser air: all that the air gives and takes is in proportion to it.
+    """A vehicle in thinner or denser air, to which thrust, torque and drag are proportional.
 
     Args:
-        vehicle: The aircraft, with coefficients for the density that its aerodynamics name.
+        vehicle: The aircraft, with coefficients for the density of its aerodynamics.
         air_density: rho [kg/m^3]: 1.225 at sea level, 1.007 at 2,000 m (standard atmosphere).
 
     Raises:
@@ -271,10 +271,10 @@ def at_air_density(vehicle: Vehicle, air_density: float) -> Vehicle:
 
 
 def check_known(vehicle: Vehicle) -> None:
-    """Refuse rotors whose numbers in the full set would be those of other rotors.
+    """Refuse a vehicle with the name of a preset whose full set is for other rotors.
 
     Raises:
-        QuadrlError: The vehicle has the name of a known one, and other discs or another thrust.
+        QuadrlError: The vehicle has the name of a preset, but other discs or another thrust.
     """
 
     def rotors(one: Vehicle) -> list[tuple[float, str]]:

@@ -121,7 +121,7 @@ def mixer(rotor: Mapping[str, np.ndarray] | np.ndarray) -> np.ndarray:
 def hover_squares(mixer: np.ndarray, thrust: Array, moment: Array = 0.0) -> np.ndarray:
     """Smallest squares of the rotor speeds (..., R) that give a thrust (...) [N].
 
-    The moment (..., 3) [N m] is what acts on the aircraft beside them, which they hold.
+    They also balance a moment (..., 3) [N m] that acts on the aircraft.
     """
     # Each row over its largest entry, since they differ by orders of magnitude.
     scale: np.ndarray = np.abs(mixer).max(axis=-1, keepdims=True)

@@ -1,8 +1,8 @@
-"""The aircraft: its numbers with their units and sources, and what follows from them.
+"""The aircraft: its parameters with their units and sources, and quantities that follow from them.
 
 Body frame: x forward, y left, z up, the origin at the centre of mass. `presets` has the aircraft
-that are known by name, `parameters` makes the rows of numbers that the engines fly, and
-`quadrl.engines.mjcf` the MuJoCo model.
+that are known by name, `parameters` makes the rows that the engines fly, and `quadrl.engines.mjcf`
+the MuJoCo model.
 """
 
 # pyright: reportUnnecessaryIsInstance=false
@@ -40,14 +40,15 @@ DRAWN_HULL = (0.075, 0.060, 0.045)  # [m], semi-axes
 DRAWN_ROTOR_HEIGHT = 0.030  # [m], of a rotor's disc over the point where its thrust acts
 
 MAX_SUBSTEPS = 10_000
-# What a physics step resolves (tests/unit/test_divergence.py): the angle turned in it [rad], and
-# the rates of drag and aerodynamic moment times the step. An aircraft must be able to turn once a
-# second and to fall as fast as it can.
+# The most that a physics step resolves (tests/unit/test_divergence.py): the angle turned in it
+# [rad], and the rates of drag and aerodynamic moment times the step. An aircraft must be able to
+# turn once a second and to fall at its terminal speed.
 TURN, DAMPING = 0.5, 1.0
 SLOWEST_TURN = 2 * math.pi  # [rad/s]
-LEAN = 0.01  # of the weight; the controllers then hover about 3 cm aside
+LEAN = 0.01  # largest sideways force in hover over the weight; it costs controllers about 3 cm
 SINGULAR = 1e-9
-"""Smallest singular value of a mixer over its largest; each row over its largest entry."""
+"""Smallest singular value of a mixer over its largest, after scaling each row by its largest
+entry."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,12 +190,12 @@ class Vehicle:
 
     @functools.cached_property
     def hover_speed(self) -> np.ndarray:
-        """(R,) Omega_hover [rad/s]: together they carry the weight and give no moment."""
+        """(R,) Omega_hover [rad/s]: speeds that carry the weight without a moment."""
         return np.sqrt(hover_squares(self.mixer, self.mass * GRAVITY))
 
     @property
     def layout(self) -> np.ndarray:
-        """(4, R) Which way each rotor lifts and turns the aircraft: 1, -1, or 0 for not at all."""
+        """(4, R) signs of each rotor's thrust along z and moments: 1, -1, or 0 for none."""
         rows = self.mixer / np.abs(self.mixer).max(axis=1, keepdims=True)
         return np.sign(np.where(np.abs(rows) < SINGULAR, 0.0, rows))
 
@@ -277,7 +278,7 @@ def commanded(action: Array, hover: Array, scale: Any, most: Array | None = None
         action: (N, R), clipped to [-1, 1].
         hover: Speeds at an action of 0, (R,) or (N, R) [rad/s].
         scale: Change of the speed at an action of 1 [rad/s].
-        most: Largest speeds (R,) [rad/s], to which commands are cut, as to 0; None for no limits.
+        most: Largest speeds (R,) [rad/s]; commands are clipped to 0 and to these. None: no limits.
     """
     command = hover + scale * np.minimum(np.maximum(action, -1.0), 1.0)
     return command if most is None else np.minimum(np.maximum(command, 0.0), most)
