@@ -1,4 +1,4 @@
-"""Allocation: from thrust and moments to the rotors, within what each of them can do."""
+"""Allocation: from thrust and moments to rotor speeds, within the limits of each rotor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Allocation:
     """
 
     def __init__(self, inverse: Array, low: Array, high: Array) -> None:
-        """Take what the rotors can do.
+        """Take the limits of the rotors.
 
         Args:
             inverse: (R, 4), a right inverse of the mixer: thrust [N] and moments about x, y, z
@@ -61,15 +61,15 @@ class Allocation:
 
 
 def product(matrix: Array, vector: Array) -> Array:
-    """Matrix (m, k) times vectors (N, k), (N, m); the same bits in row i whatever N is.
+    """Matrix (m, k) times vectors (N, k), (N, m), with the same bits in row i for every N.
 
-    BLAS would choose the order of the additions by N, and so would NumPy's sum.
+    The order of the additions in BLAS and in NumPy's sum depends on N.
     """
     return functools.reduce(np.add, matrix.T[:, :, None] * vector.T[:, None]).T
 
 
 def columns(*parts: Array) -> Array:
-    """Vectors (N, k) side by side, each component in one stretch of memory.
+    """Vectors (N, k) side by side, each component contiguous in memory.
 
     NumPy's loops then run over the aircraft, not over the components.
     """
@@ -77,5 +77,5 @@ def columns(*parts: Array) -> Array:
 
 
 def within(value: Array, low: Array | float, high: Array | float) -> Array:
-    """The value, or the limit that it passes; NumPy's own clip takes twice as long for N = 1."""
+    """A value clipped to limits; NumPy's own clip takes twice as long for N = 1."""
     return np.minimum(np.maximum(value, low), high)

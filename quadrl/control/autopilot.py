@@ -1,6 +1,6 @@
-"""The autopilot of N aircraft: a control mode with loops, compiled where that can be done.
+"""The autopilot of N aircraft: a control mode with loops, compiled if there is a compiler.
 
-At every physics step the loops turn the state of now and the setpoint into rotor commands. They
+At every physics step the loops turn the present state and the setpoint into rotor commands. They
 are written once (`quadrl.control.modes`, `loops`), as functions of arrays; without a compiler NumPy
 runs them, with the same results.
 """
@@ -21,17 +21,17 @@ from quadrl.engines.rowwise import RowFunction, reverse
 from quadrl.engines.state import State
 
 COORDINATES = 7, 6
-"""Numbers of a row of qpos and of qvel; rotor speeds follow."""
+"""Sizes of a row of qpos and of qvel; rotor speeds follow."""
 
 
 class Laws:
-    """A control mode as functions of coordinates and not of a state."""
+    """A control mode as functions of coordinates instead of a state."""
 
     def __init__(self, mode: ControlMode, engine: Engine) -> None:
         """Take the mode, and the origin of the task's frame."""
         self.mode, self._origin = mode, engine.origin
         self.widths = *COORDINATES, mode.vehicle.rotor_count
-        """Numbers of a row of qpos, qvel and rotor speeds, the first arguments of both."""
+        """Sizes of a row of qpos, qvel and rotor speeds, the first arguments of both functions."""
 
     def setpoint(self, qpos: Array, qvel: Array, act: Array, action: Array) -> Array:
         """The setpoint (N, n), as `ControlMode.setpoint` gives it."""
@@ -47,34 +47,34 @@ class Laws:
 
 
 class Autopilot:
-    """Flies the rows of an engine by the loops of a mode."""
+    """Flies the rows of an engine with the loops of a mode."""
 
     def __init__(self, mode: ControlMode, engine: Engine, action: np.ndarray) -> None:
         """Compile the loops.
 
         Args:
             mode: A mode with loops.
-            engine: Flies the aircraft.
-            action: (N, k), read live when a control step begins.
+            engine: The engine that flies the aircraft.
+            action: (N, k), live: it is read when a control step begins.
         """
         self._mode, self._engine, self._action = mode, engine, action
         self.rotor_command = np.zeros(engine.act.shape)
-        """(N, R) [rad/s], the last ones."""
+        """The last commands (N, R) [rad/s]."""
         self._compiled: tuple[Callable[[], None], Callable[[], None]] | None = None
         laws, live = Laws(mode, engine), (engine.qpos, engine.qvel, engine.act)
         first = RowFunction(laws.setpoint, *laws.widths, mode.size)
         second = RowFunction(laws.command, *laws.widths, first.width)
         self.functions = first, second
-        """Setpoint and rotor commands, to be compiled."""
+        """The functions to compile: setpoint and rotor commands."""
         self.setpoint = np.zeros((engine.num_envs, first.width))
-        """(N, n), of this control step."""
+        """The setpoint (N, n) of this control step."""
         with contextlib.suppress(NativeError):
             at_first = first.on(*live, action, self.setpoint)
             self._compiled = at_first, second.on(*live, self.setpoint, self.rotor_command)
 
     @functools.cached_property
     def reversed(self) -> Reversed:
-        """Its derivatives."""
+        """The derivatives of its commands."""
         return Reversed(self._mode, self._engine)
 
     @property
@@ -83,7 +83,7 @@ class Autopilot:
         return self._compiled is not None
 
     def begin(self) -> None:
-        """Take the setpoint of a control step that begins."""
+        """Compute the setpoint of a control step that begins."""
         if self._compiled:
             self._compiled[0]()
         else:
@@ -92,7 +92,7 @@ class Autopilot:
     def command(self) -> np.ndarray:
         """Rotor commands (N, R) [rad/s] for the next physics step; valid until the one after.
 
-        Those of an aircraft that has diverged may be no numbers.
+        Those of an aircraft that has diverged may be NaN.
         """
         if self._compiled:
             self._compiled[1]()
@@ -104,10 +104,10 @@ class Autopilot:
 
 
 class Reversed:
-    """The derivatives of an autopilot's commands by where aircraft are, and by their actions."""
+    """The derivatives of an autopilot's commands by the motion and the actions of aircraft."""
 
     def __init__(self, mode: ControlMode, engine: Engine) -> None:
-        """Trace them; they are compiled when they are used first."""
+        """Trace the functions; they are compiled at their first use."""
         laws = Laws(mode, engine)
         self._width = sum(laws.widths)
         setpoint = RowFunction(laws.setpoint, *laws.widths, mode.size)
@@ -117,10 +117,10 @@ class Reversed:
         widths = *laws.widths, mode.size
         self._setpoint = RowFunction(reverse(laws.setpoint), *widths, setpoint.width)
         self.functions = self._command, self._setpoint
-        """To be compiled."""
+        """The functions to compile."""
 
     def compile(self) -> None:
-        """Compile them where the cache does not hold them.
+        """Compile the functions that are not in the cache.
 
         Raises:
             NativeError: There is no compiler, or it refused the source.
@@ -131,19 +131,19 @@ class Reversed:
     def command(
         self, motion: np.ndarray, setpoint: np.ndarray, given: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """From the derivatives by rotor commands (N, R) to those by motion and setpoint.
+        """Derivatives of a scalar by motion and setpoint, from those by rotor commands.
 
         Args:
             motion: (N, 13 + R), qpos, qvel and rotor speeds side by side.
             setpoint: (N, n).
-            given: (N, R).
+            given: The derivatives (N, R) by the rotor commands.
         """
         return self._split(self._command(*self._parts(motion), setpoint, given))
 
     def setpoint(
         self, motion: np.ndarray, action: np.ndarray, given: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """From the derivatives by a setpoint (N, n) to those by the motion and the action."""
+        """Derivatives of a scalar by motion and action, from those by the setpoint (N, n)."""
         return self._split(self._setpoint(*self._parts(motion), action, given))
 
     def _parts(self, motion: np.ndarray) -> list[np.ndarray]:

@@ -1,8 +1,8 @@
 """Feasibility: whether actions can carry an aircraft, turn it, and respond in time.
 
-Commands stay within hover plus and minus `Vehicle.action_scale` in most control modes
-(`ControlMode.reach`), with the hover speeds of the specified aircraft. One that a randomization
-draws may need more than that to hover level and still; no policy then holds it in the air.
+In most control modes commands stay within hover plus and minus `Vehicle.action_scale`
+(`ControlMode.reach`), with the hover speeds of the specified aircraft. An aircraft that a
+randomization draws may need more to hover level and still; then no policy can keep it in the air.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from quadrl.control import modes, trim
 from quadrl.engines.rng import uniform
 
 MARGIN = 1.2
-"""Thrust over weight that an aircraft needs to be flown. With it thrust carries the weight at a
-tilt of 33 degrees, or climbs with g / 5; the aircraft that come with quadrl have at least 1.33."""
+"""Largest thrust over weight that an aircraft needs to be flown. At 1.2 the thrust carries the
+weight at a tilt of 33 degrees, or climbs with g / 5; the presets have at least 1.33."""
 FEW = 0.02
-"""Share of drawn aircraft that may be unable to hover without a warning: tasks ask for 98 to 100 %
-of success, which more of them rule out."""
+"""Share of drawn aircraft that may be unable to hover without a warning. Tasks ask for a success of
+98 to 100 %, which a larger share rules out."""
 SAMPLES, CORNERS = 1024, 256
 SURE = 1e-9
-"""Share of a bound by which rounding may exceed it."""
+"""Relative tolerance for rounding."""
 BISECTIONS = 24
 BY_HOVER = AFFECTS.keys() - {"inertia", "inertia_axes", "drag", "inflow", "lag", "rotor_inertia"}
-"""Fields of a randomization that change how fast rotors turn in hover, or may turn."""
+"""Fields of a randomization that change the hover speeds or the largest speeds of rotors."""
 
 
 class Reach:
-    """The thrusts without a moment that the rotors of some aircraft (n,) can give, exactly.
+    """The exact range of thrust without a moment that the rotors of some aircraft (n,) can give.
 
     Rotors between a lowest and a highest speed give the wrenches of a zonotope: the mixer times a
-    box of squared speeds. A wrench lies in it if it lies between its facets, each of which is
-    parallel to the columns of three rotors. That also holds where more than four rotors can share
-    the weight in many ways.
+    box of squared speeds. A wrench is in it if it lies between its facets, each of which is
+    parallel to the columns of three rotors. This also holds for more than four rotors, which can
+    share the weight in many ways.
     """
 
     def __init__(self, vehicle: Vehicle, table: np.ndarray | None = None) -> None:
-        """Take rows of parameters (n,); None for the vehicle as it is specified."""
+        """Take rows of parameters (n,); None for those of the vehicle itself."""
         table = parameters.rows(vehicle) if table is None else table
         self.vehicle = vehicle
         rotor = table["rotor"][:, : vehicle.rotor_count]
@@ -61,26 +61,26 @@ class Reach:
         rows = rows / size
         triples = [*itertools.combinations(range(vehicle.rotor_count), 3)]
         spanned = np.moveaxis(rows[:, :, np.array(triples)], 1, -1)  # (n, F, 3, 4)
-        # Their normals, as the cross product of three vectors in four dimensions.
+        # The facets' normals: the cross product of three vectors in four dimensions.
         normal = np.stack(
             [(-1) ** k * np.linalg.det(np.delete(spanned, k, axis=-1)) for k in range(4)], axis=-1
         )
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
-        # Three columns in a plane span no facet: a normal of zero bounds nothing.
+        # Three columns in a plane span no facet; their normal is zero, which bounds nothing.
         normal = np.where(length > SURE, normal / np.maximum(length, SURE), 0.0)
         normal = normal * np.where(normal[..., :1] < 0, -1.0, 1.0)
         self._across = normal @ rows  # (n, F, R)
         self._weight = normal[..., 0] * (parameters.hover_thrust(table) / size[:, 0, 0])[:, None]
-        moment = table["steady_moment"] / size[:, 1:, 0]  # which the rotors hold
+        moment = table["steady_moment"] / size[:, 1:, 0]  # which the rotors balance
         self._held = (normal[..., 1:] * moment[:, None]).sum(axis=-1)  # (n, F)
         self._max_speed = np.minimum(rotor["max_speed"], vehicle.max_speed)  # (n, R) [rad/s]
         self.hover_speed = rotor["hover_speed"]
-        """(n, R) [rad/s], of the drawn aircraft."""
+        """Hover speeds (n, R) [rad/s] of the drawn aircraft."""
         room = vehicle.max_speed - vehicle.hover_speed
         self.room = float(room.min())
-        """Largest action scale [rad/s] with which no command is cut at a largest speed."""
+        """Largest action scale [rad/s] that commands no speed above a rotor's largest."""
         self.most = float(max(room.max(), vehicle.hover_speed.max()))
-        """An action scale [rad/s] with which actions reach all that the rotors can do."""
+        """An action scale [rad/s] with which actions command every speed of the rotors."""
 
     def speeds(self, scale: Array | float) -> tuple[Array, Array]:
         """Lowest and highest rotor speeds (n, R) [rad/s] for an action scale [rad/s], or (n, 1)."""
@@ -126,7 +126,7 @@ class Reach:
 
 
 def samples(sampler: AircraftSampler) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of parameters of aircraft that are drawn, and of some at corners of the ranges."""
+    """Rows of parameters of sampled aircraft, and of some at corners of the ranges."""
     keys = np.arange(SAMPLES)
     shares = uniform(keys, np.zeros_like(keys), PARAMETERS, 0, len(sampler.names))
     corners = np.where(shares[:CORNERS] < 0.5, 0.0, 1 - SURE)
@@ -134,14 +134,12 @@ def samples(sampler: AircraftSampler) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unreached(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[float, str, float]:
-    """The share of drawn aircraft that cannot hover level and still.
-
-    From a sample that is always the same; exact where nothing is drawn.
+    """The share of drawn aircraft that cannot hover level and still, from a fixed sample.
 
     Returns:
-        Their share; what the worst of the sample lacks, in words; the action scale [rad/s] with
-        which each has the MARGIN, in the corners of the ranges too, or all that the rotors give.
-        With a share of 0 there are no words, and the action scale is the vehicle's.
+        The share; what the worst aircraft of the sample lacks, in words; the action scale [rad/s]
+        with which each has the MARGIN, also in the corners of the ranges, or as much as its rotors
+        can give. With a share of 0 the text is empty, and the action scale is the vehicle's.
     """
     if not sampler.randomization.per_row:
         return 0.0, "", vehicle.action_scale
@@ -163,9 +161,9 @@ def unreached(vehicle: Vehicle, sampler: AircraftSampler) -> tuple[float, str, f
 
 
 def held_command(vehicle: Vehicle, control_mode: str) -> float:
-    """Time for which rotors are given one command [s].
+    """Time for which the rotors hold a command [s].
 
-    The loops of every mode but "rotor" answer at each physics step.
+    The loops of every mode but "rotor" command at each physics step.
     """
     looped = modes.kind(control_mode).has_loops
     return vehicle.physics_timestep if looped else vehicle.control_timestep
@@ -174,11 +172,11 @@ def held_command(vehicle: Vehicle, control_mode: str) -> float:
 def warn_of_unreached(
     vehicle: Vehicle, randomization: Randomized, control_mode: str = "rotor", wind: float = 0.0
 ) -> None:
-    """Warn the caller's caller of what no policy can make up for.
+    """Warn the caller's caller of faults that no policy can compensate.
 
-    More than a FEW of the drawn aircraft cannot hover, half of the actions or more are cut at the
-    largest speed, an action lasts longer than the rotors take to follow it, or the mean wind [m/s]
-    is more than they hold.
+    More than a FEW of the drawn aircraft cannot hover, at least half of the actions are clipped at
+    the largest speed, an action lasts longer than the rotors take to follow it, or the mean wind
+    [m/s] is stronger than the rotors can hold against.
 
     Raises:
         QuadrlError: The randomization does not fit the aircraft.
@@ -216,19 +214,19 @@ def limit(
     """The level of a disturbance beyond which no policy can hover, outwards from the usual one.
 
     Args:
-        at: What a level is.
-        usual: The level at which nothing is disturbed.
-        end: The last level on one side; what lies up to eight times as far off is found as well.
+        at: The randomization or weather of a level.
+        usual: The level without a disturbance.
+        end: The last level on one side; the search goes up to eight times as far.
         vehicle: The aircraft, with the action scale that it flies with.
 
     Returns:
-        The level; None where the actions reach as far, or where a level changes no hover.
+        The level; None where actions suffice at every level, or where no level changes the hover.
     """
 
     def able(given: Any) -> bool:
         try:
             sampler = AircraftSampler(given, vehicle)
-        except QuadrlError:  # even at their limits the rotors do not carry it
+        except QuadrlError:  # even at their limits the rotors do not carry the aircraft
             return False
         drawn = np.tile(sampler.low, (vehicle.rotor_count, 1))
         sampler.columns(drawn, DAMAGED)[:, 0] = np.arange(vehicle.rotor_count)
@@ -253,10 +251,11 @@ def limit(
 
 
 def held_wind(vehicle: Vehicle, load: float) -> float:
-    """Steady wind [m/s] against which a thrust of `load` times the weight still holds the place.
+    """Strongest steady wind [m/s] against which a thrust of `load` times the weight can hover.
 
-    Leaned until its vertical part is the weight, sideways it has sqrt(load^2 - 1) of it; the drag
-    of the aircraft and of its rotors is k_D v^2 + k_H sum(Omega) v.
+    Tilted until its vertical part is the weight, the thrust has a horizontal part of
+    sqrt(load^2 - 1) times the weight; the drag of the aircraft and its rotors is
+    k_D v^2 + k_H sum(Omega) v.
     """
     if load <= 1:
         return 0.0

@@ -1,8 +1,8 @@
 """Geometric tracking control on SE(3), with the lag of the rotors in the design.
 
 Lee, Leok and McClamroch, "Geometric Tracking Control of a Quadrotor UAV on SE(3)", CDC 2010. The
-loops are those of `quadrl.control.loops`, flown at the control step; a task says where to be
-(`Task.guide`) and brings gains of its own where it needs them (`Task.gains`).
+loops are those of `quadrl.control.loops`, flown at the control step; a task gives the setpoint
+(`Task.guide`) and, where it needs them, gains of its own (`Task.gains`).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Controller(abc.ABC):
     """A controller maps flat observations of a task to actions, as a policy does."""
 
     control_mode = "rotor"
-    """The control mode that it flies with."""
+    """The control mode of its actions."""
 
     def __init__(self, vehicle: Vehicle, task: Guide) -> None:
-        """Take the aircraft, and the task that says where to be and whether to head east."""
+        """Take the aircraft, and the task that gives the setpoint."""
         self.vehicle, self.task = vehicle, task
 
     def __call__(self, observation: Array) -> Array:
@@ -41,12 +41,12 @@ class Controller(abc.ABC):
 
     @abc.abstractmethod
     def action(self, reading: Reading, offset: Array, velocity: Array) -> Array:
-        """The action (N, R) towards a place at an offset, which moves at a velocity.
+        """The action (N, R) that flies to a setpoint, which may move.
 
         Args:
             reading: The aircraft now.
-            offset: (N, 3) [m], world frame.
-            velocity: (N, 3) [m/s], world frame.
+            offset: Offset (N, 3) [m] of the setpoint, world frame.
+            velocity: Velocity (N, 3) [m/s] of the setpoint, world frame.
         """
 
 

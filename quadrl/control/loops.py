@@ -1,16 +1,16 @@
-"""The loops that fly an aircraft, from its position to its rotors.
+"""The nested control loops of an aircraft, from its position to its rotors.
 
     position    v_d = approach velocity to p_d                               [m/s]
     velocity    f = k_v (v_d - v) + g e3 + k_D |v| v / m                     [m/s^2]
     attitude    omega_d = -k_R e_R(R, R_d(f, heading)),  T = m f . R e3      [rad/s], [N]
     body rate   M = J k_w (omega_d - omega) + omega x J omega + k_M |omega| omega    [N m]
-    rotors      w_c = w + lead ((T, M) - w),  w the thrust and moments of now
+    rotors      w_c = w + lead ((T, M) - w),  w the present thrust and moments
 
 The geometric controller flies them at the control step, the control modes at the physics step. They
 are those of Lee, Leok and McClamroch, "Geometric Tracking Control of a Quadrotor UAV on SE(3)",
-CDC 2010, whose thrust and moment act at once; here they pass rotors that lag, once a step, within a
-narrow range of commands. So the gains place the poles of the whole chain, sampled and with the lag,
-and each loop asks the next one only for what the rotors can give.
+CDC 2010, whose thrust and moment act at once; here they come from rotors that lag, with one command
+a step, in a narrow range. So the gains place the poles of the whole chain, sampled and with the
+lag, and each loop asks the next one only for what the rotors can give.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ INTEGRATORS: dict[Controlled, tuple[int, int, int]] = {
     "velocity": (3, 1, 1),
     "body_rate": (1, 0, 1),
 }
-"""Integrators between the rotors and what is controlled: east and north, up, heading.
+"""Integrators between the rotors and the controlled quantity: east and north, up, heading.
 
-With a velocity the rate of the heading is controlled, with body rates the thrust.
+In "velocity" the rate of the heading is controlled, in "body_rate" the thrust.
 """
 # n integrators behind the lag, and all n + 1 poles at p, make the rates of the two innermost loops
 # n p / 2 and (n - 1) p / 3. With the largest angle a and the largest body rate sqrt(acc a) they ask
@@ -77,7 +77,7 @@ class Gains:
 
 
 class Loops:
-    """The nested loops for rows of one vehicle, without a memory."""
+    """The nested loops for rows of one vehicle; they keep no memory."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class Loops:
         Args:
             vehicle: The aircraft.
             timestep: Time between two commands to the rotors [s].
-            controlled: What the outermost loop controls.
+            controlled: Quantity that the outermost loop controls.
             gains: Bandwidths and limits; None for the defaults.
             share: Share of the bandwidths that gains, lag and moments allow.
         """
@@ -107,13 +107,14 @@ class Loops:
         tilt = min(gains.max_tilt, gains.authority * math.acos(1 / largest))  # [rad]
         sideways, vertical = GRAVITY * math.tan(tilt), min(self._climb, self._descent)
         self.max_acceleration = np.array([sideways, sideways, vertical])
-        """(3,) [m/s^2], largest asked for along x and y, and along z both up and down."""
+        """Largest acceleration (3,) [m/s^2] that is asked for along x, y and z, up and down."""
         self._inertia = np.array(vehicle.inertia)
         # (3,) [rad/s^2], largest asked for
         self._angular_acceleration = gains.authority * self._allocation.moment / self._inertia
         angles = np.array([tilt, tilt, MAX_HEADING_ERROR])  # [rad], the largest errors
         self.max_body_rate = np.sqrt(self._angular_acceleration * angles)
-        """(3,) [rad/s], largest that is asked for: stopped within half of the largest errors."""
+        """Largest body rate (3,) [rad/s] that is asked for: it can be stopped within half of the
+        largest errors."""
         lag, slowest = rotor_lag(vehicle)
         unit = 1 / slowest + timestep  # [s]
         integrators, most = INTEGRATORS[controlled], INTEGRATORS["position"]
@@ -125,7 +126,7 @@ class Loops:
             min(gains.heading / unit, fastest[2]),
         )
         level, height, heading = (
-            # Loops further out than what is controlled have a rate of zero.
+            # Loops outside of the controlled quantity have a gain of zero.
             np.append(np.zeros(full - n), cascade(lag, share * bandwidth, n, timestep))
             for bandwidth, full, n in zip(bandwidths, most, integrators, strict=True)
         )
@@ -138,8 +139,9 @@ class Loops:
     def approach_velocity(self, offset: Array, max_speed: float) -> Array:
         """Velocity (N, 3) [m/s] to a place at an offset (N, 3) [m], both in the world frame.
 
-        In proportion to the distance d near the place; farther off what half of the largest
-        acceleration, b, can stop: sqrt(2 b (d - d_0 / 2)). Both meet smoothly at d_0 = b / k^2.
+        Near the place it is proportional to the distance d; farther away it is the speed that half
+        of the largest acceleration, b, can stop: sqrt(2 b (d - d_0 / 2)). Both meet smoothly at
+        d_0 = b / k^2.
         """
         rate, brake = self._position_gain, self.max_acceleration[1:] / 2  # (2,), level and up
         half = brake / rate**2 / 2
@@ -156,15 +158,15 @@ class Loops:
         turn: Array | float = 0.0,
         target_motion: Motion | None = None,
     ) -> Array:
-        """Rotor commands (N, R) [rad/s] that take away an error of the velocity.
+        """Rotor commands (N, R) [rad/s] that remove an error of the velocity.
 
         Args:
             motion: The aircraft now.
-            error: (N, 3) [m/s], how much the velocity is too large, world frame.
-            heading: Unit vectors (N, 2), east and north, where to point.
-            turn: (N, 1) [rad/s], rate of that heading.
-            target_motion: Acceleration [m/s^2] and jerk [m/s^3] of what is followed, (N, 3) each,
-                world frame, which the loops would otherwise learn of from errors alone.
+            error: Velocity less the wanted one (N, 3) [m/s], world frame.
+            heading: Wanted heading, unit vectors (N, 2), east and north.
+            turn: Rate of that heading (N, 1) [rad/s].
+            target_motion: Acceleration [m/s^2] and jerk [m/s^3] of the target, (N, 3) each, world
+                frame, to feed forward.
         """
         wanted = -self._velocity_gain * error
         level = limited(wanted[:, :2], self.max_acceleration[0])
@@ -185,14 +187,14 @@ class Loops:
         return self.body_rate_command(motion, self.vehicle.mass * force[:, 2:], body_rate)
 
     def body_rate_command(self, motion: State | Reading, thrust: Array, body_rate: Array) -> Array:
-        """Rotor commands (N, R) [rad/s] that bring thrust and body rate through the lag.
+        """Rotor commands (N, R) [rad/s] for a thrust and body rate, with a lead against the lag.
 
-        They stay within what actions of -1 and 1 command in the control mode "rotor".
+        They stay between the commands of actions -1 and 1 in the control mode "rotor".
 
         Args:
             motion: The aircraft now.
-            thrust: (N, 1) [N], collective.
-            body_rate: (N, 3) [rad/s], wanted.
+            thrust: Wanted collective thrust (N, 1) [N].
+            body_rate: Wanted body rate (N, 3) [rad/s].
         """
         omega, largest = motion.body_rate, self._angular_acceleration
         acceleration = within(self._body_rate_gain * (body_rate - omega), -largest, largest)
@@ -207,9 +209,9 @@ class Loops:
 def rotor_lag(vehicle: Vehicle) -> tuple[float, float]:
     """Rates [1/s] at which rotors follow their commands: for the poles, and for the bandwidths.
 
-    For a moment as many rotors speed up as slow down, by as much: whichever way it goes, its rate
-    is the mean of lag_up and lag_down, for which the poles are placed. Thrust alone has either
-    rate, so the bandwidths are those of the slower one.
+    For a moment as many rotors speed up as slow down, by as much, so that its rate is the mean of
+    lag_up and lag_down, for which the poles are placed. Thrust alone follows at either rate, so
+    the bandwidths are those of the slower one.
     """
     rates = [rate for rotor in vehicle.rotors for rate in (rotor.lag_up, rotor.lag_down)]
     return sum(rates) / len(rates), min(rates)
@@ -218,18 +220,18 @@ def rotor_lag(vehicle: Vehicle) -> tuple[float, float]:
 def cascade(lag: float, bandwidth: float, integrators: int, timestep: float) -> Array:
     """Gains of nested loops around a chain of integrators that the rotors drive.
 
-    All poles of the closed loop, sampled with lag and hold, stand at exp(-bandwidth * timestep)
+    All poles of the closed loop, sampled with lag and hold, are at exp(-bandwidth * timestep)
     (Ackermann's formula).
 
     Args:
-        lag: Lag of the rotors [1/s].
-        bandwidth: [rad/s].
-        integrators: n, between what the rotors give and what is controlled.
-        timestep: Between two commands [s].
+        lag: Rate of the rotors [1/s].
+        bandwidth: Bandwidth of the closed loop [rad/s].
+        integrators: Number of integrators, n.
+        timestep: Time between two commands [s].
 
     Returns:
-        (n + 1,): the rates of the n loops from the outermost [1/s], and the lead: how many times
-        the wanted change of thrust or moment is commanded.
+        (n + 1,): the gains of the n loops from the outermost [1/s], and the lead: the commanded
+        over the wanted change of thrust or moment.
     """
     size = integrators + 1
     a, b = np.eye(size, k=1), np.eye(size)[:, -1:] * lag
@@ -273,7 +275,7 @@ def attitude_error(force: Array, heading: Array) -> Array:
 def turned(vector: Array, heading: Array) -> Array:
     """Vectors (N, k) turned about the vertical by a heading (N, 2): forward, left to east, north.
 
-    By the opposite heading, (east, -north), it takes world vectors to forward and left.
+    The opposite heading, (east, -north), turns world vectors to forward and left.
     """
     east, north, x, y = heading[:, :1], heading[:, 1:], vector[:, :1], vector[:, 1:2]
     return columns(east * x - north * y, north * x + east * y, vector[:, 2:])

@@ -1,7 +1,7 @@
 """The linear-quadratic regulator around hover, sampled at the control step, rotor lag included.
 
-Far from hover the errors are limited, and actions past the range are cut as the geometric
-controller's: with neither, 59 of 100 flights from up to 60 degrees of tilt recover; with both, all.
+Far from hover the errors are limited, and actions are clipped like the geometric controller's:
+with neither, 59 of 100 flights from up to 60 degrees of tilt recover; with both, all do.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ STATES = {
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """What counts as a large deviation (Bryson's rule): the cost is the sum of their squares.
+    """Deviations that cost 1 each (Bryson's rule); the cost is the sum of their squares.
 
-    An action of 1 costs 1; the rotor speed costs nothing of its own.
+    An action of 1 costs 1; the rotor speed itself costs nothing.
     """
 
     position: float = 0.25
@@ -58,10 +58,9 @@ class Weights:
 
 
 def linear_model(vehicle: Vehicle) -> tuple[Array, Array]:
-    """A (12 + R, 12 + R) and B (12 + R, R) of dx/dt = A x + B a, an action a, around hover.
+    """A (12 + R, 12 + R) and B (12 + R, R) of dx/dt = A x + B a around hover, for actions a.
 
-    A rotor has one lag here, the mean of up and down: by half of the difference the response to an
-    action is faster than this upwards, and slower downwards.
+    A rotor has one lag here, the mean of those up and down.
     """
     size = 12 + vehicle.rotor_count
     a, b = np.zeros((size, size)), np.zeros((size, vehicle.rotor_count))
@@ -94,9 +93,9 @@ class LQRController(Controller):
             [w.position, w.velocity, w.tilt, w.heading, w.body_rate, np.inf], [3, 3, 2, 1, 3, count]
         )
         self.q, self.r = np.diag(deviations**-2), np.eye(count)
-        """Costs of a state and of an action: x' q x + action' r action."""
+        """Weights of a state and of an action in the cost x' q x + action' r action."""
         self.p = solve_discrete_are(self.a, self.b, self.q, self.r)
-        """The cost that is left, x' p x."""
+        """The remaining cost from a state is x' p x."""
         weight = self.r + self.b.T @ self.p @ self.b
         self.gain = np.linalg.solve(weight, self.b.T @ self.p @ self.a)
         """(R, 12 + R): action = -gain x."""

@@ -1,10 +1,10 @@
 """Control modes, the meaning of an action: rotor speeds, thrust and body rates, velocity, position.
 
 An action is k numbers in [-1, 1]; each has a unit, a value at 0 and a scale that follow from the
-vehicle. `rotor` is the paper's, and holds for a control step. The others are flown by inner loops
-(`quadrl.control.loops`) that see the true state and command the rotors at every physics step, as
-an autopilot does. `thrust_body_rate` spans all that the rotors can do; the others stay within what
-`rotor` can command, hover plus and minus `Vehicle.action_scale`.
+vehicle. `rotor` is the paper's, whose commands hold for a control step. The others are flown by
+inner loops (`quadrl.control.loops`) that see the true state and command the rotors at every physics
+step, as an autopilot does. `thrust_body_rate` spans all that the rotors can do; the others command
+speeds within hover plus and minus `Vehicle.action_scale`, as `rotor` does.
 
 Velocities and offsets are along the level heading: forward, left, up, as in the Crazyflie's hover
 setpoint and MAVLink's SET_POSITION_TARGET_LOCAL_NED with MAV_FRAME_BODY_OFFSET_NED (forward,
@@ -28,11 +28,11 @@ from quadrl.control.loops import MAX_HEADING_ERROR, Controlled, Loops, turned
 from quadrl.engines.state import State
 
 RESPONSE_TIME = 1.0
-"""[s] in which the largest acceleration reaches the velocity at action 1; at the offset of action 1
-a flight of that velocity can be stopped with half of it."""
+"""Time [s] in which the largest acceleration reaches the velocity of action 1; half of it can stop
+from that velocity within the offset of action 1."""
 POSITION_SHARE = 0.5
-"""Share of the bandwidth at which positions are flown to. With all of it the rotors are at their
-limits for every setpoint that an exploring policy draws, and hover was learned to 61 cm only."""
+"""Share of the bandwidth with which positions are approached. With all of it the rotors reach their
+limits for every setpoint of an exploring policy, and hover was learned to 61 cm only."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,7 @@ class ActionTerm:
     name: str
     unit: str
     meaning: str
-    """And the frame."""
+    """Its meaning and frame."""
 
 
 class ControlMode(abc.ABC):
@@ -51,15 +51,15 @@ class ControlMode(abc.ABC):
     name: ClassVar[str]
     """The name in CONTROL_MODES."""
     has_loops: ClassVar[bool] = True
-    """Whether the rotor commands follow the state, at every physics step."""
+    """Whether the rotor commands depend on the state at every physics step."""
     terms: tuple[ActionTerm, ...]
-    """What the k numbers are."""
+    """The k numbers of an action."""
     centre: Array
-    """(k,) in the terms' units, at an action of 0."""
+    """Values (k,) in the terms' units at an action of 0."""
     scale: Array
-    """(k,) what an action of 1 adds to it."""
+    """What an action of 1 adds to them (k,)."""
     scale_down: Array
-    """(k,) what an action of -1 takes away from it."""
+    """What an action of -1 subtracts from them (k,)."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         """Take the scales from the vehicle."""
@@ -71,13 +71,13 @@ class ControlMode(abc.ABC):
         return len(self.terms)
 
     def values(self, action: Array) -> Array:
-        """The values that actions (N, k), clipped to [-1, 1], stand for, in the terms' units."""
+        """The values of actions (N, k), clipped to [-1, 1], in the terms' units."""
         share = within(np.asanyarray(action, order="F"), -1.0, 1.0)
         return self.centre + np.where(share > 0.0, self.scale, self.scale_down) * share
 
     @classmethod
     def reach(cls, vehicle: Vehicle) -> Vehicle:
-        """The aircraft with the action scale that the mode has of the rotors."""
+        """Return the aircraft with the action scale that the mode commands within."""
         return vehicle
 
     def setpoint(self, state: State, action: Array) -> Array:
@@ -111,7 +111,7 @@ class Rotor(ControlMode):
         )
 
     def setpoint(self, state: State, action: Array) -> Array:
-        """Within what the rotors can do: `Vehicle.rotor_command`."""
+        """The commands of `Vehicle.rotor_command`, within the limits of the rotors."""
         return self.vehicle.rotor_command(action)
 
     def slope(self, action: Array) -> Array:
@@ -140,7 +140,7 @@ class _Looped(ControlMode):
 
 
 class ThrustBodyRate(_Looped):
-    """Collective thrust and body rates, as acrobatic pilots and rate controllers have it."""
+    """Collective thrust and body rates, as acrobatic pilots and rate controllers command them."""
 
     name = "thrust_body_rate"
     controlled = "body_rate"
@@ -152,7 +152,7 @@ class ThrustBodyRate(_Looped):
     )
 
     def __init__(self, vehicle: Vehicle) -> None:
-        """The least and the largest thrust of all rotors; rates that a largest tilt stops."""
+        """Scale to the least and the largest thrust, and to the largest body rates of the loops."""
         super().__init__(vehicle)
         self.centre = np.array([1.0, 0.0, 0.0, 0.0])
         (least, largest), rates = self._loops.thrust, self._loops.max_body_rate
@@ -162,7 +162,7 @@ class ThrustBodyRate(_Looped):
 
     @classmethod
     def reach(cls, vehicle: Vehicle) -> Vehicle:
-        """All that the rotors can do, as rate controllers have it."""
+        """Span all that the rotors can do, as rate controllers do."""
         return dataclasses.replace(vehicle, action_scale=float(np.max(vehicle.max_speed)))
 
     def rotor_command(self, state: State, setpoint: Array) -> Array:
@@ -172,23 +172,23 @@ class ThrustBodyRate(_Looped):
 
 
 class ScaledThrustBodyRate(ThrustBodyRate):
-    """An earlier version within what `rotor` can command, for policies that were saved then."""
+    """An earlier version within the range of `rotor`, for policies saved then."""
 
     name = "thrust_body_rate-v1"
 
     @classmethod
     def reach(cls, vehicle: Vehicle) -> Vehicle:
-        """Hover plus and minus the vehicle's action scale."""
+        """Keep the vehicle's action scale."""
         return vehicle
 
 
 class EvenThrustBodyRate(ScaledThrustBodyRate):
-    """The one before, with as much thrust to add as to take away."""
+    """A still earlier version with the same scale of thrust up and down."""
 
     name = "thrust_body_rate-v0"
 
     def __init__(self, vehicle: Vehicle) -> None:
-        """Thrust as far as all rotors together reach down, less a reserve."""
+        """Scale thrust to the largest vertical acceleration that the loops ask for."""
         super().__init__(vehicle)
         self.scale[0] = self.scale_down[0] = self._loops.max_acceleration[2] / GRAVITY
 
@@ -206,7 +206,7 @@ class Velocity(_Looped):
     )
 
     def __init__(self, vehicle: Vehicle) -> None:
-        """Velocities that are reached within RESPONSE_TIME."""
+        """Scale to velocities that are reached within RESPONSE_TIME."""
         super().__init__(vehicle)
         yaw_rate = self._loops.max_body_rate[2]
         largest = np.append(self._loops.max_acceleration * RESPONSE_TIME, yaw_rate)
@@ -220,9 +220,9 @@ class Velocity(_Looped):
 
 
 class Position(_Looped):
-    """A place and a heading, from those that the aircraft has when the control step begins.
+    """A position and a heading, relative to those at the begin of the control step.
 
-    An action of 0 brakes and stays; a place is held by giving its offset again at every step.
+    An action of 0 brakes and stays; a position is held by giving its offset again at every step.
     """
 
     name = "position"
@@ -236,14 +236,14 @@ class Position(_Looped):
     )
 
     def __init__(self, vehicle: Vehicle) -> None:
-        """Offsets at which the approach is as fast as RESPONSE_TIME allows."""
+        """Scale to offsets at which the approach is as fast as RESPONSE_TIME allows."""
         super().__init__(vehicle)
         offsets = self._loops.max_acceleration * RESPONSE_TIME**2
         self.scale = self.scale_down = np.append(offsets, MAX_HEADING_ERROR)
         self._max_speed = float(self._loops.max_acceleration[0] * RESPONSE_TIME)  # [m/s]
 
     def setpoint(self, state: State, action: Array) -> Array:
-        """Where to be (3) [m], task frame, and the heading (2), east and north: (N, 5)."""
+        """Position (3) [m], task frame, and heading (2), east and north, side by side: (N, 5)."""
         values, heading = self.values(action), heading_of(state.rotation)
         place = state.position + turned(values[:, :3], heading)
         yaw = values[:, 3:]
@@ -262,10 +262,10 @@ CONTROL_MODES: dict[str, type[ControlMode]] = {
 }
 """Every control mode by name."""
 EARLIER = {mode.name: mode for mode in (EvenThrustBodyRate, ScaledThrustBodyRate)}
-"""Earlier versions of modes, which files name."""
+"""Earlier versions of modes by the name that files have for them."""
 RENAMED = {ThrustBodyRate.name: (EvenThrustBodyRate.name, "thrust_body_rate-v2")}
-"""Modes whose actions meant something else before: what their bare names mean in files, and what
-files call them now."""
+"""Modes whose actions had another meaning before: the earlier mode that the bare name in a file
+means, and the name by which files call the present one."""
 
 
 def named(given: Any) -> str:
@@ -281,12 +281,12 @@ def named(given: Any) -> str:
 
 
 def to_save(name: str) -> str:
-    """What a file calls a control mode; `named` knows it."""
+    """The name by which files call a control mode; `named` knows it."""
     return RENAMED[name][1] if name in RENAMED else name
 
 
 def as_saved(given: Any) -> Any:
-    """The control mode that a file names: under a bare name, what it meant before."""
+    """The control mode that a file names; a name that was reused means the earlier mode."""
     return RENAMED[given][0] if given in RENAMED else given
 
 

@@ -14,12 +14,12 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, heading_of, norm, rotation_of_angles, to_world
 
 Motion = tuple[Array, Array]
-"""Acceleration [m/s^2] and jerk [m/s^3] of what is followed, (N, 3) each, world frame."""
+"""Acceleration [m/s^2] and jerk [m/s^3] of a target, (N, 3) each, world frame."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
-    """The quantities of a flat observation, in the frames that controllers use."""
+    """The quantities in a flat observation, in the frames that controllers use."""
 
     rotation: Array  # (N, 3, 3), body to world
     velocity: Array  # (N, 3) [m/s], world frame
@@ -32,7 +32,7 @@ class Reading:
 
     @classmethod
     def of(cls, observation: Array, terms: Mapping[str, Any], vehicle: Vehicle) -> Reading:
-        """Read the observation (N, size) of a task with some observation terms.
+        """Decode the flat observation (N, size) of a task by its observation terms.
 
         Raises:
             QuadrlError: The observation has another size.
@@ -95,9 +95,9 @@ class Guide(Protocol):
         ...
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
-        """Where to be, as an offset (N, 3) [m], and the velocity (N, 3) [m/s] of that place."""
+        """The setpoint: its offset (N, 3) [m] from the aircraft and its velocity (N, 3) [m/s]."""
         ...
 
     def feed_forward(self, reading: Reading) -> Motion | None:
-        """Acceleration and jerk of that place; None where they are not known."""
+        """Acceleration and jerk of the setpoint; None where they are not known."""
         ...

@@ -1,4 +1,4 @@
-"""Trim: the attitude and the rotor speeds with which an aircraft stays where it is in wind."""
+"""Trim: the attitude and the rotor speeds with which an aircraft hovers in wind."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from quadrl.engines.state import Start
 
 FASTEST, HIGH = 25.0, 1e3  # [m/s]; [m], where no ground is near
 SPEEDS, BEARINGS = 51, 32
-"""Of the wind in a table: from 0 to FASTEST, and all around the aircraft."""
+"""Winds in a table: speeds from 0 to FASTEST, and bearings all around the aircraft."""
 ITERATIONS, SHARE = 16, 0.7
-"""Lift grows faster than the square of the rotor speed: with the whole correction it swings."""
+"""Share of the correction that each iteration makes. Lift grows faster than the square of the rotor
+speed, so that the whole correction would oscillate."""
 STILL, STEADY = 0.01, 0.1  # [m/s^2], [rad/s^2], below which an aircraft is in trim
 
 
 def trimmed(vehicle: Vehicle, start: Start, wind: np.ndarray) -> Start:
-    """Starts that are in trim, where they are at rest and level; the heading stays.
+    """Starts of which those that are at rest and level are trimmed; the heading stays.
 
-    The trim is that of the specified aircraft, away from the ground. Where its rotors cannot hold
-    it in the wind, and in calm air, a start stays as it is.
+    The trim is that of the specified aircraft, away from the ground. In calm air, and where the
+    rotors cannot hold the aircraft in the wind, a start stays as it is.
 
     Args:
         vehicle: The aircraft in its air.
         start: Arrays (n, k).
-        wind: (n, 2) [m/s], towards east and north.
+        wind: Wind (n, 2) [m/s] towards east and north.
     """
     speed = norm(wind)
     tilt, turn = start.quaternion[:, 1:3], 2 * np.arctan2(*start.quaternion[:, [3, 0]].T)
@@ -60,11 +61,11 @@ def trimmed(vehicle: Vehicle, start: Start, wind: np.ndarray) -> Start:
 
 @functools.lru_cache(maxsize=8)
 def _table(vehicle: Vehicle) -> np.ndarray:
-    """The body's z axis along the wind and to its left, and squares of the rotor speeds.
+    """Trims in winds up to FASTEST.
 
     Returns:
-        (SPEEDS + 2, BEARINGS, 2 + R), the squares over those of hover, for winds up to
-        FASTEST; NaN where there is no trim.
+        (SPEEDS + 2, BEARINGS, 2 + R): the body's z axis along the wind and to its left, and squares
+        of the rotor speeds over those of hover; NaN where there is no trim.
     """
     p = Parameters.of(parameters.rows(vehicle), vehicle.control_timestep)
     speed, bearing = np.meshgrid(
@@ -86,7 +87,7 @@ def _table(vehicle: Vehicle) -> np.ndarray:
         balance = (norm(rate.velocity) < STILL) & (norm(rate.body_rate) < STEADY)
         up = rotation_matrix(quaternion)[:, :, 2]
         lift = p.mass * ((rate.velocity + [0, 0, GRAVITY]) * up).sum(-1)
-        # The force along body z that would balance the others, were the attitude such.
+        # The force that would balance the others, if body z pointed along it.
         needed = lift[:, None] * up - p.mass[..., None] * rate.velocity
         force = norm(needed)
         east, north = needed[:, 0] / force, needed[:, 1] / force
@@ -101,14 +102,14 @@ def _table(vehicle: Vehicle) -> np.ndarray:
 
 
 def _turned(x: np.ndarray, y: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A vector in the plane, turned to the left [rad]."""
+    """A vector in the plane, turned to the left by an angle [rad]."""
     return np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y
 
 
 def _attitude(level: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Attitudes (n, 4) with the heading (roll, pitch, yaw: Z-Y-X) of level ones (n, 4).
+    """Attitudes (n, 4) that have the yaw (Z-Y-X angles) of level ones (n, 4).
 
-    The body's z axis is at x and y (n,) along the axes of the level one.
+    Their body z axis has components x and y (n,) along the x and y axes of the level ones.
     """
     w, z = level[:, 0], level[:, 3]
     roll, pitch = -np.arcsin(y), np.arctan2(x, np.sqrt(1 - np.minimum(x * x + y * y, 1.0)))
@@ -119,9 +120,9 @@ def _attitude(level: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def fastest_held(vehicle: Vehicle) -> float:
-    """Fastest wind of the table [m/s], from anywhere, up to which the rotors at their limits hold.
+    """Fastest wind of the table [m/s] in which the aircraft can be trimmed, whatever the bearing.
 
-    Unlike drag alone, it knows what a tilted rotor loses to the wind that blows through it.
+    Unlike `held_wind` it includes the thrust that tilted rotors lose to the wind through them.
     """
     held = np.isfinite(_table(vehicle)[..., 0]).all(1)
     return FASTEST * (int(np.argmin(held)) - 1) / (SPEEDS - 1)
