@@ -1,4 +1,4 @@
-"""Options of the observation: what a policy sees beside or instead of the task's own entries."""
+"""Options of the observation: what a policy sees besides or instead of the task's own entries."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from quadrl.conditions.sensors import LONGEST_HISTORY, Sensor
 
 ROTOR_SPEEDS = ("true", "estimated", "none")
 SWITCHES = ("relative_rotor_speed", "rotation", "airspeed", "disturbance", "privileged")
-"""Sensors that are seen where the option of their name is true."""
+"""Sensors that are added by an option of their name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Observing:
         """The sensors by name, in the order in which they sense.
 
         Args:
-            further: Those that the task asks for, where the options do not name them.
+            further: Sensors that the task asks for, whose options those of `sensors` override.
             uncertain: Whether the randomization gives the state estimate errors.
         """
         lengths = "action_history", "observation_history"
@@ -92,7 +92,7 @@ class Observing:
         return dict(sorted(made.items(), key=lambda item: item[1].last))
 
     def given(self) -> dict[str, Any]:
-        """The options that differ from the usual."""
+        """The options that differ from the defaults."""
         usual = vars(Observing())
         return {name: value for name, value in vars(self).items() if value != usual[name]}
 
@@ -103,13 +103,13 @@ class Observing:
 
 
 Observed = Observing | Mapping[str, Any] | None
-"""What `resolve` takes."""
+"""Types that `resolve` takes."""
 
 
 def resolve(given: Observed) -> Observing:
     """Make options of the observation from a mapping of some of them; None is the default.
 
     Raises:
-        QuadrlError: It is something else, or an option is unknown or out of range.
+        QuadrlError: The value is something else, or an option is unknown or out of range.
     """
     return resolved("observe", {} if given is None else given, Observing, word="option")

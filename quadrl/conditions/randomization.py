@@ -1,4 +1,4 @@
-"""Randomizations: what differs from the specified flight, drawn at the start of each episode.
+"""Randomizations: changes to the specified flight, drawn at the start of each episode.
 
 Aircraft are drawn around the specified one, by factors, so that a preset fits every vehicle.
 `quadrl.conditions.sampler` makes the aircraft, `quadrl.conditions.randomizer` applies the rest.
@@ -17,7 +17,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import number, numbers, resolved
 
 Range = tuple[float, float]
-LEAST, MOST = 0.01, 100.0  # of a factor
+LEAST, MOST = 0.01, 100.0  # smallest and largest factor
 LONGEST_DELAY = 10.0  # [s]
 OFF = (1.0, 1.0)  # a factor that changes nothing
 AFFECTS: dict[str, tuple[str, ...]] = {
@@ -39,9 +39,10 @@ AFFECTS: dict[str, tuple[str, ...]] = {
     "force": ("steady_force",),
     "moment": ("steady_moment",),
 }
-"""What a field of `Randomization` changes in a row of parameters (`aircraft/parameters.py`)."""
+"""Numbers that a field of `Randomization` changes in a row of parameters
+(`aircraft/parameters.py`)."""
 FACTORS = ("mass", "inertia", "thrust", "torque", "lag", "drag", "inflow", "max_speed")
-"""Those of them that are one factor for the whole aircraft."""
+"""Fields that are one factor for the whole aircraft."""
 DELAYS = ("command_delay", "observation_delay", "rate_delay")
 AGES = DELAYS[1:]
 
@@ -66,7 +67,7 @@ class Errors:
 
     @property
     def sizes(self) -> np.ndarray:
-        """Of all twelve errors, (12,), in the order of the fields."""
+        """Sizes (12,) of all errors, in the order of the fields."""
         return np.repeat([*vars(self).values()], 3)
 
 
@@ -88,7 +89,7 @@ class Pushes:
 
 
 def _pair(name: str, given: Any, low: float, high: float) -> Range:
-    """A range, from two numbers or from one for both ends."""
+    """A range, from two numbers or from one number for both ends."""
     whole = isinstance(given, (list, tuple, np.ndarray))
     first, last = numbers(name, given if whole else (given, given), 2, low, high)
     if first > last:
@@ -157,7 +158,7 @@ class Randomization:
     of their ranges, since slow rotors are hardest to fly where commands are late."""
 
     def __post_init__(self) -> None:
-        """Validate what can be judged without an aircraft."""
+        """Validate as far as that needs no aircraft."""
         for field in dataclasses.fields(self):
             name, given = field.name, getattr(self, field.name)
             if name in ("centre_of_mass", "corners", "force", "moment"):
@@ -175,7 +176,7 @@ class Randomization:
         return f"Randomization({', '.join(f'{k}={v!r}' for k, v in self.given().items())})"
 
     def given(self) -> dict[str, Any]:
-        """The fields that differ from none, as JSON has them."""
+        """The fields that differ from the defaults, as JSON has them."""
         off, own = dataclasses.asdict(NONE), dataclasses.asdict(self)
         return {name: value for name, value in own.items() if value != off[name]}
 
@@ -186,7 +187,7 @@ class Randomization:
 
     @property
     def uncertain(self) -> bool:
-        """Whether the state estimate has errors, or is of an earlier moment."""
+        """Whether the state estimate has errors or is late."""
         late = self.observation_delay[1] > 0 or self.rate_delay[1] > 0
         return late or (self.noise, self.bias) != (Errors(), Errors())
 
@@ -239,18 +240,19 @@ RANDOMIZATIONS = {
         pushes=Pushes(rate=0.2, velocity=0.3, body_rate=0.5),  # chosen
     ),
 }
-"""What is known by name."""
+"""Randomizations by name."""
 
 
 Randomized = Randomization | Mapping[str, Any] | str | None
-"""What `resolve` takes."""
+"""Types that `resolve` takes."""
 
 
 def resolve(given: Randomized) -> Randomization:
     """Make a randomization from a name, a mapping of fields or a randomization; None is none.
 
     Raises:
-        QuadrlError: It is something else, a name or field is unknown, or a value out of range.
+        QuadrlError: The value is something else, a name or field is unknown, or a number is out of
+            range.
     """
     given = "none" if given is None else given
     return resolved("randomization", given, Randomization, RANDOMIZATIONS)

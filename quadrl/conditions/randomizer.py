@@ -1,7 +1,7 @@
 """Apply a randomization to rows of aircraft: their parameters, late commands, and pushes.
 
-Everything that the next steps depend on stands in arrays that are saved and restored, and every
-random number follows from the seed of its row, the episode and the control step.
+All that the next steps depend on is in arrays that are saved and restored, and every random number
+follows from the seed of its row, the episode and the control step.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Randomizer:
         """Set up the arrays.
 
         Args:
-            sampler: Samples what is drawn.
-            engine: Flies the aircraft.
-            active: Whether anything follows from what is drawn; nothing is drawn otherwise, unless
+            sampler: The sampler of the randomization.
+            engine: The engine that flies the aircraft.
+            active: Whether anything depends on the drawn numbers; otherwise they are drawn only if
                 commands are late.
         """
         self.sampler, self._engine = sampler, engine
@@ -42,7 +42,8 @@ class Randomizer:
         given, vehicle = sampler.randomization, engine.vehicle
         self._rows: np.ndarray = np.arange(count)
         self.drawn = np.tile(sampler.low, (count, 1))
-        """Numbers of the present episodes, (N, k), by `sampler.names`; replaced, never changed."""
+        """Drawn numbers of the present episodes, (N, k), a column for each of `sampler.names`; the
+        array is replaced, never changed."""
         self.place = np.zeros((2, count), np.int64)
         """Seeds and numbers of the present episodes."""
         self.steps = np.zeros(count, np.int64)
@@ -53,13 +54,13 @@ class Randomizer:
         fewest, most = (self._dead + steps for steps in sampler.delays["command_delay"])
         self._aged = max(sampler.delays[name][1] for name in AGES)
         self.late = most + self._aged > 0
-        """Whether commands pass a queue, or what was is remembered."""
+        """Whether commands pass a queue, or earlier motions are remembered."""
         each = range(vehicle.substeps)
         late = each if self._aged else {k % vehicle.substeps for k in range(fewest, most + 1)}
         ends = [k for k in each if k in late and k] + [vehicle.substeps]
         self.held = [next(end for end in ends if end > k) - k for k in each]
-        """For how many physics steps, from each of a control step on, no command changes and
-        nothing has to be remembered."""
+        """For each physics step of a control step, how many steps can be flown at once: until a
+        command changes or a motion has to be remembered."""
         self.active = active or self.late
         length = 1 + max(most, self._aged)
         self.queue = np.zeros((length, count, rotors))  # [rad/s]
@@ -74,8 +75,8 @@ class Randomizer:
         """Draw the numbers of episodes (n,); nothing changes yet.
 
         Returns:
-            Numbers (n, k), None where nothing follows from them, and rows of parameters (n,), None
-            where all aircraft are the specified one.
+            Numbers (n, k), or None if nothing depends on them, and rows of parameters (n,), or None
+            if all aircraft are the specified one.
 
         Raises:
             QuadrlError: One of the aircraft cannot hover.
@@ -93,7 +94,7 @@ class Randomizer:
     def begin(
         self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray, drawn: Array | None
     ) -> None:
-        """Begin episodes (n,) with the numbers that `sample` gave, the aircraft in their place.
+        """Begin episodes (n,) with the numbers from `sample`, after the aircraft were placed.
 
         Until the first command arrives, the rotors keep their speed.
         """
@@ -108,9 +109,9 @@ class Randomizer:
             self.forget(rows)
 
     def forget(self, rows: np.ndarray) -> None:
-        """Take the present coordinates of aircraft for those that they had before.
+        """Replace the remembered coordinates of aircraft by the present ones.
 
-        Commands on their way that are no numbers become their present rotor speeds.
+        Queued commands that are not finite become the present rotor speeds.
         """
         self.past[:, rows] = self._coordinates[rows]
         late = self.queue[:, rows]
@@ -121,7 +122,7 @@ class Randomizer:
         return np.concatenate([self._engine.qpos, self._engine.qvel], axis=1)
 
     def column(self, name: str) -> Array:
-        """A number of the present episodes by its name, (N,)."""
+        """A drawn number of the present episodes by its name, (N,)."""
         return self.sampler.columns(self.drawn, name)[:, 0]
 
     def shown(self) -> dict[str, Array]:
@@ -129,7 +130,7 @@ class Randomizer:
         return {self.sampler.names[k]: self.drawn[:, k] for k in self.sampler.spread}
 
     def scaled(self, rows: np.ndarray | None = None) -> Array:
-        """The same of some aircraft (n,), or of all, (n, d) from -1 at the lowest to 1."""
+        """The drawn values that differ, of some aircraft (n,) or of all, (n, d), from -1 to 1."""
         return self.sampler.scaled(self.drawn if rows is None else self.drawn[rows])
 
     def _set_delay(self) -> None:
@@ -139,20 +140,20 @@ class Randomizer:
         self._delay, self._ages = self._dead + steps[0], np.array(steps[1:])
 
     def wind_speed(self, drawn: Array | None, weather: Weather) -> Array | None:
-        """Wind speed (n,) [m/s] with the numbers that `sample` gave; None for the weather's."""
+        """Wind speed (n,) [m/s] with the numbers from `sample`; None for the weather's."""
         if drawn is None or self.sampler.randomization.wind == (1.0, 1.0):
             return None
         return weather.wind_speed * self.sampler.columns(drawn, "wind")[:, 0]
 
     def delayed(self, command: Array, steps: int) -> Array:
-        """The delayed command for some physics steps, given the present one, (N, R) [rad/s]."""
+        """Queue a command (N, R) [rad/s] for some physics steps; return the one that arrives."""
         if not self.late:
             return command
         length = len(self.queue)
         first = int(self.newest[0]) + 1
         self.queue[first % length] = command
         arrived = self.queue[(first - self._delay) % length, self._rows]
-        for k in range(1, min(steps, length)):  # which may overwrite what arrives
+        for k in range(1, min(steps, length)):  # this may overwrite the one that arrives
             self.queue[(first + k) % length] = command
         if self._aged:
             self.past[first % length] = self._coordinates
@@ -163,8 +164,8 @@ class Randomizer:
         """Coordinates with the ages, the noise and the bias of the randomization, (n, 13 + R).
 
         Args:
-            rows: Of some aircraft (n,), or of all for None.
-            rotor_speed: That is estimated, (n, R) [rad/s].
+            rows: Which aircraft (n,); None for all.
+            rotor_speed: Estimated rotor speeds (n, R) [rad/s].
 
         Returns:
             Position [m], world frame, quaternion, velocity [m/s], world frame, body rate [rad/s],
@@ -173,7 +174,7 @@ class Randomizer:
         chosen: Any = slice(None) if rows is None else rows
         given, true = self.sampler.randomization, self._coordinates
         if self._aged:
-            # Each physics step remembers what was before it.
+            # Each physics step remembers the coordinates before it.
             places = (self.newest - self._ages + 1) % len(self.past)
             old = np.where(self._ages[..., None], self.past[places, self._rows], true)
             true = np.concatenate([old[0][:, :10], old[1][:, 10:]], axis=1)
@@ -192,7 +193,7 @@ class Randomizer:
         return found
 
     def begin_step(self) -> None:
-        """Count a control step that begins, and push the aircraft that chance hits."""
+        """Count a control step that begins, and push the aircraft that are drawn for it."""
         if self._chance > 0:
             keys, episodes = (array.ctypes.data for array in self.place)
             place = keys, episodes, self.steps.ctypes.data, PUSHES
@@ -207,7 +208,7 @@ class Randomizer:
         return {name: np.array(getattr(self, name)) for name in SAVED}
 
     def check_saved(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Refuse what `save` cannot have given, under its names in a saved environment.
+        """Refuse arrays, by their names in a saved environment, that cannot be from `save`.
 
         Raises:
             QuadrlError: The message names the array.

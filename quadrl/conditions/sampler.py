@@ -1,4 +1,4 @@
-"""Sample aircraft parameters: the rows that a randomization makes of a specified aircraft."""
+"""Sample aircraft parameters: the rows that a randomization makes from a specified aircraft."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from quadrl.conditions.randomization import (
 EACH_ROTOR = ("thrust", "torque", "lag")
 """Factors that each rotor has once more on its own, within `Randomization.rotors`."""
 DAMAGED = "damaged_rotor"
-"""Number of the rotor, from 0 on, that `Randomization.one_rotor` is about."""
+"""Name of the number, from 0 on, of the rotor to which `Randomization.one_rotor` applies."""
 STEADY = ("force", "moment")
 CORNER = "corner"
-"""Whether an episode is one of the share `Randomization.corners`: 1 or 0."""
-UPPER = 0.75  # of a range, above which its corner lies
+"""Name of the flag, 1 or 0, of the episodes in the share `Randomization.corners`."""
+UPPER = 0.75  # share of a range where its corner begins
 ROUNDING = 1e-9
 EXCHANGES = 3
-"""Rounds that suffice: in layouts of four to eight rotors, more find no worse aircraft."""
+"""Enough rounds: in layouts of four to eight rotors, more find no worse aircraft."""
 
 
 class AircraftSampler:
@@ -45,8 +45,8 @@ class AircraftSampler:
         """Validate for a vehicle.
 
         Raises:
-            QuadrlError: It is what `resolve` refuses, a delay is not a multiple of the time step,
-                or an aircraft at the ends of the ranges cannot exist or cannot hover.
+            QuadrlError: `resolve` refuses the randomization, a delay is not a multiple of the time
+                step, or an aircraft at the ends of the ranges cannot exist or cannot hover.
         """
         self.randomization = randomization = resolve(randomization)
         self._vehicle, self._specified = vehicle, parameters.rows(vehicle)
@@ -66,7 +66,7 @@ class AircraftSampler:
             ends |= {f"{name}_bias_{axis}": (-size, size) for axis in "xyz"}
         rotors = range(1, vehicle.rotor_count + 1)
         ends |= {f"{name}_{k}": randomization.rotors for name in EACH_ROTOR for k in rotors}
-        # New numbers stand at the end, so that those before them keep their random numbers.
+        # New numbers are added at the end, so that the others keep their random numbers.
         last = vehicle.rotor_count - 1 if randomization.one_rotor != OFF else 0
         ends |= {"one_rotor": randomization.one_rotor, DAMAGED: (0, last)}
         ends |= {name: getattr(randomization, name) for name in ("rate_delay", "rotor_inertia")}
@@ -77,7 +77,7 @@ class AircraftSampler:
         ends[CORNER] = (0, randomization.corners > 0)
         ends["torque"] = (self._least_torque(), ends["torque"][1])
         self.names = tuple(ends)
-        """Of the numbers; all are drawn, so that a range has no effect on the others."""
+        """Names of the drawn numbers. All are drawn, so that no range affects the other numbers."""
         whole = [
             *((name, ends, step) for name, ends in self.delays.items()),
             (DAMAGED, (0, last), 1.0),
@@ -86,7 +86,7 @@ class AircraftSampler:
         self.low, self._high = np.array([*ends.values()]).T
         self._width = self._high - self.low
         self.spread = np.flatnonzero(self._width)
-        """Which of them differ from aircraft to aircraft."""
+        """Indices of those that differ between aircraft."""
         if randomization != NONE:
             self._check_ends()
         if randomization.moment:
@@ -119,12 +119,12 @@ class AircraftSampler:
         return drawn[:, first : first + count]
 
     def scaled(self, drawn: Array) -> Array:
-        """Those that differ, (n, ...), from -1 at the lowest to 1 at the highest."""
+        """The numbers that differ (n, d), scaled to -1 at the lowest and 1 at the highest."""
         low, width = self.low[self.spread], self._width[self.spread]
         return 2 * (drawn[:, self.spread] - low) / width - 1
 
     def table(self, drawn: Array) -> np.ndarray:
-        """Rows of parameters (n,) of aircraft with some numbers (n, k)."""
+        """Rows of parameters (n,) of the aircraft with drawn numbers (n, k)."""
         count = self._vehicle.rotor_count
         table = np.repeat(self._specified, len(drawn))
         for name in (*FACTORS, "rotor_inertia", "inertia_axes", "one_rotor"):
@@ -142,7 +142,7 @@ class AircraftSampler:
         if self.randomization.inertia_axes != OFF:
             inertia = table["inertia"]
             np.minimum(inertia, inertia.sum(-1, keepdims=True) - inertia, out=inertia)
-        # The origin of the body is the centre of mass: what moves are the rotors.
+        # The origin of the body is the centre of mass, so the rotors move instead of it.
         shift = self.columns(drawn, "centre_of_mass_x", 3)
         self._field(table, *AFFECTS["centre_of_mass"])[:] -= shift[:, None]
         for name, unit in zip(STEADY, self._units, strict=True):
@@ -189,7 +189,7 @@ class AircraftSampler:
         return max(given.torque[0], least)
 
     def _at(self, count: int, **columns: Any) -> Array:
-        """Numbers (count, k): some columns, each from a name on, and the lowest of the others."""
+        """Numbers (count, k): the given columns, each from a name on, and the lowest elsewhere."""
         drawn = np.tile(self.low, (count, 1))
         for name, values in columns.items():
             self.columns(drawn, name, np.atleast_1d(values).shape[-1])[:] = values
@@ -199,7 +199,7 @@ class AircraftSampler:
         """Build the aircraft at the ends of the ranges, which must be sound vehicles."""
         given, count = self.randomization, self._vehicle.rotor_count
         for heavy, inertia, drag in itertools.product((0, 1), repeat=3):
-            # Its mass at one end, what its rotors give at the other.
+            # The mass is at one end of its range, the strength of the rotors at the other.
             weak = 1 - heavy
             ends = {"mass": heavy, "inertia": inertia, "drag": drag, "inflow": 1, "lag": 0}
             ends |= {"rotor_inertia": 1, "thrust": weak, "torque": weak, "max_speed": weak}
@@ -239,8 +239,8 @@ class AircraftSampler:
     def _corners(self) -> Array:
         """Numbers (n, k) of the aircraft in which a rotor turns fastest, or slowest, in hover.
 
-        Thrust and torque of each rotor and the centre of mass lie at one end of their ranges; ends
-        are exchanged as long as that makes it faster, or slower.
+        Thrust and torque of each rotor, the centre of mass and the moment are at one end of their
+        ranges; ends are exchanged as long as that makes the rotor faster, or slower.
         """
         given, count = self.randomization, self._vehicle.rotor_count
         each = "thrust_1", "centre_of_mass_x", "moment_x"
@@ -253,7 +253,7 @@ class AircraftSampler:
         columns["force_x"] = (given.force, given.force, -given.force)  # down, and aside
         drawn = self._at(len(cases), **columns)
         for _ in range(EXCHANGES):
-            # Each aircraft as it is, and with one end exchanged after the other.
+            # Each aircraft as it is, and with each end exchanged in turn.
             tried = np.repeat(drawn[:, None], 1 + len(places), axis=1)
             each = np.arange(len(places))
             tried[:, 1 + each, places] = both - tried[:, 1 + each, places]

@@ -1,8 +1,8 @@
-"""The world of a task: what stands there, and where in each episode.
+"""The world of a task: its solids and where they are in each episode.
 
 A task declares its solids (`Task.solids`) and places them at each reset (`Task.place`), each row
-for itself. Aircraft collide with them in both engines; free flight hands whoever comes near one to
-MuJoCo. What is free, and what was hit, stands in the `Surroundings` of a snapshot.
+for itself. Aircraft collide with them in both engines; free flight hands an aircraft that comes
+near one to MuJoCo. The `Surroundings` of a snapshot have clearances and hits.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from quadrl.engines.solids import KINDS, MOTION
 
 FAR = 1000.0  # [m]
 HIDDEN = 3
-"""Group of the geoms: pictures have the solids as markers, where they stand in the episode."""
+"""Geom group that pictures do not show: they draw the solids where they are in the episode."""
 ELSEWHERE = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
-"""Pose that the geoms are compiled with. At the origin, upright, MuJoCo would take them to stay
-there."""
+"""Pose with which the geoms are compiled: MuJoCo would assume that geoms at the origin, upright,
+stay there."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -51,7 +51,7 @@ class Scene:
         """Check the names.
 
         Raises:
-            QuadrlError: Two solids have the same name, or something is none.
+            QuadrlError: Two solids have the same name, or something is not a solid.
         """
         self.solids = tuple(solids)
         for solid in self.solids:
@@ -59,7 +59,7 @@ class Scene:
                 allowed = "Sphere, Cylinder, Box and Gate of quadrl.conditions.solids"
                 raise QuadrlError(name="solids", value=solid, allowed=allowed)
         self.names = tuple(solid.name for solid in self.solids)
-        """Of the solids, in their order."""
+        """Names of the solids, in order."""
         if len(set(self.names)) < len(self.names):
             raise QuadrlError(name="solids", value=self.names, allowed="a name of its own for each")
         counts = [len(solid.parts) for solid in self.solids]
@@ -67,10 +67,10 @@ class Scene:
         """Number of the first geom of each solid."""
         parts = [(solid.position, part.offset) for solid in self.solids for part in solid.parts]
         self._declared = np.array(parts, dtype=float).reshape(-1, 2, 3).swapaxes(0, 1)
-        """Centres (K, 3) of the geoms' solids, task frame, and the ways from there [m]."""
+        """Centres (K, 3) of the geoms' solids, task frame, and the geoms' offsets from them [m]."""
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add the geoms to a world; where they stand is a row's own."""
+        """Add the geoms to a world; each row has poses of its own."""
         position, quaternion = ELSEWHERE
         for index, solid in enumerate(self.solids):
             for k, part in enumerate(solid.parts):
@@ -83,7 +83,7 @@ class Scene:
             spec.nuser_geom = MOTION + 12
 
     def check(self, engine: Engine) -> None:
-        """Refuse an engine, made already, whose world has other solids.
+        """Refuse an engine whose world has other solids.
 
         Raises:
             QuadrlError: The message names the solids.
@@ -103,9 +103,9 @@ class Scene:
 
         Args:
             placed: Poses of solids by name.
-            count: n.
-            origin: (3,) [m], of the task frame in the world frame.
-            last: Poses of the others; by default they stand where they are declared.
+            count: Number of rows, n.
+            origin: Origin (3,) [m] of the task frame in the world frame.
+            last: Poses of the other solids; by default the declared ones.
 
         Raises:
             QuadrlError: There is no such solid, or an array has the wrong shape.
@@ -136,7 +136,7 @@ class Scene:
         return made
 
     def nothing_near(self, count: int) -> Surroundings:
-        """The surroundings of aircraft (n,) far from everything, before there is an engine."""
+        """The surroundings of aircraft (n,) far from every solid, for use without an engine."""
         position = np.tile([solid.position for solid in self.solids], (count, 1, 1))
         touched = np.zeros((count, len(self.solids)), dtype=bool)
         far, never = np.full(count, FAR), np.zeros(count, dtype=bool)
@@ -145,7 +145,7 @@ class Scene:
         return Surroundings(self.names, *measured)
 
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
-        """The solids as pictures show them, where they stand in the world of a row."""
+        """The solids as pictures show them, at their poses in a row."""
         parts = ((solid, part) for solid in self.solids for part in solid.parts)
         shown: list[Primitive] = []
         for (solid, part), placed in zip(parts, engine.solids.table[row], strict=True):
@@ -159,8 +159,8 @@ class Scene:
     def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
         """The present surroundings of some aircraft (n,) of an engine, or of all.
 
-        They are copies, but for the positions of all: where nothing moves those are live, since
-        they change with an episode and not with a step.
+        They are copies, except for the positions of all aircraft's solids: if no solid moves, these
+        are live, since they then change only with an episode.
         """
         chosen = slice(None) if rows is None else rows
         which, speed = engine.hits[chosen].T

@@ -1,4 +1,4 @@
-"""Base class and registry of sensors, and the output of one for a batch of aircraft."""
+"""Base class and registry of sensors, and the output of a sensor for a batch of aircraft."""
 
 from __future__ import annotations
 
@@ -30,29 +30,29 @@ Kind = TypeVar("Kind", bound=type)
 
 @dataclasses.dataclass(slots=True)
 class Moment:
-    """All that a sensor may look at, at the end of a control step; arrays (n, ...)."""
+    """All that a sensor may read at the end of a control step; arrays (n, ...)."""
 
     true: State
-    state: State  # that is estimated on board; the true one where nothing disturbs the estimate
-    rotor_speed: Array  # (n, R) [rad/s], that the estimate takes
+    state: State  # estimated on board; the true one where nothing disturbs the estimate
+    rotor_speed: Array  # (n, R) [rad/s], for the estimate
     wind: Array  # (n, 3) [m/s], world frame
     action: Array  # (n, k), as it was given; zero at the start
     parameters: Parameters  # of the specified aircraft
     randomizer: Randomizer
     rows: np.ndarray | None  # (n,) which aircraft; None for all
-    frame: EstimatedState | None  # where the estimate is kept; None where it is the truth
-    entries: Array = None  # (n, e), the task's entries of the estimated state, that are seen
+    frame: EstimatedState | None  # keeps the estimate; None where it is the true state
+    entries: Array = None  # (n, e), the task's entries that are seen, of the estimated state
     estimated: Mapping[str, Array] = dataclasses.field(default_factory=dict[str, Array])
-    """All its entries of the estimated state, (n, k) by name."""
+    """All the task's entries, (n, k) by name, of the estimated state."""
     truth: Mapping[str, Array] = dataclasses.field(default_factory=dict[str, Array])
-    """The same of the true state."""
-    observed: Array = None  # (n, m), what is measured, as late as it is seen
+    """The same, of the true state."""
+    observed: Array = None  # (n, m), all measured entries as they are seen, with their delays
     memory: Memory = dataclasses.field(default_factory=Memory)  # what the sensor itself remembers
 
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """Numbers in what sensors look at, for one aircraft."""
+    """Sizes of what sensors read, for one aircraft."""
 
     rotors: int
     actions: int
@@ -64,19 +64,19 @@ class Sizes:
 
 @dataclasses.dataclass(frozen=True)
 class Sensor(abc.ABC):
-    """A sensor of N aircraft. Every number of it has the same errors."""
+    """A sensor of N aircraft. Its errors are the same for each of its numbers."""
 
     name: ClassVar[str]
     """The name in the registry and of the entry in the observation."""
     size: ClassVar[int] = 1
-    """Numbers that it gives."""
+    """Numbers in a sample."""
     unit: ClassVar[str] = "1"
     measured: ClassVar[bool] = True
-    """Whether the history of the observation holds for it."""
+    """Whether it is part of the observation's history."""
     shown: ClassVar[bool] = True
     """Whether it is an entry of the observation."""
     last: ClassVar[bool] = False
-    """Whether it looks at the task's entries or at what is observed, which tasks cannot see."""
+    """Whether it reads the task's entries or what is observed; a task cannot see such a sensor."""
 
     noise: float = 0.0
     """Standard deviation of the error of each sample, in the sensor's unit."""
@@ -95,34 +95,34 @@ class Sensor(abc.ABC):
             object.__setattr__(self, name, value)
 
     def width(self, sizes: Sizes) -> int:
-        """Numbers that it gives on an aircraft."""
+        """Numbers in a sample on an aircraft."""
         return self.size
 
     @property
     def hides(self) -> tuple[str, ...]:
-        """Entries of the task that are not seen with it."""
+        """Entries of the task that it hides."""
         return ()
 
     def begin(self, now: Moment) -> Memory:
-        """What it remembers at the start of episodes, arrays (n, ...) by name."""
+        """Its memory at the start of episodes, arrays (n, ...) by name."""
         return {}
 
     def follow(
         self, memory: Memory, specified: Parameters, command: Array, seconds: float
     ) -> Memory:
-        """What it remembers after commands (N, R) [rad/s] to the rotors for a time [s]."""
+        """Its memory after commands (N, R) [rad/s] to the rotors for a time [s]."""
         return memory
 
     def update(self, now: Moment) -> Memory:
-        """What it remembers after a control step, in place of `now.memory`."""
+        """Its memory after a control step, which replaces `now.memory`."""
         return now.memory
 
     @abc.abstractmethod
     def sense(self, now: Moment) -> Array:
-        """What it measures, (n, size)."""
+        """A sample without errors, (n, size)."""
 
     def tell(self, now: Moment, seen: Array) -> None:
-        """Put what is seen of all aircraft (N, size) where the sensors after it look."""
+        """Write what is seen of all aircraft (N, size) into `now`, for the sensors after it."""
         return
 
 
@@ -132,7 +132,7 @@ SENSORS: dict[str, type[Sensor]] = {}
 
 @dataclass_transform(frozen_default=True)
 def register_sensor(kind: Kind) -> Kind:
-    """Add a sensor to the registry, so that `observe` knows it by its name.
+    """Add a sensor to the registry, so that `observe` finds it by its name.
 
     Raises:
         QuadrlError: It is not a Sensor subclass with a name, or another sensor has the name.
@@ -143,10 +143,10 @@ def register_sensor(kind: Kind) -> Kind:
 
 
 def make(name: str, options: Any) -> Sensor:
-    """The sensor of a name with some options.
+    """Make the sensor of a name with some options.
 
     Raises:
-        QuadrlError: An unknown sensor or option; the message lists the choices.
+        QuadrlError: The sensor or an option is unknown; the message lists the choices.
     """
     kind = SENSORS[choice("sensor", name, SENSORS)]
     if not isinstance(options, Mapping):
@@ -179,11 +179,11 @@ class Channel:
 
     @property
     def seen(self) -> Array:
-        """What is seen of it now, (N, width)."""
+        """What is seen now, (N, width)."""
         return self._values[self._delay]
 
     def begin(self, now: Moment) -> None:
-        """Begin episodes; the first sample is seen until the next one arrives."""
+        """Begin episodes, whose first sample is seen until the next one arrives."""
         rows = self._rows if now.rows is None else now.rows
         now.memory = self.sensor.begin(now)
         kept = {name: np.array(array) for name, array in self._memory.items()}
@@ -199,11 +199,11 @@ class Channel:
         self.sensor.tell(now, self.seen)
 
     def follow(self, specified: Parameters, command: Array, seconds: float) -> None:
-        """Take commands (N, R) [rad/s] to the rotors for a time [s]."""
+        """Update the memory by commands (N, R) [rad/s] to the rotors for a time [s]."""
         self._memory = self.sensor.follow(self._memory, specified, command, seconds)
 
     def step(self, now: Moment) -> None:
-        """Sense all after a control step."""
+        """Take samples of all aircraft after a control step."""
         now.memory = self._memory
         self._memory = now.memory = self.sensor.update(now)
         sample = self._sample(self._rows, now)
@@ -228,7 +228,7 @@ class Channel:
         return sample
 
     def save(self) -> dict[str, np.ndarray]:
-        """Copies of what the next steps depend on, by the sensor's name."""
+        """Copies of the arrays that the next steps depend on, under the sensor's name."""
         own = {"values": self._values, "bias": self._bias, **self._memory}
         return {f"{self.sensor.name}.{name}": np.array(array) for name, array in own.items()}
 
@@ -240,10 +240,10 @@ class Channel:
 
 
 class EstimatedState(Frame):
-    """A table of states by other coordinates than the engine's."""
+    """A table of states from other coordinates than the engine's."""
 
     def __init__(self, engine: Engine) -> None:
-        """Lay it out for the aircraft of an engine."""
+        """Make the table for the aircraft of an engine."""
         count, rotors = engine.ctrl.shape
         super().__init__(count, rotors)
         self._coordinates = np.zeros((count, 13 + rotors))
@@ -254,11 +254,11 @@ class EstimatedState(Frame):
         self._rows = native.struct(*arrays, 13 + rotors, 0, self.columns, rotors)
 
     def fill(self, coordinates: np.ndarray, rows: np.ndarray | None) -> State:
-        """The state of some aircraft (n,), or of all.
+        """Fill the table, and return the state of some aircraft (n,), or of all.
 
         Args:
-            coordinates: Of all, (N, 13 + R): position [m], world frame, quaternion, velocity
-                [m/s], world frame, body rate [rad/s], body frame, and rotor speeds [rad/s].
+            coordinates: Coordinates of all, (N, 13 + R): position [m], world frame, quaternion,
+                velocity [m/s], world frame, body rate [rad/s], body frame, rotor speeds [rad/s].
             rows: Which aircraft; None for all.
         """
         self._coordinates[:] = coordinates

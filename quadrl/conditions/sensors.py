@@ -1,9 +1,9 @@
-"""Sensors: what is estimated, measured and remembered, each with its own errors, delay and rate.
+"""Sensors: estimates, measurements and histories, each with its own errors, delay and rate.
 
 A sensor is a frozen dataclass: its fields are its options, its methods are pure functions of a
-`Moment`. One of your own is a class with `sense`, registered by its name. In a control step they
-sense one after the other: rotor speeds, the estimate, what is measured; then, after the task's
-functions, the task's entries, the history, and what the critic alone sees.
+`Moment`. To add one, register a class with a name and `sense`. In a control step sensors are read
+in order: rotor speeds, the state estimate, measurements; then, after the task's functions, the
+task's entries, the history, and what the critic alone sees.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class RotorSpeed(Sensor):
 
     @property
     def hides(self) -> tuple[str, ...]:
-        """The task's own entry, on demand."""
+        """The task's entry, unless `entry` is true."""
         return () if self.entry else ("rotor_speed",)
 
     def width(self, sizes: Sizes) -> int:
@@ -55,13 +55,13 @@ class RotorSpeed(Sensor):
         return sizes.rotors
 
     def begin(self, now: Moment) -> Memory:
-        """The model starts from the true ones."""
+        """A model starts from the true speeds."""
         return {} if self.source == "true" else {"speed": now.true.rotor_speed}
 
     def follow(
         self, memory: Memory, specified: Parameters, command: Array, seconds: float
     ) -> Memory:
-        """Each approaches its command, no faster than the rotor turns at most."""
+        """Each speed approaches its command, up to the rotor's largest speed."""
         if not memory:
             return memory
         speed, rotor = memory["speed"], specified.rotor
@@ -70,11 +70,11 @@ class RotorSpeed(Sensor):
         return {"speed": speed + np.where(goal > speed, up, down) * (goal - speed)}
 
     def sense(self, now: Moment) -> Array:
-        """True or modelled."""
+        """The true or modelled speeds."""
         return now.true.rotor_speed if self.source == "true" else now.memory["speed"]
 
     def tell(self, now: Moment, seen: Array) -> None:
-        """To the estimate."""
+        """Give the speeds to the estimate."""
         now.rotor_speed = seen if now.rows is None else seen[now.rows]
 
 
@@ -101,11 +101,11 @@ class StateEstimate(Sensor):
         return 13 + sizes.rotors
 
     def sense(self, now: Moment) -> Array:
-        """With the errors that are drawn."""
+        """The coordinates with errors."""
         return now.randomizer.estimated(now.rows, now.rotor_speed)
 
     def tell(self, now: Moment, seen: Array) -> None:
-        """To all that looks at the estimated state."""
+        """Make the estimate the state that the other sensors and the task see."""
         if now.frame is not None:
             now.state = now.frame.fill(seen, now.rows)
 
@@ -117,11 +117,11 @@ class Entries(Sensor):
     name, unit, last = "state", "", True
 
     def width(self, sizes: Sizes) -> int:
-        """All of them that are seen."""
+        """All entries that are seen."""
         return sizes.entries
 
     def sense(self, now: Moment) -> Array:
-        """As the task gives them."""
+        """The entries as the task gives them."""
         return now.entries
 
 
@@ -133,7 +133,7 @@ class RelativeRotorSpeed(Sensor):
 
     @property
     def hides(self) -> tuple[str, ...]:
-        """The same over the largest speed."""
+        """The task's entry, which is relative to the largest speed."""
         return ("rotor_speed",)
 
     def width(self, sizes: Sizes) -> int:
@@ -141,7 +141,7 @@ class RelativeRotorSpeed(Sensor):
         return sizes.rotors
 
     def sense(self, now: Moment) -> Array:
-        """True or modelled, as `rotor_speed` says."""
+        """From the estimate, whose speeds the sensor `rotor_speed` gives."""
         return now.state.rotor_speed / now.parameters.rotor.hover_speed - 1.0
 
 
@@ -182,7 +182,7 @@ class Disturbance(Sensor):
         number("disturbance smoothing", self.smoothing, 0, MAX)
 
     def share(self, timestep: float) -> float:
-        """What of a change arrives within a control step [s]."""
+        """The share of a change that is felt within a control step [s]."""
         return 1 - math.exp(-timestep / self.smoothing) if self.smoothing else 1.0
 
     def begin(self, now: Moment) -> Memory:
@@ -191,14 +191,14 @@ class Disturbance(Sensor):
         return {"motion": motion, "felt": np.zeros((len(motion), 3))}
 
     def update(self, now: Moment) -> Memory:
-        """Smooth what the last control step shows."""
+        """Smooth the acceleration of the last control step."""
         last, motion = now.memory["motion"], moving(now.parameters, now.state)
         timestep = float(now.parameters.control_timestep)
         share = self.share(timestep)
         return {"motion": motion, "felt": felt(now.memory["felt"], last, motion, timestep, share)}
 
     def sense(self, now: Moment) -> Array:
-        """In the body frame."""
+        """The smoothed acceleration in the body frame."""
         return to_body(now.state.rotation, now.memory["felt"])
 
 
@@ -206,8 +206,8 @@ class Disturbance(Sensor):
 class Aim(Sensor):
     """From the aircraft to a place beyond the goal by the sum of past offsets, body frame.
 
-    It stands in the place of the goal and of the position: what flies to it as to a goal comes to
-    rest at the goal itself, whatever lasting force there is, since until then the place moves on.
+    It replaces the goal and the position: a policy that flies to this place as to a goal comes to
+    rest at the goal itself under any constant force, since the place moves on until then.
     """
 
     name, size, unit, last = "aim", 3, "m", True
@@ -233,15 +233,15 @@ class Aim(Sensor):
 
     @property
     def hides(self) -> tuple[str, ...]:
-        """What says where the goal is."""
+        """The entries that tell where the goal is."""
         return ("position",) if self.beside_goal else ("position", "goal")
 
     def begin(self, now: Moment) -> Memory:
-        """Nothing is summed up."""
+        """The sum is zero."""
         return {"sum": np.zeros((len(now.wind), self.size))}
 
     def update(self, now: Moment) -> Memory:
-        """Add a short offset."""
+        """Add the offset to the sum if it is short."""
         offset = to_world(now.state.rotation, now.estimated["goal"])
         added = np.where(norm(offset)[:, None] < self.near, offset, 0.0)
         seconds = float(now.parameters.control_timestep)
@@ -249,7 +249,7 @@ class Aim(Sensor):
         return {"sum": np.clip(summed, -self.most, self.most)}
 
     def sense(self, now: Moment) -> Array:
-        """From the estimated state."""
+        """The goal of the estimated state, plus the sum in the body frame."""
         return now.estimated["goal"] + to_body(now.state.rotation, now.memory["sum"])
 
 
@@ -279,15 +279,15 @@ class ActionHistory(History):
         return self.length * sizes.actions
 
     def begin(self, now: Moment) -> Memory:
-        """No action was taken."""
+        """Zeros: no action was taken yet."""
         return {"actions": np.zeros((len(now.action), self.length * now.action.shape[1]))}
 
     def update(self, now: Moment) -> Memory:
-        """Put the last one before the others, of which the oldest goes."""
+        """Put the last action before the others, of which the oldest is dropped."""
         return {"actions": pushed(now.memory["actions"], np.clip(now.action, -1.0, 1.0))}
 
     def sense(self, now: Moment) -> Array:
-        """As they were taken."""
+        """The actions, clipped to [-1, 1]."""
         return now.memory["actions"]
 
 
@@ -298,19 +298,19 @@ class ObservationHistory(History):
     name, unit, last = "observation_history", "", True
 
     def width(self, sizes: Sizes) -> int:
-        """All numbers of what is measured."""
+        """All numbers of all observations."""
         return self.length * sizes.observed
 
     def begin(self, now: Moment) -> Memory:
-        """There is none but the first."""
+        """The first observation, repeated."""
         return {"past": np.tile(now.observed, 1 + self.length)}
 
     def update(self, now: Moment) -> Memory:
-        """Put the present one before the others, of which the oldest goes."""
+        """Put the present one before the others, of which the oldest is dropped."""
         return {"past": pushed(now.memory["past"], now.observed)}
 
     def sense(self, now: Moment) -> Array:
-        """Those before the present one."""
+        """The observations before the present one."""
         return now.memory["past"][:, now.observed.shape[1] :]
 
 
@@ -324,17 +324,17 @@ class Privileged(Sensor):
     name, unit, measured, shown, last = "privileged", "", False, False, True
 
     def width(self, sizes: Sizes) -> int:
-        """All of that."""
+        """All of these."""
         return sizes.truth + sizes.drawn + 3
 
     def sense(self, now: Moment) -> Array:
-        """Side by side."""
+        """The true entries, what was drawn and the wind, side by side."""
         wind, drawn = to_body(now.true.rotation, now.wind), now.randomizer.scaled(now.rows)
         return np.concatenate([*now.truth.values(), drawn, wind], axis=-1)
 
 
 def pushed(past: Array, newest: Array) -> Array:
-    """Numbers (n, k) of the past with the newest (n, m) before them; the oldest m go."""
+    """Past numbers (n, k) with the newest (n, m) before them; the oldest m are dropped."""
     return np.concatenate([newest, past[:, : -newest.shape[1]]], axis=-1)
 
 
@@ -351,11 +351,11 @@ def felt(
     """The acceleration that weight and specified thrust do not explain, smoothed.
 
     Args:
-        disturbance: The last one, (n, 3) [m/s^2], world frame.
-        last: What `moving` gave a control step ago, (n, 6).
-        now: What it gives now.
+        disturbance: The last result, (n, 3) [m/s^2], world frame.
+        last: Result of `moving` a control step ago, (n, 6).
+        now: Its present result.
         timestep: Control timestep [s].
-        share: What of a change arrives within it, as `Disturbance.share`.
+        share: Share of a change that is felt within it, as `Disturbance.share`.
     """
     rate = (now[:, :3] - last[:, :3]) / timestep
     rate = rate - (0.5 * (now[:, 3:] + last[:, 3:]) + WEIGHT)

@@ -28,7 +28,7 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Solid(abc.ABC):
-    """Something that an aircraft can hit."""
+    """An object that an aircraft can hit."""
 
     name: str
     """Name by which the task places it."""
@@ -53,7 +53,7 @@ class Solid(abc.ABC):
     @property
     @abc.abstractmethod
     def parts(self) -> tuple[Part, ...]:
-        """The geoms that it is made of."""
+        """The geoms that make up the solid."""
 
 
 @dataclasses.dataclass(frozen=True)

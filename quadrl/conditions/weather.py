@@ -1,16 +1,15 @@
 """The weather: the parameters of the wind, and the process that generates it.
 
-The wind is one vector for an aircraft. It changes once a control step, before the physics, and
-stands in the aircraft's row of air (`engine.air`) meanwhile.
+The wind is one vector per aircraft, in its row of air (`engine.air`). It changes once a control
+step, before the physics.
 
 - Mean wind over rough ground: U(h) = W20 ln(h/z0) / ln(6.096/z0) at the height h of the aircraft,
   zero up to h = z0.
 - Turbulence: Dryden's spectra at low altitude (MIL-F-8785C, 3.7.2), along the mean wind, to its
   left and up. The filters are discretised exactly, so the spectra do not depend on the step. The
-  mean wind carries the turbulence past, at the task's altitude: the air is the same whatever the
-  aircraft does.
-- One gust an episode: a pulse (1 - cos), at a random time.
-- Where it is asked for, a noise of the lift of each rotor: independent first-order processes.
+  mean wind at the task's altitude carries the turbulence past, whatever the aircraft does.
+- One gust an episode: a pulse (1 - cos) at a random time.
+- On demand, a noise of the lift of each rotor: independent first-order processes.
 """
 
 from __future__ import annotations
@@ -89,7 +88,7 @@ WEATHERS: dict[str, Weather] = {
 
 
 Weathered = str | Weather | Mapping[str, Any] | None
-"""What `Weather.of` takes."""
+"""Types that `Weather.of` takes."""
 
 
 def noise_time_of(vehicle: Vehicle) -> float:
@@ -107,9 +106,9 @@ def noise_time_of(vehicle: Vehicle) -> float:
 
 
 class WeatherProcess:
-    """The weather of the aircraft of an engine, a column of its table for each.
+    """The weather of the aircraft of an engine, with a table of a column for each.
 
-    An aircraft's weather depends on the key and the number of its episode alone.
+    An aircraft's weather depends only on its key and the number of its episode.
     """
 
     def __init__(
@@ -119,8 +118,8 @@ class WeatherProcess:
 
         Args:
             weather: The weather.
-            engine: Whose air it writes.
-            time_limit: Time limit of an episode [s]: the gust blows within it.
+            engine: The engine whose air is written.
+            time_limit: Time limit of an episode [s], within which the gust blows.
             noise_time: Correlation time of the noise of each rotor's lift [s]; 0 for none.
         """
         self.weather = weather
@@ -157,10 +156,10 @@ class WeatherProcess:
         """Begin episodes, and write their first air.
 
         Args:
-            rows: Numbers (n,) of the aircraft, which are where their episodes begin.
-            keys: (n,) int64, of those rows.
-            episodes: (n,) int64, numbers of the episodes.
-            wind_speed: (n,) [m/s], where each has another than the weather's.
+            rows: Numbers (n,) of the aircraft, which were placed already.
+            keys: Keys (n,) int64 of those rows.
+            episodes: Numbers (n,) int64 of the episodes.
+            wind_speed: Wind speed (n,) [m/s] of each; None for the weather's.
         """
         self._streams[:, rows] = keys, episodes
         if wind_speed is not None:
@@ -191,7 +190,7 @@ class WeatherProcess:
         return stack(mean * np.cos(bearing), mean * np.sin(bearing))
 
     def _drawn(self, keys: Array, episodes: Array) -> tuple[Array, Array, Array]:
-        """Directions of the mean wind and of the gust [rad], and when it begins, 0 to 1, (n,)."""
+        """Directions (n,) of mean wind and gust [rad], and when the gust begins, 0 to 1."""
         rng = Rng(keys, episodes, WEATHER)
         wind, gust, begins = (rng.uniform(0.0, 1.0) for _ in range(3))
         if self.weather.direction is not None:
@@ -207,11 +206,11 @@ class WeatherProcess:
             self._table[ROWS.index(name), rows] = value
 
     def save(self) -> dict[str, np.ndarray]:
-        """Everything that the next steps depend on, as arrays."""
+        """All arrays that the next steps depend on."""
         return {"table": self._table.copy(), "streams": self._streams.copy()}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Refuse what was saved in another weather, or is not finite.
+        """Refuse arrays that were saved in another weather, or are not finite.
 
         Raises:
             QuadrlError: The message names the array.
