@@ -1,12 +1,12 @@
 """Derivatives of free flight by the state and by the rotor commands.
 
-`native/adjoint.c` is the reverse of the steps of `native/free_flight.c`, with every force: the
-paper's, wind, and what the air does to rotors. The reverse of the equations is written by
-`quadrl.base.trace` from `dynamics.derivative`, for the effects of the air and the number of rotors
-that are flown. Forces that are defined piece by piece (the largest rotor speed, rotors that rise
-and fall at different rates, the limits of lift, the vortex ring state) have the derivative of the
-piece that they are on; at an edge, where there is none, that of one side. The wind counts as given,
-although its mean depends on the height.
+`native/adjoint.c` is the reverse mode of the steps of `native/free_flight.c`, with every force: the
+paper's, wind, and effects of the air on rotors. `quadrl.base.trace` generates the reverse of the
+equations from `dynamics.derivative`, for the effects of the air and the number of rotors that are
+flown. Forces that are defined piece by piece (the largest rotor speed, rotors that rise and fall at
+different rates, the limits of lift, the vortex ring state) have the derivative of the piece in use;
+at an edge, where there is none, that of one side. The wind counts as given, although its mean
+depends on the height.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from quadrl.engines.native import compiling
 from quadrl.engines.threads import LANES
 
 COORDINATES = 13
-"""Numbers of a motion beside its rotor speeds: 7 of qpos, 6 of qvel."""
+"""Size of a motion without rotor speeds: 7 of qpos, 6 of qvel."""
 STEP_ROWS = 4 * (COORDINATES + MAX_ROTORS) + 4
-"""Of `Step` in native/adjoint.c, LANES numbers each."""
+"""Rows of `Step` in native/adjoint.c, of LANES numbers each."""
 PLACES = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
-"""A row whose numbers say where they stand."""
+"""A row of parameters in which each number is its own index."""
 SOURCE = """enum {{ EFFECTS = {effects}, ROTORS = {rotors} }};
 static const double c[] = {{{constants}}};
 
-// From the derivatives of a number by the rates of change of motions m to those by the motions,
-// which are set, and by the commands, to which it adds. p: the numbers of an Aircraft.
+// From the derivatives of a scalar by the rates of change of motions m to those by the motions,
+// which are set, and by the commands, which are added to. p: the numbers of an Aircraft.
 VECTORISED static void back_derivative(
     const Lanes* restrict p, const Lanes* restrict m, const Lanes* restrict command,
     const Lanes* restrict air, const Lanes* restrict rate_, Lanes* restrict m_,
@@ -51,7 +51,7 @@ VECTORISED static void back_derivative(
 
 
 def reverse(effects: int, rotors: int) -> str:
-    """C of the reverse of `dynamics.derivative`, with some effects of the air and rotors."""
+    """C of the reverse of `dynamics.derivative`, for effects of the air and a number of rotors."""
     trace, size = Trace(max_operations=math.inf), COORDINATES + rotors
 
     def read(name: str, rows: Array) -> Array:
@@ -73,18 +73,18 @@ def reverse(effects: int, rotors: int) -> str:
 
 
 def build(effects: int, rotors: int, target: compiling.Target = compiling.HERE) -> Path:
-    """Compile native/adjoint.c as `compiling.build` does, for what `kernel` takes."""
+    """Compile native/adjoint.c by `compiling.build`; the other arguments are those of `kernel`."""
     generated = {"reverse.h": reverse(effects, rotors)}
     return compiling.build(("adjoint.c",), "adjoint", generated, target=target)
 
 
 @functools.cache
 def kernel(effects: int, rotors: int) -> Callable[[int, int, int], None]:
-    """`quadrl_adjoint` of native/adjoint.c, compiled where the cache does not hold it.
+    """`quadrl_adjoint` of native/adjoint.c, compiled unless it is in the cache.
 
     Args:
-        effects: The most that an aircraft has, as `Aerodynamics.effects`.
-        rotors: How many each has.
+        effects: The largest `Aerodynamics.effects` of the aircraft.
+        rotors: Number of rotors of each.
 
     Raises:
         NativeError: There is no compiler, or it refused the sources.
@@ -104,7 +104,7 @@ class Leg:
     air: np.ndarray  # (N, AIR), as `parameters.AIR` has it
     parameters: np.ndarray  # (1,) row for all, or blocks of LANES, as free flight has them
     world: np.ndarray  # (3,), of `free_flight.world`
-    steps: int  # physics steps
+    steps: int  # number of physics steps
 
     def fly(self) -> np.ndarray:
         """The state at its end, (N, 13 + R)."""
@@ -133,7 +133,7 @@ class Leg:
         legs = native.struct(*taken, given, *filled, block)
         column = int(PLACES["effects"][0])
         own = self.parameters[:, column] if block else self.parameters["effects"]
-        # A row that names another number is a damaged one, and not a number afterwards.
+        # A row with another value is damaged; its results are NaN.
         found = (kind for kind in (ROTOR_EFFECTS, GROUND_EFFECT) if (own == kind).any())
         most = max(found, default=STILL_AIR)
         for effects in (min(most, ROTOR_EFFECTS), most):  # few come near the ground

@@ -1,7 +1,7 @@
-"""How the air moves: mean wind, turbulence, a gust, and the unsteady lift of rotors that sink.
+"""Coefficients of the air's motion: mean wind, turbulence, a gust, and unsteady lift of rotors.
 
-The definition, in any array namespace; `native/weather.c` does the same arithmetic in the same
-order. `quadrl/conditions/weather.py` says what the weather is, and lets it blow.
+`native/weather.c` computes the motion itself; `quadrl/conditions/weather.py` has the parameters of
+the weather and runs it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from quadrl.base.philox import TURBULENCE
 REFERENCE = 6.096  # [m], 20 ft: the height of W20
 FOOT = 0.3048  # [m]
 LOWEST = 10 * FOOT
-"""Height down to which the standard gives the turbulence [m]. Below it upward gusts fade in
+"""Lowest height for which the standard gives the turbulence [m]. Below it upward gusts fade in
 proportion to the height, since no air blows through the ground (the law of the wall)."""
-LEAST_SPEED = 1.0  # [m/s], with which turbulence is carried past at least
-"""Chosen: in weaker wind turbulence would stand still."""
-WALK = ("keep", "rate", "first", "across", "second")  # of a filter of second order
+LEAST_SPEED = 1.0
+"""Smallest speed [m/s] at which turbulence is carried past (chosen); in calm air it would stand
+still."""
+WALK = ("keep", "rate", "first", "across", "second")
+"""Coefficients of a second-order filter."""
 FIXED = (
     "shear",  # [m/s], mean wind over ln(h/z0)
     "level_deviation",  # [m/s], of turbulence along the mean wind and to its left
@@ -31,24 +33,26 @@ FIXED = (
     *(f"up_{name}" for name in WALK),
     *("noise_keep", "noise_fresh"),
 )
-"""What follows from the weather alone."""
+"""Quantities that follow from the weather alone."""
 DRAWN = ("east", "north", "gust_start", "gust_east", "gust_north")
-"""Direction of the mean wind; begin [s] and velocity [m/s] of the gust."""
+"""Direction of the mean wind; start [s] and velocity [m/s] of the gust."""
 NOISE = tuple(f"noise_{k}" for k in range(MAX_ROTORS))
 FILTERS = ("along", "left", "left_lag", "up", "up_lag", *NOISE)
 """States of the filters, of unit variance."""
 ROWS = (*FIXED, *DRAWN, "steps", *FILTERS)
-"""Of the table of a process, a column for each aircraft; `steps` counts the control steps."""
+"""Rows of the table of a `WeatherProcess`, which has a column for each aircraft; `steps` counts the
+control steps."""
 BLOCKS = 3 + MAX_ROTORS // 2
-"""Of four random words, for a step: five numbers of the turbulence, and one for each rotor."""
+"""Blocks of four random words that a step takes: for five normal numbers of the turbulence, and one
+for each rotor."""
 LOG_TERMS, SINE_TERMS = 11, 11
-"""Of the series, for an error of some 1e-16."""
+"""Terms of the series, for an error of some 1e-16."""
 
 
 def fixed_of(
     wind_speed: Any, roughness: float, altitude: float, timestep: float, noise_time: float
 ) -> dict[str, Any]:
-    """The rows FIXED, numbers or (n,).
+    """Compute the rows FIXED, numbers or (n,).
 
     Args:
         wind_speed: W20, a number or (n,) [m/s].
@@ -83,9 +87,9 @@ def mean_wind(wind_speed: Any, roughness: float, height: Any) -> Any:
 
 
 def _second_order(name: str, rate: Any) -> dict[str, Any]:
-    """One step of x1' = -x1 + noise, x2' = -x2 + x1 over `rate` time constants.
+    """Coefficients of a step of x1' = -x1 + noise, x2' = -x2 + x1 over `rate` time constants.
 
-    Covariances: of x1 1/2, of x1 and x2 1/4, of x2 1/4, before and after each step.
+    The covariances of x1, of x1 and x2, and of x2 are 1/2, 1/4 and 1/4 before and after each step.
     """
     keep, square = np.exp(-rate), np.exp(-2 * rate)
     q11 = -np.expm1(-2 * rate) / 2

@@ -1,8 +1,8 @@
 """The equations of motion in the array API: the definition that the C of `native/` is held against.
 
-Equations 3 to 10 of the paper for rows of aircraft, in NumPy or torch, and what the air does to
-rotors beside them (`quadrl.aircraft.aerodynamics`). `native/aero.h` has the same forces; a force
-term is written there and here, under the same name. Its derivatives are generated from here
+Equations 3 to 10 of the paper for rows of aircraft, in NumPy or torch, and further effects of the
+air on rotors (`quadrl.aircraft.aerodynamics`). `native/aero.h` has the same forces: a force is
+written there and here, under the same name. Its derivatives are generated from this file
 (`quadrl.engines.adjoint`).
 """
 
@@ -36,7 +36,7 @@ from quadrl.base.rotation import (
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """What moves, arrays (N, k); rates of change stand in the same fields."""
+    """Position, velocity and rotor speeds, arrays (N, k), or their rates of change."""
 
     position: Array  # (N, 3) [m], world frame
     quaternion: Array  # (N, 4) (w, x, y, z), body to world
@@ -48,7 +48,7 @@ class Motion:
 def rotor_acceleration(p: Parameters, speed: Array, command: Array) -> Array:
     """Equation 10 (N, R) [rad/s^2]: the lag of the rotors, which may rise and fall differently.
 
-    A command above a rotor's largest speed asks for that.
+    A command above a rotor's largest speed counts as that speed.
     """
     xp = namespace(speed)
     goal = xp.where(command < p.rotor.max_speed, command, p.rotor.max_speed)
@@ -217,11 +217,11 @@ def derivative(
 
     Args:
         p: Parameters of the rows.
-        motion: What is.
+        motion: The present motion.
         command: (N, R) of the rotors [rad/s].
         air: (N, AIR) as `parameters.AIR` has it, or the wind alone (N, 3) [m/s, world frame].
         gravity: Along z [m/s^2], negative.
-        effects: `Aerodynamics.effects`: what of the air is written down at all.
+        effects: Largest `Aerodynamics.effects` of the rows; other effects are left out.
     """
     rate, speed, q = motion.body_rate, motion.rotor_speed, motion.quaternion
     rotation = rotation_matrix(q / norm(q)[..., None])

@@ -1,6 +1,6 @@
 """The interface of engines: rows of coordinates, commands, air and parameters, and a State.
 
-An engine takes rotor commands, advances some physics steps, and says which aircraft diverged.
+An engine takes rotor commands, advances some physics steps, and reports which aircraft diverged.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Engine(abc.ABC):
     air: np.ndarray  # (N, AIR) rows of air; saved and restored with the rest
     wind: np.ndarray  # (N, 3) [m/s], world frame: the first numbers of `air`
     parameters: np.ndarray  # (N,) rows, or (1,) where all are the same
-    forked = False  # whether it is of the process that this one was forked from, as its threads are
+    forked = False  # whether it was made before this process was forked, which lacks its threads
 
     def __init__(
         self,
@@ -71,8 +71,8 @@ class Engine(abc.ABC):
             fields["userdata"][:, parameters.AIR :][:, part]
             for part in (np.s_[: parameters.HIT], np.s_[parameters.HIT :])
         )
-        """(N, HIT) of this control step and (N, FEET) of this episode, live; (N, 0) in a world
-        without solids."""
+        """Hits (N, HIT) of this control step and touches of feet (N, FEET) in this episode, live;
+        (N, 0) in a world without solids."""
         rows = self._model_field("body_user")[:, 1]
         self.parameters = rows.view(parameters.AIRCRAFT)[:, 0]
         flown = self.model, fields, self.parameters, self._threads, self.solids
@@ -103,7 +103,7 @@ class Engine(abc.ABC):
         """Give some aircraft (n,) parameters (n,) of their own; MuJoCo's own fields follow."""
         rotor = table["rotor"][:, : self.vehicle.rotor_count]
         mass, inertia = table["mass"][:, None], table["inertia"]
-        # What MuJoCo works out from mass and inertia when it compiles a model.
+        # As MuJoCo computes them from mass and inertia when it compiles a model.
         weights = np.concatenate([1 / mass, (1 / inertia).mean(1, keepdims=True)], axis=1)
         ratio = rotor["torque_coefficient"] / rotor["thrust_coefficient"]
         for name, place, value in (
@@ -131,7 +131,7 @@ class Engine(abc.ABC):
         """Fly some physics steps with the commands in `ctrl`."""
 
     def leg(self, steps: int) -> Leg:
-        """Copy the start and the conditions of the next physics steps, for their derivatives.
+        """Copy the state, commands, air and parameters of the next steps, for their derivatives.
 
         Raises:
             QuadrlError: The engine is not free flight.
@@ -140,7 +140,7 @@ class Engine(abc.ABC):
             reason = "MuJoCo's steps have no derivatives here"
             raise QuadrlError(reason, name="engine", value=self.name, allowed="'free_flight'")
         start = np.concatenate([self.qpos, self.qvel, self.act], axis=1)
-        own = len(self.parameters) > 1  # which a reset may change
+        own = len(self.parameters) > 1  # a reset may change them
         table = flies.parameters.copy() if own else flies.parameters
         return Leg(start, self.ctrl.copy(), self.air.copy(), table, flies.world, steps)
 
@@ -174,14 +174,14 @@ class Engine(abc.ABC):
         return broken
 
     def peek(self) -> State:
-        """The state in the middle of a control step, in buffers of its own; nothing is checked."""
+        """The state in the middle of a control step, in separate buffers, unchecked."""
         if self._middle is None:
             self._middle = Frame(self.num_envs, self.vehicle.rotor_count)
         self._kernel(self._address, self.num_envs, None, self._middle.address)
         return self._middle.state
 
     def _check_parameters(self, rows: np.ndarray) -> None:
-        """Refuse parameters that are not finite, with which aircraft diverge at every step."""
+        """Refuse parameters that are not finite: with them aircraft diverge at every step."""
         table = self.parameters if len(self.parameters) == 1 else self.parameters[rows]
         for name in parameters.AIRCRAFT.names or ():
             if not np.isfinite(table[name].copy().view(np.float64)).all():
@@ -191,7 +191,7 @@ class Engine(abc.ABC):
                 )
 
     def check_air(self) -> None:
-        """Refuse air that is not finite: what is written to `wind` and `air` is not checked there.
+        """Refuse air that is not finite, since users may write to `wind` and `air`.
 
         Raises:
             QuadrlError: The message names the aircraft.
@@ -213,16 +213,16 @@ class Engine(abc.ABC):
 
         Args:
             rows: Which aircraft, (n,).
-            start: Arrays (n, k).
-            table: Parameters (n,) that they get; None for those that they have.
-            solids: Poses (n, K, 7) of the geoms of solids, as `Solids.place` takes them; None for
-                where they are.
+            start: Their starts, arrays (n, k).
+            table: New parameters (n,) for them; None to keep theirs.
+            solids: Poses (n, K, 7) of the geoms of solids, as `Solids.place` takes them; None to
+                keep theirs.
 
         Returns:
             The state of those aircraft.
 
         Raises:
-            QuadrlError: The start is what `read` calls diverged; nothing has changed then.
+            QuadrlError: `read` would call the start diverged; then nothing has changed.
         """
         self._check_start(rows, start, table)
         if table is not None:
@@ -237,7 +237,7 @@ class Engine(abc.ABC):
         return State.of_table(self.frames[0].table[:, rows])
 
     def _check_start(self, rows: np.ndarray, start: Start, table: np.ndarray | None) -> None:
-        """Refuse a start that the step does not resolve: by the rules of native/state.c."""
+        """Refuse a start that the physics step does not resolve, by the rules of native/state.c."""
         limits = self._limits if table is None else parameters.limits(table)
         limits = limits if len(limits) in (1, len(rows)) else limits[rows]
         most = np.array([mujoco.mjMAXVAL])
@@ -255,11 +255,11 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def save(self) -> dict[str, np.ndarray]:
-        """Everything that the next step depends on, as arrays."""
+        """All arrays that the next step depends on."""
 
     @abc.abstractmethod
     def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Restore a state that `save` gave."""
+        """Restore what `save` returned."""
 
     def _restore_state(self, saved: dict[str, np.ndarray]) -> None:
         table = np.ascontiguousarray(saved["parameters"]).view(parameters.AIRCRAFT)[:, 0]
@@ -270,14 +270,14 @@ class Engine(abc.ABC):
         self._fill(None)
 
     def _saved(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """What `save` gives, with the rows of the simulation."""
+        """The result of `save`, from the rows of the simulation."""
         saved = {"rows": rows, "parameters": parameters.numbers(self.parameters).copy()}
         return saved | ({"solids": self.solids.save()} if len(self.solids.geoms) else {})
 
     def clearance(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Lower bound of aircraft's distance to a solid, (n,) [m]; infinite without solids."""
+        """Lower bound of each aircraft's distance to a solid, (n,) [m]; infinite without solids."""
         if rows is None and self.forked:
-            rows = np.arange(self.num_envs)  # without threads
+            rows = np.arange(self.num_envs)  # this way takes no threads
         return self.solids.clearance(self.qpos, self.parameters, self.vehicle.rotor_count, rows)
 
     def _write(self, rows: np.ndarray, start: Start | State) -> None:
@@ -286,6 +286,6 @@ class Engine(abc.ABC):
         self.act[rows] = start.rotor_speed
 
     def _fill(self, rows: np.ndarray | None) -> int:
-        """Run the C kernel; how many aircraft are not sound."""
+        """Run the C kernel, and return how many aircraft are not sound."""
         count, ids = (self.num_envs, None) if rows is None else (len(rows), rows.ctypes.data)
         return self._kernel(self._address, count, ids, self.frames[0].address)

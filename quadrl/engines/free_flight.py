@@ -1,9 +1,9 @@
-"""Free flight, integrated in C by the equations alone.
+"""Free flight: the equations of motion alone, integrated in C.
 
-Away from everything that it could touch the aircraft is an ordinary differential equation.
-`native/free_flight.c` integrates it by the Runge-Kutta method on the rows that MuJoCo itself
-steps, so an aircraft passes from one engine to the other with every bit of its state. The forces
-are the callbacks' own (`native/aero.h`), and so are the bytes of the parameters.
+Away from everything that it could touch, an aircraft follows an ordinary differential equation.
+`native/free_flight.c` integrates it by the Runge-Kutta method on the very rows that MuJoCo steps,
+so an aircraft passes from one engine to the other with every bit of its state. It shares the forces
+(`native/aero.h`) and the bytes of the parameters with MuJoCo's callbacks.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from quadrl.engines.solids import Solids, geoms_of_solids
 from quadrl.engines.threads import LANES, Threads
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
-"""Those of mjData that free flight reads or writes."""
+"""Arrays of mjData that free flight reads or writes."""
 MARGIN = 0.05
-"""Clearance at which MuJoCo takes over [m]; more than what a contact's own margin is."""
+"""Clearance at which MuJoCo takes over [m]; larger than the margin of a contact."""
 
 
 class FreeFlight:
@@ -76,8 +76,8 @@ class FreeFlight:
         """Fly some physics steps.
 
         Returns:
-            None, or the numbers of the aircraft that could touch something meanwhile: they were
-            left as they are, and are MuJoCo's.
+            None, or the numbers of the aircraft that could touch something meanwhile, which were
+            left to MuJoCo.
         """
         address = self._address
         marked = self._threads.call(lambda first, end: self._kernel(address, first, end, steps))
@@ -87,8 +87,8 @@ class FreeFlight:
 def world(model: mujoco.MjModel) -> np.ndarray:
     """Physics step [s], gravity along z [m/s^2], floor and reach [m]: `World` of the kernel.
 
-    The floor is the height of the centre of mass under which the ground may be touched; within the
-    reach of a solid that solid may be.
+    An aircraft may touch the ground if its centre of mass is below the floor, and a solid if it is
+    within the reach of it.
     """
     own = model.geom_bodyid == 1
     # Everything of the aircraft lies in a sphere of this radius about its centre of mass.
@@ -102,7 +102,7 @@ def world(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _check(model: mujoco.MjModel) -> None:
-    """Refuse what the equations do not describe."""
+    """Refuse a model that the equations do not describe."""
     free = model.njnt == 1 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
     rotors = (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_USER).all()
     obstacles = [

@@ -1,4 +1,4 @@
-"""MuJoCo models of a vehicle: the lean one that is simulated and the one that is drawn."""
+"""MuJoCo models of a vehicle: a lean one for simulation and one for pictures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ ASSETS = Path(__file__).parents[1] / "assets"
 DRAWN_RADIUS = 0.06  # [m], of the rotor in assets/rotor.xml
 FOOT_RADIUS = 0.008  # [m], of an aircraft with `scale` 1
 STRIKE_HEIGHT = 0.005  # [m], half the height of what collides of the rotor in assets/rotor.xml
-# Paint of the rotors ahead, aside and behind; how far ahead one is: the cosine of its bearing.
+# Colours of the rotors ahead, aside and behind; a rotor is ahead if the cosine of its bearing is
+# above AHEAD.
 FRONT, SIDE, BACK = (1.00, 0.42, 0.10), (0.74, 0.77, 0.81), (0.18, 0.50, 0.92)
 AHEAD = 0.2
 Scene = Callable[[mujoco.MjSpec], None]
@@ -27,12 +28,12 @@ Scene = Callable[[mujoco.MjSpec], None]
 def spec(
     vehicle: Vehicle, *, contact: bool = False, drawn: bool = True, scene: Scene | None = None
 ) -> mujoco.MjSpec:
-    """The vehicle over the ground as an MjSpec, to add to or to compile.
+    """The vehicle over the ground as an MjSpec, to be extended or compiled.
 
     Args:
         vehicle: The aircraft.
-        contact: Let feet, hull and rotors collide with the ground and with what `scene` adds.
-        drawn: Include what is only seen (geoms, lights, cameras, textures).
+        contact: Let feet, hull and rotors collide with the ground and with the geoms of `scene`.
+        drawn: Include all that is only seen (geoms, lights, cameras, textures).
         scene: Adds geoms to the world; those that the aircraft can hit have contype 1.
     """
     whole = mujoco.MjSpec.from_file(str(ASSETS / "scene.xml"))
@@ -50,7 +51,7 @@ def spec(
         _add_collision(whole.body("aircraft"), vehicle)
     if _has_solids(whole):
         whole.nuserdata += parameters.HIT + parameters.FEET
-        # MuJoCo would look for them where they were compiled.
+        # The midphase would look for them where they were compiled.
         whole.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     if not drawn:  # a step without what is only seen takes a sixth less time
         whole.compiler.discardvisual = True
@@ -64,9 +65,9 @@ def compile_model(
 ) -> mujoco.MjModel:
     """The model of a vehicle; arguments as for `spec`. Installs the rotor callbacks.
 
-    The lean model (`drawn=False`) has the same physics bit for bit and skips each stage of a step
-    that has nothing to do; whoever steps it calls `native.check_installed`. The drawn one fails at
-    its first step in a process without the callbacks: its gravity compensation is NaN, which the
+    The lean model (`drawn=False`) has the same physics bit for bit and skips the stages of a step
+    that do nothing; call `native.check_installed` before stepping it. The drawn one fails at its
+    first step in a process without the callbacks: its gravity compensation is NaN, which the
     passive callback overwrites.
 
     Raises:
@@ -95,7 +96,7 @@ def _has_solids(whole: mujoco.MjSpec) -> bool:
 
 
 def _add_physics(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
-    """Mass, rotors and the row of parameters that the callbacks read."""
+    """Add mass, rotors and the row of parameters that the callbacks read."""
     body = whole.body("aircraft")
     body.explicitinertial = True
     body.mass, body.inertia, body.ipos = vehicle.mass, vehicle.inertia, (0, 0, 0)
@@ -121,7 +122,7 @@ def _add_physics(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
 
 
 def _add_collision(body: mujoco.MjsBody, vehicle: Vehicle) -> None:
-    """What can touch: the hull, the discs of the rotors and the feet, but not one another."""
+    """Add hull, discs of the rotors and feet, which collide with the world, not with each other."""
     shape = mujoco.mjtGeom
     common = dict(contype=0, conaffinity=1, mass=0.0, group=3, rgba=(0.9, 0.2, 0.5, 0.4))
     body.add_geom(name="strike_hull", type=shape.mjGEOM_ELLIPSOID, size=vehicle.hull, **common)
@@ -159,7 +160,7 @@ def _draw(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
         geom.size, geom.fromto = np.asarray(geom.size) * scale, np.asarray(geom.fromto) * scale
     for mesh in whole.meshes:
         mesh.scale = np.asarray(mesh.scale) * scale
-    # After the scaling: a metre on the ground is a metre for every aircraft.
+    # Attached after the scaling, since a metre on the ground is one for every aircraft.
     ground = mujoco.MjSpec.from_file(str(ASSETS / "landmarks.xml"))
     whole.attach(ground, prefix="ground_", frame=whole.worldbody.add_frame())
     for k, rotor in enumerate(vehicle.rotors):
@@ -171,7 +172,7 @@ def _draw(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
         # The arm points at the centre of mass, however the rotor leans.
         along = _product(level, _turn(-slope, (0, 1, 0)))
         arm = max(math.hypot(x, y, z), rotor.radius / 2) / DRAWN_SIZE
-        # What turns has the rotor's radius, the motor one between that and the airframe's.
+        # Turning parts scale with the rotor's radius, the motor with the mean of that and the size.
         disc = rotor.radius / DRAWN_RADIUS
         motor = math.sqrt(disc * scale)
         for geom in part.geoms:

@@ -1,4 +1,4 @@
-"""MuJoCo with rotor callbacks, alone or with free flight where nothing can be touched."""
+"""The engines: MuJoCo with rotor callbacks, alone or with free flight away from obstacles."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _BATCHES: weakref.WeakSet[BatchEngine] = weakref.WeakSet()
 
 
 def _after_fork() -> None:
-    """In a forked process: mark its engines, whose threads are not there."""
+    """In a forked process, mark the engines, whose threads do not exist there."""
     for engine in list(_BATCHES):
         engine.forked = True
-        # Never freed here: that would wait for the threads, too.
+        # Never freed in this process, since that would also wait for the threads.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(engine.batch))
     _BATCHES.clear()
 
@@ -56,8 +56,8 @@ class BatchEngine(Engine):
             vehicle: The aircraft.
             num_envs: N, at least 1.
             altitude: Height of the origin of the task's frame above the ground [m].
-            model: The lean model of the aircraft in its world; None for nothing to touch.
-            num_threads: Threads to step on; 0 for every core.
+            model: The lean model of the aircraft in its world; None for a world without contacts.
+            num_threads: Number of threads; 0 for every core.
             engine: One of ENGINES.
             per_row: Whether each aircraft has parameters of its own.
         """
@@ -78,8 +78,8 @@ class BatchEngine(Engine):
         """Fly some physics steps of every aircraft with the commands in `ctrl`.
 
         Raises:
-            NativeError: The rotor callbacks were taken away.
-            QuadrlError: It is of the process that this one was forked from.
+            NativeError: The rotor callbacks were removed.
+            QuadrlError: The engine was made before this process was forked.
         """
         if self.forked:
             raise QuadrlError(
@@ -94,7 +94,7 @@ class BatchEngine(Engine):
 
     def clear(self, rows: np.ndarray) -> None:
         """Reset MuJoCo's warm starts and warnings of some aircraft."""
-        # What Batch.reset does, in a tenth of its time: a row is all that it keeps of an aircraft.
+        # As Batch.reset does, in a tenth of its time: a row is all that it keeps of an aircraft.
         self.batch.state[rows] = self._fresh
         self.batch.warning[rows] = 0
 
@@ -109,7 +109,7 @@ class BatchEngine(Engine):
 
 
 class DataEngine(Engine):
-    """One aircraft in an MjData, stepped by `mj_step` or by the owner of the data."""
+    """One aircraft in an MjData, which `mj_step` or the owner of the data steps."""
 
     def __init__(
         self,
@@ -131,7 +131,7 @@ class DataEngine(Engine):
         super().__init__(vehicle, fields, altitude, engine, 1)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For pickle and deepcopy: over the copy of its data that its owner has then."""
+        """Pickle and copy as an engine over the copied data, which the data's owner shares."""
         return _over, (self.vehicle, self.data, self.origin[2], self.name)
 
     def _model_field(self, name: str) -> np.ndarray:
@@ -141,21 +141,24 @@ class DataEngine(Engine):
         """Fly some physics steps with the commands in `ctrl`.
 
         Raises:
-            NativeError: The rotor callbacks were taken away.
+            NativeError: The rotor callbacks were removed.
         """
         if not self.fly(steps):
             native.check_installed()
             mujoco.mj_step(self.model, self.data, steps)
 
     def fly(self, steps: int) -> bool:
-        """Advance in free flight, if that is the engine and there is nothing to touch; whether."""
+        """Advance in free flight if possible, and return whether it was.
+
+        It is possible if that is the engine and the aircraft cannot touch anything.
+        """
         if self._free_flight is None or self._free_flight.advance(steps) is not None:
             return False
         self.data.time += steps * self.model.opt.timestep
         return True
 
     def clear(self, rows: np.ndarray) -> None:
-        """Reset the data: warm start, warnings, time."""
+        """Reset the data, with warm start, warnings and time."""
         mujoco.mj_resetData(self.model, self.data)
 
     def save(self) -> dict[str, np.ndarray]:
@@ -170,7 +173,7 @@ class DataEngine(Engine):
         spec = mujoco.mjtState.mjSTATE_INTEGRATION
         mujoco.mj_setState(self.model, self.data, saved["rows"][0], spec)
         self._restore_state(saved)
-        # What is drawn and measured belongs to the new state; the warm start is what was saved.
+        # Derived quantities are those of the new state; the warm start is the saved one.
         mujoco.mj_forward(self.model, self.data)
         mujoco.mj_setState(self.model, self.data, saved["rows"][0], spec)
 
@@ -189,7 +192,7 @@ def make(
     num_threads: int = 0,
     per_row: bool = False,
 ) -> Engine:
-    """Make the engine of a name for N aircraft in a world, as `BatchEngine` takes them.
+    """Make the engine of a name for N aircraft in a world; arguments as for `BatchEngine`.
 
     Raises:
         QuadrlError: Unknown name or impossible count.
@@ -206,7 +209,7 @@ def make(
 
 
 def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:
-    """Refuse a model whose coordinates are not the aircraft's alone, or that would fly wrongly."""
+    """Refuse a model with other coordinates than the aircraft's, or one that would fly wrongly."""
     count = vehicle.rotor_count
     sizes = (model.nq, model.nv, model.na, model.nu) == (7, 6, count, count)
     row: Any = model.body_user[1] if model.nbody > 1 and model.nuser_body else [0.0]

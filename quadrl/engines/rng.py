@@ -1,8 +1,8 @@
 """Keyed random numbers: any number of any stream, the same for one aircraft and for a batch.
 
-Row i of a batch that is seeded with s has the key s + i, whatever its neighbours and the threads
-do, and no generator has a state that would have to be saved. NumPy uses the C of
-`native/random.c`; `quadrl.base.philox` is its definition for every array namespace.
+Row i of a batch with seed s has the key s + i, whatever its neighbours and the threads do, and
+there is no state of a generator to save. NumPy uses the C of `native/random.c`;
+`quadrl.base.philox` draws the same numbers in every array namespace.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from quadrl.engines.state import Start
 
 FULL_TURN = 2 * math.pi
 ADVANCE = 16
-"""Numbers that are drawn at once, about as many as a start takes."""
+"""Numbers that are drawn at once: about as many as a start takes."""
 
 
 def uniform(keys: Array, episodes: Array, stream: int, first: int, count: int) -> Array:
     """Numbers first..first+count-1 of streams, uniform in [0, 1), a multiple of 2^-32 each.
 
     Args:
-        keys: (n,) int64, of the rows.
-        episodes: (n,) int64.
-        stream: Which stream of the episode.
-        first: Number of the first one.
-        count: How many.
+        keys: Keys (n,) int64 of the rows.
+        episodes: Numbers (n,) int64 of the episodes.
+        stream: Which stream of the episodes.
+        first: Index of the first number.
+        count: How many numbers.
 
     Returns:
         (n, count) float64.
@@ -49,14 +49,14 @@ def uniform(keys: Array, episodes: Array, stream: int, first: int, count: int) -
 
 
 def normal(keys: Array, episodes: Array, steps: Array, stream: int, count: int) -> np.ndarray:
-    """Numbers of a control step of streams, of mean 0 and variance 1, within 3.5 of it.
+    """Nearly normal numbers of a control step, of mean 0 and variance 1, between -3.5 and 3.5.
 
     Args:
-        keys: (n,) int64, of the rows.
-        episodes: (n,) int64.
-        steps: (n,) int64, control steps since the start of the episode.
-        stream: Which stream of the episode.
-        count: How many.
+        keys: Keys (n,) int64 of the rows.
+        episodes: Numbers (n,) int64 of the episodes.
+        steps: Control steps (n,) int64 since the start of the episodes.
+        stream: Which stream of the episodes.
+        count: How many numbers.
 
     Returns:
         (n, count) float64.
@@ -68,15 +68,15 @@ def normal(keys: Array, episodes: Array, steps: Array, stream: int, count: int) 
 
 
 class Rng:
-    """The random numbers of one stream of the episodes of n rows, taken one after the other."""
+    """A stream of random numbers for the episodes of n rows, taken in order."""
 
     def __init__(self, keys: Array, episodes: Array, stream: int = START) -> None:
         """Begin the stream.
 
         Args:
-            keys: (n,) int64, of the rows.
-            episodes: (n,) int64, numbers of the episodes.
-            stream: START, PARAMETERS, ...
+            keys: Keys (n,) int64 of the rows.
+            episodes: Numbers (n,) int64 of the episodes.
+            stream: Which stream: START, PARAMETERS, ...
         """
         self._keys, self._episodes, self._stream = keys, episodes, stream
         self._drawn: Array = None  # (n, k) numbers of the stream from `_first` on
@@ -85,7 +85,7 @@ class Rng:
     def uniform(self, low: float, high: float, size: int | None = None) -> Array:
         """Uniform numbers in [low, high): (n,), or (n, size)."""
         count = 1 if size is None else size
-        if self._used + count > self._end:  # more than are asked for: each call costs as much
+        if self._used + count > self._end:  # several at once, since a call's cost is nearly fixed
             self._first, self._end = self._used, self._used + max(count, ADVANCE)
             many = self._end - self._first
             self._drawn = uniform(self._keys, self._episodes, self._stream, self._first, many)
@@ -143,5 +143,5 @@ class Rng:
 
 
 def hovering(like: Array, parameters: Parameters) -> Array:
-    """Hover speeds of the rotors (n, R) [rad/s], a row per row of another array."""
+    """Hover speeds of the rotors (n, R) [rad/s], for as many rows as another array has."""
     return parameters.rotor.hover_speed + namespace(like).zeros_like(like[..., :1])

@@ -1,9 +1,8 @@
 """Pure functions of rows, compiled: arrays (N, k) in, one array (N, j) out.
 
-The tracer of `quadrl.base.trace` writes the C of one row, and LANES rows are computed side by side,
-as vector instructions. The operations are NumPy's, in its order; only what is not a number may be
-lost where it is compared. `reverse` makes the function of
-the derivatives, from the same trace.
+The tracer of `quadrl.base.trace` generates the C of one row, and LANES rows are computed side by
+side with vector instructions. The operations are NumPy's, in the same order, except that
+comparisons may drop a NaN. `reverse` makes the function of the derivatives, from the same trace.
 """
 
 # pyright: standard
@@ -69,14 +68,14 @@ class RowFunction:
     """A pure function of rows, in C."""
 
     def __init__(self, function: Callable[..., Array], *widths: int) -> None:
-        """Trace it; it is compiled when it is used first.
+        """Trace a function, which is compiled at its first use.
 
         Args:
-            function: From arrays (N, k) to one (N, j).
-            *widths: Numbers k in a row of each of its arguments.
+            function: Takes arrays (N, k) and returns one (N, j).
+            *widths: Numbers k in a row of each argument.
 
         Raises:
-            NotCompilable: It does more than arithmetic.
+            NotCompilable: The function does more than arithmetic.
         """
         trace, taken = Trace(max_operations=math.inf, sound=True), sum(widths)
         whole = trace.read("x[{}][i]", np.arange(taken)[None])
@@ -84,16 +83,16 @@ class RowFunction:
         with symbolic():
             result = function(*(whole[:, a:b] for a, b in zip(ends, ends[1:], strict=False)))[0]
         self.width = len(result)
-        """Numbers j in a row of what it gives."""
+        """Numbers j in a row of its result."""
         body = trace.body({f"y[{k}][i]": value for k, value in enumerate(result)})
         export = (Path(compiling.__file__).parent / "export.h").read_text()
         self._constants = np.array([*trace.constants, 0.0])
         sizes = {"taken": taken, "given": self.width, "constants": len(self._constants)}
         self.source = SOURCE.format(export=export, body=body, **sizes)
-        """Its C, in which the constants are not."""
+        """Its C, without the constants."""
 
     def load(self) -> Any:
-        """The C function, compiled where the cache does not hold it.
+        """The C function, compiled unless it is in the cache.
 
         Raises:
             NativeError: There is no compiler, or it refused the source.
@@ -103,10 +102,10 @@ class RowFunction:
         return run
 
     def on(self, *arrays: np.ndarray) -> Callable[[], None]:
-        """The function on some arrays, which may change but stay where they are.
+        """The function bound to arrays, whose numbers may change but not their places in memory.
 
         Args:
-            *arrays: Its arguments and then what it fills, float64, each row contiguous.
+            *arrays: Its arguments and then its result, float64, each row contiguous.
 
         Raises:
             NativeError: There is no compiler, or it refused the source.
@@ -123,7 +122,7 @@ class RowFunction:
         return run
 
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
-        """What it gives of arrays (N, k), (N, j)."""
+        """The result (N, j) for arrays (N, k)."""
         found = np.empty((len(arrays[0]), self.width))
         given = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
         self.on(*given, found)()
@@ -131,9 +130,9 @@ class RowFunction:
 
 
 def reverse(function: Callable[..., Array]) -> Callable[..., Array]:
-    """The derivatives of a number by the arguments of a function, side by side (N, sum of k).
+    """The function of the derivatives of a scalar by a function's arguments (N, sum of k).
 
-    It takes those arguments, and the derivatives of the number by what the function gives (N, j).
+    It takes those arguments, and the derivatives (N, j) of the scalar by the function's result.
     """
 
     def back(*given: Any) -> Array:

@@ -1,9 +1,9 @@
-"""Solids in the world of N aircraft: their poses in each row, clearances and touches.
+"""Solids in the world of N aircraft: their poses in each row, and clearances.
 
-A solid is one or more geoms of the world that MuJoCo lets aircraft collide with. Their sizes are
-the model's; where they stand is a row's own, and a new one at each reset or, of those that move, at
-each physics step. `native/solids.h` knows how far a point is from one, so that free flight hands
-over whoever comes near.
+A solid is one or more geoms of the world with which MuJoCo lets aircraft collide. The model has
+their sizes; each row has poses of its own, which change at a reset or, if they move, at each
+physics step. `native/solids.h` computes the distance of a point from a solid, so that free flight
+can hand an aircraft that comes near one to MuJoCo.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ KINDS: dict[mujoco.mjtGeom, Shape] = {
     mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
     mujoco.mjtGeom.mjGEOM_BOX: "box",
 }
-"""What a solid can be made of."""
+"""Geoms that a solid can be made of, and their names in pictures."""
 MOTION = 6
-"""Where velocity and angular velocity of a geom stand in its user data, and their derivatives."""
+"""Index in a geom's user data of its velocity and angular velocity, and of their derivatives."""
 SOLID = np.dtype([("kind", "f8"), ("size", "f8", 3), ("position", "f8", 3), ("turn", "f8", 9)])
 """`Solid` in native/solids.h."""
 NEARBY = np.dtype([("place", "f8", 3), ("distance", "f8", 9), ("solid", SOLID, 8)])
@@ -34,14 +34,14 @@ NEARBY = np.dtype([("place", "f8", 3), ("distance", "f8", 9), ("solid", SOLID, 8
 
 
 def geoms_of_solids(model: mujoco.MjModel) -> np.ndarray:
-    """Numbers (K,) of the geoms that make up solids: those whose user data names one."""
+    """Numbers (K,) of the geoms that make up solids, which their user data marks."""
     if model.nuser_geom < 2:
         return np.zeros(0, dtype=np.int64)
     return np.flatnonzero(model.geom_user[:, 0] == MARK)
 
 
 class Solids:
-    """K geoms that stand somewhere else in each of N rows."""
+    """K geoms with poses of their own in each of N rows."""
 
     def __init__(
         self,
@@ -51,14 +51,14 @@ class Solids:
         field: Callable[[str], np.ndarray],
         threads: Threads,
     ) -> None:
-        """Take kinds and sizes from the model; all stand at the origin until they are placed.
+        """Take kinds and sizes from the model; all are at the origin until they are placed.
 
         Args:
-            model: With the geoms.
+            model: The model with the geoms.
             count: Number of aircraft, N.
-            origin: (3,) of the task frame [m], world frame.
-            field: Gives a field of the model with a leading axis N, live.
-            threads: To measure on.
+            origin: Origin (3,) of the task frame [m], world frame.
+            field: Returns a field of the model with a leading axis N, live.
+            threads: Threads for the measurement of clearances.
         """
         self.geoms, self._origin, self._field = geoms_of_solids(model), origin, field
         self._threads, self._kernel = threads, native.library().quadrl_clearance
@@ -66,34 +66,34 @@ class Solids:
         self._first = np.unique(which, return_index=True)[1]  # geom of each solid
         self._offsets = np.transpose(offset)[self._first]
         self.centres = np.zeros((count, len(self._first), 3))
-        """Of the S solids, (N, S, 3) [m], task frame, live."""
+        """Centres of the S solids, (N, S, 3) [m], task frame, live."""
         self.table = np.zeros((count, len(self.geoms)), dtype=SOLID)
         self.table["kind"] = model.geom_type[self.geoms]
         self.table["size"] = model.geom_size[self.geoms]
         self.table["turn"] = np.eye(3).reshape(-1)
         self.nearby = np.zeros(count if len(self.geoms) else 0, dtype=NEARBY)
-        """Which solids are the nearest to each aircraft; unknown where it is not a number."""
+        """Lists of the solids nearest to each aircraft; unknown where the place is NaN."""
         self.nearby["place"] = np.nan
         self.poses = np.zeros((count, len(self.geoms), 7))
-        """Where they are now, (N, K, 7), as `place` takes it."""
+        """Present poses (N, K, 7), as `place` takes them."""
         self.motion = np.zeros((count, len(self.geoms), 6))
-        """Velocity and angular velocity (N, K, 6) on the way there [m/s], [rad/s], world frame."""
+        """Velocity [m/s] and angular velocity [rad/s] of the last move (N, K, 6), world frame."""
         self.moves = False
         """Whether any has moved since it was placed."""
 
     def place(self, rows: np.ndarray, poses: np.ndarray) -> None:
-        """Put the solids of some rows (n,) somewhere.
+        """Give the solids of some rows (n,) new poses.
 
         Args:
-            rows: Which.
-            poses: (n, K, 7) position [m], world frame, and quaternion (w, x, y, z).
+            rows: Which rows.
+            poses: Position [m], world frame, and quaternion (w, x, y, z), (n, K, 7).
         """
         if self.moves or not np.array_equal(self.poses[rows], poses):  # most stand where they stood
             self.poses[rows], self.motion[rows] = poses, 0.0
             self._stand(rows, poses)
 
     def _stand(self, rows: np.ndarray, poses: np.ndarray) -> None:
-        """Let engines take the geoms of some rows to be somewhere."""
+        """Write poses of the geoms of some rows for both engines."""
         position, quaternion = poses[..., :3], poses[..., 3:]
         turn = rotation_matrix(quaternion)
         self.nearby["place"][rows] = np.nan
@@ -107,8 +107,8 @@ class Solids:
     def move(self, poses: np.ndarray, timestep: float) -> None:
         """Move the solids of all rows to poses (N, K, 7) within a physics step [s].
 
-        During the step they stand half-way, and contacts have the mean velocity of the way and the
-        acceleration since the step before, which MuJoCo knows nothing of.
+        During the step they stand half-way; contacts take into account the mean velocity and the
+        acceleration since the step before, which MuJoCo does not know.
         """
         last, self.moves = self.poses.copy(), True
         half = (last + poses) / 2
@@ -117,23 +117,23 @@ class Solids:
         self.poses[:] = poses
         velocity = (poses[..., :3] - last[..., :3]) / timestep
         motion = np.concatenate([velocity, _turn_rate(last, poses, timestep)], axis=-1)
-        # Of the first step after a start the one before is not known.
+        # Before the first step after a start no velocity is known.
         known = self.motion.any(axis=-1, keepdims=True)
         faster = np.where(known, (motion - self.motion) / timestep, 0.0)
         self._field("geom_user")[:, self.geoms, MOTION:] = np.concatenate([motion, faster], axis=-1)
         self.motion[:] = motion
 
     def arrive(self) -> None:
-        """Let them stand where the last step ended."""
+        """Write the poses at the end of the last step, if they moved."""
         if self.moves:
             self._stand(np.arange(len(self.poses)), self.poses)
 
     def save(self) -> np.ndarray:
-        """Where they are and how they move, (N, K, 13)."""
+        """Poses and velocities, (N, K, 13)."""
         return np.concatenate([self.poses, self.motion], axis=-1)
 
     def restore(self, saved: np.ndarray) -> None:
-        """Put them where `save` found them."""
+        """Restore what `save` returned."""
         poses, motion = np.split(saved, [7], axis=-1)
         self.place(np.arange(len(poses)), poses)
         self.motion[:] = motion
@@ -146,8 +146,8 @@ class Solids:
         Args:
             qpos: (N, 7), live.
             parameters: Rows (N,), or (1,) for all.
-            rotors: How many each has.
-            rows: Of which aircraft; by default of all.
+            rotors: Number of rotors of each.
+            rows: Which aircraft (n,); None for all.
         """
         out = np.full(len(qpos) if rows is None else len(rows), np.inf)
         if len(self.geoms):
@@ -164,7 +164,7 @@ class Solids:
 
 
 def _turn_rate(last: np.ndarray, poses: np.ndarray, timestep: float) -> np.ndarray:
-    """Angular velocity (N, K, 3) [rad/s], world frame, from poses (N, K, 7) to others."""
+    """Angular velocity (N, K, 3) [rad/s], world frame, between two poses (N, K, 7)."""
     was, now = last[..., 3:], poses[..., 3:]
     half = was[..., :1] * now[..., 1:] - now[..., :1] * was[..., 1:]
     half = half + cross(was[..., 1:], now[..., 1:])

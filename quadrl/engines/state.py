@@ -31,7 +31,7 @@ SIZES = {
 """Rows of the table that `native/state.c` fills, in their order."""
 FIRST = dict(zip(SIZES, np.cumsum([0, *SIZES.values()]).tolist(), strict=False))
 """First row of each quantity."""
-REST_SPEED, REST_TURN = 0.05, 0.1  # [m/s], [rad/s]: slower is at rest
+REST_SPEED, REST_TURN = 0.05, 0.1  # [m/s], [rad/s]: a slower aircraft is at rest
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class State:
         rotor_speed: Array,
         origin_height: float,
     ) -> State:
-        """The same from coordinates in any array namespace; the definition of the C kernel.
+        """The state of coordinates in any array namespace; it defines the C kernel.
 
         Args:
             position: (N, 3) [m], task frame.
@@ -135,7 +135,7 @@ class Start:
     rotor_speed: Array  # (n, R) [rad/s]
 
     def replaced(self, given: Mapping[str, Any], rows: np.ndarray, count: int) -> Start:
-        """A start with some arrays given, (count, k) or (k,), of which some rows (n,) count.
+        """A start with some arrays replaced by given ones, (count, k) or (k,), at rows (n,).
 
         Raises:
             QuadrlError: Unknown name, wrong shape, or a quaternion of length 0.
@@ -161,21 +161,21 @@ class Start:
 
 
 def c_rows() -> str:
-    """The rows of the table as C constants."""
+    """C constants of the rows of the table."""
     rows = ", ".join(f"ROW_{name.upper()} = {first}" for name, first in FIRST.items())
     return f"enum {{ {rows} }};\n"
 
 
 def padded(count: int) -> int:
-    """Columns of a table for some aircraft: a cache line more, against set conflicts between rows.
+    """Columns of a table for N aircraft: a cache line more avoids set conflicts between rows.
 
-    A few aircraft have none, and contiguous arrays are faster in NumPy.
+    A few aircraft have no such conflicts, and NumPy is faster on contiguous arrays.
     """
     return count + 8 * (1 + count // 8 % 2) if count > 8 else count
 
 
 class Frame:
-    """One table of state with its named views and its address."""
+    """A table of the state with its named views and its address."""
 
     def __init__(self, count: int, rotors: int) -> None:
         self.columns = padded(count)

@@ -1,4 +1,4 @@
-"""Threads that go through parts of N aircraft at the same time."""
+"""Threads that process parts of N aircraft at the same time."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 
 ROWS_PER_THREAD = 256
-"""Aircraft that are worth a thread."""
+"""Smallest number of aircraft that is worth a thread."""
 LANES = 8
-"""Aircraft that a kernel flies side by side."""
+"""Number of aircraft that a kernel flies side by side."""
 
 
 class Threads:
     """Calls kernels for parts of N aircraft, each part in a thread of its own."""
 
     def __init__(self, count: int, threads: int) -> None:
-        """Divide N aircraft among threads, of which there is one at least."""
+        """Divide N aircraft among threads, at least one."""
         parts = max(1, min(threads, count // ROWS_PER_THREAD))
         # Whole groups of lanes to each, so that no group is flown twice.
         ends = [LANES * (count * k // parts // LANES) for k in range(parts)] + [count]
@@ -23,12 +23,12 @@ class Threads:
         self._pool = ThreadPoolExecutor(parts - 1) if parts > 1 else None
 
     def call(self, kernel: Callable[[int, int], int]) -> int:
-        """Call a kernel with the first number of each part and the one after its last.
+        """Call a kernel with the first index of each part and the one after its last.
 
-        It has to let go of the interpreter, as what is called through ctypes does.
+        It must release the interpreter's lock, as calls through ctypes do.
 
         Returns:
-            The sum of what it returns.
+            The sum of its results.
         """
         waiting: list[Future[int]] = []
         if self._pool is not None:

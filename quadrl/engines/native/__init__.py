@@ -21,10 +21,10 @@ from quadrl.base.errors import NativeError
 from quadrl.engines.native.compiling import build, open_library
 
 MARK_SLOT = 9
-"""Entry of an actuator's `dynprm` that holds MARK."""
+"""Index of MARK in an actuator's `dynprm`."""
 CALLBACKS = ("act_dyn", "act_gain", "passive")
 MAX_WARNINGS = 500
-"""Lines of a file of MuJoCo's warnings: at most 60 kB."""
+"""Largest number of lines in a file of MuJoCo's warnings, at most 60 kB."""
 
 _POINTER, _INTEGER, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 _ACTUATOR_CALLBACK = ctypes.CFUNCTYPE(ctypes.c_double, _POINTER, _POINTER, ctypes.c_int)
@@ -35,7 +35,7 @@ _KINDS = {
     "time": ctypes.CFUNCTYPE(ctypes.c_double),
     "warning": ctypes.CFUNCTYPE(None, ctypes.c_char_p),
 }
-"""Functions that MuJoCo calls."""
+"""Types of the functions that MuJoCo calls."""
 _KERNELS = {
     "state": (_INTEGER, _POINTER, _INTEGER, _POINTER, _POINTER),
     "unsound_air": (_INTEGER, _POINTER, _INTEGER),
@@ -48,14 +48,14 @@ _KERNELS = {
     "uniform": (None, _INTEGER, _POINTER, _POINTER, _INTEGER, _INTEGER, _INTEGER, _POINTER),
     "write_warnings": (None, ctypes.c_char_p, ctypes.c_int),
 }
-"""Functions that Python calls: the kind of what each returns, and of its arguments."""
+"""Functions that Python calls: the types of the result and of the arguments of each."""
 
 
 def load(path: Path) -> ctypes.CDLL:
-    """Open a compiled library and make sure that it belongs to the mujoco that runs.
+    """Open a compiled library and check that it was compiled against the running mujoco.
 
     Raises:
-        NativeError: It was compiled against another version of mujoco.
+        NativeError: It was compiled against another version.
     """
     opened = open_library(path)
     built, running = opened.quadrl_mujoco_version(), mujoco.mj_version()
@@ -73,9 +73,9 @@ def load(path: Path) -> ctypes.CDLL:
 
 
 def address(array: np.ndarray) -> int:
-    """The address of an array's numbers, in a third of the time of `array.ctypes.data`.
+    """The address of an array's data, in a third of the time of `array.ctypes.data`.
 
-    It must be contiguous and writable, and not be empty.
+    The array must be contiguous, writable and not empty.
     """
     return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
 
@@ -94,8 +94,8 @@ _LOCK = threading.Lock()
 
 
 def library() -> ctypes.CDLL:
-    """The library for this process, built when needed."""
-    with _LOCK:  # one for all threads, since MuJoCo has one set of callbacks
+    """The library for this process, compiled when needed."""
+    with _LOCK:  # one library for all threads, since MuJoCo has one set of callbacks
         return _library()
 
 
@@ -106,7 +106,7 @@ def _library() -> ctypes.CDLL:
 
 @functools.cache
 def _stop_clock() -> None:
-    """Spare every step MuJoCo's readings of the clock, unless a clock is installed already.
+    """Save the time in which MuJoCo reads the clock at every step, unless a clock is installed.
 
     Done once per process. Physics does not depend on it, but `mjData.timer` of every model then
     shows no durations. To keep them, set `$QUADRL_KEEP_CLOCK` to 1 before the first model is made,
@@ -118,7 +118,7 @@ def _stop_clock() -> None:
 
 @functools.cache
 def _take_warnings() -> None:
-    """Write a few of MuJoCo's warnings to stderr and none to a file, unless somebody has them.
+    """Write a few of MuJoCo's warnings to stderr and none to a file, unless a handler is installed.
 
     Done once per process. MuJoCo itself writes all of them, also to MUJOCO_LOG.TXT in the working
     folder; `mujoco.set_mju_user_warning(None)` brings that back at any time.
@@ -129,9 +129,9 @@ def _take_warnings() -> None:
 
 @contextlib.contextmanager
 def warnings_in(path: Path) -> Generator[None]:
-    """Add MuJoCo's warnings to a file, which has at most MAX_WARNINGS lines, and not to stderr.
+    """Append MuJoCo's warnings to a file of at most MAX_WARNINGS lines instead of stderr.
 
-    It is made with the first one. A handler of somebody else's keeps its warnings.
+    The first warning creates it. A handler that other code installed keeps its warnings.
     """
     lines = len(path.read_text(errors="replace").splitlines()) if path.exists() else 0
     write = library().quadrl_write_warnings
@@ -145,14 +145,14 @@ def warnings_in(path: Path) -> Generator[None]:
 def install(replace: bool = False) -> None:
     """Install the rotor callbacks in this process (idempotent).
 
-    Every model that `quadrl.engines.mjcf` makes needs them; it calls this itself. A process that
+    Every model of `quadrl.engines.mjcf` needs them, which calls this itself. A process that
     receives such a model from elsewhere (a spawned worker) calls it once.
 
     Args:
         replace: Replace callbacks that other code installed, with a warning.
 
     Raises:
-        NativeError: Somebody else's callback is installed and `replace` is False.
+        NativeError: Other code has installed a callback, and `replace` is False.
     """
     ours = library()
     foreign = [
@@ -177,7 +177,7 @@ def check_installed() -> None:
     """Raise unless the rotor callbacks are in place.
 
     Raises:
-        NativeError: One of them was removed or replaced: the physics would be wrong.
+        NativeError: One of them was removed or replaced, so that the physics would be wrong.
     """
     ours = library()
     if (

@@ -1,9 +1,9 @@
-// The reverse of free flight: from the derivatives of a number by where aircraft are after some
-// physics steps to those by where they were and by what their rotors were commanded.
+// The reverse of free flight: from the derivatives of a scalar by the motions after some physics
+// steps to those by the motions before them and by the rotor commands.
 //
-// It is the reverse of the very steps that free_flight.c makes, stage by stage, not of the equation
-// that they approximate: it agrees with differences of those steps to their rounding. In the names,
-// x_ is the derivative of that number by x.
+// It is the reverse of the very steps of free_flight.c, stage by stage, not of the equation that
+// they approximate: it agrees with differences of those steps to their rounding. In the names, x_
+// is the derivative of the scalar by x.
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
@@ -18,8 +18,8 @@
 
 #include "reverse.h"  // written by quadrl/engines/adjoint.py for EFFECTS of the air and ROTORS
 
-// What the way back has to know of a step: where its stages were, and the quaternion that it made
-// one of unit length at its end.
+// What the reverse needs of a step: the motions at its stages, and the quaternion at its end before
+// it was normalised.
 typedef struct {
   Lanes at[4][ROWS], quaternion[4];
 } Step;
@@ -40,14 +40,15 @@ VECTORISED static void there(const Aircraft* a, const World* world, Setting* s, 
   }
 }
 
-// Of one Runge-Kutta step: m_, the derivatives by where it leads, become those by where it began.
+// The reverse of a Runge-Kutta step: m_, the derivatives by the motion at its end, become those by
+// the motion at its start.
 INLINE void back_step(const Aircraft* a, const World* world, const Setting* s, const Step* step,
                       Lanes* m_, Lanes* command_) {
   const double h = world->timestep, ahead[3] = {0.5 * h, 0.5 * h, h};
   const double share[4] = {h / 6, h / 3, h / 3, h / 6};
   const int rows = SPEED + ROTORS;
   Lanes end_[ROWS], rate_[ROWS], at_[ROWS];
-  // The quaternion is made one of unit length at the end.
+  // The step normalises the quaternion at its end.
   for (int i = 0; i < LANES; ++i) {
     double square = 0, along = 0;
     for (int k = 0; k < 4; ++k) {
@@ -77,7 +78,7 @@ VECTORISED static void back(const Aircraft* a, const World* world, const Setting
   while (steps-- > 0) back_step(a, world, s, path + steps, m_, command_);
 }
 
-// Whether a stage was where the ground has an effect that EFFECTS leave out.
+// Whether a stage was where the ground has an effect that EFFECTS lack.
 static int misses_ground(const Aircraft* a, const Step* path, int64_t steps, int filled) {
   if (EFFECTS == GROUND_EFFECT) return 0;
   for (const Step* step = path; step < path + steps; ++step) {
@@ -90,11 +91,11 @@ static int misses_ground(const Aircraft* a, const Step* path, int64_t steps, int
   return 0;
 }
 
-// Where the rows are, all contiguous: motions (7 of qpos, 6 of qvel, one per rotor), commands (one
-// per rotor), air (AIR) and parameters as in free_flight.c. given: the derivatives by the motions
-// at the end, or NULL to fly alone. Filled: end, from_start and from_command. path: room for the
-// steps. left: 1 for each LANES aircraft that are to be flown; what is done becomes 0. Filled by
-// quadrl/engines.
+// Addresses of the rows, all contiguous: motions (7 of qpos, 6 of qvel, one per rotor), commands
+// (one per rotor), air (AIR) and parameters as in free_flight.c. given: the derivatives by the
+// motions at the end, or NULL to fly without a reverse. Results: end, from_start and from_command.
+// path: space for the steps. left: 1 for each LANES aircraft that are to be flown, 0 once they are.
+// Filled by quadrl/engines.
 typedef struct {
   const double *start, *command, *air, *parameters, *given;
   const World* world;
@@ -104,9 +105,10 @@ typedef struct {
   int64_t block;
 } Legs;
 
-// Flies `count` aircraft some steps, and goes back. It knows no ground: the derivatives are those
-// of a flight that touches nothing. Nothing of one whose parameters are not sound is a number. Those
-// that come where the ground has an effect are left, if this kernel does not have it.
+// Flies `count` aircraft some steps, and goes back. Contacts are left out: the derivatives are
+// those of a flight that touches nothing. All is NaN for an aircraft whose parameters are not
+// sound. Aircraft that come where the ground has an effect which this kernel lacks are left to
+// another.
 QUADRL_EXPORT void quadrl_adjoint(const Legs* legs, int64_t count, int64_t steps) {
   const Legs r = *legs;
   Setting s;

@@ -1,8 +1,9 @@
-// Everything that acts on an aircraft, once, for the MuJoCo callbacks and for free flight.
+// The forces on an aircraft, written once for the MuJoCo callbacks and for free flight.
 //
 // Aircraft are flown LANES at a time: every parameter is an array of LANES numbers, and each
 // function takes the lane i. The callbacks have one lane, which makes an Aircraft exactly a row of
-// quadrl/aircraft/parameters.py. The same equations in NumPy and torch stand in quadrl/engines/dynamics.py.
+// quadrl/aircraft/parameters.py. quadrl/engines/dynamics.py has the same equations in NumPy and
+// torch.
 //
 // Body frame: x forward, y left, z up, the origin at the centre of mass.
 #ifndef QUADRL_AERO_H_
@@ -16,11 +17,12 @@
 
 typedef double Lanes[LANES];
 
-// A loop that is short enough for the compiler to unroll it, which would keep it from making vector
-// instructions.
+// A loop that is not unrolled: short as it is, the compiler would unroll it, and then make no
+// vector instructions.
 #define EACH_LANE _Pragma("GCC unroll 1") for (int i = 0; i < LANES; ++i)
 
-// Aerodynamics.effects of an aircraft, for each of which the kernels are compiled, or -1 where its row names none: not every number is an int.
+// Aerodynamics.effects of an aircraft, for each of which the kernels are compiled, or -1 where its
+// row has another number, which need not be an int.
 AERO int aero_effects(const Aircraft* a, int i) {
   if (a->effects[i] == STILL_AIR) return STILL_AIR;
   if (a->effects[i] == ROTOR_EFFECTS) return ROTOR_EFFECTS;
@@ -28,7 +30,7 @@ AERO int aero_effects(const Aircraft* a, int i) {
 }
 
 // Equation 10: the lag of the rotor speed [rad/s^2]; it may rise and fall at different rates, and a
-// command above the rotor's largest speed asks for that.
+// command above the rotor's largest speed counts as that speed.
 AERO double aero_rotor_acceleration(const Rotor* rotor, double speed, double command, int i) {
   const double goal = command < rotor->max_speed[i] ? command : rotor->max_speed[i];
   const double rate = goal > speed ? rotor->lag_up[i] : rotor->lag_down[i];
@@ -62,8 +64,7 @@ AERO double aero_length(const double v[3]) {
   return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
 }
 
-// What acts beside thrust and reaction: equations 8 and 9, quadratic drag and moment, and the steady
-// moment of an episode.
+// Quadratic drag and moment, equations 8 and 9, and the steady moment of an episode.
 //   airspeed: velocity less wind [m/s]; body_rate [rad/s]; both in the body frame.
 //   force [N] and moment [N m] are added to, body frame.
 AERO void aero_wrench(const Aircraft* a, const double airspeed[3], const double body_rate[3],
@@ -79,7 +80,7 @@ AERO double aero_largest_drag(const Aircraft* a, double airspeed_square, int i) 
   return a->drag_coefficient[i] * airspeed_square / a->mass[i];
 }
 
-// ------------------------------------------------- what the air does to rotors beside equation 7
+// --------------------------------------------- effects of the air on rotors beyond equation 7
 
 AERO double aero_clip(double x, double low, double high) {
   x = x < low ? low : x;
@@ -89,7 +90,7 @@ AERO double aero_clip(double x, double low, double high) {
 // The larger of x and 0, without a branch that would keep the compiler from vector instructions.
 AERO double aero_positive(double x) { return 0.5 * (x + fabs(x)); }
 
-// What follows from the disc and the blades of a rotor.
+// Quantities that follow from the disc and the blades of a rotor.
 typedef struct {
   Lanes flow;      // 2 rho A [kg/m]
   Lanes induced;   // nu [m/rad]: induced velocity in hover over rotor speed
@@ -162,8 +163,8 @@ AERO void aero_ground(const Aircraft* a, int rotors, const Rotor* rotor, const L
   }
 }
 
-// Share of the moment flap * speed * p on a hub that is left where it cannot move the centre of lift
-// farther than MOST_OFFSET radii: 1 in slow flight, and smooth.
+// Factor of the moment flap * speed * p on a hub, which limits the offset of the centre of lift to
+// MOST_OFFSET radii smoothly; 1 in slow flight.
 AERO double aero_flapping_share(const Aircraft* a, const Rotor* rotor, double speed,
                                 double p_square, int i) {
   const double flap = a->flapping_moment[i];
@@ -172,7 +173,7 @@ AERO double aero_flapping_share(const Aircraft* a, const Rotor* rotor, double sp
   return most / sqrt(most * most + flap * flap * p_square + 1e-40);
 }
 
-// What the air does to the rotors beside equation 7, and their inertia.
+// Effects of the air on the rotors beyond equation 7, and of their inertia.
 //   effects: STILL_AIR, ROTOR_EFFECTS or GROUND_EFFECT, a constant.
 //   speed, command: of the rotors [rad/s]; noise: of their thrust. airspeed, body_rate: as in
 //   aero_wrench. up: the world's vertical in the body frame; height of the centre of mass over the

@@ -3,17 +3,17 @@
 // They are global to the process, so each first asks whether the actuator or body is ours and
 // otherwise answers exactly what MuJoCo does with no callback installed.
 //
-// Where an aircraft's numbers stand in a model (written there by quadrl/engines/mjcf.py):
+// Where an aircraft's numbers are in a model (written there by quadrl/engines/mjcf.py):
 //   body_user         its row, an Aircraft
 //   actuator_dynprm   [0] number of the rotor, [MARK_SLOT] mark
 //   actuator_gear     along and about the rotor's axis: 1, aero_reaction
-//   userdata (mjData) its air: the wind [m/s], world frame, and what quadrl/aircraft/parameters.py says;
-//                     in a world with solids then HIT numbers: 1 + the solid that was hit fastest since
-//                     they were cleared, and how fast [m/s]; and FEET numbers of the first touch of a
-//                     foot
-//   geom_user         [0] mark, [1] the number of the solid that a geom is of, [GRIP] with how many
-//                     times its weight it holds an aircraft whose feet touch it, [MOTION] its velocity
-//                     and angular velocity, then their derivatives, world frame
+//   userdata (mjData) its air, as in quadrl/aircraft/parameters.py: the wind [m/s], world frame,
+//                     and the noise of the rotors; in a world with solids then HIT numbers: 1 + the
+//                     solid that was hit fastest since they were cleared, and how fast [m/s]; and
+//                     FEET numbers of the first touch of a foot
+//   geom_user         [0] mark, [1] the number of the geom's solid, [GRIP] with how many times its
+//                     weight it holds an aircraft whose feet touch it, [MOTION] its velocity and
+//                     angular velocity, then their derivatives, world frame
 #include <math.h>
 #include <mujoco/mujoco.h>
 #include <stdint.h>
@@ -36,16 +36,15 @@ static const Aircraft* aircraft_of(const mjModel* m, int body) {
   return is_same(a->mark[0], QUADRL_MARK) && is_same(a->size[0], ROW_SIZE) ? a : 0;
 }
 
-// A number of a model as an int from 0 to the one below `count`, or -1. A model can be edited: none
-// of its numbers is an index before it was looked at.
+// A number of a model as an index below `count`, or -1 if it is none: a model can be edited, so
+// that every index in it has to be checked.
 static int index_of(mjtNum number, int count) {
-  if (!(number >= 0 && number < count)) return -1;  // nor is what is not a number
+  if (!(number >= 0 && number < count)) return -1;  // also where it is NaN
   const int index = (int)number;
   return index == number ? index : -1;
 }
 
-// Whether an aircraft is one that can fly: on a free joint, with as many rotors and such effects as
-// there are.
+// Whether an aircraft can fly: on a free joint, with a possible number of rotors and known effects.
 static int can_fly(const mjModel* m, const Aircraft* a, int body) {
   const int joint = m->body_jntadr[body], dof = m->body_dofadr[body];
   return joint >= 0 && joint < m->njnt && m->jnt_type[joint] == mjJNT_FREE && dof >= 0 &&
@@ -55,8 +54,8 @@ static int can_fly(const mjModel* m, const Aircraft* a, int body) {
 
 enum { FOREIGN = -1, UNSOUND = -2 };
 
-// What a marked actuator is that is on no aircraft: a foreign one, unless the model has an aircraft
-// that it is missing from. Out of line, since it is rare.
+// What a marked actuator that is on no aircraft is: FOREIGN, or UNSOUND if the model has an
+// aircraft that it may have been removed from. Out of line, since it is rare.
 static __attribute__((noinline, cold)) int lost_rotor(const mjModel* m) {
   for (int body = 1; body < m->nbody; ++body) {
     if (aircraft_of(m, body)) return UNSOUND;
@@ -64,8 +63,8 @@ static __attribute__((noinline, cold)) int lost_rotor(const mjModel* m) {
   return FOREIGN;
 }
 
-// The number of the rotor that an actuator is, and whose. FOREIGN where it is not one of ours;
-// UNSOUND where it is, but the model does not say of which aircraft, or not which of its rotors.
+// The number of an actuator's rotor, and its aircraft. FOREIGN if it is not one of ours; UNSOUND if
+// it is, but the model does not tell of which aircraft, or which of its rotors.
 static int rotor_of(const mjModel* m, int actuator, const Aircraft** owner) {
   const mjtNum* parameters = m->actuator_dynprm + mjNDYN * actuator;
   if (!is_same(parameters[MARK_SLOT], QUADRL_MARK)) return FOREIGN;
@@ -80,7 +79,7 @@ static int rotor_of(const mjModel* m, int actuator, const Aircraft** owner) {
   return rotor >= 0 ? rotor : UNSOUND;
 }
 
-// What an actuator of ours commands: nothing once something holds the aircraft.
+// The command of an actuator of ours: 0 once a solid grips the aircraft.
 static mjtNum command_of(const mjModel* m, const mjData* d, int actuator) {
   const int grips = m->nuser_geom > GRIP && m->nuserdata >= AIR + HIT + FEET;
   if (grips && d->userdata[AIR + HIT + HELD] > 0) return 0;
@@ -102,7 +101,7 @@ QUADRL_EXPORT mjtNum quadrl_act_gain(const mjModel* m, const mjData* d, int actu
   return aero_rotor_gain(a->rotor + rotor, d->act[m->actuator_actadr[actuator]], 0);
 }
 
-// What the air does to the rotors of a body beside equation 7, and their inertia.
+// Adds the effects of the air on the rotors of a body beyond equation 7, and of their inertia.
 static void add_rotor_effects(const mjModel* m, const mjData* d, const Aircraft* a, int body,
                               const mjtNum airspeed[3], mjtNum force[3], mjtNum moment[3]) {
   const mjtNum *turn = d->xmat + 9 * body, *rate = d->qvel + m->body_dofadr[body] + 3;
@@ -139,7 +138,7 @@ QUADRL_EXPORT void quadrl_passive(const mjModel* m, mjData* d) {
     const Aircraft* a = aircraft_of(m, body);
     if (!a) continue;
     if (!can_fly(m, a, body)) {
-      // It fails as a model of ours without callbacks does.
+      // It must fail, as a model of ours without callbacks does.
       for (int k = 0; k < m->nv; ++k) d->qfrc_passive[k] = NAN;
       return;
     }

@@ -1,6 +1,7 @@
-// Contacts of an aircraft with the solids of the world: how they touch, what grips, and what moves.
+// Contacts of an aircraft with the solids of the world: hits, solids that grip, and solids that
+// move.
 //
-// userdata (mjData) and geom_user (mjModel): as callbacks.c says.
+// userdata (mjData) and geom_user (mjModel) are those of callbacks.c.
 #include <math.h>
 #include <mujoco/mujoco.h>
 #include <stdint.h>
@@ -8,16 +9,16 @@
 
 enum { GRIP = 5, MOTION = 6, LEGS = 4 };
 
-// Whether a number of a model is this one, bit for bit: that is quicker than `==`.
+// Whether two numbers are equal bit for bit, which is quicker than `==`.
 static int is_same(mjtNum number, mjtNum expected) {
   return memcmp(&number, &expected, sizeof number) == 0;
 }
 
-// Whether an address of a model is one in an array of some length; as unsigned numbers, since then a
-// negative one is too large.
+// Whether an index of a model is within an array of some length; compared as unsigned numbers, of
+// which a negative one is too large.
 static int is_in(int address, mjtSize length) { return (uint64_t)address < (uint64_t)length; }
 
-// Pulls a foot towards the solid that it touches, `way` being the unit vector there.
+// Pulls a foot towards the solid that it touches, along the unit vector `way`.
 static void hold(const mjModel* m, mjData* d, const Aircraft* a, int body, mjtNum grip,
                  const mjtNum way[3], const mjtNum arm[3]) {
   const int dof = m->body_dofadr[body];
@@ -32,7 +33,7 @@ static void hold(const mjModel* m, mjData* d, const Aircraft* a, int body, mjtNu
   d->userdata[AIR + HIT + HELD] = 1;
 }
 
-// Writes down how the first foot touched a solid that moves with a velocity.
+// Records the first touch of a foot on a solid that moves with a velocity.
 static void note_touch(const mjModel* m, mjData* d, int body, const mjtNum way[3],
                        const mjtNum moves[3]) {
   const mjtNum *velocity = d->qvel + m->body_dofadr[body], *rate = velocity + 3;
@@ -52,7 +53,7 @@ static void note_touch(const mjModel* m, mjData* d, int body, const mjtNum way[3
   memcpy(feet, touch, sizeof touch);
 }
 
-// Adds the vector product of two vectors to a third one.
+// Adds the cross product of two vectors to a third one.
 static void add_cross(const mjtNum a[3], const mjtNum b[3], mjtNum sum[3]) {
   for (int k = 0; k < 3; ++k) {
     const int next = (k + 1) % 3, last = (k + 2) % 3;
@@ -60,7 +61,7 @@ static void add_cross(const mjtNum a[3], const mjtNum b[3], mjtNum sum[3]) {
   }
 }
 
-// Velocity and acceleration of the place of a contact as a point of a solid's geom, world frame.
+// Velocity and acceleration of a point of a solid's geom, world frame.
 static void solid_motion(const mjModel* m, const mjData* d, int geom, const mjtNum place[3],
                          mjtNum velocity[3], mjtNum acceleration[3]) {
   for (int k = 0; k < 3; ++k) velocity[k] = acceleration[k] = 0;
@@ -77,9 +78,9 @@ static void solid_motion(const mjModel* m, const mjData* d, int geom, const mjtN
   for (int k = 0; k < 3; ++k) velocity[k] = motion[k] + swing[k];
 }
 
-// Makes a contact that of an aircraft with a solid which moves. MuJoCo asks each of its rows for the
-// acceleration -b v - k r, where v is the row's speed of the aircraft alone, since geoms of the world
-// stand still: so much is added to r that speed and acceleration count from the solid.
+// Makes a contact with a solid one with a moving solid. MuJoCo asks each of its rows for the
+// acceleration -b v - k r, where v is the row's speed of the aircraft alone, since geoms of the
+// world do not move: r is changed so that speed and acceleration are relative to the solid.
 static void carry(const mjModel* m, mjData* d, const mjContact* contact, const mjtNum velocity[3],
                   const mjtNum acceleration[3], int solid_is_first) {
   const int row = contact->efc_address, pyramid = contact->dim > 1;
@@ -93,7 +94,7 @@ static void carry(const mjModel* m, mjData* d, const mjContact* contact, const m
     }
   }
   for (int k = 0; k < rows; ++k) {
-    const int tangent = 1 + k / 2;  // behind the two there are turns, which are left alone
+    const int tangent = 1 + k / 2;  // the two are followed by rotations, which are not changed
     const mjtNum* kbi = d->efc_KBIP + 4 * (row + k);
     mjtNum asked = kbi[1] * speed[0] + faster[0], stiffness = kbi[0] * kbi[2];
     if (pyramid && tangent < 3) {
@@ -105,8 +106,8 @@ static void carry(const mjModel* m, mjData* d, const mjContact* contact, const m
   }
 }
 
-// Writes down the fastest hit of an aircraft on a solid and the first touch of its feet, from the
-// contacts of this moment, and holds its feet where the solid grips them.
+// Records the fastest hit of an aircraft on a solid and the first touch of its feet, from the
+// present contacts, and holds feet that a solid grips.
 static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) {
   const mjtNum *rate = d->qvel + m->body_dofadr[body] + 3, *turn = d->xmat + 9 * body;
   const int notes = m->nuserdata >= AIR + HIT + FEET, grips = notes && m->nuser_geom > GRIP;
@@ -130,7 +131,8 @@ static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) 
     }
     for (int k = 0; k < 3; ++k) {
       const int next = (k + 1) % 3, last = (k + 2) % 3;
-      velocity[k] = d->qvel[m->body_dofadr[body] + k] + spin[next] * arm[last] - spin[last] * arm[next];
+      velocity[k] = d->qvel[m->body_dofadr[body] + k] + spin[next] * arm[last] -
+                    spin[last] * arm[next];
       speed += (velocity[k] - moves[k]) * way[k];
     }
     // The feet are the aircraft's only spheres.

@@ -1,8 +1,8 @@
 // Free flight: equations 3 to 10 of the paper, integrated by the classical Runge-Kutta method.
 //
-// Away from the ground the aircraft is this ordinary differential equation and nothing else, so it
-// needs no general engine. The attitude is of fourth order here and of second in MuJoCo, which turns
-// the quaternion once per step by the mean of the stages' body rates.
+// Away from the ground an aircraft follows this ordinary differential equation and nothing else, so
+// it needs no general engine. The attitude is of fourth order here and of second in MuJoCo, which
+// turns the quaternion once per step by the mean of the stages' body rates.
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -35,7 +35,7 @@ VECTORISED static void fly_near_ground(const Aircraft* a, int rotors, const Worl
   runge_kutta(a, GROUND_EFFECT, rotors, world, s, m, steps);
 }
 
-// Largest acceleration that the aircraft of a lane can have in `time` [s], whatever it does.
+// Upper bound of the acceleration of the aircraft of a lane within `time` [s].
 static double strongest_pull(const Aircraft* a, int rotors, const World* world, const Setting* s,
                              const Lanes* m, double time, int i) {
   double lift = 0, squares = 0, speeds = 0;
@@ -50,7 +50,8 @@ static double strongest_pull(const Aircraft* a, int rotors, const World* world, 
     squares += air * air;
   }
   const double f[3] = {a->steady_force[0][i], a->steady_force[1][i], a->steady_force[2][i]};
-  double pull = fabs(world->gravity) + (lift + aero_length(f)) / a->mass[i] + aero_largest_drag(a, squares, i);
+  double pull = fabs(world->gravity) + (lift + aero_length(f)) / a->mass[i] +
+                aero_largest_drag(a, squares, i);
   if (a->effects[i] != STILL_AIR) {
     const double r[3] = {m[BODY_RATE][i], m[BODY_RATE + 1][i], m[BODY_RATE + 2][i]};
     double reach, radius;
@@ -61,7 +62,7 @@ static double strongest_pull(const Aircraft* a, int rotors, const World* world, 
   return pull;
 }
 
-// Height under which it cannot come in that time.
+// Lower bound of its height in that time.
 static double lowest(const Lanes* m, double pull, double time, int i) {
   const double sink = m[VELOCITY + 2][i] < 0 ? -m[VELOCITY + 2][i] : 0;
   return m[POSITION + 2][i] - (sink + pull * time) * time;
@@ -82,8 +83,8 @@ static int may_touch(const Solid* solids, int64_t count, Nearby* list, double re
   return !(way_since(list, p) + way < list->distance[LISTED]);
 }
 
-// The kernel of the aircraft that stay above a height each (`low`): the effects that they have, but
-// for a ground effect that is exactly nothing up there.
+// The largest effects of aircraft that stay above a height each (`low`), without a ground effect
+// that is exactly zero up there.
 static int effects_of(const Aircraft* a, int rotors, const double low[LANES]) {
   int effects = STILL_AIR;
   for (int i = 0; i < LANES; ++i) {
@@ -94,13 +95,13 @@ static int effects_of(const Aircraft* a, int rotors, const double low[LANES]) {
   return effects;
 }
 
-// Where the rows of a simulation are. qpos (7), qvel (6), act, ctrl (one per rotor), warm (6,
+// Addresses of the rows of a simulation. qpos (7), qvel (6), act, ctrl (one per rotor), warm (6,
 // MuJoCo's warm start, cleared) and air (AIR: wind [m/s, world], noise of the rotors' thrust) of
-// aircraft i stand at i * stride doubles. parameters: with block = 0 a row for all, an Aircraft of
+// aircraft i are at i * stride doubles. parameters: with block = 0 a row for all, an Aircraft of
 // one lane; else those of aircraft i..i+LANES-1 side by side at i / LANES * block doubles, an
-// Aircraft as far as there are rotors. rotors: how many all have, at most MAX_ROTORS. solids: those
-// of aircraft i, `count` of them, at i * count. nearby: what each knows of them. Filled by
-// quadrl/engines.
+// Aircraft without the rotors that there are not. rotors: the number that all have, at most
+// MAX_ROTORS. solids: those of aircraft i, `count` of them, at i * count. nearby: the list of the
+// nearest solids of each. Filled by quadrl/engines.
 typedef struct {
   double *qpos, *qvel, *act;
   const double* ctrl;
@@ -114,9 +115,8 @@ typedef struct {
 } Rows;
 
 // Advances aircraft first..last-1 by a number of steps, in place, except those that may touch
-// something meanwhile: these are left as they are and marked in near. The position of one whose
-// parameters are not sound any more is not a number afterwards. first is a multiple of LANES.
-// Returns how many are marked.
+// something meanwhile, which are marked in near. The position of one whose parameters are not sound
+// becomes NaN. first is a multiple of LANES. Returns how many are marked.
 QUADRL_EXPORT int64_t quadrl_free_flight(const Rows* rows, int64_t first, int64_t last,
                                          int64_t steps) {
   const Rows r = *rows;

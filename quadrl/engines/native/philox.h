@@ -31,7 +31,7 @@ static inline __attribute__((always_inline)) void words(uint32_t w[4], int64_t b
   philox(w, (uint32_t)key, (uint32_t)(key >> 32));
 }
 
-// A number of mean 0 and variance 1 of two words: the sum of four uniform ones of 16 bits.
+// A nearly normal number, of mean 0 and variance 1: the sum of four uniform ones of 16 bits.
 static inline __attribute__((always_inline)) double normal(uint32_t one, uint32_t other) {
   const int32_t halves = (int32_t)((one & 0xFFFF) + (one >> 16) + (other & 0xFFFF) + (other >> 16));
   return (halves + (2 - 131072)) * 0x1.bb67ae8584caap-16;  // the root of 3 over 2^16

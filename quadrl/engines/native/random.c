@@ -1,4 +1,4 @@
-// Keyed random numbers. The definition in the array API stands in quadrl/engines/rng.py.
+// Keyed random numbers, as quadrl/base/philox.py defines them in the array API.
 #include <stdint.h>
 
 #include "export.h"

@@ -9,7 +9,7 @@
 
 #define INLINE static inline __attribute__((always_inline))
 
-// What moves, a row each, an aircraft a column. Rates of change stand in the same rows.
+// Rows of a motion, with a column for each aircraft. Rates of change are in the same rows.
 enum {
   POSITION = 0,     // [m], world
   QUATERNION = 3,   // w, x, y, z, body to world
@@ -18,13 +18,13 @@ enum {
   SPEED = 13,       // of the rotors [rad/s]
   ROWS = SPEED + MAX_ROTORS
 };
-// What is the same for all: gravity [m/s^2] points along z. Everything of an aircraft that touches
-// something is below `floor`, or nearer to a solid than `reach` [m].
+// The same for all aircraft. gravity [m/s^2] is along z. An aircraft may touch something only with
+// its centre of mass below `floor`, or nearer to a solid than `reach` [m].
 typedef struct {
   double timestep, gravity, floor, reach;
 } World;
 
-// What one call flies in: constants of the steps.
+// Constants of the steps of one call.
 typedef struct {
   Lanes lever[6 * MAX_ROTORS], command[MAX_ROTORS];
   Lanes air[AIR];
@@ -38,7 +38,7 @@ static inline void spread(const double* row, Aircraft* a) {
   }
 }
 
-// Whether a row of parameters, which may be live, is still one that is flown with so many rotors.
+// Whether a row of parameters, which users can edit, is still one with so many rotors.
 INLINE int is_sound(const Aircraft* a, int rotors, int i) {
   return a->rotor_count[i] == rotors && aero_effects(a, i) >= 0;
 }
@@ -55,8 +55,8 @@ static inline void extent(const Aircraft* a, int rotors, double* reach, double* 
   }
 }
 
-// Body to world. Between the stages the quaternion is not quite of unit length; its direction
-// counts.
+// Rotation matrix, body to world. Between the stages the quaternion is not quite of unit length;
+// only its direction counts.
 INLINE void rotation(const Lanes* q, double turn[3][3], int i) {
   const double w = q[0][i], x = q[1][i], y = q[2][i], z = q[3][i];
   const double twice = 2 / (w * w + x * x + y * y + z * z);
@@ -69,7 +69,7 @@ INLINE void rotation(const Lanes* q, double turn[3][3], int i) {
   }
 }
 
-// Velocity less wind, body frame.
+// Velocity minus wind, body frame.
 INLINE void airspeed_of(const Setting* s, const Lanes* m, double turn[3][3], double u[3], int i) {
   const double air[3] = {m[VELOCITY][i] - s->air[0][i], m[VELOCITY + 1][i] - s->air[1][i],
                          m[VELOCITY + 2][i] - s->air[2][i]};
@@ -78,8 +78,8 @@ INLINE void airspeed_of(const Setting* s, const Lanes* m, double turn[3][3], dou
   }
 }
 
-// The time derivative of a motion. Each loop over the lanes becomes vector instructions; over the
-// rotors, whose number is not known, none would.
+// The time derivative of a motion. The loops over the lanes become vector instructions; loops over
+// the rotors would not, since their number is not known.
 INLINE void derivative(const Aircraft* a, const Setting* s, int effects, int rotors,
                        double gravity, const Lanes* m, Lanes* d) {
   Lanes push[3] = {{0}}, twist[3] = {{0}}, airspeed[3], up[3];
@@ -141,7 +141,7 @@ INLINE void move(int rows, const Lanes* from, double time, const Lanes* rate, La
   }
 }
 
-// What the stages of a step have.
+// Motion and rate of the present stage of a step, and the weighted sum of the rates.
 typedef struct {
   Lanes at[ROWS], rate[ROWS], sum[ROWS];
 } Stages;
@@ -156,7 +156,7 @@ INLINE void do_stage(const Aircraft* a, const Setting* s, int effects, int rotor
   if (number < 3) move(rows, m, ahead[number], rate, t->at);
 }
 
-// What is the same in all steps.
+// Computes the constants of the steps.
 INLINE void prepare(const Aircraft* a, int effects, int rotors, Setting* s) {
   for (int k = 0; k < rotors; ++k) {
     for (int i = 0; i < LANES; ++i) {
@@ -168,7 +168,7 @@ INLINE void prepare(const Aircraft* a, int effects, int rotors, Setting* s) {
   }
 }
 
-// What the stages give, and a quaternion of unit length.
+// Adds the rates of the stages to the motion, and normalises the quaternion.
 INLINE void finish_step(int rotors, const World* world, const Stages* t, Lanes* m) {
   move(SPEED + rotors, m, world->timestep / 6, t->sum, m);
   Lanes* q = m + QUATERNION;
@@ -196,7 +196,8 @@ INLINE void runge_kutta(const Aircraft* a, int effects, int rotors, const World*
   }
 }
 
-// Whether the ground has an effect, on an aircraft that has it, with the centre of mass at a height.
+// Whether an aircraft with a ground effect is near enough to the ground for it, with the centre of
+// mass at a height.
 static inline int is_near_ground(const Aircraft* a, int rotors, double height, int i) {
   double reach, radius;
   if (a->effects[i] != GROUND_EFFECT) return 0;

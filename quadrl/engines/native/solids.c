@@ -1,4 +1,4 @@
-// How far aircraft are from the solids about them.
+// Clearance of aircraft from the solids around them.
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -8,9 +8,9 @@
 #include "export.h"
 #include "solids.h"
 
-// Where the rows of a simulation are: qpos (7) of aircraft i stands at i * stride doubles, its
-// parameters at i * row doubles (0: all the same), its solids, `count` of them, at i * count, and
-// what it knows of them.
+// Addresses of the rows of a simulation: qpos (7) of aircraft i is at i * stride doubles, its
+// parameters are at i * row doubles (0: the same for all), its solids, `count` of them, at i *
+// count, and its list of the nearest ones at i.
 typedef struct {
   const double *qpos, *parameters;
   const Solid* solids;
@@ -20,8 +20,8 @@ typedef struct {
 
 enum { AHEAD = 4, CACHE_LINE = 64 };  // aircraft, bytes
 
-// The spheres around the hull and around each rotor's disc, body frame, and a radius about the
-// centre of mass that holds all of them.
+// Spheres around the hull and around each rotor's disc, body frame, and the radius of a sphere
+// about the centre of mass that encloses them.
 typedef struct {
   double centre[MAX_ROTORS + 1][3], radius[MAX_ROTORS + 1], reach;
 } Outline;
@@ -46,8 +46,8 @@ static Outline outline_of(const Aircraft* a, int64_t rotors) {
   return o;
 }
 
-// Distance of the nearest solid from the spheres of the outline, for the aircraft first..last-1, or
-// for those of ids: what is free at least [m].
+// Distance [m] of the nearest solid from the spheres of the outline, a lower bound of the
+// clearance, for the aircraft first..last-1, or for those of ids.
 QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t last,
                                        const int64_t* ids, double* out) {
   Outline own = outline_of((const Aircraft*)rows->parameters, rows->rotors);
@@ -70,7 +70,7 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
     }
     const Solid* solids = rows->solids + i * rows->count;
     Nearby* list = rows->nearby + i;
-    // What the next aircraft knows is not in the cache: its list as far as the two nearest.
+    // The list of an aircraft ahead is not in the cache: fetch it as far as its two nearest solids.
     if (row + AHEAD < last) {
       const int64_t next = ids ? ids[row + AHEAD] : row + AHEAD;
       for (size_t k = 0; k < offsetof(Nearby, solid[2]); k += CACHE_LINE) {
@@ -78,7 +78,7 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
       }
       __builtin_prefetch(rows->qpos + next * rows->stride);
     }
-    // Whether some part of the aircraft may be nearer to a solid that is not listed.
+    // List anew if some part of the aircraft may be nearer to a solid that is not listed.
     const double *then = list->distance, *next = then + LISTED;
     double way = way_since(list, p);
     if (!(then[0] + 2 * way + own.reach < *next)) {
@@ -88,8 +88,8 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
     const int all = !(then[0] + 2 * way + own.reach < *next);
     const int64_t count = all || rows->count < LISTED ? rows->count : LISTED;
     for (int64_t s = 0; s < count; ++s) {
-      // No part of the aircraft is nearer to it than this, which spares most solids a closer look:
-      // nor to any of those that were farther when they were listed.
+      // Most solids need no closer look: no part of the aircraft is nearer to this one than that,
+      // nor to any of those after it, which were farther when they were listed.
       if (!all && then[s] - way - own.reach > least) break;
       const Solid* solid = (all ? solids : list->solid) + s;
       if (solid_distance(solid, p) - own.reach > least) continue;

@@ -1,12 +1,12 @@
-// Solids that stand in the world, how far a point is from one, and which are the nearest.
+// Solids of the world: the distance of a point from one, and lists of the nearest ones.
 #include <math.h>
 #include <stdint.h>
 
-// What a solid is: MuJoCo's numbers of these geoms (mjtGeom).
+// Kinds of solids, by MuJoCo's numbers (mjtGeom).
 enum { SPHERE = 2, CYLINDER = 5, BOX = 6 };
 
-// size: radius; radius and half the height; halves of the edges [m]. turn: its axes in the world, as
-// columns. Written by quadrl/engines/solids.py.
+// size: radius; radius and half the height; halves of the edges [m]. turn: rotation matrix to the
+// world. Written by quadrl/engines/solids.py.
 typedef struct {
   double kind, size[3], position[3], turn[9];
 } Solid;
@@ -21,7 +21,7 @@ static double solid_distance(const Solid* s, const double point[3]) {
   if (s->kind == SPHERE) {
     return sqrt(local[0] * local[0] + local[1] * local[1] + local[2] * local[2]) - s->size[0];
   }
-  // Past each pair of faces, or past the mantle: positive outside.
+  // Distance beyond each pair of faces, or beyond the mantle: positive outside.
   double past[3] = {fabs(local[0]) - s->size[0], fabs(local[1]) - s->size[1],
                     fabs(local[2]) - s->size[2]};
   if (s->kind == CYLINDER) {
@@ -37,11 +37,11 @@ static double solid_distance(const Solid* s, const double point[3]) {
   return out > 0 ? sqrt(out) : in;
 }
 
-// Copies of the solids that were the nearest to a place, in order, and how far they were; the last
-// distance is that of the next one, which is not listed. On the way from there a distance changes by
-// no more than the way is long, so that most steps need no look at all the others, which are far
-// away in memory. A place that is not a number: they are not known. Written here, and made unknown
-// by quadrl/engines/solids.py whenever a solid is put somewhere else.
+// Copies of the solids that were nearest to a place, in order, and their distances; the last
+// distance is that of the next one, which is not listed. When the aircraft moves, no distance
+// changes by more than the length of its way, so that most steps need not read all the others,
+// which are far away in memory. With a place of NaN the list is unknown, which
+// quadrl/engines/solids.py sets whenever a solid gets another pose.
 enum { LISTED = 8 };
 #define ROUNDING 1e-9  // [m], more than the error of any distance
 typedef struct {
@@ -49,7 +49,7 @@ typedef struct {
   Solid solid[LISTED];
 } Nearby;
 
-// How far a point is from the place of a list [m].
+// Distance of a point from the place of a list [m].
 static double way_since(const Nearby* list, const double point[3]) {
   double squares = 0;
   for (int k = 0; k < 3; ++k) {
@@ -58,7 +58,7 @@ static double way_since(const Nearby* list, const double point[3]) {
   return sqrt(squares) + ROUNDING;
 }
 
-// Lists the solids that are the nearest to a point.
+// Lists the solids nearest to a point.
 static void list_nearest(const Solid* solids, int64_t count, const double point[3], Nearby* list) {
   double* sorted = list->distance;
   int64_t which[LISTED + 1] = {0};

@@ -1,9 +1,9 @@
 // Named quantities of many aircraft from MuJoCo's generalised coordinates, in one pass.
 //
-// The definition is State.of_coordinates (quadrl/engines/state.py); this is the same arithmetic in the same
-// order (the tests compare bit by bit), because a single environment cannot afford forty NumPy
-// calls a step. Compiled without contraction to fused multiply-add. The rows of the output
-// (ROW_POSITION, ...) are written into layout.h from quadrl/engines/state.py.
+// State.of_coordinates (quadrl/engines/state.py) defines them; this is the same arithmetic in the
+// same order (the tests compare bit by bit), because a single environment cannot afford forty NumPy
+// calls a step. Compiled without contraction to fused multiply-add. quadrl/engines/state.py writes
+// the rows of the output (ROW_POSITION, ...) into layout.h.
 #include <math.h>
 #include <stdint.h>
 
@@ -13,17 +13,17 @@
 
 static int is_sound(double x) { return fabs(x) < 1e10; }  // mjMAXVAL; false for NaN
 
-// Where the rows of a simulation are. qpos (7), qvel (6) and act (one per rotor) of aircraft i stand
-// at i * stride doubles, and so does its air (AIR numbers); its largest speed [m/s] and spin [rad/s] at
-// i * limit_stride (0: all the same). Filled by quadrl/engines.
+// Addresses of the rows of a simulation. qpos (7), qvel (6), act (one per rotor) and air (AIR
+// numbers) of aircraft i are at i * stride doubles; its largest speed [m/s] and body rate [rad/s]
+// at i * limit_stride (0: the same for all). Filled by quadrl/engines.
 typedef struct {
   const double *qpos, *qvel, *act, *origin, *limits, *air;
   int64_t stride, limit_stride, columns, rotors;
 } Rows;
 
 // ids lists the n aircraft to compute, or is NULL for the first n. out has a row per quantity and
-// `columns` columns, one per aircraft. Returns how many of them hold a number that is not finite or
-// that MuJoCo itself calls unstable, or are faster than a physics step resolves.
+// `columns` columns, one per aircraft. Returns how many aircraft have a number that is not finite
+// or that MuJoCo calls unstable, or are faster than a physics step resolves.
 QUADRL_EXPORT int64_t quadrl_state(const Rows* rows, int64_t n, const int64_t* ids, double* out) {
   const int64_t stride = rows->stride, columns = rows->columns;
   const double* origin = rows->origin;
@@ -80,7 +80,7 @@ QUADRL_EXPORT int64_t quadrl_state(const Rows* rows, int64_t n, const int64_t* i
   return broken;
 }
 
-// The first of n aircraft whose air holds a number that is not finite; -1 where there is none.
+// The first of n aircraft whose air has a number that is not finite, or -1.
 QUADRL_EXPORT int64_t quadrl_unsound_air(const Rows* rows, int64_t n) {
   for (int64_t i = 0; i < n; ++i) {
     const double* air = rows->air + i * rows->stride;

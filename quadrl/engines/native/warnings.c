@@ -1,8 +1,8 @@
 // MuJoCo's warnings: a bounded number of lines, on stderr or at the end of a file.
 //
-// MuJoCo itself writes every one of them to stderr and to MUJOCO_LOG.TXT in whatever folder the
-// process stands in. This is C, not Python: threads warn that do not hold Python's lock, and an
-// exception there (a Ctrl-C, say) would end the process.
+// MuJoCo itself writes every one of them to stderr and to MUJOCO_LOG.TXT in the working folder.
+// This is C, not Python, since threads that do not hold Python's lock may warn, and an exception
+// there (by Ctrl-C, for example) would end the process.
 #include <pthread.h>
 #include <stdio.h>
 #include <string.h>
@@ -12,7 +12,7 @@
 enum { MOST = 120 };  // characters of a warning that are written
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
-static char file[4096];              // empty: stderr
+static char file[4096];                  // empty: stderr
 static int file_left, stderr_left = 10;  // lines that may still be written
 
 QUADRL_EXPORT void quadrl_warning(const char* text) {
@@ -30,7 +30,7 @@ QUADRL_EXPORT void quadrl_warning(const char* text) {
   pthread_mutex_unlock(&lock);
 }
 
-// From now on at most so many lines are added to a file; NULL: to stderr again, as many as are left.
+// Lets at most so many lines be appended to a file; NULL: to stderr again, as many as are left.
 QUADRL_EXPORT void quadrl_write_warnings(const char* path, int lines) {
   pthread_mutex_lock(&lock);
   *file = 0;

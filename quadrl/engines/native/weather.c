@@ -1,11 +1,12 @@
-// The weather of many aircraft, a control step forward: turbulence, gust, noise of the lift.
+// The weather of many aircraft over a control step: mean wind, turbulence, gust, noise of the lift.
 //
-// The definition is quadrl/engines/air.py; this is the same arithmetic in the same order (the tests compare
-// bit by bit). The rows of the table (WEATHER_...) are written into layout.h from there.
+// tests/air_reference.py defines it in the array API; this is the same arithmetic in the same order
+// (the tests compare bit by bit). quadrl/engines/air.py writes the rows of the table (WEATHER_...)
+// into layout.h.
 #include <stdint.h>
 #include <string.h>
 
-// Nobody looks at floating-point exceptions here, and a choice between numbers needs no branch then.
+// Floating-point exceptions are not used here, so that a choice between numbers needs no branch.
 #if defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize("no-trapping-math")
 #endif
@@ -17,8 +18,8 @@
 
 typedef double Lanes[LANES];
 
-// What is the same for all, and where the rest stands. The table has a row per quantity and
-// `columns` columns, one per aircraft. Height above the ground [m] and air of aircraft i stand at
+// Addresses of the rows, and numbers that are the same for all. The table has a row per quantity
+// and `columns` columns, one per aircraft. Height above the ground [m] and air of aircraft i are at
 // i * stride doubles. Filled by quadrl/conditions/weather.py.
 typedef struct {
   double* table;
@@ -43,7 +44,7 @@ AERO void words_of(const Streams* s, int block, uint32_t w[4][LANES]) {
   }
 }
 
-// ln(max(x, 1)): with the C library's, bits would depend on the machine.
+// ln(max(x, 1)). With the C library's logarithm, bits would depend on the machine.
 AERO double logarithm(double x) {
   x = x > 1.0 ? x : 1.0;
   uint64_t bits, exponent;
@@ -56,7 +57,7 @@ AERO double logarithm(double x) {
   memcpy(&power, &exponent, sizeof power);
   power -= 0x1p52 + 1022;
   const int low = part < 0x1.6a09e667f3bcdp-1;  // the root of 1/2
-  const double twice = 2.0 * part, less = power - 1.0;  // outside of branches, for the vectors
+  const double twice = 2.0 * part, less = power - 1.0;  // without branches, for vector instructions
   part = low ? twice : part;
   power = low ? less : power;
   const double ratio = (part - 1.0) / (part + 1.0), square = ratio * ratio;
@@ -79,7 +80,7 @@ AERO double half_wave(double share) {
   return angle * total;
 }
 
-// The filters, at the begin of an episode or a step further, and the noise of `rotors` rotors.
+// Starts the filters, and the noise of `rotors` rotors, or advances them by a step.
 AERO void filters(Lanes* t, Streams* s, int rotors, int begin) {
   uint32_t w[3][4][LANES];
   for (int i = 0; i < LANES; ++i) t[WEATHER_STEPS][i] = begin ? 0.0 : t[WEATHER_STEPS][i] + 1.0;
@@ -153,7 +154,7 @@ VECTORISED static void blow(Lanes* t, Streams* s, const Rows* r, const double* h
   blowing(t, r, height, wind);
 }
 
-// Begins the episodes of n aircraft, or brings them a control step forward, and writes their air.
+// Begins the episodes of n aircraft, or advances them by a control step, and writes their air.
 // ids lists them, or is NULL for the first n.
 QUADRL_EXPORT void quadrl_weather(const Rows* rows, int64_t n, const int64_t* ids, int64_t begin) {
   const Rows r = *rows;
