@@ -99,20 +99,14 @@ class Columns:
 
     def __init__(self, first: int, arrays: list[Any]) -> None:
         """Lay the arrays out by their shapes, from row `first` on."""
-        self._places: list[tuple[Any, int, tuple[int, ...]]] = []
+        self._places: list[tuple[slice, tuple[int, ...]]] = []
         self.end = first
         for array in arrays:
             tail = array.shape[1:]
             start, self.end = self.end, self.end + math.prod(tail)
-            self._places.append((slice(start, self.end) if tail else start, len(tail), tail))
+            self._places.append((slice(start, self.end), tail))
 
     def views(self, table: np.ndarray) -> list[np.ndarray]:
         """The arrays as views of a table."""
-        return [
-            table[place]
-            if not axes
-            else table[place].T
-            if axes == 1
-            else np.moveaxis(table[place].reshape(*tail, -1), -1, 0)
-            for place, axes, tail in self._places
-        ]
+        parts = (table[place].reshape(*tail, -1) for place, tail in self._places)
+        return [np.moveaxis(part, -1, 0) for part in parts]

@@ -36,11 +36,8 @@ def number(
     kind = abstract.Integral if whole else abstract.Real
     if isinstance(value, kind) and not isinstance(value, (bool, np.bool_)):
         converted: Any = int(value) if whole else _float(value)  # type: ignore[arg-type]
-        if (
-            low <= converted <= high
-            and (whole or math.isfinite(converted))
-            and (converted > 0 or not positive)
-        ):
+        within = low <= converted <= high and (converted > 0 or not positive)
+        if within and (whole or math.isfinite(converted)):
             return converted
     raise QuadrlError(name=name, value=value, allowed=_range(low, high, whole, positive))
 
@@ -194,11 +191,9 @@ def tuples(value: Any) -> Any:
     """A value with each list turned into a tuple, at any depth."""
     if isinstance(value, dict):
         return {name: tuples(item) for name, item in cast(dict[str, Any], value).items()}
-    return (
-        tuple(map(tuples, cast(Iterable[Any], value)))
-        if isinstance(value, (list, tuple))
-        else value
-    )
+    if isinstance(value, (list, tuple)):
+        return tuple(map(tuples, cast(Iterable[Any], value)))
+    return value
 
 
 def like(name: str, value: Any, default: Any) -> Any:

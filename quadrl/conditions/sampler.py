@@ -78,11 +78,9 @@ class AircraftSampler:
         ends["torque"] = (self._least_torque(), ends["torque"][1])
         self.names = tuple(ends)
         """Names of the drawn numbers. All are drawn, so that no range affects the other numbers."""
-        whole = [
-            *((name, ends, step) for name, ends in self.delays.items()),
-            (DAMAGED, (0, last), 1.0),
-        ]
-        self._whole = [(self.names.index(name), ends, unit) for name, ends, unit in whole]
+        whole = {name: (steps, step) for name, steps in self.delays.items()}
+        whole[DAMAGED] = (0, last), 1.0
+        self._whole = [(self.names.index(name), *given) for name, given in whole.items()]
         self.low, self._high = np.array([*ends.values()]).T
         self._width = self._high - self.low
         self.spread = np.flatnonzero(self._width)
