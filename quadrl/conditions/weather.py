@@ -136,8 +136,8 @@ class WeatherProcess:
         arrays = (self._whole, *self._streams, engine.qpos[:, 2], engine.air)
         rotors = engine.vehicle.rotor_count if noise_time else 0
         sizes = self._whole.shape[1], engine.qpos.strides[0] // 8, rotors
-        scales = 1 / weather.roughness, float(step), 1 / weather.gust_time
-        # As `Rows` in native/weather.c.
+        scales = np.array([1 / weather.roughness, step, 1 / weather.gust_time]).view(np.int64)
+        # As `Rows` in native/weather.c, doubles by their bits.
         self._rows = native.struct(*arrays, *sizes, *scales)
         self._address = self._rows.ctypes.data
         self._kernel = native.library().quadrl_weather

@@ -80,14 +80,12 @@ def address(array: np.ndarray) -> int:
     return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
 
 
-def struct(*members: np.ndarray | float | None) -> np.ndarray:
-    """A C struct of pointers to arrays (None for NULL), 64-bit integers and doubles, in order.
+def struct(*members: np.ndarray | int | None) -> np.ndarray:
+    """A C struct of pointers to arrays (None for NULL) and 64-bit integers, in order.
 
     It does not keep the arrays alive.
     """
-    words = [x.ctypes.data if isinstance(x, np.ndarray) else x or 0 for x in members]
-    # Doubles stand beside integers by their bits.
-    return np.array([np.float64(x).view(np.int64) if isinstance(x, float) else x for x in words])
+    return np.array([x.ctypes.data if isinstance(x, np.ndarray) else x or 0 for x in members])
 
 
 _LOCK = threading.Lock()
