@@ -15,24 +15,17 @@
 #include "runge_kutta.h"
 #include "solids.h"
 
-// With the number of rotors known, the compiler unrolls their loop.
-VECTORISED static void fly(const Aircraft* a, int rotors, const World* world, Setting* s, Lanes* m,
-                           int64_t steps) {
-  if (rotors == 4) {
+VECTORISED static void fly(const Aircraft* a, int effects, int rotors, const World* world,
+                           Setting* s, Lanes* m, int64_t steps) {
+  if (effects == GROUND_EFFECT) {
+    runge_kutta(a, GROUND_EFFECT, rotors, world, s, m, steps);
+  } else if (effects == ROTOR_EFFECTS) {
+    runge_kutta(a, ROTOR_EFFECTS, rotors, world, s, m, steps);
+  } else if (rotors == 4) {  // with the number of rotors known, the compiler unrolls their loop
     runge_kutta(a, STILL_AIR, 4, world, s, m, steps);
   } else {
     runge_kutta(a, STILL_AIR, rotors, world, s, m, steps);
   }
-}
-
-VECTORISED static void fly_in_air(const Aircraft* a, int rotors, const World* world, Setting* s,
-                                  Lanes* m, int64_t steps) {
-  runge_kutta(a, ROTOR_EFFECTS, rotors, world, s, m, steps);
-}
-
-VECTORISED static void fly_near_ground(const Aircraft* a, int rotors, const World* world,
-                                       Setting* s, Lanes* m, int64_t steps) {
-  runge_kutta(a, GROUND_EFFECT, rotors, world, s, m, steps);
 }
 
 // Upper bound of the acceleration of the aircraft of a lane within `time` [s].
@@ -162,14 +155,7 @@ QUADRL_EXPORT int64_t quadrl_free_flight(const Rows* rows, int64_t first, int64_
     }
     marked += touching;
     if (touching == filled) continue;
-    const int effects = effects_of(a, rotors, low);
-    if (effects == GROUND_EFFECT) {
-      fly_near_ground(a, rotors, world, &s, m, steps);
-    } else if (effects == ROTOR_EFFECTS) {
-      fly_in_air(a, rotors, world, &s, m, steps);
-    } else {
-      fly(a, rotors, world, &s, m, steps);
-    }
+    fly(a, effects_of(a, rotors, low), rotors, world, &s, m, steps);
     for (int i = 0; i < filled; ++i) {
       if (r.near[row + i]) continue;
       const int64_t place = (row + i) * stride;
