@@ -222,16 +222,26 @@ class Trace:
         return [by[symbol].item() if symbol in by else 0.0 for symbol in arguments]
 
     def body(self, outputs: Mapping[str, Any]) -> str:
-        """C that computes outputs, given by the expressions of the memory that they go to."""
-        stores = {place: self.name_of(value) for place, value in outputs.items()}
-        used, lines = set(stores.values()), []
+        """C that computes outputs, given by the expressions of the memory that they go to.
+
+        It reads memory first, and stores each output at once, which frees its register.
+        """
+        stores: dict[str, list[str]] = {}
+        for place, value in outputs.items():
+            name = self.name_of(value)
+            stores.setdefault(name, []).append(f"{place} = {name};")
+        used, reads, operations = set(stores), [], []
         for symbol in reversed(self.known.values()):
             if symbol.name in used:  # directly or indirectly, by an output
                 used.update(x.name for x in symbol.operands if isinstance(x, Symbol))
                 kind = "int" if symbol.is_flag else "double"
-                lines.append(f"const {kind} {symbol.name} = {symbol.text};")
-        lines = lines[::-1] + [f"{place} = {value};" for place, value in stores.items()]
-        return "\n    ".join(lines)
+                line = f"const {kind} {symbol.name} = {symbol.text};"
+                if symbol.operands:
+                    operations += [*stores.pop(symbol.name, []), line]
+                else:
+                    reads.append(line)
+        rest = [line for lines in stores.values() for line in lines]
+        return "\n    ".join(reads[::-1] + operations[::-1] + rest)
 
 
 class Symbols(np.ndarray):

@@ -34,7 +34,7 @@ from quadrl.deploy import flights
 from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import world
 from quadrl.engines.native import compiling
-from quadrl.engines.state import c_rows
+from quadrl.engines.state import c_state
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.policy_file import CLIP, FORMAT, UNSEALED
 from quadrl.rendering import drawing
@@ -194,7 +194,7 @@ def shapes(primitives: Iterable[Primitive]) -> dict[str, Any]:
 
 def compile_flights(source: str) -> bytes:
     """The WebAssembly of quadrl's kernels and of the C of the flights."""
-    (BUILD / "layout.h").write_text(parameters.c_structs() + c_rows())
+    (BUILD / "layout.h").write_text(parameters.c_structs() + c_state())
     (BUILD / "flights.c").write_text(source)
     exported = ["flight_memory", *KERNELS.values(), *re.findall(r"^void (\w+)", source, re.M)]
     names = BUILD / "exported.json"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, norm, rotation_matrix, sin_cos_attitude, to_body
+from quadrl.base.trace import Trace
 from quadrl.base.validation import keys
 
 SIZES = {
@@ -31,6 +33,14 @@ SIZES = {
 """Rows of the table that `native/state.c` fills, in their order."""
 FIRST = dict(zip(SIZES, np.cumsum([0, *SIZES.values()]).tolist(), strict=False))
 """First row of each quantity."""
+SOURCE = """enum {{ {rows} }};
+static inline void write_state(const double* restrict qpos, const double* restrict qvel,
+                               const double* restrict origin, int64_t columns,
+                               double* restrict out) {{
+  static const double c[] = {{{constants}}};
+    {body}
+}}
+"""
 REST_SPEED, REST_TURN = 0.05, 0.1  # [m/s], [rad/s]: a slower aircraft is at rest
 
 
@@ -94,7 +104,7 @@ class State:
         rotor_speed: Array,
         origin_height: float,
     ) -> State:
-        """The state of coordinates in any array namespace; it defines the C kernel.
+        """The state of coordinates in any array namespace; the C kernel is generated from it.
 
         Args:
             position: (N, 3) [m], task frame.
@@ -160,10 +170,19 @@ class Start:
         return dataclasses.replace(self, **arrays)
 
 
-def c_rows() -> str:
-    """C constants of the rows of the table."""
+@functools.cache
+def c_state() -> str:
+    """C of the rows of the table, and of the function that fills those of an aircraft."""
+    trace, sizes = Trace(), {"qpos": 7, "qvel": 6, "origin": 3}
+    qpos, qvel, origin = (trace.read(f"{k}[{{}}]", np.arange(n)[None]) for k, n in sizes.items())
+    rotors = qvel[:, :0]  # none, since their number is not known here
+    parts = qpos[:, :3] - origin, qpos[:, 3:], qvel[:, :3], qvel[:, 3:], rotors
+    state = State.of_coordinates(*parts, origin_height=origin[0, 2])
+    values = [value for name in SIZES for value in getattr(state, name).flat]
+    body = trace.body({f"out[{k} * columns]": value for k, value in enumerate(values)})
     rows = ", ".join(f"ROW_{name.upper()} = {first}" for name, first in FIRST.items())
-    return f"enum {{ {rows} }};\n"
+    constants = ", ".join(map(float.hex, trace.constants))
+    return SOURCE.format(rows=rows, constants=constants, body=body)
 
 
 def padded(count: int) -> int:

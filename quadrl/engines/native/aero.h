@@ -10,6 +10,7 @@
 #define QUADRL_AERO_H_
 
 #include <math.h>
+#include <stdint.h>
 
 #include "layout.h"  // Rotor, Aircraft: written by quadrl/native from quadrl/aircraft/parameters.py
 
