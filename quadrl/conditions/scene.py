@@ -147,14 +147,11 @@ class Scene:
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
         """The solids as pictures show them, at their poses in a row."""
         parts = ((solid, part) for solid in self.solids for part in solid.parts)
-        shown: list[Primitive] = []
-        for (solid, part), placed in zip(parts, engine.solids.table[row], strict=True):
-            turn = np.empty(4)
-            mujoco.mju_mat2Quat(turn, placed["turn"])
-            place = placed["position"].copy()
-            kind = KINDS[part.kind]
-            shown.append(Primitive(kind, part.size, place, turn, solid.rgba, glow=0.0))
-        return tuple(shown)
+        poses = engine.solids.poses[row].copy()
+        return tuple(
+            Primitive(KINDS[part.kind], part.size, pose[:3], pose[3:], solid.rgba, glow=0.0)
+            for (solid, part), pose in zip(parts, poses, strict=True)
+        )
 
     def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
         """The present surroundings of some aircraft (n,) of an engine, or of all.
