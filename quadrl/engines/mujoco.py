@@ -216,14 +216,11 @@ def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:
     marked = model.nuser_body == parameters.ROW_SIZE and row[0] == parameters.MARK
     marked = marked and row.view(parameters.AIRCRAFT)["rotor_count"][0] == count
     rotors = sizes and (model.actuator_dynprm[:, native.MARK_SLOT] == parameters.MARK).all()
-    step = model.opt.timestep
+    step, air = model.opt.timestep, parameters.AIR
     for right, what in (
         (sizes, f"7 positions, 6 velocities, {count} rotors, and nothing else that moves"),
         (marked and rotors, "the parameters of an aircraft: begin with quadrl.engines.mjcf.spec"),
-        (
-            model.nuserdata >= parameters.AIR,
-            f"nuserdata of at least {parameters.AIR}, for the air",
-        ),
+        (model.nuserdata >= air, f"nuserdata of at least {air}, for the air"),
         (step == vehicle.physics_timestep, f"the vehicle's step, {vehicle.physics_timestep} s"),
     ):
         if not right:
