@@ -7,9 +7,8 @@ import helpers
 import mujoco
 import numpy as np
 import pytest
-import torch
 
-from quadrl.aircraft.parameters import Parameters, rows
+from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY, plus
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
 from quadrl.base.rotation import norm
@@ -45,24 +44,11 @@ class Case:
         air = np.concatenate([motion.wind, noise], axis=-1)
         return cls(vehicle, helpers.parameter_rows(vehicle, COUNT), motion, command, air)
 
-    def equations(self, function, *more, array=np.asarray):
-        """What a function of `dynamics` gives, in NumPy or with tensors."""
-        p = Parameters.of(self.table).map(array)
-        motion = dynamics.Motion(*(array(getattr(self.motion, name)) for name in FIELDS))
-        given = (array(self.command), array(self.air), -GRAVITY, *more)
-        return function(p, motion, *given)
-
-
-def tensor(array):
-    return torch.tensor(np.ascontiguousarray(array))
-
-
-def assert_close(got, expected, tolerance=1e-12):
-    """Every field of two motions, over the largest number in it."""
-    for name in FIELDS:
-        value = np.asarray(getattr(expected, name))
-        atol = tolerance * np.abs(value).max()
-        np.testing.assert_allclose(getattr(got, name), value, rtol=0, atol=atol, err_msg=name)
+    def equations(self, function, *more):
+        """What a function of `dynamics` gives."""
+        motion = dynamics.Motion(*(getattr(self.motion, name) for name in FIELDS))
+        given = (self.command, self.air, -GRAVITY, *more)
+        return function(Parameters.of(self.table), motion, *given)
 
 
 def step_of_equations(p, motion, command, wind, gravity, timestep):
@@ -92,10 +78,13 @@ def test_a_step_of_free_flight_is_that_of_the_equations(name):
     flying.ctrl[:], flying.air[:] = case.command, case.air
     flying.advance(1)
     step = case.equations(step_of_equations, case.vehicle.physics_timestep)
-    assert_close(helpers.taken(flying, origin=0), step)
-    # It is a step: what it changes is far more than the tolerance.
+    found = helpers.taken(flying, origin=0)
     for field in FIELDS:
-        assert np.abs(getattr(step, field) - getattr(case.motion, field)).min() > 0
+        value = getattr(step, field)
+        atol = 1e-12 * np.abs(value).max()
+        np.testing.assert_allclose(getattr(found, field), value, rtol=0, atol=atol, err_msg=field)
+        # It is a step: what it changes is far more than the tolerance.
+        assert np.abs(value - getattr(case.motion, field)).min() > 0
 
 
 @every_layout
@@ -119,25 +108,6 @@ def test_the_accelerations_of_mujoco_are_the_derivative(name):
         (acceleration[:, :3], acceleration[:, 3:], spin_up), expected, strict=True
     ):
         np.testing.assert_allclose(got, value, rtol=0, atol=1e-12 * np.abs(value).max())
-
-
-@every_layout
-def test_tensors_give_the_same_numbers(name):
-    case = Case.of(name)
-    step = step_of_equations, case.vehicle.physics_timestep
-    got = case.equations(*step, array=tensor)
-    assert all(getattr(got, field).dtype == torch.float64 for field in FIELDS)
-    assert_close(got, case.equations(*step), tolerance=1e-14)
-
-
-@every_layout
-def test_the_wrench_of_the_rotors_is_the_mixer(name):
-    vehicle = EVERY[name]
-    speed = helpers.random_motion(vehicle, COUNT, rotor=0.9).rotor_speed
-    force, moment = dynamics.thrust_wrench(Parameters.of(rows(vehicle, COUNT)), speed)
-    mixed = speed**2 @ vehicle.mixer.T
-    np.testing.assert_allclose(force[:, 2], mixed[:, 0], rtol=1e-13)
-    np.testing.assert_allclose(moment, mixed[:, 1:], rtol=0, atol=1e-14 * np.abs(mixed).max())
 
 
 # -------------------------------------------------------------------------------- worked numbers
@@ -171,11 +141,3 @@ def test_rotors_speed_up_and_slow_down_at_rates_of_their_own(engine):
     up, down = math.exp(-3), math.exp(-1)
     expected = [[300 - 100 * up, 200, 100 + 100 * down, 200 * down]]
     np.testing.assert_allclose(flying.act, expected, atol=1e-6)
-
-
-def test_acceleration_of_a_rotor_by_hand():
-    # -10 (200 - 300) = 1000; -(1/0.3) (200 - 140) = -200 rad/s^2. 320 rad/s is the fastest: of a
-    # command of 900, -10 (200 - 320) = 1200.
-    speed, command = np.full((1, 4), 200.0), np.array([[300.0, 200.0, 140.0, 900.0]])
-    got = dynamics.rotor_acceleration(Parameters.of(rows(UNEVEN)), speed, command)
-    np.testing.assert_allclose(got, [[1000, 0, -200, 1200]], rtol=1e-12)
