@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import reference
 
-import quadrl
 from quadrl.aircraft.aerodynamics import EFFECTS, Aerodynamics
 from quadrl.aircraft.parameters import WIND, Parameters, rows
 from quadrl.aircraft.presets import VEHICLES, at_air_density, in_real_air, with_effects
@@ -26,9 +25,8 @@ from quadrl.engines.mujoco import BatchEngine, DataEngine
 PAPER = Vehicle()
 FULL = Aerodynamics.full()
 HIGH = 50.0  # [m], far from the ground
-T_H, V_H, OMEGA_H = 1.594125, 3.033975, 225.6781
+T_H, V_H = 1.594125, 3.033975
 RADIUS = 0.15
-ENGINES = ("mujoco", "free_flight")
 INFLOW = Aerodynamics(inflow=True, blade_lift=0.953)
 VORTEX = dataclasses.replace(INFLOW, vortex_ring=0.44)
 
@@ -88,30 +86,6 @@ def lift_share(vehicle, climb, across=0.0):
 # ------------------------------------------------------------------------------- what all share
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_hovering_aircraft_does_not_turn_by_a_bit(engine):
-    flying = BatchEngine(in_real_air(PAPER), 1, altitude=3.0, engine=engine)
-    flying.qpos[:], flying.act[:] = (0, 0, 2.0, 1, 0, 0, 0), PAPER.hover_speed[0]
-    flying.ctrl[:] = flying.act
-    flying.advance(200)
-    np.testing.assert_array_equal(flying.qpos[0, 3:], [1, 0, 0, 0])
-    np.testing.assert_allclose(flying.qvel, 0, atol=1e-12)
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("name", helpers.LAYOUTS)
-def test_effects_of_no_strength_change_no_bit(name, engine):
-    # The kernels for aircraft in air, with the least of an effect: gone against the mass.
-    plain = helpers.LAYOUTS[name]
-    aired = dataclasses.replace(plain, aerodynamics=Aerodynamics(rotor_drag=1e-40))
-    motion = helpers.random_motion(plain, 9, speed=5.0, turn=5.0, wind=3.0, rotor=0.3)
-    commands = helpers.random_commands(plain, 9, 5, rotor=0.3)
-    ends = [helpers.flown(v, engine, motion, commands, 5) for v in (plain, aired)]
-    for field in dataclasses.fields(ends[0]):
-        got, expected = (getattr(end, field.name) for end in ends)
-        np.testing.assert_array_equal(got, expected, err_msg=field.name)
-
-
 def test_a_rotor_at_rest_feels_no_lift():
     for velocity in ((3, 0, 2), (-5, 4, -100), (0, 0, 60)):
         force, moment = Probe(bare(FULL))(velocity=velocity, speed=0.0, height=0.1)
@@ -120,34 +94,6 @@ def test_a_rotor_at_rest_feels_no_lift():
 
 
 # ---------------------------------------------------------------------------------------- inflow
-
-
-def test_the_flow_through_a_disc_in_hover():
-    rotor = PAPER.rotors[0]
-    assert rotor.disc == 0.15 and rotor.radius == 0.06
-    assert rotor.figure_of_merit(1.225) == pytest.approx(0.561, abs=1e-3)
-    assert pytest.approx(math.sqrt(0.65 * 9.81 / (8 * 1.225 * math.pi * 0.15**2)), 1e-6) == V_H
-    p = Parameters.of(rows(bare(INFLOW)))
-    assert dynamics._disc(p)[1][0, 0] * OMEGA_H == pytest.approx(V_H, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "climb", "across", "share"),
-    [
-        ("paper", 1.0, 0.0, 0.5076),
-        ("paper", 0.5, 0.0, 0.7782),
-        ("paper", -1.0, 0.0, 1.3255),
-        ("crazyflie", 1.0, 0.0, 0.7603),
-        ("racer", 1.0, 0.0, 0.5839),
-        ("paper", 0.0, 0.5, 1.0475),
-        ("paper", 0.0, 1.0, 1.1647),
-        ("paper", 0.0, 2.0, 1.4294),
-    ],
-)
-def test_climb_and_flight_across_change_the_thrust(name, climb, across, share):
-    own = with_effects(VEHICLES[name], "inflow").aerodynamics
-    vehicle = bare(dataclasses.replace(own, translational_lift=0.0), name)
-    assert lift_share(vehicle, climb, across) == pytest.approx(share, abs=1e-3)
 
 
 def test_translational_lift_is_that_of_the_rotor_whatever_its_size():
@@ -235,13 +181,6 @@ def test_two_newton_steps_are_the_root(name):
     assert max(worst) < LACKING[name][0] and worst[1] < LACKING[name][1], worst
 
 
-def test_a_fall_at_any_speed_gives_a_thrust_that_a_rotor_can_give():
-    probe = Probe(bare(FULL))
-    for way in itertools.product((-100, -9, 0, 9, 100), (0, 5, 100)):
-        force, _ = probe(velocity=(way[1], 0, way[0]), noise=3.0)
-        assert -1e-9 <= force[2] <= 1.6 * 4 * T_H + 1e-9
-
-
 # ------------------------------------------------------------------------ rotor drag and flapping
 
 
@@ -262,25 +201,6 @@ def test_rotor_drag_is_linear_in_airspeed_and_rotor_speed():
     assert probe(rate=(0, 0, 1))[1][2] == pytest.approx(-5.97e-3, abs=1e-5)
 
 
-def test_the_flapping_moment_lifts_the_nose_in_forward_flight():
-    # 4 * 2.3e-5 * 225.678 = 0.0208 N m a m/s. Nose up is -y.
-    moment = Probe(bare(Aerodynamics(flapping_moment=2.3e-5)))(velocity=(0.1, 0, 0))[1]
-    np.testing.assert_allclose(moment, [0, -0.00208, 0], atol=5e-6)
-
-
-def test_the_velocity_moment_of_the_crazyflies_is_the_one_of_the_flights():
-    # Brushless: 6.4e-4 N m a m/s on 2.5e-5 kg m^2, 25 rad/s^2 in roll. Brushed: 0.0293 kg and
-    # 1886 rad/s in place of 0.037 kg and 1566 rad/s, so 6.4e-4 * 0.792 * 0.830 = 4.2e-4 N m.
-    # At 0.1 m/s a rotor's are 1.6e-5 and 1.05e-5 of at most 0.2 T R, 5.0e-4 and 3.2e-4 N m:
-    # hypot(1, 0.032) and hypot(1, 0.033) take less than a thousandth.
-    for name, moment in (("crazyflie_brushless", 6.4e-4), ("crazyflie", 4.2e-4)):
-        flap = in_real_air(VEHICLES[name]).aerodynamics.flapping_moment
-        probe = Probe(bare(Aerodynamics(flapping_moment=flap), name))
-        np.testing.assert_allclose(
-            probe(velocity=(0, 0.1, 0))[1], [0.1 * moment, 0, 0], rtol=0.01, atol=1e-12
-        )
-
-
 def test_the_velocity_moment_never_moves_the_lift_farther_than_a_fifth_of_the_radius():
     # 4 * 0.2 * 1.594 N * 0.15 m = 0.1913 N m is the most, which 2.3e-5 alone would reach at
     # 0.1913 / 0.02076 = 9.214 m/s: there it is 1 / sqrt(2) of that, 0.1353 N m.
@@ -293,27 +213,25 @@ def test_the_velocity_moment_never_moves_the_lift_farther_than_a_fifth_of_the_ra
     assert not probe(velocity=(1000, 0, 0), speed=np.zeros(4))[1].any()
 
 
-def test_the_crazyflies_are_damped_as_in_the_flights():
+@pytest.mark.parametrize(
+    ("name", "heave", "sideways", "moment"),
+    [("crazyflie", 0.437, 0.476, 4.2e-4), ("crazyflie_brushless", 0.47, 0.423, 6.4e-4)],
+)
+def test_the_crazyflies_move_in_air_as_in_the_flights(name, heave, sideways, moment):
     # Heave 0.0128 / 0.0293 = 0.437 1/s (drone-models), and 0.47 1/s (IMRCLab). Along x and y k_H
     # gives 4 * 1.85e-6 * 1886 / 0.0293 = 0.476 and 4 * 2.5e-6 * 1566 / 0.037 = 0.423 1/s: between
     # the 0.34 and 0.48 1/s of the flights.
-    for name, heave, sideways in (
-        ("crazyflie", 0.437, 0.476),
-        ("crazyflie_brushless", 0.47, 0.423),
-    ):
-        vehicle = in_real_air(VEHICLES[name])
-        probe = Probe(bare(vehicle.aerodynamics, name))
-        up = (probe(velocity=(0, 0, way * 1e-3))[0][2] for way in (-1, 1))
-        assert (next(up) - next(up)) / (2e-3 * vehicle.mass) == pytest.approx(heave, rel=0.01)
-        across = -probe(velocity=(1e-3, 0, 0))[0][0] / (1e-3 * vehicle.mass)
-        assert across == pytest.approx(sideways, rel=0.01)
-
-
-@pytest.mark.parametrize("name", ["crazyflie", "crazyflie_brushless"])
-def test_the_controller_holds_the_crazyflies_in_wind(name):
-    settings = {"vehicle": name, "aerodynamics": "full", "weather": {"wind_speed": 3.0}}
-    figures = quadrl.evaluate("geometric", "hover", episodes=8, time_limit=4, **settings).metrics
-    assert figures["survival_rate"] == 1.0
+    # Moment of a velocity: brushless 6.4e-4 N m a m/s on 2.5e-5 kg m^2, 25 rad/s^2 in roll. Brushed
+    # 0.0293 kg and 1886 rad/s in place of 0.037 kg and 1566 rad/s, so 6.4e-4 * 0.792 * 0.830. At
+    # 0.1 m/s it is far from its limit, 0.2 T R, which takes less than a thousandth.
+    vehicle = in_real_air(VEHICLES[name])
+    probe = Probe(bare(vehicle.aerodynamics, name))
+    down, up = (probe(velocity=(0, 0, way * 1e-3))[0][2] for way in (-1, 1))
+    assert (down - up) / (2e-3 * vehicle.mass) == pytest.approx(heave, rel=0.01)
+    across = -probe(velocity=(1e-3, 0, 0))[0][0] / (1e-3 * vehicle.mass)
+    assert across == pytest.approx(sideways, rel=0.01)
+    turning = probe(velocity=(0, 0.1, 0))[1]
+    np.testing.assert_allclose(turning, [0.1 * moment, 0, 0], rtol=0.01, atol=1e-7)
 
 
 # --------------------------------------------------------------------------------- ground effect
@@ -341,20 +259,6 @@ def test_a_rotor_alone_has_the_ground_effect_of_cheeseman_and_bennett(height, fa
     vehicle = dataclasses.replace(bare(Aerodynamics(ground_effect=True)), rotors=far)
     force, _ = Probe(vehicle)(height=height * RADIUS)
     assert force[2] / (4 * T_H) == pytest.approx(factor, abs=1e-4)
-
-
-def test_there_is_exactly_no_ground_effect_from_eight_radii_on():
-    vehicle = bare(Aerodynamics(ground_effect=True))
-    there, far, near = (Probe(vehicle)(height=h)[0][2] for h in (8.0 * RADIUS, HIGH, 7.9 * RADIUS))
-    assert there == far < near
-
-
-def test_the_ground_rights_a_tilted_aircraft():
-    # Hub plane at 1 R, rolled by 0.1 rad: the right side is lower and lifts more.
-    vehicle = bare(Aerodynamics(ground_effect=True))
-    tilted = (math.cos(0.05), math.sin(0.05), 0, 0)
-    moment = Probe(vehicle)(height=RADIUS, attitude=tilted)[1]
-    np.testing.assert_allclose(moment, [-0.0230, 0, 0], atol=5e-5)
 
 
 def test_the_ground_effect_fades_across_the_disc_and_with_the_tilt():
@@ -416,17 +320,6 @@ def test_lift_rises_towards_the_windmill_state():
 def test_there_is_exactly_no_vortex_ring_state_in_slow_descent_and_out_sideways(climb, across):
     with_it, without = (bare(a) for a in (VORTEX, INFLOW))
     assert lift_share(with_it, climb, across) == lift_share(without, climb, across)
-
-
-def test_the_descent_at_which_heave_becomes_unstable():
-    probe = Probe(bare(VORTEX))
-
-    def slope(speed):
-        more, less = (probe(velocity=(0, 0, speed + d))[0][2] for d in (1e-5, -1e-5))
-        return more - less
-
-    # d lift / dV is 0 at -0.4535 v_h = -1.376 m/s.
-    assert slope(-1.370) < 0 < slope(-1.382)
 
 
 def test_the_noise_of_the_vortex_ring_state():
