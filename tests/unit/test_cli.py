@@ -380,15 +380,6 @@ def test_a_run_keeps_its_settings(refusal, copy, words, name):
     assert contents(copy) == before
 
 
-def test_a_run_goes_on_further(copy, undrawn):
-    words = ["--resume", copy, "--no-video", "--episodes", "2"]
-    assert command("train", *words, "--steps", "320", "--num-threads", "1") == 0
-    assert [int(row["steps"]) for row in metrics(copy)] == list(range(32, 321, 32))
-    assert quadrl.Policy.load(copy).metadata["steps"] == 320
-    assert TrainConfig.of_folder(copy).steps == 320
-    assert (copy / "evaluation.json").exists()
-
-
 def test_seeds_go_with_neither_a_seed_nor_a_run(refusal, copy):
     assert refusal("train", "--seeds", "5:5")[0].name == "seeds"
     assert refusal("train", "--seeds", "0:2", "--seed", "1")[0].name == "--seed"
@@ -417,9 +408,17 @@ def test_an_interrupted_run_can_be_flown(tmp_path, capsys, monkeypatch):
     assert command("evaluate", folder, "--episodes", "2") == 0
 
 
-def test_version(capsys):
-    assert command("--version") == 0
-    assert quadrl.__version__ in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("words", "printed"),
+    [
+        ("--version", quadrl.__version__),
+        ("", "quadrl train hover"),  # no words ask for help
+        ("train hover --steps 1e6 --dry-run", "1000000"),
+    ],
+)
+def test_what_is_asked_is_answered(capsys, words, printed):
+    assert command(*words.split()) == 0
+    assert printed in capsys.readouterr().out
 
 
 def test_completion_knows_the_names(capsys):
@@ -507,19 +506,12 @@ def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, firs
 
 # --------------------------------------------------------------------------- what it refuses
 
-WIDE = {"attitude_weight": 60.0, "tilt": 10, "spin": 0.6, "radius": 0.75, "speed": 0.5}
-"""As hover is practised, but one."""
-
 
 @pytest.mark.parametrize(
     ("arguments", "name", "value"),
     [
         (["--algo", "sac"], "algo", "sac"),
-        (["--task-options", "radius=-1"], "hover radius", -1),
-        (["--task-options", "tilt=10"], "hover options", WIDE),
-        (["--seed", "4294967296"], "seed", 2**32),
         (["--episodes", "0"], "episodes", 0),
-        (["--task-options", "horizn=5"], "hover option", "horizn"),
         (["--task-options", "time_limit"], "task option", "time_limit"),
     ],
 )
@@ -561,16 +553,6 @@ def test_a_mistyped_command_is_answered_in_a_line(capsys, tmp_path, words):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("quadrl: ") and MISTYPED[words] in line
     assert not list(tmp_path.iterdir())
-
-
-def test_steps_may_be_written_as_1e6(capsys):
-    assert command("train", "hover", "--steps", "1e6", "--dry-run") == 0
-    assert "1000000" in capsys.readouterr().out
-
-
-def test_no_words_ask_for_help(capsys):
-    assert command() == 0
-    assert "quadrl train hover" in capsys.readouterr().out
 
 
 def test_folders_that_cannot_be_used(refusal, copy, tmp_path):
@@ -632,7 +614,6 @@ def test_a_disk_that_fills_up(capsys, tmp_path, monkeypatch, undrawn):
     [
         (["evaluate", "--episodes", "0"], "episodes"),
         (["evaluate", "--task-options", "x=1"], "hover option"),
-        (["evaluate", "--task-options", "x"], "task option"),
         (["render", "--camera", "chse"], "camera"),
         (["render", "--width", "161"], "width"),
         (["render", "--out", "a.avi"], "path"),
