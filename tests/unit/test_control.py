@@ -23,8 +23,6 @@ from quadrl.control.autopilot import Laws, Reversed
 from quadrl.control.geometric import towards_east
 from quadrl.control.loops import (
     Loops,
-    attitude_error,
-    cascade,
     rotor_lag,
     sampled,
     turned,
@@ -48,12 +46,6 @@ both = pytest.mark.parametrize("name", CONTROLLERS)
 looped = pytest.mark.parametrize("name", LOOPED)
 presets = pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES)
 layouts = pytest.mark.parametrize("vehicle", LAYOUTS.values(), ids=LAYOUTS)
-
-
-class AnyHeading(Hover):
-    """Hover, at whatever heading."""
-
-    heading_matters = False
 
 
 def hovering(vehicle, headings, **coordinates):
@@ -145,53 +137,13 @@ def test_yaw_is_cut_first_then_thrust_then_roll_and_pitch_together(vehicle):
     np.testing.assert_allclose(given[2, 1:3], best.x[0] * much_tilt[1:3], rtol=1e-9)
 
 
-# ------------------------------------------------------------------------------------- the loops
+# ------------------------------------------------------------------------------------ controllers
 
 
-@pytest.mark.parametrize("integrators", [2, 4])
-def test_cascade_places_every_pole(integrators):
-    """The closed loop's characteristic polynomial is (z - exp(-p T))^(n + 1)."""
-    size, lag = integrators + 1, 1 / 0.18
-    assert rotor_lag(PAPER) == (pytest.approx(lag), lag)
-    rates = cascade(lag, 5.0, integrators, 0.05)
-    # Nested: command = now + lead (rate_n (... rate_1 (0 - x_1) - x_2 ...) - now).
-    gain = np.zeros(size)
-    for k, rate in enumerate(rates[:-1]):
-        gain[k] += 1
-        gain *= rate
-    gain *= rates[-1]
-    gain[-1] = rates[-1] - 1
-    a, b = np.eye(size, k=1), np.eye(size)[:, -1:] * lag
-    a[-1, -1] = -lag
-    a, b = sampled(a, b, 0.05)
-    poles = np.full(size, math.exp(-5.0 * 0.05))
-    np.testing.assert_allclose(np.poly(a - b * gain), np.poly(poles), atol=1e-9)
-    # Where sampling is fast these are the textbook's: p / 3 and p for three poles.
-    if integrators == 2:
-        np.testing.assert_allclose(cascade(lag, 5.0, 2, 1e-4)[:2], [5 / 3, 5.0], rtol=1e-3)
-
-
-def test_attitude_error_is_the_sine_of_the_angle_about_its_axis():
-    rng = np.random.default_rng(0)
-    axis = rng.normal(size=(50, 3))
-    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
-    angle = rng.uniform(0, math.pi, (50, 1))
-    # R = R_d exp(angle axis): in the body frame R_d's columns are those of the inverse turn.
-    desired = Rotation.from_rotvec(-angle * axis).as_matrix()
-    error = attitude_error(3.0 * desired[:, :, 2], desired[:, :, 0] + 0.3 * desired[:, :, 2])
-    np.testing.assert_allclose(error, np.sin(angle) * axis, atol=1e-12)
-
-
-def test_headings_turn_the_right_way():
-    # Heading north, a metre forward is north and a metre left is west.
-    north = np.array([[0.0, 1.0]])
-    np.testing.assert_allclose(turned(np.array([[1.0, 2.0, 3.0]]), north), [[-2.0, 1.0, 3.0]])
+def test_the_controller_turns_towards_east_by_the_shorter_way():
     for heading, wanted in ((0.2, 0.0), (-0.2, 0.0), (2.0, 1.5), (-3.0, -2.5)):  # 0.5 rad nearer
         nearer = towards_east(np.array([[math.cos(heading), math.sin(heading)]]))
         np.testing.assert_allclose(nearer, [[math.cos(wanted), math.sin(wanted)]], atol=1e-12)
-
-
-# ------------------------------------------------------------------------------------ controllers
 
 
 @both
@@ -238,28 +190,6 @@ def test_recovers_from_sixty_degrees_of_tilt(name, speed, spin):
     wild = dict(tilt=math.radians(60), speed=speed, spin=spin, max_distance=20.0, altitude=20.0)
     task = tasks.make("hover", **wild)
     assert summarize(fly(make_controller(name, task), task, episodes=50))["success_rate"] == 1.0
-
-
-@both
-@pytest.mark.parametrize(
-    ("task", "goal", "heading", "sign"),
-    [
-        (Hover, (0, 0, 0), 0.0, (0, 0, 0, 0)),
-        # Rotors 1 to 4 sit ahead, left, behind and right. Ahead: nose down, so behind pushes.
-        (Hover, (0.2, 0, 0), 0.0, (-1, 0, 1, 0)),
-        (Hover, (0, 0.2, 0), 0.0, (0, -1, 0, 1)),
-        (Hover, (0, 0, -0.2), 0.0, (-1, -1, -1, -1)),
-        # Heading north, a goal in the east is to the right: rotor 2, left, pushes.
-        (AnyHeading, (0.2, 0, 0), math.pi / 2, (0, 1, 0, -1)),
-        (AnyHeading, (0, 0, 0), 0.2, (0, 0, 0, 0)),
-        # Back to the right: rotors 1 and 3 react that way (equation 7).
-        (Hover, (0, 0, 0), 0.2, (1, -1, 1, -1)),
-    ],
-)
-def test_goals_and_headings_are_approached_the_right_way(name, task, goal, heading, sign):
-    task = task()
-    action = CONTROLLERS[name](PAPER, task)(observations(task, [heading], goal))
-    np.testing.assert_array_equal(np.sign(np.round(action, 2)), [sign])
 
 
 def test_a_task_brings_gains_of_its_own_unless_others_are_given():
