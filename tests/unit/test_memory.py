@@ -97,20 +97,6 @@ def sequence_batch(observation, state, begins):
 # ------------------------------------------------------------------- what it computes
 
 
-def test_the_unit_is_torchs():
-    actor, _, _ = remembering()
-    cell, _ = cell_of(actor)
-    unit = export(actor, "hover", {}).memory
-    observation, state, _ = sequences()
-    for t in range(STEPS):
-        expected = cell(observation[:, t], state).detach()
-        got = unit.step(observation[:, t].numpy(), state.numpy())
-        np.testing.assert_allclose(got, expected, atol=3e-7)
-        state = expected
-    huge = unit.step(np.full((1, SIZE), 1e6, "f"), np.zeros((1, WIDTH), "f"))
-    assert (np.abs(huge) <= 1).all()  # without a warning
-
-
 def test_an_exported_policy_flies_a_sequence_as_the_actor_does(tmp_path):
     actor, _, _ = remembering()
     observation, state, begins = sequences()
@@ -252,28 +238,6 @@ def test_the_critic_alone_reads_what_is_privileged(monkeypatch, tmp_path, memory
     np.testing.assert_allclose(training.normalisers["privileged"].mean, 50, atol=2)
     stopped(config, tmp_path / "other", 3)
     assert_same_run(tmp_path / "run", train(config, tmp_path / "other", resume=True))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_critic_learns_what_only_it_is_told(kind):
-    """The value is a random number of each transition, which the privileged observation holds."""
-    losses = []
-    for privileged in (0, 1):
-        actor, critic, normalisers = remembering(privileged)
-        algorithm = kind(actor, critic, KINDS[kind])
-        batch = sequence_batch(*sequences())
-        value = torch.randn(ROWS, STEPS, 1)
-        batch["privileged"], batch["value_target"] = 100 + 7 * value, value
-        batch["action"] = torch.randn(ROWS, STEPS, ACTIONS)
-        batch["advantage"] = torch.zeros(ROWS, STEPS, 1)
-        with torch.no_grad(), set_recurrent_mode():
-            batch["action_log_prob"] = actor.get_dist(batch).log_prob(batch["action"])
-        if privileged:
-            normalisers["privileged"].update(batch["privileged"])
-        for _ in range(25):
-            found = algorithm.update(batch.clone(), 1.0)
-        losses.append(found["critic_loss"])
-    assert losses[1] < 0.3 * losses[0], losses
 
 
 # ------------------------------------------------------------------- the policy
