@@ -154,14 +154,6 @@ def test_for_another_mujoco_it_is_said_which_one_needs_no_compiler(no_compiler, 
         compiling.build()
 
 
-def test_a_library_without_a_digest_of_an_earlier_version_is_built_anew(copying_compiler, cache):
-    path = compiling.build()
-    path.unlink()
-    product, name, version, key, *_ = path.stem.split("-")
-    path.with_name(f"{product}-{name}-{version}-{key}.so").write_bytes(b"cut short")
-    assert native.load(compiling.build()).quadrl_mujoco_version() == mujoco.mj_version()
-
-
 def test_what_the_system_does_not_load_is_said_in_a_line(cache, monkeypatch):
     monkeypatch.setenv("QUADRL_CFLAGS", "-O0 -Wl,-z,now")
     with pytest.raises(native.NativeError, match="cannot be loaded.*nowhere.*QUADRL_CACHE"):

@@ -29,6 +29,10 @@ def fly(environment, action=DIVE):
 def test_after_register_dm_control_loads_the_same_environments():
     suite.register()
     suite.register()  # harmless
+    assert suite.ALL_TASKS == tuple(("quadrotor", name) for name in TASKS)
+    assert suite.TASKS_BY_DOMAIN == {"quadrotor": tuple(TASKS)}
+    with pytest.raises(AttributeError, match="NO_SUCH_TASKS"):
+        _ = suite.NO_SUCH_TASKS
     assert ("cartpole", "balance") in dm_suite.BENCHMARKING  # the others are still there
     for name in TASKS:
         assert ("quadrotor", name) in dm_suite.ALL_TASKS
@@ -40,13 +44,6 @@ def test_after_register_dm_control_loads_the_same_environments():
             assert list(one.observation) == list(other.observation) == list(TASKS[name].observation)
             for term in one.observation:
                 np.testing.assert_array_equal(one.observation[term], other.observation[term])
-
-
-def test_the_lists_of_the_domain_name_every_task():
-    assert suite.ALL_TASKS == tuple(("quadrotor", name) for name in TASKS)
-    assert suite.TASKS_BY_DOMAIN == {"quadrotor": tuple(TASKS)}
-    with pytest.raises(AttributeError, match="NO_SUCH_TASKS"):
-        _ = suite.NO_SUCH_TASKS
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -144,14 +141,6 @@ def test_a_random_state_seeds_the_episodes():
     one, same, other = (start(np.random.RandomState(seed)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one, same)
     assert not np.array_equal(one, other)
-
-
-def test_a_reset_leaves_the_solver_no_memory():
-    # As in a fresh MjData, from which a plain loop starts.
-    environment = quadrl.load("landing")
-    fly(environment)
-    environment.reset()
-    assert not environment.physics.data.qacc_warmstart.any()
 
 
 def test_free_flight_flies_the_same_and_shows_what_it_flies():

@@ -6,7 +6,6 @@ import pytest
 from helpers import begun, idle
 
 from quadrl import tasks
-from quadrl.core.environment import Environment
 from quadrl.tasks.hover import Hover
 
 
@@ -18,26 +17,6 @@ def held(environment, positions):
 
 
 # ------------------------------------------------------------------- one definition of the numbers
-
-
-def test_seeding_again_gives_the_same_episodes_and_another_seed_others():
-    actions = helpers.random_actions(10, 2)
-    environment = begun(num_envs=2, seed=5)
-    once = helpers.fly(environment, actions)
-    assert environment.seed(5) == 5
-    environment.reset()
-    helpers.assert_records(helpers.fly(environment, actions), once)
-    environment.seed(6)
-    environment.reset()
-    other = helpers.fly(environment, actions)
-    assert (once[0]["coordinates"] != other[0]["coordinates"]).any()
-    assert len({Environment("hover").seed() for _ in range(3)}) == 3
-    # Some rows alone: row 1 begins the episodes of seed 5 + 1 anew, row 0 goes on.
-    environment.seed(5, np.array([1]))
-    environment.reset()
-    new = begun(num_envs=2, seed=5)
-    equal = (environment.engine.qpos == new.engine.qpos).all(axis=1)
-    assert equal.tolist() == [False, True]
 
 
 # ------------------------------------------------------------------------------- reward and goals
