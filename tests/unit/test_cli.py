@@ -272,6 +272,15 @@ def test_render_writes_a_video_that_plays(run, tmp_path, capsys):
     assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (30, 1.5)
 
 
+def test_json_is_printed_alone(capsys, tmp_path):
+    words = ["--disturbances", "wind", "--no-recovery", "--episodes", "2", "--quiet", "--json"]
+    flown = ["robustness", "--controller", "geometric", "--out", tmp_path / "card", *words]
+    assert command(*flown) == 0
+    printed = json.loads(capsys.readouterr().out)
+    kept = json.loads((tmp_path / "card" / "robustness.json").read_text())
+    assert printed.items() <= kept.items() and printed["axes"]["wind"]["flown"]
+
+
 def test_quiet_prints_errors_alone(capsys):
     assert command("tasks", "--quiet") == 0
     assert capsys.readouterr() == ("", "")

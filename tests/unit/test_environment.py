@@ -22,14 +22,6 @@ def held(environment, positions):
 # ------------------------------------------------------------------------------- reward and goals
 
 
-def test_control_costs_the_square_of_the_deviation():
-    # sum((35 * (1, -1, 0.5, 0))^2) / 319.157^2 = 1225 * 2.25 / 101861 = 0.027059; beyond +-1 it is
-    # the clipped command that costs: 1225 * 4 / 101861 = 0.048105.
-    now = helpers.placed(count=2).step(np.array([[1, -1, 0.5, 0], [9.0] * 4]))
-    np.testing.assert_allclose(now.reward_terms["control"], [-0.027059, -0.048105], atol=1e-6)
-    np.testing.assert_array_equal(now.reward_terms["survival"], 10.0)
-
-
 def test_smoothness_costs_the_square_of_the_change_of_the_commands():
     # From hover speed to 35 * (1, -1, 0.5, 0) above it, as above; then back by twice the half.
     task = tasks.make("hover", smoothness_weight=2.0)

@@ -84,20 +84,6 @@ def test_loads_are_the_least_and_the_most_of_a_linear_program(name):
     assert solved >= 6
 
 
-def test_an_action_of_1_lifts_what_is_in_reach_and_no_more():
-    masses = {"mass": (1.30, 1.37)}
-    environment = helpers.flying(count=8, engine="free_flight", randomization=masses)
-    assert MOST == pytest.approx(1.334, abs=1e-3)
-    drawn = environment.randomizer.shown()["mass"]
-    climb = before = np.zeros(8)  # [m/s]
-    for _ in range(16):  # 0.8 s, over four times the lag
-        environment.step(np.ones((8, 4)))
-        climb, before = np.array(environment.snapshot.state.velocity[:, 2]), climb
-    climbs = climb > before
-    near = abs(drawn - MOST) < 0.01
-    assert ((drawn < MOST) == climbs)[~near].all() and len(set(climbs[~near])) == 2
-
-
 @pytest.mark.parametrize(
     ("axis", "expected"),
     [
@@ -237,13 +223,6 @@ def test_train_says_it_before_it_begins(tmp_path):
 
 def refuse():
     raise InterruptedError
-
-
-def test_the_command_says_it_once_whatever_flies(capsys):
-    words = ["--randomization", '{"one_rotor": 0.7}', "--episodes", "1"]
-    cli.main(["evaluate", "hover", *words, "--task-options", "time_limit=0.5"])
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and said.startswith("quadrl: warning: 100 % of the drawn")
 
 
 # ---------------------------------------------------------------------------------- the card

@@ -49,13 +49,6 @@ def test_a_step_returns_pythons_own_types_and_an_info_of_scalars():
         assert sum(terms.values()) == reward
 
 
-def test_an_action_may_be_a_list():
-    one, same = gym.make(HOVER), gym.make(HOVER)
-    one.reset(seed=0), same.reset(seed=0)
-    given, expected = one.step([0.1, 0.2, 0.3, 0.4]), same.step(np.array([0.1, 0.2, 0.3, 0.4]))
-    assert data_equivalence(given, expected)
-
-
 def test_reward_terms_are_an_array_with_names():
     environment = gym.make(HOVER)
     environment.reset(seed=0)
