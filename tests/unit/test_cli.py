@@ -393,21 +393,6 @@ def test_a_device_that_is_not_there(refusal, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_an_interrupted_run_can_be_flown(tmp_path, capsys, monkeypatch):
-    folder, shown = tmp_path / "run", quadrl.base.progress.ProgressBar.show
-
-    def stop(bar, now):
-        shown(bar, now)
-        if now.iteration == 3:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr("quadrl.base.progress.ProgressBar.show", stop)
-    assert command("train", "hover", *TINY, "--out", folder) == 130
-    assert f"quadrl train --resume {folder}" in capsys.readouterr().err
-    assert quadrl.Policy.load(folder).metadata["steps"] == 64
-    assert command("evaluate", folder, "--episodes", "2") == 0
-
-
 @pytest.mark.parametrize(
     ("words", "printed"),
     [
