@@ -1,7 +1,6 @@
 """Control modes and controllers: they do what they say, on every layout of rotors."""
 
 import dataclasses
-import functools
 import math
 
 import numpy as np
@@ -19,7 +18,6 @@ from quadrl.base.errors import NativeError
 from quadrl.base.rotation import heading_of, quaternion_from_heading_and_tilt
 from quadrl.control import CONTROL_MODES, CONTROLLERS, Gains, Weights, lqr, modes
 from quadrl.control.allocation import Allocation
-from quadrl.control.autopilot import Laws, Reversed
 from quadrl.control.geometric import towards_east
 from quadrl.control.loops import (
     Loops,
@@ -483,43 +481,6 @@ def test_compiled_loops_command_what_numpy_commands(name, settings, monkeypatch)
 
 def fail(source):
     raise NativeError("there is no C compiler")
-
-
-@looped
-@pytest.mark.parametrize("vehicle", ["paper", "hexa"])
-def test_the_derivatives_of_commands_are_those_of_differences(name, vehicle):
-    rng, count = np.random.default_rng(1), 16
-    flyer = Flyer(name, VEHICLES[vehicle], np.linspace(0, 6, count))
-    flyer.fly(rng.uniform(-1, 1, (count, 4)), 0.3)
-    mode, engine = flyer.mode, flyer.engine
-    laws, back = Laws(mode, engine), Reversed(mode, engine)
-    motion = np.concatenate([engine.qpos, engine.qvel, engine.act], axis=1)
-    action = rng.uniform(-0.9, 0.9, (count, 4))
-
-    def parts(motion):
-        return motion[:, :7], motion[:, 7:13], motion[:, 13:]
-
-    setpoint = laws.setpoint(*parts(motion), action)
-    for function, derivative, other in (
-        (laws.setpoint, back.setpoint, action),
-        (laws.command, back.command, setpoint),
-    ):
-        given = rng.normal(size=function(*parts(motion), other).shape)
-        moves = [rng.normal(size=array.shape) for array in (motion, other)]
-        pairs = zip(derivative(motion, other, given), moves, strict=True)
-        found = sum((slope * move).sum(1) for slope, move in pairs)
-
-        def slope(step, function=function, other=other, given=given, moves=moves):
-            ends = (
-                function(*parts(motion + s * moves[0]), other + s * moves[1]) for s in (step, -step)
-            )
-            return (given * functools.reduce(np.subtract, ends)).sum(1) / (2 * step)
-
-        coarse, fine = slope(1e-6), slope(1e-7)
-        # Where the two agree, no edge lies between: the function is smooth there.
-        smooth = np.isclose(coarse, fine, rtol=1e-4, atol=1e-4)
-        assert smooth.sum() > count / 2
-        np.testing.assert_allclose(found[smooth], fine[smooth], rtol=1e-3, atol=1e-3)
 
 
 @looped

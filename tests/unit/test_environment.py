@@ -52,30 +52,6 @@ def test_a_new_goal_is_seen_at_once_and_costs_nothing():
     assert 0.04 < gained < 0.05
 
 
-@pytest.mark.parametrize("vehicle", ["paper", "hexa"])
-@pytest.mark.parametrize(
-    "name", [n for n, task in tasks.TASKS.items() if "position" in task.observation]
-)
-def test_the_flat_observation_is_that_of_the_documentation(name, vehicle):
-    environment = begun(name, 4, vehicle=vehicle)
-    rotors = environment.vehicle.rotor_count
-    now = environment.step(helpers.random_actions(1, 4, rotors)[0])
-    flat, state = environment.flatten(now.observation), environment.snapshot.state
-    speed = state.rotor_speed / environment.vehicle.max_speed
-    parts = [state.position, state.sin_attitude, state.cos_attitude, state.body_velocity]
-    whole = np.concatenate([*parts, state.body_rate, speed], axis=-1).astype(np.float32)
-    width = 15 + rotors
-    np.testing.assert_array_equal(flat[:, :width], whole)
-    # Then the goal vector, body frame: back in the world it leads to the goal.
-    lead = np.einsum("nij,nj->ni", state.rotation, flat[:, width : width + 3])
-    np.testing.assert_allclose(state.position + lead + [0, 0, environment.origin[2]],
-                               environment.goals(), atol=1e-5)  # fmt: skip
-    # The velocity of what moves; of a trajectory also its acceleration, jerk and ten places ahead.
-    moving = {"straight_and_level": 3, "target_following": 3, "trajectory": 39}.get(name, 0)
-    assert flat.shape == (4, width + 3 + moving) == (4, environment.size)
-    assert flat.dtype == np.float32
-
-
 # ------------------------------------------------------------------------------- how episodes end
 
 
