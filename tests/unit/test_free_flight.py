@@ -179,23 +179,11 @@ def test_ground_that_a_task_raises_is_not_flown_through():
     assert 2.0 < environment.engine.qpos[0, 2] < 2.3
 
 
-def test_a_task_that_builds_a_wall_is_refused_in_free_flight_and_flown_in_mujoco():
+def test_a_task_that_builds_a_wall_is_refused():
     class Walled(type(tasks.make("hover"))):
         def scene(self, spec):
-            spec.worldbody.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 5, 5], pos=[0.8, 0, 3], contype=1
-            )
+            wall(spec)
 
-    class Touching(Walled):
-        contact = True
-
-    def reached(task):
-        environment = helpers.placed(task, velocity=(3, 0, 0))
-        for _ in range(8):
-            environment.step(np.zeros((1, 4)))
-        return environment.engine.qpos[0, 0]
-
-    # At 3 m/s for 0.4 s it is 1.2 m on, but for a wall at 0.7 m whose face stops its rotors.
-    assert reached(tasks.make("hover")) > 1.1 and reached(Touching()) < 0.5
-    with helpers.refused("engine"):
-        Environment(Touching(), engine="free_flight")
+    with helpers.refused("engine", match="wall"):
+        Environment(Walled(), engine="free_flight")
+    Environment(Walled())

@@ -68,14 +68,6 @@ def test_one_bit_that_has_changed_is_refused(copy, name, read):
         assert str(path) in str(caught.value), bit
 
 
-@pytest.mark.parametrize("name", PARTS[:2])
-def test_a_run_is_not_continued_from_a_damaged_file(copy, name):
-    path = copy / name
-    path.write_bytes(flipped(path.read_bytes(), 8 * (path.stat().st_size - 100)))
-    with refused():
-        Training(changed(steps=10 * TINY.steps), copy, resume=True)
-
-
 def test_files_of_an_earlier_quadrl_are_read_with_a_note(copy, run):
     for name in PARTS[1:]:
         (copy / name).write_bytes(unsealed((run / name).read_bytes()))
