@@ -22,6 +22,7 @@ from quadrl.core.environment import Environment
 from quadrl.engines.mjcf import compile_model
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.engines.state import Start
+from quadrl.tasks.hover import Hover
 
 # ------------------------------------------------------------------- motions, flown by an engine
 
@@ -268,6 +269,12 @@ def starting(task, start, task_state=None):
 
     kind = type(type(task).__name__, (type(task),), {"begin": begin})
     return kind(**{field.name: getattr(task, field.name) for field in dataclasses.fields(task)})
+
+
+def variant(base=Hover, options=None, **members):
+    """A task with some methods or members replaced."""
+    body = {"name": base.name, "__annotations__": {}, **members}
+    return dataclasses.dataclass(frozen=True)(type("Variant", (base,), body))(**(options or {}))
 
 
 def placed(

@@ -7,6 +7,7 @@ import functools
 import helpers
 import numpy as np
 import pytest
+from helpers import variant
 
 from quadrl import tasks
 from quadrl.base import trace
@@ -19,12 +20,6 @@ from quadrl.tasks.hover import Hover
 
 STEPS = 40
 SEEN = {"rotor_speed": "estimated", "airspeed": True, "disturbance": True, "action_history": 2}
-
-
-def variant(base=Hover, options=None, **members):
-    """A task with some methods or members replaced."""
-    body = {"name": base.name, "__annotations__": {}, **members}
-    return dataclasses.dataclass(frozen=True)(type("Variant", (base,), body))(**(options or {}))
 
 
 def arrays(record, name=""):

@@ -523,22 +523,6 @@ def test_who_knows_how_the_target_goes_on_lags_behind_no_longer(vehicle):
     assert error[True] < error[False] / 20
 
 
-def test_the_motion_of_the_target_is_the_slope_of_its_velocity():
-    task = tasks.make("target_following", sees_motion=True)
-    environment = begun(task, num_envs=8, seed=3)
-    now, step = environment.snapshot, 1e-5
-
-    def at(seconds):
-        return dataclasses.replace(now, time=now.time + seconds)
-
-    def slope(quantity):
-        return (quantity(at(step)) - quantity(at(-step))) / (2 * step)
-
-    acceleration, jerk = task.target_motion(now)
-    np.testing.assert_allclose(slope(task.target_velocity), acceleration, atol=1e-8)
-    np.testing.assert_allclose(slope(lambda then: task.target_motion(then)[0]), jerk, atol=1e-8)
-
-
 @pytest.mark.parametrize(
     ("call", "name", "value"),
     [

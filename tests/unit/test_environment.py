@@ -6,7 +6,6 @@ import pytest
 from helpers import begun, idle
 
 from quadrl import tasks
-from quadrl.tasks.hover import Hover
 
 
 def held(environment, positions):
@@ -91,15 +90,3 @@ def test_success_is_judged_on_the_mean_of_the_last_two_seconds():
     np.testing.assert_array_equal(now.truncated, True)
     np.testing.assert_array_equal(now.is_success, [True, False, False, True])
     np.testing.assert_allclose(now.error, [0, 0, 0.2, 0.05], atol=1e-4)
-
-
-def test_errors_of_the_last_episode_do_not_weigh_on_the_next():
-    environment = begun(Hover(time_limit=2.0), 2)  # 40 steps, all of them within the last 2 s
-    for k in range(60):
-        now = held(environment, [[0, 0, 0], [2.0 * (k < 20), 0, 0]])
-        if k == 19:
-            environment.reset(np.array([1]))
-        if k == 39:
-            np.testing.assert_array_equal(now.is_success, [True, False])
-            environment.reset(np.array([0]))
-    np.testing.assert_array_equal(now.is_success, [False, True])

@@ -18,12 +18,6 @@ from quadrl.tasks.hover import Hover
 # ------------------------------------------------------------------------------- a user's own task
 
 
-def hostile_task(**methods):
-    """Hover with some methods replaced."""
-    body = {"name": "hostile", "__annotations__": {}, **methods}
-    return dataclasses.dataclass(frozen=True)(type("Hostile", (Hover,), body))()
-
-
 def changed_start(**changes):
     def begin(self, rng, parameters):
         start, state = Hover.begin(self, rng, parameters)
@@ -74,7 +68,7 @@ HOSTILE = {  # methods, and what the error names
 def test_a_task_that_gives_what_none_may_is_refused(case):
     methods, name = HOSTILE[case]
     with helpers.refused() as caught:
-        helpers.idle(helpers.begun(hostile_task(**methods), 3))
+        helpers.idle(helpers.begun(helpers.variant(**methods), 3))
     assert name in caught.value.name
 
 
@@ -83,7 +77,7 @@ def test_a_reward_that_is_nan_later_is_refused_too():
         terms = Hover.reward(self, before, now, end)
         return terms | {"late": np.where(now.state.speed > 0.5, np.nan, 0.0)}
 
-    environment = helpers.begun(hostile_task(reward=late), 3)
+    environment = helpers.begun(helpers.variant(reward=late), 3)
     with helpers.refused() as caught:
         for _ in range(40):  # four rotors at full command: more than 0.5 m/s within a second
             environment.step(np.ones((3, 4)))
@@ -99,7 +93,7 @@ def test_what_a_task_raises_is_its_own_and_the_environment_goes_on():
         return Hover.terminated(self, now)
 
     environment, other = (
-        helpers.begun(hostile_task(terminated=terminated, compiled=False), 2),
+        helpers.begun(helpers.variant(terminated=terminated, compiled=False), 2),
         helpers.begun("hover", 2),
     )
     failing[0] = True
