@@ -68,22 +68,6 @@ def test_the_cache_is_used_and_other_flags_make_another_library(
     assert path.stat().st_mtime_ns == built
 
 
-@pytest.mark.parametrize("kind", ["read-only", "unreadable"])
-def test_a_cache_that_cannot_be_written_is_done_without(
-    copying_compiler, cache, tmp_path, monkeypatch, kind
-):
-    # Root may write everywhere, so both stand in: a folder under a file cannot be made, and a
-    # name past the file system's limit cannot even be asked for.
-    impossible = tmp_path / "file" / "quadrl" if kind == "read-only" else tmp_path / ("x" * 300)
-    (tmp_path / "file").write_text("")
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setenv("QUADRL_CACHE", str(impossible))
-    path = compiling.build()
-    assert path.is_relative_to(tmp_path / "tmp")
-    assert native.load(path).quadrl_mujoco_version() == mujoco.mj_version()
-
-
 def generated(function="f"):
     """A library of generated C, loaded as for the first time."""
     seen = '__attribute__((visibility("default")))'
@@ -180,18 +164,23 @@ def run(tmp_path, cache):
 
 
 @pytest.mark.parametrize(
-    ("code", "compiler"),
+    ("code", "place", "compiler"),
     [
-        ("library(), compiling.compile_generated('int f;')", None),
-        ("compiling.build(), compiling.build(name='again')", None),
-        ("compiling.build()", "false"),
+        # Root may write everywhere, so both stand in: a folder under a file cannot be made, and a
+        # name past the file system's limit cannot even be asked for.
+        ("library(), compiling.compile_generated('int f;')", "file/quadrl", None),
+        ("library()", "x" * 300, None),
+        ("compiling.build(), compiling.build(name='again')", "file/quadrl", None),
+        ("compiling.build()", "file/quadrl", "false"),
     ],
-    ids=["loaded", "never loaded", "refused"],
+    ids=["loaded", "unreadable", "never loaded", "refused"],
 )
-def test_where_there_is_no_cache_nothing_is_left(tmp_path, copying_compiler, run, code, compiler):
+def test_without_a_cache_it_is_built_and_nothing_is_left(
+    tmp_path, copying_compiler, run, code, place, compiler
+):
     (tmp_path / "file").write_text("")
     variables = {"CC": compiler} if compiler else {}
-    process = run(code, QUADRL_CACHE=str(tmp_path / "file" / "quadrl"), **variables)
+    process = run(code, QUADRL_CACHE=str(tmp_path / place), **variables)
     assert process.wait() == (1 if compiler else 0)
     assert list((tmp_path / "tmp").iterdir()) == []
 
