@@ -157,38 +157,27 @@ def test_a_model_without_room_for_wind_flies_in_calm_air():
 # ------------------------------------------------------------------------- who owns the callbacks
 
 
-def gain(model, data, actuator):
+def somebody_elses(*given):
     return 3.0
 
 
-def test_install_does_not_take_over_a_foreign_callback():
-    mujoco.set_mjcb_act_gain(gain)
-    for make in (native.install, lambda: mjcf.compile_model(Vehicle())):
-        with pytest.raises(native.NativeError, match="mjcb_act_gain"):
-            make()
-    assert mujoco.get_mjcb_act_gain() is gain
-    with pytest.warns(UserWarning, match="mjcb_act_gain"):
-        native.install(replace=True)
-    native.check_installed()
-
-
-def test_every_foreign_callback_is_named_and_those_of_other_kinds_are_left():
-    def control(model, data):
-        pass
-
-    mujoco.set_mjcb_control(control)
+def test_foreign_callbacks_are_named_and_left_until_they_are_to_be_replaced():
+    before = [getattr(mujoco, f"get_mjcb_{name}")() for name in native.CALLBACKS]
+    native.install()  # again: nothing changes
+    assert [getattr(mujoco, f"get_mjcb_{name}")() for name in native.CALLBACKS] == before
+    for name in ("act_dyn", "passive", "control"):
+        getattr(mujoco, f"set_mjcb_{name}")(somebody_elses)
     try:
-        before = [getattr(mujoco, f"get_mjcb_{name}")() for name in native.CALLBACKS]
-        native.install()  # again: nothing changes
-        assert [getattr(mujoco, f"get_mjcb_{name}")() for name in native.CALLBACKS] == before
-        assert mujoco.get_mjcb_control() is control
+        for make in (native.install, native.check_installed, lambda: mjcf.compile_model(Vehicle())):
+            with pytest.raises(native.NativeError, match="mjcb_act_dyn, mjcb_passive"):
+                make()
+        assert mujoco.get_mjcb_act_dyn() is somebody_elses
+        with pytest.warns(UserWarning, match="mjcb_act_dyn"):
+            native.install(replace=True)
+        native.check_installed()
+        assert mujoco.get_mjcb_control() is somebody_elses  # of another kind
     finally:
         mujoco.set_mjcb_control(None)
-    mujoco.set_mjcb_passive(lambda model, data: None)
-    mujoco.set_mjcb_act_dyn(gain)
-    for refusing in (native.install, native.check_installed):
-        with pytest.raises(native.NativeError, match="mjcb_act_dyn, mjcb_passive"):
-            refusing()
 
 
 @pytest.mark.parametrize("name", native.CALLBACKS)
