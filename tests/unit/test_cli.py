@@ -42,12 +42,6 @@ FILES = {
 METRICS = {"success_rate", "survival_rate", "position_error_m", "return_mean", "return_std"}
 
 
-def without(option: str, words: list[str]) -> list[str]:
-    """Options that each have one value, but for one of them."""
-    pairs = zip(words[::2], words[1::2], strict=True)
-    return [word for pair in pairs if pair[0] != option for word in pair]
-
-
 def command(*arguments: object) -> int:
     """Exit code of the command in this process."""
     try:
@@ -380,19 +374,6 @@ def test_a_run_keeps_its_settings(refusal, copy, words, name):
     assert contents(copy) == before
 
 
-def test_seeds_go_with_neither_a_seed_nor_a_run(refusal, copy):
-    assert refusal("train", "--seeds", "5:5")[0].name == "seeds"
-    assert refusal("train", "--seeds", "0:2", "--seed", "1")[0].name == "--seed"
-    assert refusal("train", "--seeds", "0:2", "--resume", copy)[0].name == "--resume"
-
-
-def test_a_device_that_is_not_there(refusal, tmp_path):
-    for device in ("quantum", "meta"):
-        error, _ = refusal("train", *TINY, "--device", device, "--out", tmp_path / "run")
-        assert (error.name, error.value) == ("device", device)
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "printed"),
     [
@@ -443,9 +424,6 @@ def test_evaluations_in_wind_and_with_noise(capsys, refusal):
     for text in ('{"mass": [0.9', '{"masses": 1}'):
         refused, _ = refusal("evaluate", "hover", "--randomization", text)
         assert "randomization" in refused.name
-    words = ("--controller", "lqr", "--sampled")
-    assert refusal("evaluate", *words)[0].name == "sampled"
-    assert refusal("evaluate", "hover", "--weather", "windy")[0].name == "weather"
 
 
 WORDS = '    "Largest distance from the waypoint at the start [m]."\n'
@@ -491,26 +469,44 @@ def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, firs
 
 # --------------------------------------------------------------------------- what it refuses
 
+REFUSED = {  # words, {run} for the folder of a run, and what the error is about
+    "train hover --algo sac": "algo",
+    "train hover --episodes 0": "episodes",
+    "train hover --task-options time_limit": "task option",
+    "train hover --device quantum": "device",
+    "train hover --device meta": "device",
+    "train --seeds 5:5": "seeds",
+    "train --seeds 0:2 --seed 1": "--seed",
+    "train --seeds 0:2 --resume {run}": "--resume",
+    "train hovr": "task",
+    "tasks hovr": "task",
+    "evaluate {run} --task hovr": "task",
+    "evaluate {run} --episodes 0": "episodes",
+    "evaluate {run} --task-options x=1": "hover option",
+    "evaluate {run} --controller lqr": None,
+    "evaluate --controller pid": "controller",
+    "evaluate --controller lqr --sampled": "sampled",
+    "evaluate hover --weather windy": "weather",
+    "evaluate": None,
+    "evaluate nowhere": None,
+    "render {run} --task hovr": "task",
+    "render {run} --camera chse": "camera",
+    "render {run} --width 161": "width",
+    "render {run} --out a.avi": "path",
+    "plot {run} --out a.xyz": "ending of a.xyz",
+    "plot nowhere": None,
+    "train --resume nowhere": None,
+    "--import nowhere.py tasks": "--import",
+}
 
-@pytest.mark.parametrize(
-    ("arguments", "name", "value"),
-    [
-        (["--algo", "sac"], "algo", "sac"),
-        (["--episodes", "0"], "episodes", 0),
-        (["--task-options", "time_limit"], "task option", "time_limit"),
-    ],
-)
-def test_trainings_that_cannot_be_are_refused(refusal, tmp_path, arguments, name, value):
-    folder = tmp_path / "run"
-    error, _ = refusal("train", "hover", *without(arguments[0], TINY), "--out", folder, *arguments)
-    assert (error.name, error.value) == (name, value)
-    assert not folder.exists()
 
-
-def test_unknown_tasks_are_refused(refusal, run):
-    for arguments in (["train"], ["tasks"], ["evaluate", run, "--task"], ["render", run, "--task"]):
-        error, _ = refusal(*arguments, "hovr")
-        assert (error.name, error.value) == ("task", "hovr") and "hover" in error.allowed
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_cannot_be_is_refused_by_its_name_and_leaves_nothing(refusal, run, tmp_path, words):
+    error, line = refusal(*(word.format(run=run) for word in words.split()))
+    assert REFUSED[words] in (None, getattr(error, "name", None))
+    assert "nowhere" not in words or "nowhere" in line
+    assert "hovr" not in words or "hover" in error.allowed
+    assert not list(tmp_path.iterdir())
 
 
 MISTYPED = {
@@ -592,32 +588,6 @@ def test_a_disk_that_fills_up(capsys, tmp_path, monkeypatch, undrawn):
     (line,) = capsys.readouterr().err.splitlines()
     assert "No space left on device" in line and f"quadrl train --resume {folder}" in line
     assert command("train", "--resume", folder, "--no-video", "--episodes", "2") == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [
-        (["evaluate", "--episodes", "0"], "episodes"),
-        (["evaluate", "--task-options", "x=1"], "hover option"),
-        (["render", "--camera", "chse"], "camera"),
-        (["render", "--width", "161"], "width"),
-        (["render", "--out", "a.avi"], "path"),
-        (["plot", "--out", "a.xyz"], "ending of a.xyz"),
-    ],
-)
-def test_flights_that_cannot_be(refusal, run, tmp_path, arguments, name):
-    error, _ = refusal(arguments[0], run, *arguments[1:])
-    assert error.name == name
-    assert not list(tmp_path.iterdir())
-
-
-def test_what_is_not_there(refusal, run):
-    refusal("evaluate")
-    refusal("evaluate", run, "--controller", "lqr")
-    for words in (("evaluate",), ("plot",), ("train", "--resume")):
-        assert "nowhere" in refusal(*words, "nowhere")[1]
-    assert refusal("evaluate", "--controller", "pid")[0].name == "controller"
-    assert refusal("--import", "nowhere.py", "tasks")[0].name == "--import"
 
 
 def test_a_warning_of_quadrl_is_one_line(capsys, monkeypatch):
