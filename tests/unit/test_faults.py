@@ -131,24 +131,33 @@ def test_an_argument_that_cannot_be_is_refused_with_the_choices(name, value, all
 
 
 OPTIONS = [
-    ({"raduis": 1.0}, "hover option", "raduis", "did you mean radius?"),
-    ({"time_limit": 0.0}, "hover time_limit", 0.0, "positive"),
-    ({"time_limit": -1.0}, "hover time_limit", -1.0, "positive"),
-    ({"time_limit": "5"}, "hover time_limit", "5", "number"),
-    ({"time_limit": 10**400}, "hover time_limit", 10**400, ""),
-    ({"altitude": np.inf}, "hover altitude", np.inf, "finite"),
-    ({"altitude": 1e12}, "hover altitude", 1e12, ""),
-    ({"radius": np.nan}, "hover radius", ..., "finite"),
-    ({"settle_time": 1e308}, "hover settle_time", 1e308, ""),
+    ("hover", "raduis", 1.0, "did you mean radius?"),
+    ("hover", "time_limit", 0.0, "positive"),
+    ("hover", "time_limit", -1.0, "positive"),
+    ("hover", "time_limit", "5", "number"),
+    ("hover", "time_limit", 10**400, ""),
+    ("hover", "altitude", np.inf, "finite"),
+    ("hover", "altitude", 1e12, ""),
+    ("hover", "radius", np.nan, "finite"),
+    ("hover", "radius", 1e300, ""),
+    ("hover", "settle_time", 1e308, ""),
+    ("target_following", "climb_share", 2, ""),
+    ("target_following", "slowest", 0, ""),
+    ("target_following", "fastest", 0.1, ""),
+    ("straight_and_level", "line_speed", 0, ""),
+    ("static_waypoint", "waypoints", 5, ""),
+    ("static_waypoint", "waypoints", ((1, 2, "x"),), ""),
+    ("static_waypoint", "waypoints", ((1, 2, 3e300),), ""),
 ]
 
 
-@pytest.mark.parametrize(("options", "name", "value", "allowed"), OPTIONS)
-def test_an_option_that_means_nothing_is_refused_by_name(options, name, value, allowed):
-    with helpers.refused(name, value, lists=allowed) as caught:
-        tasks.make("hover", **options)
-    if "option" in name:
-        assert all(field.name in caught.value.allowed for field in dataclasses.fields(Hover))
+@pytest.mark.parametrize(("task", "option", "value", "allowed"), OPTIONS)
+def test_an_option_that_means_nothing_is_refused_by_name(task, option, value, allowed):
+    known = {field.name for field in dataclasses.fields(tasks.TASKS[task])}
+    named = f"{task} {option}" if option in known else f"{task} option"
+    with helpers.refused(match=f"^{named}", lists=allowed) as caught:
+        tasks.make(task, **{option: value})
+    assert option in known or all(name in caught.value.allowed for name in known)
 
 
 def test_a_step_before_the_first_reset_is_refused():
