@@ -62,17 +62,9 @@ def sequences(seed=0):
     return observation, state, begins
 
 
-def cell_of(actor):
-    """torch's own unit with the actor's weights."""
-    (memory,) = (module for module in actor.modules() if isinstance(module, Memory))
-    cell = torch.nn.GRUCell(SIZE, WIDTH)
-    cell.load_state_dict(memory.cell.state_dict())
-    return cell, memory
-
-
 def unrolled(actor, observation, state, begins):
     """Mean and deviation (ROWS, STEPS, ACTIONS) by a loop over time with torch's own unit."""
-    _, memory = cell_of(actor)
+    (memory,) = (module for module in actor.modules() if isinstance(module, Memory))
     own = memory.cell
     loc, scale = [], []
     for t in range(observation.shape[1]):
