@@ -1,7 +1,6 @@
 """The equations twice: in C (both engines) and in the array API (`quadrl/engines/dynamics.py`)."""
 
 import dataclasses
-import math
 
 import helpers
 import mujoco
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.rotors import GRAVITY, plus
+from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
 from quadrl.base.rotation import norm
 from quadrl.engines import dynamics, mjcf
@@ -108,36 +107,3 @@ def test_the_accelerations_of_mujoco_are_the_derivative(name):
         (acceleration[:, :3], acceleration[:, 3:], spin_up), expected, strict=True
     ):
         np.testing.assert_allclose(got, value, rtol=0, atol=1e-12 * np.abs(value).max())
-
-
-# -------------------------------------------------------------------------------- worked numbers
-
-# Up with a time constant of 0.1 s, down with 0.3 s; no drag. 1 - 1/e = 0.632121.
-UNEVEN = Vehicle(
-    rotors=plus(
-        0.23,
-        thrust_coefficient=3.13e-5,
-        torque_coefficient=7.5e-7,
-        lag_up=10.0,
-        lag_down=1 / 0.3,
-        max_speed=320.0,
-    ),
-    drag_coefficient=0.0,
-    moment_coefficient=0.0,
-    physics_timestep=0.002,
-)
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
-def test_rotors_speed_up_and_slow_down_at_rates_of_their_own(engine):
-    flying = BatchEngine(UNEVEN, 1, altitude=3.0, engine=engine)
-    flying.qpos[:, 2] = 100.0
-    flying.act[:] = 200.0
-    flying.ctrl[:] = (300.0, 200.0, 100.0, 0.0)
-    flying.advance(50)  # 0.1 s
-    # 200 + 100 (1 - e^-1) = 263.2121; 200 - 100 (1 - e^(-1/3)) = 171.6531; 200 e^(-1/3) = 143.3063.
-    np.testing.assert_allclose(flying.act, [[263.2121, 200, 171.6531, 143.3063]], atol=1e-4)
-    flying.advance(100)  # 0.3 s
-    up, down = math.exp(-3), math.exp(-1)
-    expected = [[300 - 100 * up, 200, 100 + 100 * down, 200 * down]]
-    np.testing.assert_allclose(flying.act, expected, atol=1e-6)
