@@ -484,25 +484,19 @@ def fail(source):
 
 
 @looped
-@pytest.mark.parametrize("broken", [0, 4])
-def test_loops_fly_every_physics_step_and_a_divergence_in_any_ends_the_episode(name, broken):
+def test_a_divergence_within_the_physics_steps_of_loops_ends_the_episode(name):
     environment = begun("hover", num_envs=3, control_mode=name)
-    control_rotors, commands = environment.control, []
+    control_rotors, calls = environment.control, []
 
-    def noted(most):
-        steps = control_rotors(most)
-        if len(commands) == broken:
+    def faulty(most):
+        calls.append(control_rotors(most))
+        if len(calls) == PAPER.substeps:
             environment.engine.qvel[-1, 5] = np.nan
-        commands.append(environment.engine.ctrl.copy())
-        return steps
+        return calls[-1]
 
-    environment.control = noted
+    environment.control = faulty
     now = environment.step(np.tile([0.3, -0.2, 0.1, 0.5], (3, 1)))
-    assert len(commands) == PAPER.substeps
-    assert np.ptp(commands, axis=0)[:2].max() > 0.1  # the loops were at work [rad/s]
-    # The reward is of the mean command.
-    off = (np.mean(commands, axis=0) - PAPER.hover_speed) / PAPER.max_speed
-    np.testing.assert_allclose(now.reward_terms["control"][:2], -np.sum(off[:2] ** 2, axis=-1))
+    assert len(calls) == PAPER.substeps
     np.testing.assert_array_equal(now.diverged, [False, False, True])
     np.testing.assert_array_equal(now.terminated, [False, False, True])
     environment.control = control_rotors

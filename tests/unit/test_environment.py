@@ -36,21 +36,6 @@ def test_smoothness_costs_the_square_of_the_change_of_the_commands():
         tasks.make("hover", smoothness_weight=-1.0)
 
 
-def test_a_new_goal_is_seen_at_once_and_costs_nothing():
-    # The first waypoint is reached on the first step. The policy sees the second, 2 m up, from
-    # then on, and the way to it, 20 times as long, is not taken for a step away.
-    options = {"waypoints": ((0, 0, 0.1), (0, 0, 2)), "reach": 0.2}
-    environment = helpers.placed("static_waypoint", velocity=(0, 0, 1), options=options)
-    first = idle(environment)
-    height = float(environment.snapshot.state.position[0, 2])
-    assert first.reward_terms["progress"][0] == pytest.approx(100 * height, rel=1e-9)
-    np.testing.assert_allclose(first.observation["goal"], [[0, 0, 2 - height]], atol=1e-12)
-    second = idle(environment)
-    gained = float(environment.snapshot.state.position[0, 2]) - height
-    assert second.reward_terms["progress"][0] == pytest.approx(100 * gained, rel=1e-9)
-    assert 0.04 < gained < 0.05
-
-
 # ------------------------------------------------------------------------------- how episodes end
 
 
