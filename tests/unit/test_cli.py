@@ -332,14 +332,9 @@ def test_the_name_of_a_task_flies_the_policy_that_ships(capsys, refusal):
 
 
 def test_resume_takes_the_settings_of_the_run(run, copy, undrawn):
-    before = contents(copy)
-    words = ["--resume", copy, "--no-video", "--episodes", "2"]
-    assert command("train", *words) == 0  # it is finished: nothing changes
-    for name in ("policy.safetensors", "metrics.csv", "checkpoint.safetensors", "config.json"):
-        assert (copy / name).read_bytes() == before[name]
     for name in ("policy.safetensors", "checkpoint.safetensors", "metrics.csv"):
         (copy / name).unlink()
-    assert command("train", *words) == 0
+    assert command("train", "--resume", copy, "--no-video", "--episodes", "2") == 0
     assert (copy / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
 
 

@@ -44,16 +44,6 @@ SHORT = {"episodes": 1, "time_limit": 0.5}
 # ------------------------------------------------------------------------------- the arithmetic
 
 
-def test_the_loads_of_the_paper_by_worked_numbers():
-    least, most = Reach(PAPER).loads(35.0)
-    assert (least[0], most[0]) == pytest.approx((LEAST, MOST), rel=1e-4)
-    # At the limits it carries twice its weight, and falls.
-    assert Reach(PAPER).loads(1e4)[1][0] == pytest.approx(2.0)
-    assert Reach(PAPER).room == pytest.approx(319.15 - 225.68, abs=0.01)
-    # sqrt(1.2) 225.68 - 225.68 = 21.5, and up to two digits 22; downwards 19.7 do.
-    assert Reach(PAPER).scale() == pytest.approx(22.0)
-
-
 @pytest.mark.parametrize("name", ["paper", "racer", "hexa", "eight", "leaning"])
 def test_loads_are_the_least_and_the_most_of_a_linear_program(name):
     vehicle = helpers.LAYOUTS[name]

@@ -72,15 +72,6 @@ def test_every_setting_has_a_source():
     assert own["gae_lambda"] == own["ppo.beta2"] == "hover x ppo" and own["ppo.clip"] == "field"
 
 
-def test_an_aircraft_that_is_controlled_more_often_learns_as_many_seconds():
-    paper, racer = TrainConfig("hover"), TrainConfig("hover", vehicle="racer")
-    # 0.02 s instead of 0.05 s: 2.5 times as many steps, and 0.92^(1/2.5) = 0.9672.
-    assert (racer.rollout, racer.steps) == (2.5 * paper.rollout, 2.5 * paper.steps)
-    assert racer.gamma == 0.9672 and racer.iterations == paper.iterations
-    given = TrainConfig("hover", vehicle="racer", gamma=0.9, steps=4096)
-    assert (given.gamma, given.steps, given.rollout) == (0.9, 4096, 40)
-
-
 def test_a_training_has_at_least_the_steps_that_are_asked_for():
     # Batches of 32 steps: 64 and 65 take two and three of them, and one step a whole one.
     batches = {64: 2, 65: 3, 1: 1}
