@@ -12,7 +12,6 @@ from quadrl.aircraft.vehicle import DRAWN_ROTOR_HEIGHT
 from quadrl.engines import mjcf
 from quadrl.rendering import drawing
 
-PAPER = VEHICLES["paper"]
 layouts = pytest.mark.parametrize("vehicle", helpers.LAYOUTS.values(), ids=helpers.LAYOUTS)
 
 
