@@ -355,21 +355,6 @@ def test_the_settings_that_are_shown_are_those_of_the_command(refusal, monkeypat
 
 
 @pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        (["landing"], "task"),
-        (["--ppo.clip", "0.1"], "ppo"),
-        (["--out", "elsewhere"], "out"),
-        (["--steps", "100"], "steps"),
-    ],
-)
-def test_a_run_keeps_its_settings(refusal, copy, words, name):
-    before = contents(copy)
-    assert refusal("train", "--resume", copy, *words)[0].name == name
-    assert contents(copy) == before
-
-
-@pytest.mark.parametrize(
     ("words", "printed"),
     [
         ("--version", quadrl.__version__),
@@ -473,6 +458,10 @@ REFUSED = {  # words, {run} for the folder of a run, and what the error is about
     "train --seeds 5:5": "seeds",
     "train --seeds 0:2 --seed 1": "--seed",
     "train --seeds 0:2 --resume {run}": "--resume",
+    "train --resume {run} landing": "task",
+    "train --resume {run} --ppo.clip 0.1": "ppo",
+    "train --resume {run} --out elsewhere": "out",
+    "train --resume {run} --steps 100": "steps",
     "train hovr": "task",
     "tasks hovr": "task",
     "evaluate {run} --task hovr": "task",
@@ -496,12 +485,13 @@ REFUSED = {  # words, {run} for the folder of a run, and what the error is about
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_what_cannot_be_is_refused_by_its_name_and_leaves_nothing(refusal, run, tmp_path, words):
+def test_what_cannot_be_is_refused_by_its_name_and_changes_nothing(refusal, run, tmp_path, words):
+    before = contents(run)
     error, line = refusal(*(word.format(run=run) for word in words.split()))
     assert REFUSED[words] in (None, getattr(error, "name", None))
     assert "nowhere" not in words or "nowhere" in line
     assert "hovr" not in words or "hover" in error.allowed
-    assert not list(tmp_path.iterdir())
+    assert contents(run) == before and not list(tmp_path.iterdir())
 
 
 MISTYPED = {
