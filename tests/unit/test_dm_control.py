@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import level, refused, starting
 
 import quadrl
 from quadrl import suite  # before dm_control: it chooses what draws
-from quadrl.tasks import TASKS
+from quadrl.envs import dm_control
+from quadrl.tasks import TASKS, make
 
 from dm_control import suite as dm_suite  # isort: skip
 
@@ -52,6 +53,12 @@ def test_a_crash_on_the_last_step_is_a_crash_and_the_clock_is_no_crash(name):
     assert (len(on_the_clock) - 1, on_the_clock[-1].discount) == (steps, 0.0)
     earlier = fly(quadrl.load(name, {"random": 0, "time_limit": (steps - 1) * CONTROL_STEP}))
     assert (len(earlier) - 1, earlier[-1].discount) == (steps - 1, 1.0)
+
+
+def test_a_success_that_ends_an_episode_has_discount_0():
+    environment = dm_control.make(starting(make("landing"), level()), random=0)  # stands already
+    assert fly(environment)[-1].discount == 0.0
+    assert environment.task.transition.is_success[0]
 
 
 @pytest.mark.parametrize("kwargs", [{"control_timestep": 0.02}, {"n_sub_steps": 2}])
