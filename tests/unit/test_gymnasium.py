@@ -30,13 +30,13 @@ def test_every_task_has_an_id():
     assert dict(gym.registry) == registered
 
 
-def test_a_step_returns_pythons_own_types_and_an_info_of_scalars():
+def test_a_step_takes_and_returns_pythons_own_types_and_gives_an_info_of_scalars():
     environment = gym.make(HOVER)
     observation, info = environment.reset(seed=0)
     assert observation.dtype == np.float32
     assert info == {}
     for action in varied_actions(10, 1)[:, 0]:
-        observation, reward, terminated, truncated, info = environment.step(action)
+        observation, reward, terminated, truncated, info = environment.step(action.tolist())
         assert observation.dtype == np.float32
         assert type(reward) is float
         assert type(terminated) is type(truncated) is bool
