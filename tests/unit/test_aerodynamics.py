@@ -96,18 +96,6 @@ def test_a_rotor_at_rest_feels_no_lift():
 # ---------------------------------------------------------------------------------------- inflow
 
 
-def test_translational_lift_is_that_of_the_rotor_whatever_its_size():
-    # 4 * 0.0566 * 1.225 * pi 0.15^2 = 0.0196 N at 1 m/s for the paper's discs. At a p that is the
-    # same share of w0 the lift is the same share of the weight: 0.0566 w0^2 rho A, and the weight
-    # of a rotor is 2 rho A w0^2, so 0.0283 of it at p = w0.
-    more = dataclasses.replace(INFLOW, translational_lift=0.0566)
-    forces = [Probe(bare(air))(velocity=(1, 0, 0))[0][2] for air in (more, INFLOW)]
-    assert forces[0] - forces[1] == pytest.approx(0.0196, abs=1e-4)
-    for name in ("paper", "crazyflie", "hexa"):
-        shares = [lift_share(bare(air, name), 0.0, 1.0) for air in (more, INFLOW)]
-        assert shares[0] - shares[1] == pytest.approx(0.0283, rel=1e-3)
-
-
 def test_an_aircraft_of_ones_own_gets_no_blades_unasked():
     off = dataclasses.asdict(Aerodynamics())
     assert {name for name, value in off.items() if value} == {"body_lift", "air_density"}
@@ -249,18 +237,6 @@ def test_the_ground_adds_to_the_thrust(body_lift, height, factor):
     np.testing.assert_allclose(moment, 0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("height", "factor"), [(1, 1.0667), (2, 1.0159), (4, 1.0039)])
-def test_a_rotor_alone_has_the_ground_effect_of_cheeseman_and_bennett(height, factor):
-    # 1 / (1 - (R / 4 z)^2): the other rotors are too far away.
-    far = tuple(
-        dataclasses.replace(rotor, position=tuple(1000 * x for x in rotor.position))
-        for rotor in PAPER.rotors
-    )
-    vehicle = dataclasses.replace(bare(Aerodynamics(ground_effect=True)), rotors=far)
-    force, _ = Probe(vehicle)(height=height * RADIUS)
-    assert force[2] / (4 * T_H) == pytest.approx(factor, abs=1e-4)
-
-
 def test_the_ground_effect_fades_across_the_disc_and_with_the_tilt():
     probe = Probe(bare(Aerodynamics(ground_effect=True)))
     still, fast = (probe(height=RADIUS, velocity=(v, 0, 0))[0][2] for v in (0.0, V_H))
@@ -316,12 +292,6 @@ def test_lift_rises_towards_the_windmill_state():
     assert shares[3] == pytest.approx(1.6)  # the blades stall
 
 
-@pytest.mark.parametrize(("climb", "across"), [(-0.19, 0.0), (0.5, 0.0), (-1.3, 0.96), (-1, 1.5)])
-def test_there_is_exactly_no_vortex_ring_state_in_slow_descent_and_out_sideways(climb, across):
-    with_it, without = (bare(a) for a in (VORTEX, INFLOW))
-    assert lift_share(with_it, climb, across) == lift_share(without, climb, across)
-
-
 def test_the_noise_of_the_vortex_ring_state():
     # At -1.4 v_h the bump is 1: 0.1 of k_T Omega^2 for each unit of noise, of the rotor alone.
     probe = Probe(bare(dataclasses.replace(VORTEX, vortex_ring_noise=0.1)))
@@ -341,16 +311,6 @@ def test_the_noise_of_the_vortex_ring_state():
 # --------------------------------------------------------------------------------- rotor inertia
 
 INERTIA = Aerodynamics(rotor_inertia=6e-5)
-
-
-def test_a_yaw_command_turns_the_aircraft_before_the_drag_does():
-    # +-35 rad/s at 5.556 1/s: 4 * 6e-5 * 35 * 5.556 = 0.0467 N m at once. In the end the drag
-    # gives 7.5e-7 * 2 * ((225.68 + 35)^2 - (225.68 - 35)^2) = 0.0474 N m.
-    way = np.array([-35.0, 35, -35, 35])
-    at_once = Probe(bare(INERTIA))(command=PAPER.hover_speed + way)[1]
-    np.testing.assert_allclose(at_once, [0, 0, 0.0467], atol=5e-5)
-    finally_ = Probe(bare(INERTIA))(speed=PAPER.hover_speed + way)[1]
-    np.testing.assert_allclose(finally_, [0, 0, 0.0474], atol=5e-5)
 
 
 def test_the_gyroscopic_moment_does_no_work():
