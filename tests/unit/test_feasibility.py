@@ -200,19 +200,15 @@ def test_a_mode_whose_loops_answer_at_each_physics_step_holds_no_command_for_lon
     feasibility.warn_of_unreached(slow, "none", "velocity")  # a warning is an error here
 
 
-def test_train_says_it_before_it_begins(tmp_path):
-    seen = []
-    settings = {"randomization": WEAK, "algo": "ppo", "on_progress": seen.append, "episodes": 1}
-    with pytest.warns(QuadrlWarning, match="269.7 rad/s") as said:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("quadrl.learning.run.Training", lambda *_, **__: refuse())
-            with pytest.raises(InterruptedError):
-                quadrl.train(TINY, out=tmp_path / "run", **settings)
-    assert len(said) == 1 and not seen
+def test_train_says_it_before_it_begins(tmp_path, monkeypatch):
+    def begin(*_, **__):
+        raise InterruptedError
 
-
-def refuse():
-    raise InterruptedError
+    monkeypatch.setattr("quadrl.learning.run.Training", begin)
+    settings = {"randomization": WEAK, "algo": "ppo", "episodes": 1}
+    with pytest.warns(QuadrlWarning, match="269.7 rad/s") as said, pytest.raises(InterruptedError):
+        quadrl.train(TINY, out=tmp_path / "run", **settings)
+    assert len(said) == 1
 
 
 # ---------------------------------------------------------------------------------- the card

@@ -85,13 +85,7 @@ def test_a_metre_on_the_ground_is_a_metre_for_every_aircraft():
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         for part in drawing.PAINTED:
-            corners = vertices(model, data, part)
-            assert model.geom(part).contype == 0 and model.geom(part).conaffinity == 0
-            mesh = model.mesh(model.geom(part).dataid[0])
-            faces = model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]]
-            a, b, c = (corners[faces[:, k]] for k in range(3))
-            assert (np.cross(b - a, c - a)[:, 2] > 0).all()  # seen from above
-            painted.append(corners)
+            painted.append(vertices(model, data, part))
     for one, other in zip(painted[:2], painted[2:], strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
     # The tick at 10 m to the east: 0.035 m wide, 0.07 m and half of that width long each way.
