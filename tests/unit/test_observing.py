@@ -1,6 +1,6 @@
 """Options of the observation: histories, rotor speeds, airspeed, delay, and the critic's own."""
 
-import dataclasses
+import json
 import math
 
 import helpers
@@ -15,10 +15,9 @@ from quadrl.base.rotation import to_body, to_world
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.sensors import Disturbance
 from quadrl.core.environment import Environment
-from quadrl.core.observation import OBSERVATION, ROTATION
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
 from quadrl.evaluation.evaluate import evaluate
-from quadrl.tasks.hover import Hover
+from quadrl.evaluation.policy import Policy
 
 PAPER = Vehicle()
 ACTIONS = helpers.random_actions(12, 3)
@@ -102,7 +101,7 @@ def test_each_part_of_the_estimate_is_as_old_as_is_drawn_for_each_row(engine, mo
 
 
 def test_ages_are_drawn_evenly_and_change_nothing_else_that_is_drawn():
-    ages = {"observation_delay": (0.0, 0.03), "rate_delay": (0.0, 0.03)}
+    ages = dict.fromkeys(("observation_delay", "rate_delay", "command_delay"), (0.0, 0.03))
     environment = helpers.begun("hover", 400, randomization={"mass": (0.9, 1.1), **ages})
     for name in ages:
         values, counts = np.unique(
@@ -114,11 +113,6 @@ def test_ages_are_drawn_evenly_and_change_nothing_else_that_is_drawn():
     plain = helpers.begun("hover", 400, randomization={"mass": (0.9, 1.1)})
     shown = [each.randomizer.shown()["mass"] for each in (environment, plain)]
     np.testing.assert_array_equal(*shown)
-
-
-def test_rotor_speeds_are_left_out_on_demand():
-    found, environment = seen({"rotor_speed": "none"})
-    assert "rotor_speed" not in found[0] and environment.size == 18
 
 
 @pytest.mark.parametrize("mode", ["rotor", "velocity"])
@@ -148,34 +142,14 @@ def test_relative_rotor_speeds_are_zero_in_hover_and_hide_the_others():
     found, environment = seen({"relative_rotor_speed": True, "rotor_speed": "estimated"})
     modelled, _ = seen({"rotor_speed": "estimated"})
     assert "rotor_speed" not in found[0] and environment.size == 22
+    hidden, environment = seen({"rotor_speed": "none"})
+    assert "rotor_speed" not in hidden[0] and environment.size == 18
     np.testing.assert_allclose(found[0]["relative_rotor_speed"], 0.0, atol=1e-12)
     vehicle = environment.vehicle
     speed = modelled[-1]["rotor_speed"] * vehicle.max_speed  # [rad/s]
     share = speed / vehicle.hover_speed - 1
     assert np.abs(share).max() > 0.01
     np.testing.assert_allclose(found[-1]["relative_rotor_speed"], share, atol=1e-12)
-
-
-@dataclasses.dataclass(frozen=True)
-class AnyAttitude(Hover):
-    """Sees the rotation matrix as an entry of its own."""
-
-    observation = OBSERVATION | ROTATION
-
-    def observe(self, now):
-        """As hover, and the matrix."""
-        return super().observe(now) | {"rotation": now.state.rotation_entries}
-
-
-@pytest.mark.parametrize("drawn", ["none", "light"])
-def test_the_rotation_as_an_entry_of_a_task_is_that_of_the_option(drawn):
-    options = {"num_envs": 3, "seed": 1, "randomization": drawn}
-    own = Environment(AnyAttitude(), **options)
-    other = Environment("hover", observe={"rotation": True}, **options)
-    assert [*own.reset()] == [*other.reset()]
-    for action in ACTIONS:
-        a, b = (one.step(action).observation["rotation"] for one in (own, other))
-        np.testing.assert_array_equal(a, b)
 
 
 def test_the_airspeed_is_the_velocity_through_the_air():
@@ -188,26 +162,18 @@ def test_the_airspeed_is_the_velocity_through_the_air():
 
 
 @pytest.mark.parametrize("rotor_speed", ["true", "estimated", "none"])
-@pytest.mark.parametrize("mass", [0.8, 1.25])
-def test_a_mass_that_is_not_the_specified_one_shows_as_acceleration(mass, rotor_speed):
-    options = {"disturbance": True, "rotor_speed": rotor_speed}
+@pytest.mark.parametrize(("mass", "smoothing"), [(0.8, Disturbance.smoothing), (1.25, 0.0)])
+def test_a_mass_that_is_not_the_specified_one_shows_as_acceleration(mass, smoothing, rotor_speed):
+    sensors = {"disturbance": {"smoothing": smoothing}}
+    options = {"sensors": sensors, "rotor_speed": rotor_speed}
     environment = helpers.begun("hover", 2, observe=options, randomization={"mass": mass})
     environment.reset(start=REST)
     for k in range(1, 6):
         found = helpers.idle(environment).observation["disturbance"]
-        arrived = 1 - math.exp(-k * PAPER.control_timestep / Disturbance.smoothing)
+        arrived = 1 - math.exp(-k * PAPER.control_timestep / smoothing) if smoothing else 1.0
         expected = arrived * GRAVITY * (1 / mass - 1)  # the rotors turn as if it were the specified
         np.testing.assert_allclose(found, [[0, 0, expected]] * 2, atol=0.05)
     assert not environment.reset(np.array([1]), REST)["disturbance"].any()
-
-
-@pytest.mark.parametrize(("smoothing", "arrived"), [(0.0, 1.0), (0.05, 1 - math.exp(-1))])
-def test_a_disturbance_is_smoothed_as_asked(smoothing, arrived):
-    options = {"sensors": {"disturbance": {"smoothing": smoothing}}}
-    environment = helpers.begun("hover", 1, observe=options, randomization={"mass": 0.8})
-    environment.reset(start=REST)
-    found = helpers.idle(environment).observation["disturbance"]
-    np.testing.assert_allclose(found, [[0, 0, arrived * GRAVITY * 0.25]], atol=0.05)
 
 
 def test_the_push_of_the_wind_shows_as_acceleration_in_the_body_frame():
@@ -306,12 +272,15 @@ def test_a_vector_tells_what_was_drawn_for_the_present_episode(mode):
 # ------------------------------------------------------------------------------------ policies
 
 
-def test_a_policy_flies_with_the_options_of_its_training_and_no_others():
-    observe = {"action_history": 2}
-    policy = linear(30, 4, observe=observe, randomization={"mass": [0.9, 1.1]}, weather={})
+def test_a_policy_flies_with_the_options_of_its_training_and_no_others(tmp_path):
+    late = {"airspeed": {"noise": 0.3, "delay": 0.1}}
+    observe = json.loads(json.dumps(Observing(action_history=2, sensors=late).given()))
+    drawn = {"randomization": {"mass": [0.9, 1.1]}, "weather": {}}
+    linear(33, 4, observe=observe, **drawn).save(tmp_path / "policy")
+    policy = Policy.load(tmp_path / "policy")
     found = evaluate(policy, "hover", episodes=2, time_limit=0.2)
     assert found.metrics["episodes"] == 2
-    for other in ({}, {"action_history": 1}, {"action_history": 2, "airspeed": True}):
+    for other in ({}, {"action_history": 2}, {"action_history": 2, "airspeed": True}):
         with helpers.refused("observe", lists="action_history"):
             evaluate(policy, "hover", episodes=2, observe=other)
     evaluate(policy, "hover", episodes=2, time_limit=0.2, sampled=True)
@@ -336,8 +305,3 @@ def test_a_policy_flies_with_the_options_of_its_training_and_no_others():
 def test_an_impossible_option_is_refused(observe, name, value):
     with helpers.refused(name, value):
         Environment("hover", observe=observe)
-
-
-def test_options_that_are_the_usual_ones_change_nothing():
-    environment = helpers.begun("hover", 2, observe=Observing())
-    assert environment.observer is None and environment.privileged is None

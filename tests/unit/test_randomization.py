@@ -6,12 +6,14 @@ import math
 import helpers
 import numpy as np
 import pytest
+from test_sensors import WILD as EVERY_SENSOR
 
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.philox import NOISE, PUSHES, uniform_array_api
 from quadrl.base.rotation import norm
+from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
 from quadrl.control import CONTROL_MODES
 from quadrl.core.environment import Environment
@@ -19,14 +21,7 @@ from quadrl.engines.mujoco import BatchEngine
 
 ENGINES = ("mujoco", "free_flight")
 PAPER = Vehicle()
-SEEN = {
-    "action_history": 2,
-    "observation_history": 1,
-    "rotor_speed": "estimated",
-    "airspeed": True,
-    "disturbance": True,
-    "privileged": True,
-}
+SEEN = EVERY_SENSOR | {"rotor_speed": "estimated", "privileged": True}
 WILD = dataclasses.replace(
     RANDOMIZATIONS["full"],
     observation_delay=(0.0, 0.1),
@@ -38,7 +33,8 @@ WILD = dataclasses.replace(
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("mode", CONTROL_MODES)
 def test_row_i_is_disturbed_as_the_single_aircraft_of_seed_plus_i(engine, mode):
-    task = tasks.make("hover", time_limit=0.4)
+    # Landings begin at rest, so in trim with the mean wind of each.
+    task = tasks.make("landing" if engine == "free_flight" else "hover", time_limit=0.4)
     vehicle = VEHICLES["hexa" if mode == "rotor" else "paper"]
     settings = {"engine": engine, "control_mode": mode, "weather": "light", "vehicle": vehicle}
     wild = dataclasses.replace(WILD, observation_delay=(0.0, 2 * vehicle.control_timestep))
@@ -46,27 +42,23 @@ def test_row_i_is_disturbed_as_the_single_aircraft_of_seed_plus_i(engine, mode):
     size = Environment(task, **settings).action_size
     actions = np.random.default_rng(0).uniform(-1, 1, (20, 3, size))
     whole = helpers.flying(task, count=3, seed=40, **settings)
+    whole.reset(np.array([1]))
     drawn, records = whole.randomizer.drawn, helpers.fly(whole, actions)
     told = whole.privileged
     for i in range(3):
         single = helpers.flying(task, count=1, seed=40 + i, **settings)
+        if i == 1:
+            single.reset()
         np.testing.assert_array_equal(single.randomizer.drawn[0], drawn[i])
         helpers.assert_records(helpers.fly(single, actions[:, i : i + 1]), records, [i])
         np.testing.assert_array_equal(single.privileged[0], told[i])
 
 
-def test_presets_fit_every_aircraft():
-    for vehicle in VEHICLES:
-        for name in RANDOMIZATIONS:
-            environment = helpers.begun("hover", 2, vehicle=vehicle, randomization=name)
-            assert (environment.randomizer.shown() == {}) == (name == "none")
-            assert np.isfinite(helpers.idle(environment).reward).all()
-
-
 def test_none_is_the_usual_flight_and_remembers_nothing():
     for given in (None, "none", {}, {"mass": 1.0}, Randomization()):
-        environment = helpers.begun("hover", 2, randomization=given)
-        assert environment.observer is None and not environment.randomizer.active
+        environment = helpers.begun("hover", 2, randomization=given, observe=Observing())
+        assert environment.observer is None and environment.privileged is None
+        assert not environment.randomizer.active
         assert not any(name.startswith("disturbances") for name in environment.save())
 
 
@@ -137,15 +129,10 @@ def test_a_dead_time_is_saved_and_held_as_if_each_step_had_its_command(engine):
     assert one.randomizer.held == [2, 1, 3, 2, 1] and two.randomizer.held == [1] * 5
 
 
-def test_each_row_has_a_delay_of_its_own_and_every_one_is_drawn_as_often():
-    environment = helpers.begun("hover", 500, randomization={"command_delay": (0.01, 0.04)})
+def test_each_row_has_a_delay_of_its_own():
+    environment = helpers.begun("hover", 50, randomization={"command_delay": (0.01, 0.04)})
     drawn = environment.randomizer.shown()["command_delay"]
-    values, counts = np.unique(drawn.round(9), return_counts=True)
-    np.testing.assert_allclose(values, [0.01, 0.02, 0.03, 0.04])
-    # 125 of each; a binomial of 500 and 1/4 has a deviation of 9.7.
-    assert (np.abs(counts - 125) < 5 * 9.7).all()
-    action = np.full((500, 4), 0.5)
-    environment.step(action)
+    environment.step(np.full((50, 4), 0.5))
     moved = np.abs(environment.engine.act - PAPER.hover_speed[0]).max(axis=1)
     earlier = drawn[:, None] < drawn[None] - 1e-9
     assert (moved[:, None] > moved[None])[earlier].all()

@@ -6,9 +6,11 @@ import helpers
 import numpy as np
 import pytest
 from helpers import EVERYTHING, drawn, flying
+from test_sensors import WILD as EVERY_SENSOR
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.conditions.weather import Weather
 from quadrl.core.task import TaskState
 from quadrl.tasks.hover import Hover
 
@@ -80,8 +82,10 @@ def resumed(task, path, **settings):
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("randomization", [EVERYTHING, "full"], ids=["parameters", "full"])
 def test_what_was_drawn_survives_save_and_restore(randomization, engine, tmp_path):
+    gusty = Weather(wind_speed=7.72, gust_speed=5.0, gust_time=0.4)
+    around = {"weather": gusty, "observe": EVERY_SENSOR} if randomization == "full" else {}
     for task in (tasks.make("hover", time_limit=0.6), helpers.SHORT["a low landing"]):
-        settings = {"engine": engine, "randomization": randomization}
+        settings = {"engine": engine, "randomization": randomization, **around}
         for _, got, expected in resumed(task, tmp_path / "saved.npz", **settings):
             helpers.assert_records(got, expected)
 

@@ -266,20 +266,12 @@ def test_tasks_see_the_same_in_both_engines_and_a_touch_ends_the_episode():
     np.testing.assert_allclose(one[3], other[3], rtol=0.01)
 
 
-def test_solids_come_from_the_seed_of_the_row_and_stay_with_a_saved_state():
+def test_a_reset_of_some_rows_moves_their_solids_alone():
     batch = begun(Posted(), num_envs=4, seed=7)
     places = batch.snapshot.solid("post").copy()
-    for row in range(4):
-        alone = begun(Posted(), seed=7 + row)
-        np.testing.assert_array_equal(alone.snapshot.solid("post")[0], places[row])
-    saved = batch.save()
     batch.reset(np.array([1, 3]))
-    moved = batch.snapshot.solid("post")
-    np.testing.assert_array_equal(moved[[0, 2]], places[[0, 2]])
-    assert (abs(moved[[1, 3]] - places[[1, 3]]).max(axis=-1) > 0.01).all()
-    other = Environment(Posted(), num_envs=4, seed=99)
-    other.restore(saved)
-    np.testing.assert_array_equal(other.snapshot.solid("post"), places)
+    moved = abs(batch.snapshot.solid("post") - places).max(axis=-1)
+    np.testing.assert_array_equal(moved > 0.01, [False, True, False, True])
 
 
 def test_a_task_without_solids_says_so_when_one_is_asked_for():

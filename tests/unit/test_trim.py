@@ -65,15 +65,6 @@ def test_episodes_begin_in_trim(vehicle, weather):
     assert level and norm(acceleration(environment)[1]).min() > 1.0
 
 
-def test_each_row_begins_as_it_does_alone():
-    rows = begun("paper", "light", 3.0, seed=5, randomization={"wind": (0.5, 1.0)})
-    for i in (0, 17):
-        alone = helpers.begun("landing", 1, seed=5 + i, weather="light", start_height=3.0,
-                              randomization={"wind": (0.5, 1.0)})  # fmt: skip
-        np.testing.assert_array_equal(rows.engine.qpos[i], alone.engine.qpos[0])
-        np.testing.assert_array_equal(rows.engine.act[i], alone.engine.act[0])
-
-
 def test_what_asks_for_something_else_and_what_cannot_be_held_stays():
     vehicle = in_real_air(VEHICLES["paper"])
     zero, level = np.zeros((4, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (4, 1))

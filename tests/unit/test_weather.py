@@ -1,6 +1,5 @@
 """The weather against its formulas: profile, spectra, gust, noise; and that it belongs to a row."""
 
-import copy
 import dataclasses
 import math
 
@@ -15,7 +14,6 @@ from quadrl import tasks
 from quadrl.aircraft import parameters
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.conditions.weather import WEATHERS, Weather, WeatherProcess
-from quadrl.core.environment import Environment
 from quadrl.engines import air
 
 LIGHT = WEATHERS["light"]
@@ -115,21 +113,6 @@ def test_mean_wind_follows_the_profile(height, share):
     np.testing.assert_allclose(wind, expected, rtol=1e-3)
 
 
-def test_upward_gusts_fade_towards_the_ground_and_level_ones_do_not():
-    heights = np.array([0.0, 0.1, 1.524, 3.048, 6.0, -1.0])
-    made, engine = process(dataclasses.replace(LIGHT, direction=0.0), 6)
-    made.begin(np.arange(6), np.zeros(6, np.int64), np.zeros(6, np.int64))  # the same numbers
-    engine.qpos[:, 2] = heights
-    for _ in range(20):
-        made.advance()
-        full = engine.wind[4, 2]  # sigma_w is 0.1 W20 times h over 10 ft, and 0.1 W20 above
-        assert full != 0
-        np.testing.assert_allclose(
-            engine.wind[:, 2] / full, [0, 0.1 / 3.048, 0.5, 1, 1, 0], rtol=1e-12, atol=0
-        )
-        np.testing.assert_array_equal(engine.wind[:, 1], engine.wind[4, 1])
-
-
 def test_directions_are_drawn_or_given():
     count = 3000
     made, _ = process(GUSTY, count)
@@ -203,20 +186,6 @@ def test_a_step_of_any_length_keeps_the_covariance(rate):
     np.testing.assert_allclose(half @ fresh @ half.T + fresh, noise, atol=1e-15)
 
 
-def test_autocorrelations_at_the_length_of_the_turbulence():
-    turn, _ = matrices("up", 0.05)
-
-    def correlation(lag):  # in times L/V
-        return OUTPUT @ np.linalg.matrix_power(turn, round(lag / 0.05)) @ COVARIANCE @ OUTPUT
-
-    assert correlation(1) == pytest.approx(0.5 * math.exp(-1), rel=1e-12)  # 0.1839
-    assert correlation(2) == pytest.approx(0, abs=1e-15)
-    assert correlation(3) == pytest.approx(-0.5 * math.exp(-3), rel=1e-12)
-    # Along the wind: exp(-1) = 0.3679 after L/V.
-    keep = air.fixed_of(0.0, LIGHT.roughness, 3.0, 23.05 / 20, 0.0)["along_keep"]
-    assert keep**20 == pytest.approx(0.3679, rel=1e-3)
-
-
 @pytest.mark.parametrize("step_share", [1, 5])
 def test_the_wind_has_the_deviations_and_correlations_of_the_spectra(step_share):
     """Of 3000 rows, at times that are 4 L_w/V apart and more."""
@@ -252,21 +221,6 @@ def test_the_wind_has_the_deviations_and_correlations_of_the_spectra(step_share)
         assert kurtosis == pytest.approx(2.9, abs=0.3)
     for one, other in ((along, left), (along, up), (left, up)):
         assert abs(np.corrcoef(one[60], other[60])[0, 1]) < SIGMAS / math.sqrt(3000)
-
-
-def test_turbulence_does_not_depend_on_what_the_aircraft_does():
-    two = helpers.begun("hover", 2, weather=dataclasses.replace(LIGHT, direction=0.0))
-    two.seed([4, 4])
-    two.reset()
-    for _ in range(30):
-        two.step(np.array([[0.0] * 4, [0.3] * 4]))
-    assert two.engine.qpos[1, 2] > two.engine.qpos[0, 2] + 0.1
-    # Only the mean wind is another one higher up.
-    assert two.engine.wind[0, 1] == two.engine.wind[1, 1]
-    # And up to 10 ft the upward gusts are stronger.
-    gusts = two.engine.wind[:, 2] / np.minimum(two.engine.qpos[:, 2] / 3.048, 1)
-    assert abs(gusts[1] / gusts[0] - 1) < 0.05  # the wind was written a step ago
-    assert two.engine.wind[1, 0] > two.engine.wind[0, 0]
 
 
 # ---------------------------------------------------------------------------------------- gust
@@ -318,7 +272,7 @@ def test_noise_of_the_lift_is_of_first_order_and_changes_no_wind():
     assert abs((noise[0, :, 0] * engine.wind[:, 2]).mean()) < SIGMAS * 0.772 / math.sqrt(count)
 
 
-# ---------------------------------------------------------------------------- calm, and by row
+# ------------------------------------------------------------------------- calm air, and by row
 
 
 def test_calm_air_costs_nothing_and_changes_nothing():
@@ -329,60 +283,6 @@ def test_calm_air_costs_nothing_and_changes_nothing():
         helpers.idle(flown)
         np.testing.assert_array_equal(flown.engine.air[:, :3], 1.0)
         assert not flown.engine.air[:, 3:].any()
-
-
-def test_before_its_gust_air_without_wind_is_calm_to_the_last_bit():
-    task = tasks.make("hover", time_limit=4.0)
-    actions = helpers.random_actions(20, 20)
-    records = []
-    for weather in (None, Weather(gust_speed=9.0)):
-        environment = helpers.begun(task, 20, weather=weather, aerodynamics="none")
-        records.append([helpers.recorded(environment, environment.step(a)) for a in actions])
-    starts = column(environment.blowing, "gust_start")
-    assert starts.min() < 0.8 and starts.max() > 1.0  # within the first second, and after it
-    for step, (calm, gusty) in enumerate(zip(*records, strict=True), 1):
-        before = step * STEP <= starts
-        after = (step - 1) * STEP > starts
-        same = (calm["coordinates"] == gusty["coordinates"]).all(axis=-1)
-        assert same[before].all() and not same[after].any()
-
-
-CASES = [("hover", "mujoco", {}), ("hover", "free_flight", {"control_mode": "velocity"}),
-         ("landing", "free_flight", {"vehicle": "crazyflie"})]  # fmt: skip
-
-
-@pytest.mark.parametrize(("task", "engine", "settings"), CASES)
-@pytest.mark.parametrize("threads", [1, 4])
-def test_row_i_is_the_single_one_seeded_with_i_more(task, engine, settings, threads):
-    settings = {"weather": GUSTY, "engine": engine} | settings
-    task = tasks.make(task, time_limit=0.6)
-    count = 520 if threads > 1 and engine == "free_flight" else 5  # more than a thread's share
-    batch = Environment(task, num_envs=count, seed=7, num_threads=threads, **settings)
-    chosen = [0, 1, count - 1]
-    alone = [Environment(task, seed=7 + i, **settings) for i in chosen]
-    batch.reset(), [one.reset() for one in alone]
-    steps = round(1.5 / batch.vehicle.control_timestep)
-    actions = np.random.default_rng(0).uniform(-1, 1, (steps, count, batch.action_size))
-    for k, action in enumerate(actions):
-        if k == 10:  # takes up at another place, in the middle of an episode
-            other = Environment(task, num_envs=count, seed=99, num_threads=threads, **settings)
-            other.restore(batch.save())
-            batch = other
-        if k == 17:
-            alone = [copy.deepcopy(one) for one in alone]
-        now = batch.step(action)
-        over = now.terminated | now.truncated
-        for i, one in zip(chosen, alone, strict=True):
-            one.step(action[i : i + 1])
-            np.testing.assert_array_equal(one.engine.air[0], batch.engine.air[i])
-            got, expected = helpers.coordinates(one.engine), helpers.coordinates(batch.engine)
-            np.testing.assert_array_equal(got[0], expected[i])
-            if over[i]:
-                one.reset()
-                assert (one.engine.wind != batch.engine.wind[i]).any()
-        if over.any():
-            batch.reset(over)
-    assert (batch.seeds.episodes > 2).all()
 
 
 def test_rows_may_have_a_wind_speed_of_their_own():
