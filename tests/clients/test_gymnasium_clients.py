@@ -275,12 +275,3 @@ def test_human_shows_what_is_drawn(monkeypatch):
     assert np.abs(shown.astype(int) - drawn).max() <= 8
     assert shown.std() > 5
     environment.close()
-
-
-@pytest.mark.usefixtures("cheap_pictures")
-def test_a_list_of_pictures_is_collected():
-    environment = gym.make(HOVER, render_mode="rgb_array_list", **SMALL)
-    environment.reset(seed=0)
-    environment.step(np.zeros(4))
-    assert [frame.shape for frame in environment.render()] == [(48, 64, 3)] * 2
-    environment.close()

@@ -7,10 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import refused
-from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
@@ -104,22 +102,6 @@ def test_attributes_and_methods_are_those_of_the_rows():
     with refused():
         envs.set_attr("anything", 8, indices=0)
     assert envs.has_attr("environment") and not envs.has_attr("nothing_of_that_name")
-
-
-def test_a_saved_policy_acts_as_before(tmp_path):
-    envs = VecMonitor(QuadrotorVecEnv("hover", COUNT, time_limit=0.5))
-    model = PPO("MlpPolicy", envs, n_steps=16, batch_size=32, n_epochs=1, seed=0, device="cpu")
-    model.learn(64)
-    mean, _ = evaluate_policy(model, envs, n_eval_episodes=4)
-    assert np.isfinite(mean)
-    model.save(tmp_path / "policy")
-    loaded = PPO.load(tmp_path / "policy", env=envs)
-    seen = envs.reset()
-    np.testing.assert_array_equal(
-        model.predict(seen, deterministic=True)[0], loaded.predict(seen, deterministic=True)[0]
-    )
-    loaded.learn(64, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 128
 
 
 @pytest.mark.usefixtures("cheap_pictures")

@@ -4,9 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from torchrl.collectors import Collector
 from torchrl.envs import GymEnv, GymWrapper, SerialEnv, TransformedEnv
-from torchrl.envs.utils import RandomPolicy, check_env_specs
+from torchrl.envs.utils import check_env_specs
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
 import quadrl  # noqa: F401 - registers the ids
@@ -59,17 +58,6 @@ def test_a_serial_environment_of_several():
     assert flown.batch_size == (2, 25)
     assert flown["next", "done"].sum() == 4
     environment.close()
-
-
-def test_a_collector_over_it():
-    environment = GymEnv(HOVER, time_limit=0.5)
-    policy = RandomPolicy(environment.action_spec)
-    settings = {"frames_per_batch": 25, "total_frames": 50}
-    collector = Collector(environment, policy, auto_register_policy_transforms=False, **settings)
-    batches = list(collector)
-    assert [batch.numel() for batch in batches] == [25, 25]
-    assert sum(int(batch["next", "done"].sum()) for batch in batches) == 5
-    collector.shutdown()
 
 
 # ------------------------------------------------------------------- pictures of QuadrotorEnv

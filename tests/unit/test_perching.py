@@ -143,12 +143,6 @@ def test_a_way_ends_in_the_touch_that_it_was_flown_backwards_from(incline):
     np.testing.assert_allclose(velocity, -0.75 * normal(incline), atol=2e-3)
 
 
-@pytest.mark.parametrize("name", ["grip", "length"])
-def test_a_surface_of_a_negative_number_is_refused(name):
-    with refused(match=name):
-        Box("wall", **{name: -1.0})
-
-
 @pytest.mark.parametrize(
     ("name", "options"),
     [

@@ -1,6 +1,5 @@
 """Statements about flight that anyone can check by hand, in MuJoCo and in the equations."""
 
-import dataclasses
 import math
 
 import helpers
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 
 from quadrl.aircraft.parameters import Parameters, rows
-from quadrl.aircraft.rotors import PAPER_ROTORS
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.engines import dynamics, mjcf
 from quadrl.engines.mujoco import BatchEngine, DataEngine
@@ -17,7 +15,6 @@ from quadrl.engines.mujoco import BatchEngine, DataEngine
 PAPER = Vehicle()
 VACUUM = Vehicle(drag_coefficient=0.0, moment_coefficient=0.0)
 HOVER = math.sqrt(0.65 * 9.81 / (4 * 3.13e-5))  # = 225.678 rad/s
-INERTIA = np.array([7.5e-3, 7.5e-3, 1.3e-2])
 UPRIGHT = (1, 0, 0, 0)
 both = pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 
@@ -157,26 +154,6 @@ def test_one_rotor_alone():
     np.testing.assert_allclose(angular, [0, -0.28796 / 7.5e-3, -0.03 / 1.3e-2], rtol=1e-12)
 
 
-def test_one_tilted_rotor_alone():
-    # Rotor 1 leans back by 30 degrees, 0.1 m above the centre: axis (-0.5, 0, 0.866025). Rotor 3,
-    # its mirror image, stands still.
-    # 1.252 N along it: (-0.626, 0, 1.084264) N. Moment about the centre of (0.23, 0, 0.1) m:
-    # (0, 0.1 * -0.626 - 0.23 * 1.084264, 0) = (0, -0.311981, 0) N m; the reaction, -0.03 N m
-    # about the axis: (0.015, 0, -0.025981) N m.
-    leaning = [
-        dataclasses.replace(
-            PAPER_ROTORS[k], position=(side * 0.23, 0, 0.1), axis=(side * -0.5, 0, math.sqrt(0.75))
-        )
-        for k, side in ((0, 1), (2, -1))
-    ]
-    rotors = (leaning[0], PAPER_ROTORS[1], leaning[1], PAPER_ROTORS[3])
-    vehicle = dataclasses.replace(VACUUM, rotors=rotors)
-    linear, angular = accelerations(vehicle, speed=(200, 0, 0, 0))
-    np.testing.assert_allclose(linear, [-0.626 / 0.65, 0, 1.084264 / 0.65 - 9.81], atol=1e-6)
-    expected = np.array([0.015, -0.311981, -0.025981]) / INERTIA
-    np.testing.assert_allclose(angular, expected, rtol=2e-5)
-
-
 def test_yaw_reaction_is_not_rounded():
     # The torque of a rotor over its thrust is k_Q / k_T = 7.5e-7 / 3.13e-5 to the last digit.
     reaction = mjcf.compile_model(PAPER).actuator_gear[:, 5]
@@ -188,36 +165,3 @@ def test_gyroscopic_coupling_has_the_sign_of_euler():
     # omega x J omega = (0, 2 * 7.5e-3 - 1 * 26e-3, 0) = (0, -11e-3, 0), so domega_y = +11/7.5.
     _, angular = accelerations(VACUUM, rate=(1, 0, 2))
     np.testing.assert_allclose(angular, [0, 11 / 7.5, 0], atol=1e-12)
-
-
-# --------------------------------------------------------------------------- energy and momentum
-
-
-def energies(flying):
-    """Kinetic of the flight, potential, and kinetic of the turning [J]."""
-    velocity, rate = flying.qvel[0, :3], flying.qvel[0, 3:]
-    flight, height = 0.5 * 0.65 * (velocity @ velocity), 0.65 * 9.81 * flying.qpos[0, 2]
-    return np.array([flight, height, 0.5 * (INERTIA @ rate**2)])
-
-
-@both
-def test_energy_is_conserved_without_thrust_and_drag(engine):
-    tumbling = aircraft(engine, VACUUM, velocity=(3, -2, 8), rate=(1, -2, 1.5))
-    flight, height, turning = energies(tumbling)
-    for _ in range(200):
-        tumbling.advance(1)
-        flight_now, height_now, turning_now = energies(tumbling)
-        assert flight_now + height_now == pytest.approx(flight + height, rel=1e-12)
-        assert turning_now == pytest.approx(turning, rel=1e-9)
-    assert abs(flight_now - flight) > 10  # there was something to exchange
-
-
-@both
-def test_angular_momentum_is_conserved_in_torque_free_tumbling(engine):
-    finer = dataclasses.replace(VACUUM, physics_timestep=0.001)
-    tumbling = aircraft(engine, finer, rate=(1, -2, 1.5))
-    before = INERTIA * tumbling.qvel[0, 3:]  # level: the body frame is the world's
-    tumbling.advance(2000)
-    turn = helpers.matrices(tumbling.qpos[0, 3:])
-    assert np.arccos((np.trace(turn) - 1) / 2) > 0.5
-    np.testing.assert_allclose(turn @ (INERTIA * tumbling.qvel[0, 3:]), before, atol=2e-8)

@@ -184,6 +184,8 @@ def test_a_gate_is_open_in_its_middle_and_turns_with_its_pose():
     ("make_it", "name"),
     [
         (lambda: Sphere("ball", radius=0.0), "ball radius"),
+        (lambda: Box("wall", grip=-1.0), "wall grip"),
+        (lambda: Box("wall", length=-1.0), "wall length"),
         (lambda: Sphere("no name"), "solid"),
         (lambda: Scene([Sphere("ball"), Box("ball")]), "solids"),
         (lambda: Scene(["post"]), "solids"),  # pyright: ignore

@@ -126,28 +126,6 @@ def test_landing_by_hand():
     np.testing.assert_array_equal(np.stack([now.terminated, now.is_success], axis=-1), ends)
 
 
-def test_landings_in_flight():
-    starts = [  # position, velocity, roll, action; terminated, successful, failure
-        # Stands from the first step on: at rest for 0.25 s after five of 0.05 s.
-        ((0.4, 0.2, 0), (0, 0, 0), 0, -1, (1, 1, 0)),
-        # 2 cm at 0.3 m/s take 0.07 s at hover thrust, and then it slides nowhere.
-        ((0, 0, 0.02), (0, 0, -0.3), 0, -0.2, (1, 1, 0)),
-        ((0, 0, 0.2), (0, 0, -0.7), 0, 0, (1, 0, -300)),  # a touchdown at 0.7 m/s
-        ((0, 0, 0.2), (0.6, 0, -0.2), 0, 0, (1, 0, -300)),  # at 0.6 m/s, mostly sideways
-        ((0, 0, 0.07), (0, 0, -0.3), math.radians(20), 0, (1, 0, -300)),  # tilted
-        ((0.51, 0, 0), (0, 0, 0), 0, -1, (0, 0, 0)),  # beside the pad until the clock ends it
-    ]
-    position, velocity, roll, action, expected = (np.array(c) for c in zip(*starts, strict=True))
-    task = helpers.starting(tasks.make("landing"), placed(position, velocity, roll))
-    actions = np.tile(action[:, None], (200, 1, 4))
-    records = helpers.fly(helpers.begun(task, len(roll)), actions)
-    last = np.array([now["terminated"] | now["truncated"] for now in records]).argmax(0)
-    names = "terminated", "is_success", "term.failure"
-    ends = [[records[step][name][row] for name in names] for row, step in enumerate(last)]
-    np.testing.assert_array_equal(ends, expected)
-    assert last[0] + 1 == 5 and last[-1] + 1 == 200
-
-
 def test_who_rests_with_another_heading_has_not_crashed():
     # One stands on the pad and faces north; the other falls on it at 0.7 m/s.
     start = placed([(0, 0, 0), (0, 0, 0.2)], [(0, 0, 0), (0, 0, -0.7)])
@@ -241,14 +219,6 @@ def test_what_ends_a_flight_early():
         np.testing.assert_array_equal(end.terminated, [True, True, False])
         assert not end.is_success.any()
     np.testing.assert_allclose(task.error(now), [4.1, 1.95, 3.9])  # off 1 m from the target
-
-
-@pytest.mark.parametrize("name", sorted({*tasks.TASKS} - {*ON_SOLIDS}))
-def test_a_task_that_remembers_nothing_gives_its_state_back(name):
-    task = tasks.make(name)
-    before, episode = snapshot(task, (0, 0, 0.5))
-    now, *_ = finished(task, before, episode, (0, 0, 0.4))
-    assert (now.task is before.task) == (name not in ("static_waypoint", "landing", *RACES))
 
 
 def test_straight_and_level():

@@ -29,15 +29,6 @@ def rollout(environment):
     return environment.rollout(len(ACTIONS), policy(ACTIONS), break_when_any_done=False)
 
 
-def test_set_seed_gives_the_episodes():
-    one = rollout(QuadrotorEnv("hover", COUNT, seed=3, max_episode_steps=10))
-    same, other = (QuadrotorEnv("hover", COUNT, time_limit=0.5) for _ in range(2))
-    same.set_seed(3)
-    other.set_seed(3 + COUNT)
-    assert torch.equal(one["next", "observation"], rollout(same)["next", "observation"])
-    assert not torch.equal(one["observation"][:, 0], rollout(other)["observation"][:, 0])
-
-
 def test_shapes_types_and_flags_are_those_of_torchrl():
     anywhere = {"tolerance": 9.0, "heading_tolerance": math.pi}
     environment = QuadrotorEnv("hover", COUNT, seed=0, time_limit=0.5, **anywhere)

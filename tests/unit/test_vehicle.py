@@ -8,7 +8,7 @@ import pytest
 from helpers import refused
 
 from quadrl.aircraft.presets import VEHICLES, resolve
-from quadrl.aircraft.rotors import PAPER_ROTORS, plus, ring
+from quadrl.aircraft.rotors import PAPER_ROTORS, ring
 from quadrl.aircraft.vehicle import Vehicle
 
 PAPER = Vehicle()
@@ -86,15 +86,6 @@ def test_every_preset_hovers_without_turning(name):
 def test_motors_are_numbered_as_the_autopilot_does(name, places):
     rotors = VEHICLES[name].rotors
     assert [(*np.sign(rotor.position[:2]), rotor.spin) for rotor in rotors] == places
-
-
-@pytest.mark.parametrize(
-    ("physics_timestep", "control_timestep", "substeps"),
-    [(0.01, 0.01, 1), (0.0025, 0.05, 20), (0.05, 0.15, 3), (1 / 240, 1 / 48, 5)],
-)
-def test_substeps(physics_timestep, control_timestep, substeps):
-    vehicle = Vehicle(physics_timestep=physics_timestep, control_timestep=control_timestep)
-    assert vehicle.substeps == substeps
 
 
 def test_what_the_physics_step_resolves():
@@ -238,11 +229,3 @@ def test_what_is_just_allowed():
     assert Vehicle(rotors=ringed(range(0, 360, 72), [1, -1, 1, -1, 1])).rotor_count == 5
     finer = Vehicle(rotors=rotors(lag_up=1000.0), physics_timestep=0.001)
     assert finer.substeps == 50
-
-
-def test_plus_is_a_ring():
-    numbers = dict(thrust_coefficient=1e-5, torque_coefficient=1e-7, max_speed=1e3)
-    lag = dict(lag_up=10.0, lag_down=5.0)
-    assert plus(0.2, **numbers, **lag) == ring(
-        (0, 90, 180, 270), (1, -1, 1, -1), 0.2, **numbers, **lag
-    )

@@ -310,15 +310,3 @@ def test_key_presses_beyond_some_are_dropped(page):
         until(lambda: page._asked.qsize())
         page.frame(VEHICLE.control_timestep)
     assert page.keyboard.action[0] == 0.0
-
-
-def test_pushes_without_end_leave_the_flight_finite(page):
-    page.endless.value, page.paused.value, page.strength.value = True, True, 5.0
-    for _ in range(100):
-        for _ in range(browser.MOST_ASKED):
-            page._asked.put(lambda: page.push("up"))
-        page.frame(VEHICLE.control_timestep)
-    page.paused.value = False
-    for _ in range(10):
-        page.frame(VEHICLE.control_timestep)
-        check_sound(page)
