@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import refused
-from tensordict import TensorDict
 
-import quadrl
 from quadrl.testing import varied_actions
 
 pytest.importorskip("rsl_rl")
@@ -144,17 +142,6 @@ def test_its_critic_reads_the_privileged_observation_and_its_logs_are_read(tmp_p
     events = EventAccumulator(str(tmp_path)).Reload()
     assert {"Episode/success", "Episode/error"} <= set(events.Tags()["scalars"])
     assert events.Scalars("Train/mean_episode_length")[-1].value <= 10
-
-
-def test_a_policy_of_its_flies_like_any_function():
-    envs = QuadrotorVecEnv("hover", COUNT, seed=0)
-    policy = OnPolicyRunner(envs, settings()).get_inference_policy()
-
-    def flown(observation):
-        with torch.no_grad():
-            return policy(TensorDict({"policy": torch.as_tensor(observation)})).numpy()
-
-    assert quadrl.evaluate(flown, "hover", episodes=3).metrics["episodes"] == 3
 
 
 def test_without_it_the_import_says_what_to_install(monkeypatch):

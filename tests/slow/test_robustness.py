@@ -3,14 +3,10 @@
 import dataclasses
 import functools
 import json
-import os
-import subprocess
 import sys
-import time
 from typing import Any
 
 import numpy as np
-import processes
 import pytest
 from helpers import refused
 from scipy.stats import binomtest
@@ -328,22 +324,6 @@ def test_a_damaged_file_is_not_used_and_kept_aside(tmp_path, flights_flown):
             quadrl.robustness("hover", **AXIS, keep=tmp_path)
         assert caught[0].filename == __file__ and len(flights_flown) == FLOWN
         assert (tmp_path / "flown.unused").read_text() == damaged
-
-
-def test_a_killed_command_goes_on(tmp_path):
-    words = "robustness hover --disturbances delay noise --episodes 20 --no-recovery".split()
-    command = [sys.executable, "-m", "quadrl", *words, "--out", "card"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL) as process:
-        while process.poll() is None and not (tmp_path / "card" / FILE).exists():
-            time.sleep(0.005)
-        process.kill()
-    assert os.listdir(tmp_path / "card") == [FILE]
-    kept = json.loads((tmp_path / "card" / FILE).read_text())["flown"]
-    assert 0 < len(kept) < 2 * LEVELS - 1
-    processes.run(*command, cwd=tmp_path)
-    main([*words, "--out", "whole"])
-    one, other = ((tmp_path / name / "robustness.json").read_bytes() for name in ("card", "whole"))
-    assert one == other and not (tmp_path / "card" / FILE).exists()
 
 
 def test_ctrl_c_says_that_the_same_command_goes_on(tmp_path, monkeypatch, capsys):

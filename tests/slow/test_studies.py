@@ -186,19 +186,6 @@ def test_a_failed_training_is_told_at_the_end_and_stops_no_other(tmp_path, monke
     assert found.rows[0]["seeds"] == 1 and found.rows[0]["success_rate_low"] is None
 
 
-def test_a_worker_that_always_dies_is_given_up(tmp_path, monkeypatch):
-    class Dying(Process):
-        def __init__(self, what, log):
-            super().__init__(what, log)
-            self._process.kill()
-
-    monkeypatch.setattr(executor, "Process", Dying)
-    lines = []
-    with refused(match="killed by signal 9"):
-        quadrl.study(STUDY | {"seeds": [0]}, out=tmp_path, on_line=lines.append)
-    assert sum(": begun" in line for line in lines) == executor.ATTEMPTS
-
-
 def test_a_training_waits_until_a_lost_one_has_left_its_folder(tmp_path):
     (run,) = read_plan(STUDY | {"seeds": [0], "settings": SHORT}, tmp_path).runs
     run.folder.mkdir()

@@ -1,9 +1,7 @@
-"""Whole trainings: killed and continued bit for bit, and good enough in the end."""
+"""Whole trainings: on any number of cores, stopped by signals, and good enough in the end."""
 
 import json
-import multiprocessing
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from processes import command
-from runs import assert_same_run, changed, metrics, train
+from runs import metrics, train
 from scipy import stats
 
 import quadrl
@@ -81,74 +79,6 @@ def test_the_same_command_gives_the_same_policy_on_any_number_of_cores(tmp_path)
             for f in (folder, folders[0])
         )
         assert one == other
-
-
-# ------------------------------------------------------------------- killed at any moment
-
-
-@pytest.fixture(scope="module")
-def processes():
-    """Processes that have imported everything already.
-
-    They are forked from one that has computed nothing: it has no threads that a fork would lose.
-    """
-    patch = pytest.MonkeyPatch()
-    own = (Path(__file__).parents[1], Path(__file__).parent)
-    patch.setenv("PYTHONPATH", os.pathsep.join(map(str, (os.environ["PYTHONPATH"], *own))))
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([Path(__file__).stem])
-    yield context
-    patch.undo()
-
-
-def train_alone(config: TrainConfig, folder: str) -> None:
-    """In a process of its own: continue the run in the folder, or begin it."""
-    train(config, Path(folder), resume=(Path(folder) / "config.json").exists())
-
-
-@pytest.mark.parametrize(
-    ("algo", "engine", "task", "options", "checkpoint_seconds"),
-    [
-        ("ppo", "mujoco", "hover", {}, 0.05),
-        ("trpo", "free_flight", "landing", {"start_height": 0.3}, 0.0),  # down to the ground
-    ],
-)
-def test_killed_at_any_moment_it_ends_the_same(
-    processes, tmp_path, algo, engine, task, options, checkpoint_seconds
-):
-    folder = tmp_path / "killed"
-    config = changed(
-        algo=algo,
-        engine=engine,
-        task=task,
-        task_options={"time_limit": 0.5} | options,
-        checkpoint_seconds=checkpoint_seconds,
-        steps=8 * 4 * 60,
-    )
-    undisturbed = train(config, tmp_path / "undisturbed")
-    moments, killed = [], 0
-    for _ in range(2):
-        process = processes.Process(target=train_alone, args=(config, str(folder)))
-        process.start()
-        begun = len(metrics(folder)) if (folder / "metrics.csv").exists() else 0
-        # From the first row of this process on, at any moment of about the next half second.
-        deadline = time.monotonic() + 300
-        while process.is_alive() and time.monotonic() < deadline:
-            if (folder / "metrics.csv").exists() and len(metrics(folder)) != begun:
-                break
-            time.sleep(0.002)
-        moments.append(random.uniform(0.0, 0.15))
-        time.sleep(moments[-1])
-        process.kill()
-        process.join()
-        killed += process.exitcode == -signal.SIGKILL
-    assert killed >= 1, f"killed {moments} s after the first row"
-    process = processes.Process(target=train_alone, args=(config, str(folder)))
-    process.start()
-    process.join()
-    assert process.exitcode == 0
-    assert_same_run(undisturbed, folder)
-    assert not list(folder.glob("*.part"))
 
 
 # ------------------------------------------------------------------- what is learned
@@ -255,18 +185,6 @@ def test_one_policy_flies_every_figure_and_perches_at_every_incline(task, option
 TINY = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16", "--episodes", "2"]
 
 
-LONG = [
-    "train",
-    "hover",
-    *TINY[:4],
-    *TINY[6:],
-    "--steps",
-    str(32 * 100_000),
-    "--checkpoint-seconds",
-    "0",
-]
-
-
 def stopped(words, folder, signal_number, awaited):
     """Exit code and errors of a command that gets a signal as soon as a file is in its folder."""
     process = subprocess.Popen(
@@ -285,26 +203,21 @@ def stopped(words, folder, signal_number, awaited):
     return process.returncode, error
 
 
-RARELY = [*LONG[:-1], "1e9"]
+LONG = "--num-envs 8 --rollout 4 --hidden 16 --steps 3200000 --checkpoint-seconds 1e9"
+RARELY = ["train", "hover", *LONG.split()]
 """Its one checkpoint is the one that a signal asks for."""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("seeds", [(), ("--seeds", "3:5")], ids=["alone", "of several seeds"])
-def test_stopped_it_has_a_checkpoint_and_says_how_to_go_on(tmp_path, number, seeds):
-    folder = tmp_path / "hover-ppo-3" if seeds else tmp_path
-    awaited = str((folder / "metrics.csv").relative_to(tmp_path))
-    code, error = stopped([*RARELY, *seeds], tmp_path, number, awaited)
+def test_stopped_it_has_a_checkpoint_and_says_how_to_go_on(tmp_path, number):
+    code, error = stopped(RARELY, tmp_path, number, "metrics.csv")
     assert code == 128 + number
     (line,) = error.splitlines()
-    if seeds:
-        assert line.startswith("quadrl: stopped; the same command goes on: quadrl train hover ")
-    else:
-        advice = f"continue it: quadrl train --resume {folder}"
-        assert line == f"quadrl: stopped; the run is kept, {advice}"
-    steps = 32 * len(metrics(folder))  # to the last iteration that was begun
-    assert steps and Policy.load(folder).metadata["steps"] == steps
-    assert checkpoint.load(folder / "checkpoint.safetensors")[1]["iteration"] * 32 == steps
+    advice = f"continue it: quadrl train --resume {tmp_path}"
+    assert line == f"quadrl: stopped; the run is kept, {advice}"
+    steps = 32 * len(metrics(tmp_path))  # to the last iteration that was begun
+    assert steps and Policy.load(tmp_path).metadata["steps"] == steps
+    assert checkpoint.load(tmp_path / "checkpoint.safetensors")[1]["iteration"] * 32 == steps
 
 
 def test_terminated_while_it_draws_it_leaves_nothing_half_written(tmp_path):
