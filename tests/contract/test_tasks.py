@@ -1,7 +1,6 @@
 """Every task keeps the contract of quadrl.testing, and flies through every API as by mj_step."""
 
 import dataclasses
-import itertools
 
 import flights
 import numpy as np
@@ -160,48 +159,34 @@ def of_a_goal_that_moves(self, before, now):
     return now.task
 
 
-def by_branches(self, now):
-    distance = now.potentials.distance
+def by_branches(distance):
     return distance if (distance < 2.0).any() else 2 * distance
 
 
-def in_double_precision(self, now):
-    xp = namespace(now.time)
-    return xp.astype(now.potentials.distance, xp.float64)
+def random_goal(start, state):
+    return start, TaskState(state.goal + 0.01 * np.random.normal())
 
 
-def remembered(terms, now, calls=itertools.count()):  # noqa: B008 - one for all calls
-    return terms["survival"] + 1e-9 * next(calls)
+def start_by_the_mean(start, state):
+    return dataclasses.replace(start, position=0.9 * start.position.mean(0) + start.position), state
+
+
+def no_rotation(start, state):
+    return dataclasses.replace(start, quaternion=2 * start.quaternion), state
+
+
+def error(change):
+    """`error` of hover, changed."""
+    return {"error": lambda self, now: change(now.potentials.distance)}
 
 
 FAULTS = {
     "a missing text": ("solved must be a text", {"solved": ""}),
-    "other random numbers": (
-        "two starts for one key",
-        {
-            "begin": begun(
-                lambda start, state: (start, TaskState(state.goal + 0.01 * np.random.normal()))
-            )
-        },
-    ),
-    "no rotation": (
-        "quaternion of begin.*of norm 1",
-        {"begin": begun(lambda a, b: (dataclasses.replace(a, quaternion=2 * a.quaternion), b))},
-    ),
+    "other random numbers": ("two starts for one key", {"begin": begun(random_goal)}),
+    "no rotation": ("quaternion of begin.*of norm 1", {"begin": begun(no_rotation)}),
     "a start by the mean of the batch": (
         "begin of one aircraft and of a batch differ: start.position",
-        {
-            "begin": begun(
-                lambda a, b: (
-                    dataclasses.replace(a, position=0.9 * a.position.mean(0) + a.position),
-                    b,
-                )
-            )
-        },
-    ),
-    "a start in NumPy alone": (
-        "begin with tensors|begin fails",
-        {"begin": begun(lambda a, b: (dataclasses.replace(a, position=np.array(a.position)), b))},
+        {"begin": begun(start_by_the_mean)},
     ),
     "a constant entry": ("entries .2. of 'goal' never change", {"observe": level_goal}),
     "a reward by the mean of the batch": (
@@ -209,32 +194,19 @@ FAULTS = {
         {"reward": rewarded("spin", lambda terms, now: terms["spin"] - terms["spin"].mean())},
     ),
     "a reward that is not a number": ("near.*nan", {"reward": rewarded("near", nan_far_away)}),
-    "a reward with a memory": (
-        "differ: reward|get different numbers",
-        {"reward": rewarded("survival", remembered)},
-    ),
     "words to draw": ("markers fails.*'str'", {"markers": lambda self, now: ["a sphere"]}),
-    "a negative error": (
-        "an error is negative",
-        {"error": lambda self, now: now.potentials.distance - 0.5},
-    ),
+    "a negative error": ("an error is negative", error(lambda distance: distance - 0.5)),
     "a changed argument": ("read-only", {"update": of_a_goal_that_moves}),
-    "a batch of four": (
-        "a function of 1 rows.* fails",
-        {"error": lambda self, now: now.potentials.distance + 0 * now.state.position[2, 0]},
-    ),
-    "an error in NumPy alone": (
-        "torch arrays fails|with tensors gives error as ndarray",
-        {"error": lambda self, now: np.array(now.potentials.distance)},
-    ),
-    "a branch on numbers": ("fails:.*meta", {"error": by_branches}),
+    "a batch of four": ("a function of 1 rows.* fails", error(lambda x: x + 0 * x[2])),
+    "an error in NumPy alone": ("torch arrays fails|gives error as ndarray", error(np.array)),
+    "a branch on numbers": ("fails:.*meta", error(by_branches)),
     "no gradient in the goal": (
         "gradient by position at rest in the goal is .*nan",
         {"measure": measured_by_a_power},
     ),
     "double precision alone": (
         "of float32, error becomes torch.float64",
-        {"error": in_double_precision},
+        error(lambda x: namespace(x).astype(x, namespace(x).float64)),
     ),
 }
 
