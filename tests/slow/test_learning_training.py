@@ -187,10 +187,7 @@ def test_a_damaged_checkpoint_is_refused_and_nothing_is_touched(copy, damage):
 
 @pytest.mark.parametrize(
     ("change", "name", "value"),
-    [
-        ({"task": "random_waypoint"}, "task", "hover"),
-        ({"gamma": 0.5}, "gamma", TINY.gamma),
-    ],
+    [({"task": "random_waypoint"}, "task", "hover"), ({"gamma": 0.5}, "gamma", TINY.gamma)],
 )
 def test_a_checkpoint_of_another_run_is_refused(copy, tmp_path, change, name, value):
     # The networks are of one size, so nothing else would notice.

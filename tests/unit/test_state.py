@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import rotation
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.engines.state import Start, State
@@ -121,61 +120,6 @@ def test_the_state_after_a_step_is_that_of_the_coordinates_and_the_last_one_stay
         assert not np.array_equal(engine.state.position, kept["position"])
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_tensors_give_the_same_numbers_and_keep_their_precision(precision):
-    import torch
-
-    dtype = getattr(torch, precision)
-    start = random_start(10, 30)
-    expected = State.of_coordinates(**fields(start), origin_height=ALTITUDE)
-    tensors = {name: torch.tensor(value, dtype=dtype) for name, value in fields(start).items()}
-    state = State.of_coordinates(**tensors, origin_height=ALTITUDE)
-    tolerance = 1e-12 if dtype == torch.float64 else 1e-3
-    for name in NAMES:
-        got, wanted = getattr(state, name), getattr(expected, name)
-        assert got.dtype == dtype, name
-        scale = np.abs(wanted).max()
-        np.testing.assert_allclose(got, wanted, rtol=0, atol=tolerance * scale, err_msg=name)
-
-
-def test_the_errors_of_the_attitude_by_hand():
-    # Roll 90 degrees: |sin| + |cos - 1| of (roll, pitch) = |(1, 0)| + |(-1, 0)| = 2. Yaw 180
-    # degrees: level, but against east |(0, 0, 0)| + |(0, 0, -2)| = 2.
-    half = math.sqrt(0.5)
-    level = helpers.level(3)
-    start = dataclasses.replace(
-        level, quaternion=np.array([[1.0, 0, 0, 0], [half, half, 0, 0], [0, 0, 0, 1.0]])
-    )
-    placed = batch(3).place(np.arange(3), start)
-    np.testing.assert_allclose(placed.level_error, [0, 2, 0], atol=1e-7)
-    np.testing.assert_allclose(placed.east_error, [0, 2, 2], atol=1e-7)
-    np.testing.assert_allclose(placed.cos_tilt, [1, 0, 1], atol=1e-15)
-    np.testing.assert_array_equal(placed.at_rest, True)
-
-
-# -------------------------------------------------------------------------------- what is refused
-
-
-def test_a_start_that_the_step_does_not_resolve_is_refused():
-    engine = BatchEngine(Vehicle(), 2, altitude=ALTITUDE)
-    rows, level = np.array([1]), helpers.level(1)
-    fast = dataclasses.replace(level, body_rate=np.array([[0, 0, 50.0]]))
-    engine.place(rows, fast)
-    assert engine.state.angular_speed[1] == 50.0
-    # |omega| dt is at most 0.5; 2 k_D |v| dt / m at most 1: 3611 m/s.
-    for name, value, limit in (
-        ("body_rate", [0, 0, 51.0], "50"),
-        ("velocity", [3700.0, 0, 0], "3611"),
-        ("rotor_speed", [1e10] * 4, "1e+10"),  # though it comes after the others
-        ("quaternion", [np.nan, 0, 0, 1], "finite"),
-        ("position", [0, 0, np.inf], "finite"),
-    ):
-        start = dataclasses.replace(fast, **{name: np.array([value], dtype=float)})
-        with helpers.refused(lists=limit, match=f"^{name}") as caught:
-            engine.place(rows, start)
-        np.testing.assert_array_equal(caught.value.value, [value])
-
-
 # ------------------------------------------------------------------------------------- attitude
 
 
@@ -204,25 +148,3 @@ def test_rotations_are_scipys_and_inverse_to_each_other():
     vectors = np.array([[2.0, 3.0, 6.0], [0.0, -3.0, 4.0]])
     np.testing.assert_array_equal(rotation.square_norm(vectors), [49, 25])
     np.testing.assert_array_equal(rotation.norm(vectors), [7, 5])
-
-
-def test_tensors_of_length_zero_have_a_gradient():
-    import torch
-
-    # Of (3, 4): (3, 4) / 5; of (0, 0): zero, where the root's own would be 0 * inf.
-    vectors = torch.tensor([[3.0, 4.0], [0.0, 0.0]], dtype=torch.float64, requires_grad=True)
-    rotation.norm(vectors).sum().backward()
-    np.testing.assert_allclose(vectors.grad, [[0.6, 0.8], [0, 0]])
-
-
-def test_heading_and_tilt():
-    # Heading 0.7, then 0.2 rad about the body's y axis (pi/2 from x): yaw 0.7, pitch 0.2, roll 0.
-    given = (np.array([x]) for x in (0.7, 0.2, math.pi / 2))
-    quaternion = rotation.quaternion_from_heading_and_tilt(*given)
-    angles = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX")
-    np.testing.assert_allclose(angles, [[0.7, 0.2, 0.0]], atol=1e-14)
-    # Whatever the axis, the angle to the vertical is the tilt.
-    direction = np.linspace(0, 6, 7)
-    many = rotation.quaternion_from_heading_and_tilt(np.full(7, 2.0), np.full(7, 0.2), direction)
-    upright = rotation.rotation_matrix(many)[:, 2, 2]
-    np.testing.assert_allclose(upright, math.cos(0.2), atol=1e-14)

@@ -10,7 +10,7 @@ from torchrl.modules import set_recurrent_mode
 
 from quadrl.learning.networks import BEGINS, STATE
 from quadrl.learning.settings import TRPOConfig
-from quadrl.learning.trpo import TRPO, conjugate_gradients, fisher_product, flat
+from quadrl.learning.trpo import TRPO, conjugate_gradients, flat
 
 SIZE, ACTIONS, ROWS = 5, 2, 24
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -41,20 +41,6 @@ def explicit_fisher(actor, observation):
         weight = torch.cat([deviation**-2, torch.full((ACTIONS,), 2.0, dtype=torch.float64)])
         total = total + matrix.T @ (weight[:, None] * matrix)
     return total / len(observation)
-
-
-def test_fisher_product_is_the_explicit_fisher_matrix():
-    actor, algorithm = trpo()
-    batch = batch_of(actor, SIZE)
-    _, kl = algorithm.loss.surrogate_and_kl(batch)
-    product = fisher_product(kl, algorithm.policy, damping=0.0)
-    fisher = explicit_fisher(actor, batch["observation"])
-    torch.manual_seed(1)
-    vector = torch.randn(len(fisher), dtype=torch.float64)
-    expected = fisher @ vector
-    torch.testing.assert_close(product(vector), expected, rtol=1e-4, atol=1e-4)
-    damped = fisher_product(kl, algorithm.policy, damping=0.5)
-    torch.testing.assert_close(damped(vector), expected + 0.5 * vector, rtol=1e-4, atol=1e-4)
 
 
 def test_conjugate_gradients_solve():
@@ -98,16 +84,6 @@ def test_no_step_breaks_the_bound_or_loses(seed):
         assert after.item() >= before.item()
         assert metrics["kl"] == pytest.approx(kl.item(), abs=1e-6)
         assert metrics["step"] > 0 and metrics["surrogate_gain"] > 0
-
-
-@pytest.mark.parametrize("beyond", [1.02, 1.5, 4.0, 1e3, 1e6])
-def test_a_step_beyond_the_bound_is_followed_by_one_at_it(beyond):
-    """sqrt(bound / divergence) and a little less; a fixed factor would need many steps, or lose."""
-    _, algorithm = trpo(max_kl=0.02, shrink=0.7)
-    factor = algorithm.shorter(0.02 * beyond)
-    assert 0.9 < factor * beyond**0.5 < 1
-    assert algorithm.shorter(0.02) == algorithm.shorter(0.01) == 0.7  # a loss within the bound
-    assert algorithm.shorter(float("inf")) == algorithm.shorter(float("nan")) == 0.7
 
 
 @pytest.mark.parametrize("cause", ["no iteration", "no gain", "not a number", "a bound too wide"])

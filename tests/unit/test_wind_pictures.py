@@ -11,7 +11,7 @@ from quadrl.engines import mjcf
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.rendering import Renderer, overlay, render_trajectory
 from quadrl.rendering.drawing import STREAKS, streaks
-from quadrl.rendering.pictures import LiveFlight, Pictures
+from quadrl.rendering.pictures import LiveFlight
 
 WEST = Weather(wind_speed=12.0, direction=np.pi)
 HIGH = np.array([0.0, 0.0, 30.0])
@@ -81,26 +81,6 @@ def test_a_flight_is_drawn_in_its_wind(flown, monkeypatch, cheap_pictures):
     one, other = (next(heads(windy[k]["markers"])) for k in (4, 5))
     assert_moved(one, other, 0.05 * (wind[4] + wind[5]) / 2, share=3, atol=1e-9)
     assert all(one["markers"] == () for one in calm) and len(written[-1]) == 4
-
-
-def test_pictures_of_an_environment_show_its_wind(monkeypatch, cheap_pictures):
-    asked = []
-    large = np.full((300, 400, 3), 128, np.uint8)
-    monkeypatch.setattr(Renderer, "frame", lambda self, *_, **o: asked.append(o) or large.copy())
-    for weather in (WEST, None):
-        environment = helpers.begun("hover", 2, weather=weather)
-        pictures = Pictures(environment, "follow", 400, 300)
-        picture = pictures.frame(1)
-        pictures.close()
-        assert (picture[:200] != 128).any()  # the panel
-        rows = np.flatnonzero((picture != 128).any(axis=(1, 2)))
-        assert rows.max() == pytest.approx(0.72 * (18 + 138 + 21 * bool(weather)), abs=2)
-        shown = asked[-1]["markers"]
-        assert bool(shown) == bool(weather)
-        if weather:
-            ends, begins = heads(shown)
-            way = 0.05 * environment.engine.wind[1]
-            np.testing.assert_allclose(ends - begins, np.tile(way, (len(ends), 1)))
 
 
 def test_a_flight_in_progress_hands_on_how_far_the_air_has_come():
