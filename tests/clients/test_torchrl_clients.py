@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from torchrl.envs import GymEnv, GymWrapper, SerialEnv, TransformedEnv
+from torchrl.envs import GymEnv, GymWrapper, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
@@ -49,15 +49,6 @@ def test_the_info_is_read_into_tensors():
 def test_a_vector_with_gymnasiums_default_says_which_mode_torchrl_takes():
     with pytest.raises(RuntimeError, match="SAME_STEP or DISABLED"):
         GymWrapper(gym.make_vec(HOVER, num_envs=3))
-
-
-def test_a_serial_environment_of_several():
-    environment = SerialEnv(2, lambda: GymEnv(HOVER, time_limit=0.5))
-    environment.set_seed(0)
-    flown = environment.rollout(25, break_when_any_done=False)
-    assert flown.batch_size == (2, 25)
-    assert flown["next", "done"].sum() == 4
-    environment.close()
 
 
 # ------------------------------------------------------------------- pictures of QuadrotorEnv

@@ -4,9 +4,9 @@ import functools
 from pathlib import Path
 
 import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
 import pytest
-from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 from processes import python
 from stable_baselines3 import PPO
@@ -15,7 +15,6 @@ from stable_baselines3.common.vec_env import (
     SubprocVecEnv,
     VecMonitor,
     VecNormalize,
-    VecVideoRecorder,
 )
 from torchrl.envs import GymEnv, ParallelEnv
 
@@ -82,35 +81,9 @@ def test_rllib_learns_on_one_machine(monkeypatch):
 # --------------------------------------------------------------------------------------- videos
 
 
-def videos(test):
-    """The writers and the reader leave the pipes to ffmpeg to the garbage collector."""
-    test = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")(test)
-    return pytest.mark.usefixtures("cheap_pictures")(test)
-
-
-def frames_of(path):
-    """The pictures of a video."""
-    import imageio_ffmpeg
-
-    reader = imageio_ffmpeg.read_frames(str(path))
-    width, height = next(reader)["size"]
-    return [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]
-
-
-@videos
-def test_gymnasium_records_an_episode(tmp_path):
-    environment = RecordVideo(gym.make(HOVER, time_limit=0.5, **PICTURE), str(tmp_path / "one"))
-    environment.reset(seed=0)
-    while not environment.step(np.zeros(4))[3]:
-        pass
-    environment.close()
-    (video,) = (tmp_path / "one").glob("*.mp4")
-    frames = frames_of(video)
-    assert len(frames) >= 10 and frames[0].shape == (48, 64, 3)
-    assert np.std(frames[-1]) > 5
-
-
-@videos
+# The writers and the reader leave the pipes to ffmpeg to the garbage collector.
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.usefixtures("cheap_pictures")
 def test_gymnasium_records_a_vector(tmp_path):
     envs = gym.make_vec(HOVER, num_envs=4, time_limit=0.5, **PICTURE)
     envs = VectorRecordVideo(
@@ -120,20 +93,8 @@ def test_gymnasium_records_a_vector(tmp_path):
     for _ in range(12):
         envs.step(np.zeros((4, 4)))
     envs.close()
-    frames = frames_of(tmp_path / "all" / "rl-video-episode-0.mp4")
-    assert frames[0].shape == (96, 128, 3) and len(frames) >= 10
-
-
-@videos
-def test_sb3_records_the_batch(tmp_path):
-    envs = QuadrotorVecEnv("hover", 4, **PICTURE)
-    envs = VecVideoRecorder(envs, str(tmp_path), lambda step: step == 0, video_length=10)
-    envs.reset()
-    for _ in range(12):
-        envs.step(np.zeros((4, 4)))
-    envs.close()
-    frames = frames_of(next(tmp_path.glob("*.mp4")))
-    assert frames[0].shape == (96, 128, 3) and len(frames) >= 10
+    meta, *frames = imageio_ffmpeg.read_frames(str(tmp_path / "all" / "rl-video-episode-0.mp4"))
+    assert meta["size"] == (128, 96) and len(frames) >= 10
 
 
 @pytest.mark.parametrize(

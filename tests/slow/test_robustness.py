@@ -160,27 +160,6 @@ def test_maps_start_where_they_say(task, chart):
     assert cosine.min() > np.cos(0.1)
 
 
-def test_who_falls_too_fast_too_low_does_not_recover(card):
-    chart = quadrl.robustness(
-        "geometric", "hover", disturbances=("gust",), episodes=20, progress=False
-    )
-    shares = np.array(chart.found["recovery"]["falling"]["flown"]["geometric controller"])
-    heights, speeds = MAPS["falling"].y.levels, MAPS["falling"].x.levels
-    assert shares[heights.index(3.0), speeds.index(0.0)] == 1
-    # 6 m/s from 0.5 m: with an upward acceleration of at most g/3 it falls 5 m.
-    assert shares[heights.index(0.5), speeds.index(6.0)] == 0
-
-
-def test_the_command_writes_the_files(tmp_path, capsys):
-    out = tmp_path / "card"
-    few = ["--episodes", "2", "--disturbances", "delay", "--no-recovery", "--out", str(out)]
-    main(["robustness", "hover", "--controller", "geometric", *few, "--task-options",
-          "time_limit=0.5"])  # fmt: skip
-    found = Card.load(out).found
-    assert found["flown"] == ["hover", "geometric controller"] and [*found["axes"]] == ["delay"]
-    assert found["recovery"] == {} and "delay of commands" in capsys.readouterr().out
-
-
 def test_what_cannot_be_flown_is_refused(capsys):
     wrong = {"disturbance": {"disturbances": ("mas",)}, "episodes": {"episodes": 0}}
     wrong |= {"seed": {"seed": -1}, "engine": {"engine": "jet"}}

@@ -39,10 +39,8 @@ def test_a_reset_of_some_rows_renews_all_that_is_theirs_and_nothing_else():
     after, others = everything(), [0, 3]
     for name, value in before.items():
         np.testing.assert_array_equal(after[name][others], value[others], err_msg=name)
-        if name not in (
-            "task.goal",
-            "distance",
-        ):  # the task has a path, at 1 m from where it starts
+        # The task has a path, at 1 m from where it starts.
+        if name not in ("task.goal", "distance"):
             changed = (after[name][[1, 2]] != value[[1, 2]]).reshape(2, -1).any(axis=1)
             assert changed.all(), name
     now = environment.snapshot
