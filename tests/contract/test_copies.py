@@ -4,7 +4,6 @@ import copy
 import pickle
 
 import cloudpickle
-import gymnasium as gym
 import numpy as np
 import pytest
 from apis import APIS
@@ -62,22 +61,6 @@ def test_a_copy_goes_on_bit_for_bit(api, settings):
         for flown in (*others, copied):
             assert_same(flown.copied(flown.step(action)), given)
     assert len(others) == 4
-
-
-@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_wrappers_of_gymnasium_are_copied_with_it(way):
-    environment = gym.make("quadrl/Hover-v0", time_limit=0.5)
-    for wrapper in ("RecordEpisodeStatistics", "NormalizeObservation", "NormalizeReward"):
-        environment = getattr(gym.wrappers, wrapper)(environment)
-    environment.reset(seed=0)
-    environment.step(np.ones(4))
-    other = way(environment)
-    assert other.spec == environment.spec
-    for _ in range(9):
-        one, same = environment.step(np.ones(4)), other.step(np.ones(4))
-        np.testing.assert_array_equal(one[0], same[0])
-        assert one[1:4] == same[1:4]
-    assert one[3] and one[4]["episode"]["l"] == same[4]["episode"]["l"] == 10
 
 
 def test_a_copied_physics_of_dm_control_is_drawn_and_measured_as_the_other():

@@ -189,13 +189,10 @@ def test_blades_turn_counter_clockwise_by_their_angle(renderer, rotor):
 
 
 def test_what_cannot_be_drawn_is_refused(model, renderer):
-    allowed = "one of follow, fixed, track, chase, onboard"
-    with helpers.refused("camera", "sky", allowed):
+    with helpers.refused("camera", "sky", "one of follow, fixed, track, chase, onboard"):
         renderer.frame(POSE, camera="sky")
     with helpers.refused("width", 1922, lists="1920"):
         Renderer(model, 1922, 9)
-    with helpers.refused("height", 0, lists="1080"):
-        Renderer(model, 9, 0)
     with helpers.refused("shapes to draw", 2001):
         renderer.frame(POSE, markers=[Marker("ring")] * 50)  # of 48 shapes each
     with helpers.refused("kind", "cube"):
