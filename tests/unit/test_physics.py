@@ -85,17 +85,6 @@ def test_thrust_is_up_in_the_body_frame():
     np.testing.assert_allclose(linear, [4.905, 0, -1.31429], atol=1e-5)
 
 
-@both
-def test_the_speed_of_a_fall_and_its_limit(engine):
-    # m g = k_D v^2: v_t = sqrt(0.65 * 9.81 / 9e-3) = sqrt(708.5) = 26.61767 m/s, and
-    # v = v_t tanh(g t / v_t): 16.6954 m/s after 2 s; after 30 s tanh(11.06) lacks 5e-10 of one.
-    falling = aircraft(engine, height=1000.0)
-    falling.advance(200)
-    assert falling.qvel[0, 2] == pytest.approx(-26.61767 * math.tanh(19.62 / 26.61767), abs=1e-5)
-    falling.advance(2800)
-    assert falling.qvel[0, 2] == pytest.approx(-math.sqrt(0.65 * 9.81 / 9e-3), abs=1e-6)
-
-
 def test_drag_opposes_the_motion_through_the_air_and_grows_with_its_square():
     # |v| = 5: F = -9e-3 * 5 * (3, 4, 0) = (-0.135, -0.18, 0); over 0.65 kg.
     linear, angular = accelerations(velocity=(3, 4, 0))
@@ -114,13 +103,6 @@ def test_the_wind_is_one_of_the_world():
     north = (math.sqrt(0.5), 0, 0, math.sqrt(0.5))
     pushed, _ = accelerations(wind=(5, 0, 0), attitude=north)
     np.testing.assert_allclose(pushed, [0.225 / 0.65, 0, -9.81], atol=1e-12)
-
-
-def test_the_aerodynamic_moment_opposes_the_turn_and_grows_with_its_square():
-    # |omega| = 5, about x and y, where J is equal, so that omega x J omega has only a z part, 0.
-    # M = -9e-4 * 5 * (3, 4, 0) = (-0.0135, -0.018, 0); over 7.5e-3: (-1.8, -2.4, 0).
-    _, angular = accelerations(rate=(3, 4, 0))
-    np.testing.assert_allclose(angular, [-1.8, -2.4, 0], atol=1e-12)
 
 
 # ---------------------------------------------------------------------------------------- torques
@@ -144,24 +126,3 @@ def test_the_aerodynamic_moment_opposes_the_turn_and_grows_with_its_square():
 def test_sign_and_size_of_each_torque(speeds, expected):
     _, angular = accelerations(speed=speeds)
     np.testing.assert_allclose(angular, expected, atol=1e-6)
-
-
-def test_one_rotor_alone():
-    # Rotor 1 (ahead) at 200 rad/s: 3.13e-5 * 4e4 = 1.252 N at x = 0.23 m.
-    # tau = (0, -0.23 * 1.252, -7.5e-7 * 4e4) = (0, -0.28796, -0.03) N m.
-    linear, angular = accelerations(speed=(200, 0, 0, 0))
-    np.testing.assert_allclose(linear, [0, 0, 1.252 / 0.65 - 9.81], rtol=1e-12)
-    np.testing.assert_allclose(angular, [0, -0.28796 / 7.5e-3, -0.03 / 1.3e-2], rtol=1e-12)
-
-
-def test_yaw_reaction_is_not_rounded():
-    # The torque of a rotor over its thrust is k_Q / k_T = 7.5e-7 / 3.13e-5 to the last digit.
-    reaction = mjcf.compile_model(PAPER).actuator_gear[:, 5]
-    np.testing.assert_array_equal(reaction, np.array([-1, 1, -1, 1]) * (7.5e-7 / 3.13e-5))
-
-
-def test_gyroscopic_coupling_has_the_sign_of_euler():
-    # J domega = -omega x J omega, omega = (1, 0, 2), J = (7.5, 7.5, 13)e-3:
-    # omega x J omega = (0, 2 * 7.5e-3 - 1 * 26e-3, 0) = (0, -11e-3, 0), so domega_y = +11/7.5.
-    _, angular = accelerations(VACUUM, rate=(1, 0, 2))
-    np.testing.assert_allclose(angular, [0, 11 / 7.5, 0], atol=1e-12)

@@ -162,21 +162,6 @@ def test_a_call_with_arguments_is_one_with_a_tensordict(computed):
             assert value.item() == expected[name].item() != 0
 
 
-def test_reductions():
-    actor, critic = make_actor(), make_critic()
-    data = rollout(actor)
-    moved(actor)
-    terms, mean, total = (
-        TRPOLoss(actor, critic, reduction=name)(data) for name in ("none", "mean", "sum")
-    )
-    for name in ("loss_objective", "loss_critic", "kl"):
-        assert terms[name].shape == (ROWS, STEPS)
-        torch.testing.assert_close(mean[name], terms[name].mean())
-        torch.testing.assert_close(total[name], terms[name].sum())
-    with pytest.raises(NotImplementedError, match="median"):
-        TRPOLoss(actor, critic, reduction="median")(data)
-
-
 @pytest.mark.parametrize("kind", [ValueEstimators.GAE, ValueEstimators.TD0])
 def test_it_computes_the_advantage_itself(kind):
     actor, critic = make_actor(), make_critic()

@@ -1,8 +1,5 @@
 """Wind in pictures: streaks that go where the air goes, its strength in the panel."""
 
-import types
-
-import helpers
 import numpy as np
 import pytest
 
@@ -11,7 +8,6 @@ from quadrl.engines import mjcf
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.rendering import Renderer, overlay, render_trajectory
 from quadrl.rendering.drawing import STREAKS, streaks
-from quadrl.rendering.pictures import LiveFlight
 
 WEST = Weather(wind_speed=12.0, direction=np.pi)
 HIGH = np.array([0.0, 0.0, 30.0])
@@ -81,17 +77,6 @@ def test_a_flight_is_drawn_in_its_wind(flown, monkeypatch, cheap_pictures):
     one, other = (next(heads(windy[k]["markers"])) for k in (4, 5))
     assert_moved(one, other, 0.05 * (wind[4] + wind[5]) / 2, share=3, atol=1e-9)
     assert all(one["markers"] == () for one in calm) and len(written[-1]) == 4
-
-
-def test_a_flight_in_progress_hands_on_how_far_the_air_has_come():
-    recorder = types.SimpleNamespace(scale=1.0, aspect=1.0, spins=np.ones(4))
-    recorder.frame = lambda qpos, **options: next(heads(options["markers"]))
-    flying, pose = LiveFlight("track"), np.array([*HIGH, 1.0, 0, 0, 0])
-    wind = np.array([4.0, 0, 0])
-    moments = (helpers.in_flight(time, pose, wind=wind) for time in (0.0, 0.01, 0.0))
-    seen = [flying.picture(recorder, moment, 0) for moment in moments]
-    assert_moved(seen[0], seen[1], 0.01 * wind)
-    np.testing.assert_array_equal(seen[2], seen[0])  # another flight begins anew
 
 
 def test_a_resampled_flight_has_its_wind(flown):
