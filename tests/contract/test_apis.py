@@ -2,16 +2,13 @@
 
 import re
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from apis import APIS, StableBaselines, Vector
 from helpers import refused
 from processes import python
 
-import quadrl
 from quadrl.base.errors import QuadrlError
-from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
 
 ACTIONS = varied_actions(12, 4)[:, 2:]  # (T, N, 4); one dives, one does anything
@@ -128,20 +125,6 @@ def test_an_impossible_action_is_refused(api, action, name, value):
             leading = actions.shape if name == "action shape" else value
             assert caught.value.value == leading
     flown.step(np.zeros((flown.rows, 4), np.float32))  # nothing has broken
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_the_public_names_lead_to_the_same_episodes(name):
-    camel = name.replace("_", " ").title().replace(" ", "")
-    action = varied_actions(1, 3)[0]
-    single, vector = gym.make(f"quadrl/{camel}-v0"), gym.make_vec(f"quadrl/{camel}-v0", num_envs=3)
-    dm = quadrl.load(name, {"random": 7})
-    met, _ = vector.reset(seed=5)
-    np.testing.assert_array_equal(met[2], single.reset(seed=7)[0])
-    terms = np.concatenate(list(dm.reset().observation.values()))
-    np.testing.assert_array_equal(met[2], terms.astype(np.float32))
-    _, rewards, *_ = vector.step(action)
-    assert single.step(action[2])[1] == dm.step(action[2]).reward == rewards[2]
 
 
 def test_the_import_and_a_policy_are_light_and_set_no_variable():

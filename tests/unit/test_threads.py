@@ -74,11 +74,6 @@ def plain_model(thread: int) -> np.ndarray:
     return np.array(log)
 
 
-def everything(thread: int) -> np.ndarray:
-    """One of the above."""
-    return (environment, opened_and_closed, plain_model)[thread % 3](thread)
-
-
 def at_once(work: Callable[[int], np.ndarray]) -> list[np.ndarray]:
     """What `work` gives each thread, all of them started together."""
     results: dict[int, np.ndarray | BaseException] = {}
@@ -103,7 +98,7 @@ def at_once(work: Callable[[int], np.ndarray]) -> list[np.ndarray]:
     return [results[k] for k in range(THREADS)]
 
 
-@pytest.mark.parametrize("work", [environment, opened_and_closed, plain_model, everything])
+@pytest.mark.parametrize("work", [environment, opened_and_closed, plain_model])
 def test_eight_threads_get_bit_for_bit_what_one_gets(work):
     alone = [work(thread) for thread in range(THREADS)]
     assert len({result.tobytes() for result in alone}) == THREADS  # every thread has other numbers
