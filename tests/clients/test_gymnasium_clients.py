@@ -250,9 +250,6 @@ def test_an_unknown_keyword_is_refused_in_pythons_words():
         gym.make(HOVER, vehical="crazyflie")
 
 
-# ------------------------------------------------------------------------------------ a window
-
-
 @pytest.mark.usefixtures("cheap_pictures")
 def test_human_shows_what_is_drawn(monkeypatch):
     pygame = pytest.importorskip("pygame")

@@ -51,8 +51,6 @@ def test_a_vector_with_gymnasiums_default_says_which_mode_torchrl_takes():
         GymWrapper(gym.make_vec(HOVER, num_envs=3))
 
 
-# ------------------------------------------------------------------- pictures of QuadrotorEnv
-
 pictures = pytest.mark.usefixtures("cheap_pictures")
 
 

@@ -56,9 +56,6 @@ def test_a_route_keeps_it_too():
     check_task(StaticWaypoint(waypoints=WAYPOINTS, reach=0.35))
 
 
-# ------------------------------------------------------------------ the same numbers everywhere
-
-
 def check_identity(task, actions=ACTIONS, mode="rotor"):
     """Fly a task through every API; returns the flight by mj_step, which all of them repeat."""
     expected = flights.fly("mj_step", task, SEED, actions, mode)

@@ -27,9 +27,6 @@ PICTURE = {"render_mode": "rgb_array", "width": 64, "height": 48}
 EXAMPLES = Path(quadrl.__file__).parents[1] / "docs" / "examples"
 
 
-# ------------------------------------------------------------------------------------ learning
-
-
 @pytest.mark.parametrize("workers", [None, "fork", "forkserver", "spawn"])
 def test_sb3_learns_from_the_name(workers):
     settings = {}
@@ -78,9 +75,6 @@ def test_rllib_learns_on_one_machine(monkeypatch):
     ray.shutdown()
 
 
-# --------------------------------------------------------------------------------------- videos
-
-
 # The writers and the reader leave the pipes to ffmpeg to the garbage collector.
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 @pytest.mark.usefixtures("cheap_pictures")
@@ -116,9 +110,6 @@ mediapy.show_video(np.zeros((3, 48, 64, 3), np.uint8), fps=10)
 assert "video/mp4" in shown[0].data
 """
     python("-c", code)
-
-
-# ------------------------------------------------------------------------------ other processes
 
 
 @pytest.mark.parametrize("context", ["fork", "spawn"])

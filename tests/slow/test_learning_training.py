@@ -35,9 +35,6 @@ def copy(finished, tmp_path):
     return Path(shutil.copytree(finished, tmp_path / "copy"))
 
 
-# --------------------------------------------------------------------------- the same seed
-
-
 def test_same_seed_same_run_on_any_threads_of_torch(finished, tmp_path):
     before = torch.get_num_threads()
     torch.set_num_threads(3)

@@ -98,9 +98,6 @@ def test_the_clock_stands_still_unless_somebody_wants_it(before, after, moves):
     assert python("-c", FLY.format(before=before, after=after)).stdout == f"1 {moves}\n"
 
 
-# ------------------------------------------------------------------- machines that lack something
-
-
 def test_the_contract_needs_neither_pytest_nor_torch():
     code = (
         "import sys; sys.modules.update(pytest=None, torch=None, torchrl=None, tensordict=None);"

@@ -40,8 +40,6 @@ def test_several_seeds_are_a_study(tmp_path, monkeypatch, capsys):
     assert "holds a run with other settings" in capsys.readouterr().err
 
 
-# ------------------------------------------------------------------- on any number of cores
-
 ALIKE = {
     "as it is": {},
     "on one core": {"cores": 1},
@@ -79,9 +77,6 @@ def test_the_same_command_gives_the_same_policy_on_any_number_of_cores(tmp_path)
             for f in (folder, folders[0])
         )
         assert one == other
-
-
-# ------------------------------------------------------------------- what is learned
 
 
 @pytest.mark.parametrize("algo", ["ppo", "trpo"])
@@ -179,8 +174,6 @@ def test_one_policy_flies_every_figure_and_perches_at_every_incline(task, option
     if task == "trajectory":
         assert reached["distance_m"] < 0.04
 
-
-# ------------------------------------------------------------------- the command, in a process
 
 TINY = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16", "--episodes", "2"]
 

@@ -213,9 +213,6 @@ def test_the_privileged_observation_is_the_truth_what_was_drawn_and_the_wind():
     assert (environment.privileged[2, 22:-3] != before[2, 22:-3])[continuous].all()
 
 
-# ------------------------------------------------------------------------------------ the APIs
-
-
 @pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
 def test_every_api_observes_alike_and_tells_what_was_drawn(api):
     observe = {"action_history": 1, "rotor_speed": "estimated", "privileged": True}
@@ -267,9 +264,6 @@ def test_a_vector_tells_what_was_drawn_for_the_present_episode(mode):
     now = environment.environment.randomizer.shown()["mass"]
     np.testing.assert_array_equal(info["drawn"]["mass"], now)
     assert (now != first).all()
-
-
-# ------------------------------------------------------------------------------------ policies
 
 
 def test_a_policy_flies_with_the_options_of_its_training_and_no_others(tmp_path):

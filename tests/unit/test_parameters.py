@@ -29,8 +29,6 @@ ENGINES = ("mujoco", "free_flight")
 PAPER = Vehicle()
 
 
-# --------------------------------------------------------------------------------------- flown
-
 LOW = tasks.make("landing", start_height=0.03)  # [m] over where it stands
 
 
@@ -100,9 +98,6 @@ def test_the_fields_of_a_row_are_those_that_mujoco_compiles():
             for row, field in zip(engine.parameters, engine.batch.expand(name), strict=True):
                 model = mjcf.compile_model(vehicle_of(PAPER, row), drawn=False)
                 np.testing.assert_allclose(field, getattr(model, name), rtol=1e-14, err_msg=name)
-
-
-# --------------------------------------------------------------------------------------- drawn
 
 
 def test_what_is_drawn_lies_in_its_range_and_differs_by_rotor_row_and_episode():
@@ -181,9 +176,6 @@ def test_a_task_sees_the_specified_aircraft_unless_it_asks_for_the_true_one(rest
             assert seen.control_timestep == 0.05
             environment.step(np.zeros((4, 4)))
             environment.reset(np.array([1]))
-
-
-# --------------------------------------------------------------------------------------- refused
 
 
 def test_starts_and_parameters_are_drawn_from_streams_of_their_own():

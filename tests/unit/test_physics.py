@@ -51,9 +51,6 @@ def accelerations(
     return motion.velocity[0], motion.body_rate[0]
 
 
-# ---------------------------------------------------------------------------------------- forces
-
-
 @both
 def test_free_fall_without_drag_is_minus_g(engine):
     falling = aircraft(engine, VACUUM)
@@ -103,9 +100,6 @@ def test_the_wind_is_one_of_the_world():
     north = (math.sqrt(0.5), 0, 0, math.sqrt(0.5))
     pushed, _ = accelerations(wind=(5, 0, 0), attitude=north)
     np.testing.assert_allclose(pushed, [0.225 / 0.65, 0, -9.81], atol=1e-12)
-
-
-# ---------------------------------------------------------------------------------------- torques
 
 
 @pytest.mark.parametrize(

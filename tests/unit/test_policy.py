@@ -30,9 +30,6 @@ def write(path, arrays, header):
     return path
 
 
-# ---------------------------------------------------------------------------- what it computes
-
-
 def test_mean_action_by_hand():
     # Normalised: ((2-1)/2, (0-2)/4, (3-3)/1) = (0.5, -0.5, 0); hidden: tanh(0.5) = 0.46212,
     # -0.46212; means: 0.46212, -0.46212 + 0.5 = 0.03788, 0, 0; the log-variances are left out.
@@ -85,9 +82,6 @@ def test_a_policy_for_another_layout_is_refused(policy, settings, name, value, n
     assert caught.value.name.startswith(name) and caught.value.allowed.startswith(f"{needed} ")
 
 
-# -------------------------------------------------------------------------- saved and loaded
-
-
 @pytest.mark.parametrize("policy", [make_policy(), make_remembering(seed=3, algo="ppo")], ids=repr)
 def test_saved_and_loaded_it_is_the_same(policy, tmp_path):
     policy.save(tmp_path / "policy.safetensors")
@@ -106,9 +100,6 @@ def test_the_same_policy_is_the_same_file(tmp_path):
         make_policy().save(tmp_path / f"{k}.safetensors")
         contents.add((tmp_path / f"{k}.safetensors").read_bytes())
     assert len(contents) == 1
-
-
-# ------------------------------------------------------------------------ what is refused
 
 
 ARRAYS, RECURRENT = parts(make_policy()), parts(make_remembering())
@@ -197,9 +188,6 @@ def test_arrays_that_make_no_network_are_refused(tmp_path, own, header, change):
         Policy.load(write(path, change(own), header))
 
 
-# ------------------------------------------------------- the policies that come with the package
-
-
 def test_what_ships_is_found_by_its_task_and_by_its_own_name():
     for algo, file in (("ppo", "ppo"), ("gae", "gae"), ("vpg", "gae")):
         policy = Policy.pretrained("static_waypoint", algo)
@@ -215,9 +203,6 @@ def test_a_policy_that_does_not_ship(task, algo):
     with refused(name="pretrained policy", value=f"{task}_{algo}") as caught:
         Policy.pretrained(task, algo)
     assert all(file.stem in caught.value.allowed for file in shipped())
-
-
-# ------------------------------------------------------------------ what it needs to fly
 
 
 @pytest.mark.parametrize("name", ["hover_robust", "straight_and_level_robust"])

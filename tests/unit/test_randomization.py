@@ -62,9 +62,6 @@ def test_none_is_the_usual_flight_and_remembers_nothing():
         assert not any(name.startswith("disturbances") for name in environment.save())
 
 
-# ---------------------------------------------------------------------------------------- delay
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(
     ("drawn", "dead"),  # physics steps of 0.01 s, 5 in a control step
@@ -138,8 +135,6 @@ def test_each_row_has_a_delay_of_its_own():
     assert (moved[:, None] > moved[None])[earlier].all()
 
 
-# ---------------------------------------------------------------------------------------- errors
-
 SIZES = Errors(position=0.01, attitude=0.02, velocity=0.03, body_rate=0.04)
 
 
@@ -211,9 +206,6 @@ def test_the_goal_is_seen_from_where_the_estimate_is():
     # What has no error is seen as it is, to the last bit.
     estimate = environment.observer.frame.state
     np.testing.assert_array_equal(estimate.quaternion, state.quaternion)
-
-
-# ---------------------------------------------------------------------------------------- pushes
 
 
 @pytest.mark.parametrize("engine", ENGINES)

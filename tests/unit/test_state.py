@@ -55,9 +55,6 @@ def batch(count, vehicle=PAPER):
     return BatchEngine(vehicle, count, altitude=ALTITUDE)
 
 
-# ------------------------------------------------------------------- the kernel is the definition
-
-
 @pytest.mark.parametrize("name", FINE)
 def test_the_kernel_is_the_definition_bit_by_bit(name):
     vehicle = FINE[name]
@@ -118,9 +115,6 @@ def test_the_state_after_a_step_is_that_of_the_coordinates_and_the_last_one_stay
         for name in NAMES:
             np.testing.assert_array_equal(getattr(before, name), kept[name], err_msg=name)
         assert not np.array_equal(engine.state.position, kept["position"])
-
-
-# ------------------------------------------------------------------------------------- attitude
 
 
 def test_sines_and_cosines_are_those_of_the_z_y_x_angles():

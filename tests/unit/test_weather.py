@@ -45,9 +45,6 @@ def blown(weather, steps, **settings):
     return np.array(winds), made
 
 
-# ------------------------------------------------------------------------------ the definition
-
-
 @pytest.mark.parametrize(
     ("count", "noise_time", "as_array"),
     [(1, 0.0, np.asarray), (21, 0.5, np.asarray), (21, 0.5, torch.as_tensor)],
@@ -96,9 +93,6 @@ def test_no_step_draws_the_numbers_of_another():
     assert len(np.unique(blocks, axis=0)) == len(blocks) == 400 * air.BLOCKS
 
 
-# ----------------------------------------------------------------------------------- mean wind
-
-
 @pytest.mark.parametrize(
     ("height", "share"),
     # ln(h / 0.0457) / ln(6.096 / 0.0457), ln(6.096 / 0.0457) = 4.893
@@ -127,9 +121,6 @@ def test_directions_are_drawn_or_given():
     for of, speed in (("", 1.0), ("gust_", 5.0)):
         np.testing.assert_allclose(column(made, f"{of}east"), speed * math.cos(-1.2))
         np.testing.assert_allclose(column(made, f"{of}north"), speed * math.sin(-1.2))
-
-
-# ---------------------------------------------------------------------------------- turbulence
 
 
 def test_lengths_and_deviations_are_those_of_the_standard():
@@ -223,9 +214,6 @@ def test_the_wind_has_the_deviations_and_correlations_of_the_spectra(step_share)
         assert abs(np.corrcoef(one[60], other[60])[0, 1]) < SIGMAS / math.sqrt(3000)
 
 
-# ---------------------------------------------------------------------------------------- gust
-
-
 def test_the_gust_has_its_peak_and_its_integral():
     pulse = Weather(gust_speed=5.0, gust_time=2.0, direction=math.pi)
     winds, made = blown(pulse, 250, count=40)
@@ -245,9 +233,6 @@ def test_the_gust_has_its_peak_and_its_integral():
     # A gust that is longer than the episode begins with it.
     made, _ = process(Weather(gust_speed=5.0, gust_time=20.0), 3)
     np.testing.assert_array_equal(column(made, "gust_start"), 0)
-
-
-# ------------------------------------------------------------------------------------ the noise
 
 
 def test_noise_of_the_lift_is_of_first_order_and_changes_no_wind():
@@ -270,9 +255,6 @@ def test_noise_of_the_lift_is_of_first_order_and_changes_no_wind():
         found, expected = (noise[0] * noise[steps]).mean(axis=0), math.exp(-steps * STEP / tau)
         assert (abs(found - expected) < SIGMAS * math.sqrt(2 / count)).all()
     assert abs((noise[0, :, 0] * engine.wind[:, 2]).mean()) < SIGMAS * 0.772 / math.sqrt(count)
-
-
-# ------------------------------------------------------------------------- calm air, and by row
 
 
 def test_calm_air_costs_nothing_and_changes_nothing():
@@ -299,9 +281,6 @@ def test_rows_may_have_a_wind_speed_of_their_own():
             same.advance()
         np.testing.assert_array_equal(engine.wind[i], other.wind[i])
     assert not engine.wind[0].any()
-
-
-# --------------------------------------------------------------------------- saved, and refused
 
 
 def test_what_was_saved_in_another_weather_is_not_taken_up():
