@@ -14,52 +14,33 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import quadrl
+sys.path.append(str(Path(__file__).parents[1]))  # this file is run, too
+
+import apis  # noqa: E402
+
+from quadrl.core.environment import Environment  # noqa: E402
 
 PICTURE = {"render_mode": "rgb_array", "width": 64, "height": 48}
 KEPT = []
 
 
-def dm_control():
-    env = quadrl.load("landing")
-    env.reset()
-    env.step(np.zeros(4))
-    env.close()
+def opened(api, picture=False, **settings):
+    """An environment that is flown for a step, and closed."""
+    flown = api("landing", **settings)
+    flown.reset()
+    flown.step(np.zeros((flown.rows, 4), np.float32))
+    if picture:
+        flown.environment.render()
+    flown.environment.close()
 
 
-def gymnasium(**settings):
-    import gymnasium as gym
-
-    env = gym.make("quadrl/Landing-v0", **settings)
-    env.reset(seed=0)
-    env.step(np.zeros(4, np.float32))
-    if settings:
-        env.render()
-    env.close()
-
-
-def gymnasium_vector():
-    import gymnasium as gym
-
+def vectors():
     for engine in ("mujoco", "free_flight"):
-        envs = gym.make_vec("quadrl/Landing-v0", num_envs=8, engine=engine)
-        envs.reset(seed=0)
-        envs.step(np.zeros((8, 4), np.float32))
-        envs.close()
-
-
-def torchrl():
-    from quadrl.envs.torchrl import QuadrotorEnv
-
-    env = QuadrotorEnv("landing", 8)
-    env.rollout(1)
-    env.close()
+        opened(apis.Vector, engine=engine)
 
 
 def flights():
     """Half a second of random flights in both engines, down to the ground, with resets."""
-    from quadrl.core.environment import Environment
-
     if not KEPT:
         for engine in ("mujoco", "free_flight"):
             KEPT.append(Environment("landing", num_envs=16, num_threads=1, engine=engine))
@@ -79,11 +60,11 @@ def leak():
 # What is done; how often before the first reading, and how often then; what may be kept each time
 # [kB]. An open environment has 500 or more, dm_control's 6,000, one that draws 170,000.
 WORK = {
-    "dm_control": (dm_control, 10, 40, 60.0),
-    "gymnasium": (gymnasium, 30, 80, 5.0),
-    "gymnasium_vector": (gymnasium_vector, 30, 60, 20.0),
-    "torchrl": (torchrl, 15, 30, 20.0),
-    "picture": (lambda: gymnasium(**PICTURE), 3, 10, 2000.0),
+    "dm_control": (lambda: opened(apis.DmControl), 10, 40, 60.0),
+    "gymnasium": (lambda: opened(apis.Gymnasium), 30, 80, 5.0),
+    "gymnasium_vector": (vectors, 30, 60, 20.0),
+    "torchrl": (lambda: opened(apis.TorchRL), 15, 30, 20.0),
+    "picture": (lambda: opened(apis.Gymnasium, picture=True, **PICTURE), 3, 10, 2000.0),
     "flights": (flights, 30, 40, 5.0),
     "leak": (leak, 30, 40, 5.0),
 }
