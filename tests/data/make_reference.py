@@ -19,13 +19,11 @@ import extreme  # noqa: E402
 import helpers  # noqa: E402
 import reference  # noqa: E402
 
-PAPER = helpers.LAYOUTS["paper"]
 FLIGHTS = {name: (vehicle, 50, 3.0) for name, vehicle in helpers.LAYOUTS.items()}
 """Vehicle, number of flights, and largest wind in each direction [m/s]."""
-FLIGHTS |= {"still": (PAPER, 500, 0.0), "windy": (PAPER, 500, 3.0)}
-# New names stand at the end, so that those before them keep their seeds.
-NEW = ["crazyflie_brushless"]
-SEEDS = [name for name in sorted(FLIGHTS) if name not in NEW] + NEW
+NEW = {"crazyflie_brushless": 8}
+SEEDS = {name: seed for seed, name in enumerate(sorted(FLIGHTS.keys() - NEW))} | NEW
+"""Those of new names are given, so that the others keep theirs."""
 AIRCRAFT = 12
 
 
@@ -49,7 +47,7 @@ def seconds(vehicle):
 def flights(name):
     """Arrays of the flights of a name, with their ends."""
     vehicle, count, wind = FLIGHTS[name]
-    part = random_flights(vehicle, count, wind, seed=SEEDS.index(name))
+    part = random_flights(vehicle, count, wind, seed=SEEDS[name])
     end = reference.fly(vehicle, part["start"], part["command"], seconds(vehicle), part["wind"])
     return part | {"end": end}
 
