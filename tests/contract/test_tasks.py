@@ -87,6 +87,25 @@ def test_every_control_mode_gives_the_same_numbers_too(name, mode):
     assert flight["truncated"].sum() >= 2  # several episodes
 
 
+@dataclasses.dataclass(frozen=True)
+class Dropped(Hover):
+    """Falls to the ground, bounces and lies there."""
+
+    contact = True
+
+    def terminated(self, now):
+        return now.potentials.distance > 4.0
+
+
+@pytest.mark.parametrize("altitude", [0.9, 0.07])  # from the air, and on its feet [m]
+def test_contact_gives_the_same_numbers_too(altitude):
+    task = Dropped(altitude=altitude, radius=0.01, time_limit=2.0)
+    flight = check_identity(task, np.full((90, 2, 4), -1.0, np.float32))
+    height = flight["observation"][:, :, 2] + altitude
+    assert (height > -0.01).all()  # it never falls through the ground
+    assert (height < 0.15).sum() > 20  # and lies there for a second of the two
+
+
 # ------------------------------------------------------------------------- faults are noticed
 
 
