@@ -104,26 +104,22 @@ def test_an_unknown_name_or_value_is_refused(api, settings, name):
 
 @every_api
 @pytest.mark.parametrize(
-    ("action", "name", "value"),
+    ("action", "name"),
     [
-        (np.zeros(3), "action shape", (3,)),
-        (np.zeros((1, 4)), "action shape", (1, 4)),
-        (np.array([0, 0, np.nan, 0]), "action[0, 2]", None),
-        (np.array([0, -np.inf, 0, 0]), "action[0, 1]", -np.inf),
+        (np.zeros(3), "action shape"),
+        (np.zeros((1, 4)), "action shape"),
+        (np.array([0, 0, np.nan, 0]), "action[0, 2]"),
+        (np.array([0, -np.inf, 0, 0]), "action[0, 1]"),
     ],
     ids=["short", "nested", "nan", "infinite"],
 )
-def test_an_impossible_action_is_refused(api, action, name, value):
+def test_an_impossible_action_is_refused(api, action, name):
     flown = api()
     flown.reset()
-    actions = np.stack([action] * flown.rows)
     with pytest.raises((QuadrlError, RuntimeError)) as caught:
-        flown.step(actions)
+        flown.step(np.stack([action] * flown.rows))
     if isinstance(caught.value, QuadrlError):  # TorchRL itself refuses a wrong shape
         assert caught.value.name == name
-        if value is not None:
-            leading = actions.shape if name == "action shape" else value
-            assert caught.value.value == leading
     flown.step(np.zeros((flown.rows, 4), np.float32))  # nothing has broken
 
 

@@ -214,11 +214,7 @@ def test_each_axis_has_a_factor_of_its_own_of_which_there_is_a_body():
     np.testing.assert_allclose(table["inertia"], np.minimum(wanted, rest), rtol=1e-14)
     assert (wanted > rest).any()  # z of the paper's is 1.3 of a possible 1.5
     np.testing.assert_allclose(table["rotor_inertia"], 6e-5 * shown["rotor_inertia"])
-    for name, low, high in ((axes, 0.9, 1.1), (shown["rotor_inertia"], 0.5, 1.5)):
-        share = (name - low) / (high - low)
-        # The mean of 500 even numbers has a deviation of 0.0129.
-        np.testing.assert_allclose(share.mean(axis=0), 0.5, atol=5 * 0.0129)
-        assert np.ptp(share, axis=0).min() > 0.97
+    assert np.ptp(axes, axis=0).min() > 0.97 * 0.2 and np.ptp(shown["rotor_inertia"]) > 0.97
     for vehicle in VEHICLES.values():
         heavy = AircraftSampler({"inertia_axes": (0.5, 2.0)}, vehicle)
         inertia = heavy.table(heavy.sample(np.random.default_rng(0).random((99, len(heavy.names)))))
@@ -237,8 +233,6 @@ def test_a_steady_force_and_moment_accelerate_by_what_they_are(engine):
     np.testing.assert_allclose(table["steady_force"], WEIGHT * force, rtol=1e-14)
     np.testing.assert_allclose(table["steady_moment"], WEIGHT * 0.23 * moment, rtol=1e-14)
     for shares, size in ((force, 0.05), (moment, 0.002)):
-        # The mean of 200 even numbers between -1 and 1 has a deviation of 0.041.
-        np.testing.assert_allclose(shares.mean(axis=0) / size, 0.0, atol=5 * 0.041)
         assert np.abs(shares).max() <= size and (np.ptp(shares, axis=0) > 1.9 * size).all()
     # Level and at rest with rotors at hover speed, a physics step of 0.01 s.
     flown = environment.engine

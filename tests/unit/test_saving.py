@@ -97,14 +97,9 @@ def test_wind_that_somebody_sets_survives_save_and_restore(engine):
     saved = environment.save()
     other.restore(saved)
     np.testing.assert_array_equal(other.engine.wind, environment.engine.wind)
-    calm = flying(randomization=None, engine=engine, seed=3)
-    calm.restore(saved)
-    calm.engine.wind[:] = 0.0
     for action in helpers.random_actions(5, 4):
-        records = [helpers.recorded(e, e.step(action)) for e in (environment, other, calm)]
-    helpers.assert_records(records[1:2], records[:1])
-    apart = np.abs(records[2]["coordinates"] - records[0]["coordinates"])
-    assert (apart[1:, 7:10].max(axis=1) > 1e-3).all()  # [m/s]
+        records = [helpers.recorded(e, e.step(action)) for e in (environment, other)]
+        helpers.assert_records(records[1:], records[:1])
 
 
 @pytest.mark.parametrize(
