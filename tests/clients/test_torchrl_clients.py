@@ -1,4 +1,4 @@
-"""TorchRL's own environments, wrappers and collectors on ours, as they come."""
+"""TorchRL's own environments, wrappers and recorders on ours, as they come."""
 
 import gymnasium as gym
 import numpy as np

@@ -1,4 +1,4 @@
-"""What concerns the whole process: builds, spawned workers, MuJoCo's clock, what is missing."""
+"""What concerns the whole process: builds, spawned workers, MuJoCo's clock, limits and forks."""
 
 import multiprocessing
 import os

@@ -1,4 +1,4 @@
-"""The policy as numbers: what it computes, what it refuses to read, what it does not import."""
+"""The policy as numbers: what it computes, what it refuses to read, what it needs to fly."""
 
 import json
 

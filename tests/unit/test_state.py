@@ -81,20 +81,6 @@ def test_the_kernel_straight_up_is_the_definition_bit_by_bit():
     np.testing.assert_array_equal(placed.cos_attitude[:2], 0)
 
 
-@pytest.mark.parametrize("rows", [[0], [6], [1, 4, 5], list(range(7)), []])
-def test_placing_some_rows_leaves_the_others(rows):
-    engine, everyone = batch(7), random_start(2, 7)
-    engine.place(np.arange(7), everyone)
-    rows, some = np.array(rows, dtype=np.int64), random_start(3, len(rows))
-    assert_same(engine.place(rows, some), defined(some))
-    assert_same(engine.state, defined(some), rows)
-    others = np.setdiff1d(np.arange(7), rows)
-    rest = Start(**{name: value[others] for name, value in fields(everyone).items()})
-    assert_same(engine.state, defined(rest), others)
-    np.testing.assert_array_equal(engine.qpos[rows, :3], some.position + [0, 0, ALTITUDE])
-    np.testing.assert_array_equal(engine.qpos[others, 3:], everyone.quaternion[others])
-
-
 def test_the_state_after_a_step_is_that_of_the_coordinates_and_the_last_one_stays_whole():
     engine = batch(9)
     engine.place(np.arange(9), random_start(4, 9))
