@@ -15,7 +15,6 @@ from rich.console import Console
 from runs import TINY
 
 import quadrl
-from quadrl.base.files import free_name
 from quadrl.base.progress import ProgressBar
 from quadrl.cli import main
 from quadrl.evaluation.controllers import make_controller
@@ -55,13 +54,6 @@ def test_train_goes_on_further(run, tmp_path):
     assert further.policy.metadata["steps"] == 256 == further.config.steps
     with refused("seed", 4):
         quadrl.train(resume=folder, seed=4)
-
-
-def test_the_folder_of_a_run_is_a_new_one(tmp_path):
-    for name in ("a", "a-2", "a-3"):
-        assert free_name(tmp_path / "a", "config.json") == tmp_path / name
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "config.json").touch()
 
 
 def test_evaluate_takes_whatever_flies(run, tmp_path):

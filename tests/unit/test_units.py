@@ -7,33 +7,30 @@ import pytest
 from quadrl.base import units
 from quadrl.base.progress import TimeLeft
 
+LENGTHS = [
+    (0.0, "0 µm"),
+    (1e-9, "under 0.1 µm"),
+    (7.6e-7, "0.76 µm"),
+    (5.3e-5, "53 µm"),
+    (9.9996e-4, "1.00 mm"),
+    (0.0052, "5.2 mm"),
+    (0.0112, "1.1 cm"),
+    (-0.123, "-12 cm"),
+    (1234.0, "1,234 m"),
+    (math.nan, "nan µm"),
+]
+SHARES = [(1.0, "100 %"), (0.9999, "99.99 %"), (0.995, "99.5 %"), (0.12, "12 %"), (0.0, "0 %")]
+SHARES += [(0.0004, "0.04 %")]  # only all is a hundred percent, and only none is zero
+TIMES = [(0.4, "0 s"), (59.7, "1:00 min"), (725, "12:05 min"), (12000, "3:20 h")]
+
 
 @pytest.mark.parametrize(
-    ("metres", "text"),
-    [
-        (0.0, "0 µm"),
-        (1e-9, "under 0.1 µm"),
-        (7.6e-7, "0.76 µm"),
-        (5.3e-5, "53 µm"),
-        (9.9996e-4, "1.00 mm"),
-        (0.0052, "5.2 mm"),
-        (0.0112, "1.1 cm"),
-        (-0.123, "-12 cm"),
-        (1234.0, "1,234 m"),
-        (math.nan, "nan µm"),
-    ],
+    ("shown", "cases"),
+    [(units.length, LENGTHS), (units.percent, SHARES), (units.duration, TIMES)],
+    ids=["length", "share", "time"],
 )
-def test_a_length_is_shown_in_the_unit_that_fits(metres, text):
-    assert units.length(metres) == text
-
-
-@pytest.mark.parametrize(
-    ("share", "text"),
-    [(1.0, "100 %"), (0.9999, "99.99 %"), (0.995, "99.5 %"), (0.12, "12 %"), (0.0, "0 %"),
-     (0.0004, "0.04 %")],
-)  # fmt: skip
-def test_only_all_is_a_hundred_percent(share, text):
-    assert units.percent(share) == text
+def test_a_number_is_shown_in_the_unit_that_fits(shown, cases):
+    assert [shown(number) for number, _ in cases] == [text for _, text in cases]
 
 
 def test_a_metric_has_the_unit_of_its_name():
@@ -53,13 +50,6 @@ def test_a_metric_has_the_unit_of_its_name():
     }
     shown = {name: units.quantity(name, value) for name, (value, _) in metrics.items()}
     assert shown == {name: text for name, (_, text) in metrics.items()}
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.4, "0 s"), (59.7, "1:00 min"), (725, "12:05 min"), (12000, "3:20 h")]
-)
-def test_a_time_is_short(seconds, text):
-    assert units.duration(seconds) == text
 
 
 def test_the_time_left_is_told_from_the_speed_since_the_first_look(monkeypatch):
