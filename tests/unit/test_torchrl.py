@@ -1,7 +1,5 @@
 """TorchRL's batched environment, and TorchRL's wrappers of the other APIs."""
 
-import math
-
 import gymnasium as gym
 import pytest
 import torch
@@ -27,28 +25,6 @@ def policy(actions, sees="observation"):
 def rollout(environment):
     """A rollout of ACTIONS, [N, T]; resets are in between."""
     return environment.rollout(len(ACTIONS), policy(ACTIONS), break_when_any_done=False)
-
-
-def test_shapes_types_and_flags_are_those_of_torchrl():
-    anywhere = {"tolerance": 9.0, "heading_tolerance": math.pi}
-    environment = QuadrotorEnv("hover", COUNT, seed=0, time_limit=0.5, **anywhere)
-    flown = rollout(environment)
-    assert environment.num_envs == COUNT
-    assert environment.batch_size == torch.Size([COUNT])
-    assert flown["action"].shape == (COUNT, 60, 4)
-    after = flown["next"]
-    assert after["observation"].dtype == after["reward"].dtype == torch.float32
-    assert after["reward"].shape == after["done"].shape == (COUNT, 60, 1)
-    over = after["terminated"] | after["truncated"]
-    assert torch.equal(after["done"], over)
-    assert not (after["terminated"] & after["truncated"]).any()
-    # Episodes of ten steps, all of them successful with such a tolerance.
-    every_tenth = (torch.arange(60) % 10 == 9).expand(COUNT, 60)[..., None]
-    assert torch.equal(after["truncated"], every_tenth)
-    assert torch.equal(after["is_success"], every_tenth)
-    # The final observation stays, and the next step meets that of the new episode.
-    end, start = after["observation"][:, :-1], flown["observation"][:, 1:]
-    assert torch.equal((end != start).any(-1), every_tenth[:, :-1, 0])
 
 
 @pytest.mark.parametrize("task", ["hover", "target_following"])
