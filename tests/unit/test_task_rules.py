@@ -113,6 +113,7 @@ LANDINGS = [
     ((0, 0, 2), -2.1, 0, (0, 0, 0), (True, False)),  # in its own wash
     ((0, 0, 4.9), 0, 0, (0, 0, 0), (False, False)),
     ((0, 0, 5.1), 0, 0, (0, 0, 0), (True, False)),  # away
+    ((0, 0, 0.1), 0.2, 0, (1, 0, 0), (False, False)),  # bounced
 ]
 
 
@@ -122,8 +123,10 @@ def test_landing_by_hand():
     place = position, climb[:, None] * [0, 0, 1], roll
     memory = zip(("down", "rest", "speed"), remembered.T.astype(float), strict=True)
     before, episode = snapshot(task, *place, **dict(memory))
-    *_, now = finished(task, before, episode, *place)
+    after, _, now = finished(task, before, episode, *place)
     np.testing.assert_array_equal(np.stack([now.terminated, now.is_success], axis=-1), ends)
+    np.testing.assert_allclose(after.task.speed, np.abs(climb))
+    assert after.task.down[-1] == 1  # it stays so
 
 
 def test_who_rests_with_another_heading_has_not_crashed():
