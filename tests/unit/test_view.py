@@ -70,6 +70,8 @@ def test_between_two_steps_the_aircraft_is_drawn_between_their_poses():
     np.testing.assert_allclose(drawn[:, :3], expected, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(drawn[:, 3:7], axis=1), 1.0)
     assert (np.abs((drawn[:, 3:7] * flight.pose[:, 3:7]).sum(1)) > 0.99).all()
+    spins = np.sign([rotor.spin for rotor in VEHICLE.rotors])
+    np.testing.assert_array_equal(np.sign(flight.pose[0, 7:]), spins)  # the blades turn
 
 
 def test_an_episode_that_ends_begins_anew_without_a_jump_in_the_picture():
