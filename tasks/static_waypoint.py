@@ -72,7 +72,7 @@ class StaticWaypoint(Task):
         name, route = f"{self.name} waypoints", self.waypoints
         listed = isinstance(route, (Sequence, np.ndarray)) and not isinstance(route, str)
         if not listed or not len(route):
-            raise QuadrlError(name=name, value=route, allowed="at least one point (x, y, z)")
+            raise QuadrlError(name=name, value=route, allowed="at least one point [x, y, z]")
         points = tuple(numbers(name, point, 3, -MAX_OPTION, MAX_OPTION) for point in route)
         object.__setattr__(self, "waypoints", points)
         super().__post_init__()

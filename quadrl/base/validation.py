@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import math
 import numbers as abstract
 from collections.abc import Iterable, Mapping, Sequence
@@ -202,8 +203,9 @@ def like(name: str, value: Any, default: Any) -> Any:
     Raises:
         QuadrlError: The value is of another kind, not finite, or larger than `MAX_OPTION`.
     """
-    if _kind(value) != _kind(default):
-        allowed = f"a {_kind(default)}, such as {default!r}"
+    if _kind(value) != (kind := _kind(default)):
+        example = json.dumps(default or [0, 0, 1]) if kind == "sequence" else repr(default)
+        allowed = f"a {kind}, such as {example}"
         raise QuadrlError(name=name, value=value, allowed=allowed)
     if isinstance(value, (str, bool)) or value is None:
         return value
