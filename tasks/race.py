@@ -28,8 +28,8 @@ class Race(GateRace):
     asks = "fly through the gates of a track in order, as fast as possible"
     starts = "at rest within 0.1 m of the track's start, any heading, tilted up to 0.3 rad"
     ends = (
-        "through the last gate (success); through the frame of any gate, on the ground, more than "
-        "5 m farther from the next gate than when the last was passed"
+        "through the last gate (success); through the frame of the next gate, on the ground, more "
+        "than 5 m farther from the next gate than when the last was passed"
     )
     solved = "through every gate of every lap"
     targets = (
@@ -54,8 +54,8 @@ class Race(GateRace):
 
     track: str = "split_s"
     """Name of the track: airsim, alphapilot or split_s."""
-    gates: tuple[tuple[float, ...], ...] = ()
-    """Gates of one's own: x, y, z [m], heading and climb [deg] of the way through each; () for
+    gates: tuple[tuple[float, ...], ...] | None = None
+    """Gates of one's own: x, y, z [m], heading and climb [deg] of the way through each; by default
     those of the track."""
     start: tuple[float, ...] = ()
     """Where a race begins [m]; () for that of the track, or 5 m before the first of own gates."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.resources
-import itertools
 import json
 import math
 from collections.abc import Iterator
@@ -49,28 +48,24 @@ class Track:
         """Refuse a track that cannot be flown.
 
         Raises:
-            QuadrlError: It has no gates, or a number is impossible, or gates overlap.
+            QuadrlError: A number is impossible, or gates overlap.
         """
-        if not len(self.gates):
-            allowed = "at least one gate (x, y, z, heading, climb)"
-            raise QuadrlError(name=f"{self.name} gates", value=self.gates, allowed=allowed)
         number(f"{self.name} opening", self.opening, positive=True)
         number(f"{self.name} frame", self.frame, self.opening)
-        for (k, gate), (n, other) in itertools.combinations(enumerate(self.gates, 1), 2):
-            if (apart := math.dist(gate[:3], other[:3])) < self.frame:
-                reason = f"gates {k} and {n} overlap: their frames are as wide"
-                what, allowed = f"{self.name} gates", f"centres at least {self.frame:g} m apart"
-                raise QuadrlError(reason, name=what, value=round(apart, 3), allowed=allowed)
+        for k, n in self._overlapping():
+            what, centres = f"{self.name} gates {k + 1} and {n + 1}", self.centre[[k, n]]
+            allowed = f"centres so far apart that frames of {self.frame:g} m do not overlap"
+            raise QuadrlError(name=what, value=centres, allowed=allowed)
 
     @classmethod
     def of(
-        cls, name: str, gates: Any = (), start: Any = (), opening: float = 0, frame: float = 0
+        cls, name: str, gates: Any = None, start: Any = (), opening: float = 0, frame: float = 0
     ) -> Track:
         """Make a known track, or one of own gates, with what differs from it.
 
         Args:
             name: A name of `NAMES`.
-            gates: As `Track.gates`; () for those of the track.
+            gates: As `Track.gates`; None for those of the track.
             start: As `Track.start`; () for that of the track, or before the first of own gates.
             opening: As `Track.opening`; 0 for that of the track.
             frame: As `Track.frame`; 0 for that of the track.
@@ -80,9 +75,10 @@ class Track:
         """
         listed = known(choice("track", name, NAMES))
         size, rows = (-MAX_OPTION, MAX_OPTION), listed.gates
-        if isinstance(gates, str) or not hasattr(gates, "__len__"):
-            raise QuadrlError(name="gates", value=gates, allowed="rows x, y, z, heading, climb")
-        if len(gates):
+        if gates is not None:
+            if isinstance(gates, str) or not hasattr(gates, "__len__") or not len(gates):
+                allowed = "at least one row [x, y, z, heading, climb]"
+                raise QuadrlError(name="gates", value=gates, allowed=allowed)
             rows = tuple(numbers(f"gates[{k}]", gate, 5, *size) for k, gate in enumerate(gates))
             name, listed = "own", dataclasses.replace(listed, start=_before(rows[0]))
         if len(numbers("start", start)):
@@ -103,6 +99,19 @@ class Track:
         through = level * np.cos(climb) + np.array([zero, zero, np.sin(climb)])
         left = np.array([-np.sin(heading), np.cos(heading), zero])
         return _fixed(np.stack([through.T, left.T, np.cross(through.T, left.T)], axis=1))
+
+    def _overlapping(self) -> np.ndarray:
+        """Pairs (n, 2) of gates whose frames, as they are drawn, no plane keeps apart."""
+        first, second = np.triu_indices(len(self.gates), 1)
+        one, other = self.axes[first], self.axes[second]
+        off = self.centre[second] - self.centre[first]
+        # Of boxes it is enough to look along their edges, and across any two of them.
+        across = np.cross(one[:, :, None], other[:, None]).reshape(-1, 9, 3)
+        ways = np.concatenate([one, other, across], axis=1)
+        half = np.array([DEPTH, 1.0, 1.0]) * (self.frame / 2 - 1e-9)  # they may touch
+        reach = sum(abs(ways @ axes.swapaxes(1, 2)) @ half for axes in (one, other))
+        apart = (abs(ways @ off[..., None])[..., 0] > reach).any(axis=1)
+        return np.stack([first, second], axis=1)[~apart]
 
     def drawn(self, following: int, centre: Any, axes: Any) -> Iterator[Primitive]:
         """The frames, that of the gate with a number in another colour.

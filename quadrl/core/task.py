@@ -119,7 +119,7 @@ class Task(abc.ABC):
         number(f"{self.name} time_limit", self.time_limit, positive=True)
         for field in dataclasses.fields(self):
             default, name = field.default, f"{self.name} {field.name}"
-            if default is dataclasses.MISSING:
+            if default is dataclasses.MISSING or default is None:  # the task's own to check
                 continue
             value = like(name, getattr(self, field.name), default)
             counts = isinstance(default, (int, float)) and not isinstance(default, bool)

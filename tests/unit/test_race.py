@@ -198,20 +198,47 @@ def test_the_geometric_controller_comes_through_on_the_racer():
     assert figures["success_rate"] == 1.0 and figures["race_time_mean_s"] < 25.0
 
 
-OVERLAP = ((0.0, 0.0, 5.0, 0.0, 0.0), (0.0, 1.0, 5.0, 0.0, 0.0))
+FIRST = (0.0, 0.0, 5.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("second", "overlaps"),
+    [
+        ((0.0, 1.0, 5.0, 0.0, 0.0), True),
+        ((0.0, 1.5, 6.5, 0.0, 0.0), True),
+        ((0.0, 1.5, 7.0, 0.0, 0.0), False),
+        ((0.0, -2.0, 5.0, 180.0, 0.0), False),  # side by side
+        ((0.02, 0.0, 6.9, 180.0, 0.0), True),  # a frame is 6 cm deep
+        ((0.1, 0.0, 5.0, 0.0, 0.0), False),
+        ((0.9, 0.0, 5.0, 90.0, 0.0), True),  # the edge of one across the other, and before it
+        ((1.1, 0.0, 5.0, 90.0, 0.0), False),
+        ((0.0, 0.9, 5.0, 45.0, 0.0), True),  # it crosses the plane of the first at its centre
+        ((0.0, 1.1, 5.0, 45.0, 0.0), False),
+        ((0.0, 0.0, 6.1, 0.0, 90.0), False),  # flat above it
+    ],
+)
+def test_gates_whose_frames_overlap_are_refused(second, overlaps):
+    """Frames of 2 m in the plane x = 0 and elsewhere."""
+    given = {"gates": (FIRST, second), "track": "split_s"}
+    if not overlaps:
+        assert len(Race(**given).course.gates) == 2
+        return
+    with refused("own gates 1 and 2", match=r"\[\[0.0, 0.0, 5.0\], .*frames of 2 m do not overlap"):
+        Race(**given)
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         ({"track": "split"}, "split_s"),
-        ({"gates": OVERLAP}, "gates 1 and 2 overlap"),
-        ({"gates": ((0.0, 0.0, 5.0, 0.0),)}, "5 numbers"),
-        ({"gates": "split_s"}, "sequence"),
+        ({"gates": ()}, r"gates = \(\): must be at least one row"),
+        ({"gates": (FIRST[:4],)}, "5 numbers"),
+        ({"gates": "split_s"}, "at least one row"),
+        ({"start": "(0, 0, 5)"}, r"a sequence, such as \[0, 0, 1\]"),
         ({"start": (0.0, 0.0)}, "3 numbers"),
         ({"opening": 3.0}, "frame"),
         ({"opening": -1.0}, "opening"),
-        ({"frame": 2.5}, "gates 4 and 5 overlap"),
+        ({"frame": 2.5}, "gates 4 and 5"),
         ({"margin": 0.8}, "margin"),
         ({"flying": 1.5}, "flying"),
         ({"laps": 0}, "laps"),
