@@ -153,7 +153,9 @@ class Trace:
             name, values = "multiply", (values[0], values[0])
         flags = [_is_flag(value) for value in values]
         known = flags[0] if name == "where" else all(flags) == (name in LOGICAL)
-        if name not in C or not known or len(self.known) > self.max_operations:
+        if len(self.known) > self.max_operations:
+            raise NotCompilable(f"it needs more than {self.max_operations} operations")
+        if name not in C or not known:
             raise NotCompilable(f"{name} cannot be compiled")
         names = tuple(self.name_of(value) for value in values)
         is_flag = name in FLAGS or (name == "where" and all(flags))
