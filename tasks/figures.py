@@ -81,16 +81,16 @@ class Figure(Table):
     def sampled(self, order: int) -> np.ndarray:
         """Places [m] or accelerations [m/s^2] (its derivative 0 or 2), (n, 3)."""
         if self.name == "random":
-            most = (1.0, 0.0, CLIMB) if order else (1.5, 1.5, 1.5)
-            return np.array([most]) * (self.acceleration if order else self.extent)
+            most = np.array((1.0, 0.0, CLIMB) if order else (1.5, 1.5, 1.5))
+            return np.array([most, -most]) * (self.acceleration if order else self.extent)
         if self.name in SINES:
             none = np.zeros(1, dtype=int)
             one = self.reference(Rng(none, none), np.zeros((1, AXES)))
             return self.at(one, np.linspace(0.0, self.cycle, 400), order)
         return self.pieces[:, order] * math.factorial(order)
 
-    def check_room(self, name: str, box: float, lowest: float) -> None:
-        """Refuse what leaves the box [m] or sinks below a height [m].
+    def check_room(self, task: str, box: float, lowest: float) -> None:
+        """Refuse what leaves the box [m] of a task or sinks below a height [m].
 
         Raises:
             QuadrlError: The message says how far it goes.
@@ -99,10 +99,12 @@ class Figure(Table):
         most = np.abs(place).max(axis=0)
         if most.max() > box or place[:, 2].min() < lowest:
             reason = f"it goes {', '.join(f'{x:.3g}' for x in most)} m far in x, y and z"
-            allowed = f"within {box:g} m (box), {LOWEST:g} m above the ground"
-            raise QuadrlError(reason, name=name, value=self.name, allowed=allowed)
+            allowed = f"such that it stays within {box:g} m (box), {LOWEST:g} m above the ground"
+            random = self.name == "random"
+            option, value = ("extent", self.extent) if random else ("figure", self.name)
+            raise QuadrlError(reason, name=f"{task} {option}", value=value, allowed=allowed)
 
-    def check_thrust(self, name: str, parameters: Parameters) -> None:
+    def check_thrust(self, task: str, parameters: Parameters) -> None:
         """Refuse what asks for more thrust than an aircraft has.
 
         Raises:
@@ -113,7 +115,11 @@ class Figure(Table):
         asked = np.linalg.norm(self.sampled(2) + up, axis=-1).max() / GRAVITY
         if asked > (there := float(thrust.min()) / GRAVITY):
             reason = f"it asks for {asked:.3g} weights of thrust, and the aircraft has {there:.3g}"
-            raise QuadrlError(reason, name=name, value=self.name, allowed="a slower one")
+            blamed = {"random": ("acceleration", self.acceleration, "smaller")}
+            blamed |= dict.fromkeys(SINES, ("period", self.cycle, "longer"))
+            usual = "figure", self.name, "a slower one"
+            option, value, allowed = blamed.get(self.name, usual)
+            raise QuadrlError(reason, name=f"{task} {option}", value=value, allowed=allowed)
 
     def _random(self, rng: Rng) -> Reference:
         """Two sines in each coordinate, from slow ones to those of the largest acceleration."""

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
+import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +19,8 @@ from quadrl.engines.state import State
 
 AXES, WAVES = 3, 2  # sines in each coordinate
 PIECE = 0.02  # [s], length of a piece of a table
-LONGEST_GAP, FASTEST = 0.5, 20.0  # [s], [m/s], from one row of a file to the next
+# From one row of a file to the next [s], [m/s], [rad/s].
+LONGEST_GAP, FASTEST, FASTEST_TURN = 0.5, 20.0, 10.0
 FILE = "a csv file: a line of names, then at least 4 rows of time [s], x, y, z [m], maybe yaw [rad]"
 
 
@@ -128,21 +132,35 @@ def read(name: str, path: str) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         QuadrlError: There is no such file, or it has a gap or a jump. `name` is what it is called.
     """
+
+    def refusal(reason: str, allowed: str = FILE) -> QuadrlError:
+        return QuadrlError(reason, name=name, value=path, allowed=allowed)
+
     try:
-        rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        head, *lines = Path(path).read_text(encoding="utf-8-sig").splitlines() or [""]
+        with warnings.catch_warnings(action="ignore"):  # there may be no rows
+            rows = np.loadtxt(lines, delimiter=",", ndmin=2)
     except (OSError, ValueError) as error:
-        reason = str(error).partition("\n")[0]
-        raise QuadrlError(reason, name=name, value=path, allowed=FILE) from error
-    whole = rows.shape[1] in (4, 5) and len(rows) >= 4 and np.isfinite(rows).all()
-    if not whole or rows[0, 0] != 0:
-        reason = f"it has {len(rows)} rows of {rows.shape[1]} numbers"
-        allowed = f"{FILE}, finite and from time 0 on"
-        raise QuadrlError(reason, name=name, value=path, allowed=allowed)
+        reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
+        raise refusal(reason) from error
+    if re.match(r"\s*[-+.\d]", head):
+        raise refusal(f"its first line, {head}, has no names")
+    if rows.shape[1] not in (4, 5) or len(rows) < 4:
+        each = f" of {rows.shape[1]} numbers" if len(rows) else ""
+        raise refusal(f"it has {len(rows)} rows{each}")
+    for k in np.flatnonzero(~np.isfinite(rows).all(axis=1))[:1]:
+        raise refusal(f"row {k + 1} is {rows[k].tolist()}", "finite numbers")
+    if rows[0, 0] != 0:
+        raise refusal(f"row 1 is at {rows[0, 0]:g} s", "from time 0 on")
     step = np.diff(rows[:, 0])
-    speed = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1) / np.maximum(step, 1e-9)
-    wrong = (step <= 0) | (step > LONGEST_GAP) | (speed > FASTEST)
+    for k in np.flatnonzero(step <= 0)[:1]:
+        reason = f"from row {k + 1} to {k + 2} it goes from {rows[k, 0]:g} to {rows[k + 1, 0]:g} s"
+        raise refusal(reason, "times that grow from row to row")
+    speed = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1) / step
+    turn = abs(np.diff(np.unwrap(rows[:, 4:], axis=0), axis=0)).sum(axis=1) / step  # 0 without yaw
+    wrong = (step > LONGEST_GAP) | (speed > FASTEST) | (turn > FASTEST_TURN)
     for k in np.flatnonzero(wrong)[:1]:
-        reason = f"from row {k + 1} to {k + 2} it takes {step[k]:.3g} s at {speed[k]:.3g} m/s"
-        allowed = f"steps of up to {LONGEST_GAP:g} s at up to {FASTEST:g} m/s"
-        raise QuadrlError(reason, name=name, value=path, allowed=allowed)
+        how = f"{step[k]:.3g} s at {speed[k]:.3g} m/s and {turn[k]:.3g} rad/s"
+        allowed = f"of up to {LONGEST_GAP:g} s at up to {FASTEST:g} m/s and {FASTEST_TURN:g} rad/s"
+        raise refusal(f"from row {k + 1} to {k + 2} it takes {how}", f"steps {allowed}")
     return rows[None, :, 0], rows[None, :, 1:]

@@ -97,11 +97,11 @@ class Trajectory(Task):
         name, seconds = f"{self.name} figure", self.time_limit + AHEAD * EVERY
         known = self.cycle, self.acceleration, self.extent
         object.__setattr__(self, "curve", Figure.of(self.figure, seconds, name, *known))
-        self.curve.check_room(name, self.box, LOWEST - self.altitude)
+        self.curve.check_room(self.name, self.box, LOWEST - self.altitude)
 
     def check(self, parameters: Parameters) -> None:
         """Refuse a reference that asks for more thrust than there is."""
-        self.curve.check_thrust(f"{self.name} figure", parameters)
+        self.curve.check_thrust(self.name, parameters)
 
     @property
     def cycle(self) -> float:

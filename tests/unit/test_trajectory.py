@@ -102,9 +102,12 @@ STEADY = [(0.1 * k, 0.01 * k, 0, 0) for k in range(9)]
     [
         (STEADY[:5] + [(1.5, 0.05, 0, 0)], "from row 5 to 6 it takes 1.1 s"),  # a gap
         (STEADY[:5] + [(0.5, 9.0, 0, 0)], "from row 5 to 6 it takes 0.1 s at 89.6 m/s"),  # a jump
-        (STEADY[:5] + [(0.4, 0.05, 0, 0)], "from row 5 to 6 it takes 0 s"),
+        ([(*row, 3.0 * (row[0] > 0.4)) for row in STEADY], "from row 5 to 6 it .* and 30 rad/s"),
+        (STEADY[:5] + [(0.3, 0.05, 0, 0)], "from row 5 to 6 it goes from 0.4 to 0.3 s"),
+        ([], "it has 0 rows$"),
         (STEADY[:5] + [(0.5, "", 0, 0)], "could not convert"),
-        (STEADY[1:], "from time 0 on"),
+        (STEADY[:5] + [(0.5, "nan", 0, 0)], "finite numbers; row 6 is .0.5, nan, 0.0, 0.0"),
+        (STEADY[1:], "from time 0 on; row 1 is at 0.1 s"),
         (STEADY[:3], "at least 4 rows"),
         ([row[:3] for row in STEADY], "9 rows of 3 numbers"),
         ([(t, 50 * x, y, z) for t, x, y, z in STEADY], "within 3 m"),
@@ -124,7 +127,8 @@ def test_a_faulty_file_is_refused(rows, message, tmp_path):
         ({"figure": "none.csv"}, "figure", "a csv file"),
         ({"period": 5.0}, "period", "lemniscate, vertical"),
         ({"figure": "lemniscate", "period": 0.5}, "period", "at least 1 s"),
-        ({"extent": 2.5}, "figure", "box"),
+        ({"extent": 2.5}, "extent", "box"),
+        ({"altitude": 1.0}, "extent", "0.3 m above the ground; it goes 1.5"),
     ],
 )
 def test_an_impossible_reference_is_refused(options, name, message):
@@ -132,11 +136,22 @@ def test_an_impossible_reference_is_refused(options, name, message):
         tasks.make("trajectory", **options)
 
 
+@pytest.mark.parametrize("head", ["0,0,0,0", ""])
+def test_a_file_without_names_or_rows_is_refused_and_nothing_else_is_said(head, tmp_path, recwarn):
+    path = tmp_path / "own.csv"
+    path.write_text(head + "\n0.1,0,0,0" * 5 * bool(head))
+    with refused("trajectory figure", str(path), match="no names" if head else "0 rows"):
+        tasks.make("trajectory", figure=str(path))
+    assert not recwarn
+
+
 def test_more_thrust_than_there_is_is_refused():
     eight = tasks.make("trajectory", figure="lemniscate", period=2.0)
     # (2 pi / 2 s)^2 * 2.13 m = 21 m/s^2 level: 2.36 weights, of which the Crazyflie has 1.65.
-    with refused(match="2.36 weights of thrust, and the aircraft has 1.65"):
+    with refused("trajectory period", 2.0, match="2.36 weights of .*, and the aircraft has 1.65"):
         Environment(eight, vehicle="crazyflie")
+    with refused("trajectory acceleration", 30.0, allowed="smaller"):
+        Environment("trajectory", vehicle="crazyflie", task_options={"acceleration": 30.0})
     Environment(eight, vehicle="racer")
 
 
