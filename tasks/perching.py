@@ -29,6 +29,7 @@ NEAR = 0.6  # [m], from the goal, where the attitude counts half
 SPREAD = 0.2  # of what is beside a way, as a share of what is beside a start
 WORST = 3.0  # times what a limit is exceeded by, or [m/s] of what strikes: more costs no more
 OFF = 1.0  # [m], from the middle of the surface
+ROOM = 0.3  # [m], between the surface and the centre of an aircraft at the start
 NORMAL = ObservationTerm(3, "1", "unit vector out of the surface, body frame")
 
 
@@ -125,6 +126,10 @@ class Perching(Task):
         """Validate the ranges."""
         super().__post_init__()
         number(f"{self.name} most_incline", self.most_incline, self.least_incline, math.pi)
+        incline = np.linspace(self.least_incline, self.most_incline)
+        beside = self.aside * abs(np.cos(incline))  # by which a start may be nearer to the surface
+        nearest = (ROOM + beside) / np.sin((math.pi / 2 + incline) / 2)
+        number(f"{self.name} nearest", self.nearest, float(nearest.max()))
         number(f"{self.name} farthest", self.farthest, self.nearest, self.max_distance)
         number(f"{self.name} most_touch", self.most_touch, self.least_touch)
         if self.most_touch == self.least_touch:

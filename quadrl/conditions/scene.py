@@ -8,6 +8,7 @@ near one to MuJoCo. The `Surroundings` of a snapshot have clearances and hits.
 from __future__ import annotations
 
 import dataclasses
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -21,6 +22,7 @@ from quadrl.base.rotation import Array, cross
 from quadrl.conditions.solids import Pose, Solid, heading
 from quadrl.engines.engine import Engine
 from quadrl.engines.solids import KINDS, MOTION
+from quadrl.engines.state import Start
 
 FAR = 1000.0  # [m]
 HIDDEN = 3
@@ -134,6 +136,31 @@ class Scene:
                 made[:, k, :3] = position + origin + _rotated(turn, offset)
                 made[:, k, 3:] = turn
         return made
+
+    def check_start(
+        self,
+        engine: Engine,
+        rows: np.ndarray,
+        start: Start,
+        table: np.ndarray | None,
+        poses: np.ndarray | None,
+    ) -> None:
+        """Refuse aircraft that `Engine.place`, given the same, would put into a solid.
+
+        With the middle of the hull or of a rotor: they may begin on their feet.
+
+        Raises:
+            QuadrlError: The message has the rows and where the first of them would be.
+        """
+        own = engine.parameters if table is None else table
+        own = own[rows] if table is None and len(own) > 1 else own.copy()
+        own["hull"], own["rotor"]["radius"] = own["hull"].min(axis=-1, keepdims=True) / 2, 0.0
+        qpos = np.concatenate([start.position + engine.origin, start.quaternion], axis=-1)
+        placed = rows, poses, np.ascontiguousarray(qpos), own, engine.vehicle.rotor_count
+        if len(inside := np.flatnonzero(engine.solids.clearance_before(*placed) < 0)):
+            reason = f"rows that begin in one: {reprlib.repr(rows[inside].tolist())}"
+            value, allowed = start.position[inside[0]], f"outside of {', '.join(self.names)}"
+            raise QuadrlError(reason, name="position at the start", value=value, allowed=allowed)
 
     def nothing_near(self, count: int) -> Surroundings:
         """The surroundings of aircraft (n,) far from every solid, for use without an engine."""

@@ -8,6 +8,7 @@ can hand an aircraft that comes near one to MuJoCo.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import mujoco
@@ -161,6 +162,26 @@ class Solids:
             else:
                 measure(about, 0, len(rows), rows.ctypes.data, into)
         return out
+
+    def clearance_before(
+        self,
+        rows: np.ndarray,
+        poses: np.ndarray | None,
+        qpos: np.ndarray,
+        parameters: np.ndarray,
+        rotors: int,
+    ) -> np.ndarray:
+        """`clearance` of aircraft (n,) and solids that are not placed yet, with the row of each.
+
+        Poses are as `place` takes them; None for where the solids are.
+        """
+        then, count = copy.copy(self), len(rows)
+        then.table, then.nearby = self.table[rows], np.zeros(count, NEARBY)
+        then.nearby["place"] = np.nan
+        if poses is not None:
+            then.table["position"] = poses[..., :3]
+            then.table["turn"] = rotation_matrix(poses[..., 3:]).reshape(count, -1, 9)
+        return then.clearance(qpos, parameters, rotors, np.arange(count))
 
 
 def _turn_rate(last: np.ndarray, poses: np.ndarray, timestep: float) -> np.ndarray:

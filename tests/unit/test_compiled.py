@@ -108,8 +108,11 @@ def test_what_a_task_reads_is_what_it_is_live(case):
 
 
 POSTED = {
-    "solids": lambda self: [Gate("first"), Gate("second"), Cylinder("post", radius=0.05)],
-    "place": lambda self, rng, start, state: {"post": Pose(rng.level_direction())},
+    "solids": lambda self: [
+        *(Gate(name, opening=2.2) for name in ("first", "second")),
+        Cylinder("post", radius=0.05),
+    ],
+    "place": lambda self, rng, start, state: {"post": Pose(1.3 * rng.level_direction())},
     "error": lambda self, now: now.clearance,
     "succeeded": lambda self, now, end: now.touched[..., 1] | (now.touch_speed > 0.5),
     "reward": lambda self, before, now, end: {

@@ -143,10 +143,21 @@ def test_a_way_ends_in_the_touch_that_it_was_flown_backwards_from(incline):
     np.testing.assert_allclose(velocity, -0.75 * normal(incline), atol=2e-3)
 
 
+def test_practice_may_begin_in_the_surface_and_what_is_given_may_not():
+    environment = Environment(Perching(approach=1.0, most_incline=0.0), num_envs=2000, seed=0)
+    environment.reset()
+    assert (environment.snapshot.clearance < -0.05).any()
+    place = np.where(np.arange(2000) == 7, -0.05, 1.0)[:, None] * [0.0, 0.0, 1.0]
+    with refused("position at the start", match=r"outside of wall; .* \[7\]"):
+        environment.reset(start={"position": place})
+
+
 @pytest.mark.parametrize(
     ("name", "options"),
     [
         ("most_incline", {"least_incline": 1.0, "most_incline": 0.5}),
+        ("nearest", {"nearest": 0.0, "farthest": 0.0}),
+        ("nearest", {"nearest": 1.1}),  # 0.3 m over a level one: (0.5 + 0.3) m / sin 45 degrees
         ("most_touch", {"most_touch": 0.2}),
         ("most_slip", {"most_slip": 0.0}),
         ("most_spin", {"most_spin": 0.0}),

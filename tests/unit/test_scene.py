@@ -276,6 +276,40 @@ def test_a_reset_of_some_rows_moves_their_solids_alone():
     np.testing.assert_array_equal(moved > 0.01, [False, True, False, True])
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_a_start_in_a_solid_is_refused_and_changes_nothing(engine):
+    """The ball of 0.2 m stands 9 m to the north, and a rotor's hub 0.23 m from the centre."""
+    environment = begun(Posted(), num_envs=3, engine=engine)
+    before = environment.save()
+    level = {"quaternion": [1.0, 0.0, 0.0, 0.0]}
+    for north, rows in (((0.0, 9.05, 9.4), [1, 2]), ((9.0, 0.0, 0.0), [0])):
+        places = np.array([(0.0, y, 0.0) for y in north])
+        said = rf"be outside of post, ball; rows that begin in one: \{rows}"
+        with refused("position at the start", match=said):
+            environment.reset(start=level | {"position": places})
+    with refused("position at the start", match=r"\[2\]"):
+        environment.reset(np.array([2]), start=level | {"position": [0.0, 9.0, 0.0]})
+    for name, array in environment.save().items():
+        np.testing.assert_array_equal(array, before[name])
+    # The edge of a rotor may be in it: whoever touches a solid is no fault of the scene.
+    environment.reset(start=level | {"position": [0.0, 9.45, 0.0]})
+    with refused("position at the start", lists="ball"):
+        solids = {"solids": lambda self: [Sphere("ball", radius=2.0)]}
+        begun(type("InBall", (Hover,), solids)(), num_envs=3, engine=engine)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_aircraft_may_begin_on_their_feet(vehicle):
+    deck = {"solids": lambda self: [Box("deck", length=4.0, width=4.0, height=0.2)]}
+    environment = Environment(type("OnDeck", (Hover,), deck)(), vehicle=vehicle, seed=0)
+    height = 0.1 - environment.vehicle.foot[2]
+    still = dict.fromkeys(("velocity", "body_rate"), [0.0, 0.0, 0.0])
+    environment.reset(start={"position": [0, 0, height], "quaternion": [1, 0, 0, 0]} | still)
+    environment.step(np.full((1, environment.action_size), -0.1))
+    assert environment.snapshot.landed.all()
+    np.testing.assert_allclose(environment.snapshot.state.position, [[0, 0, height]], atol=0.01)
+
+
 def test_a_task_without_solids_says_so_when_one_is_asked_for():
     environment = begun("hover")
     with refused(match="declares no solids"):
