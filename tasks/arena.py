@@ -1,4 +1,4 @@
-"""The gates and poles of the LSY race, which stand elsewhere in each episode."""
+"""The gates and poles of the LSY race; their places change in each episode."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Arena(Course):
 
     gates: Array  # (N, 9 G) centre [m], unit vectors through each gate and to its left
     poles: Array  # (N, 3 P) x, y and height of the top [m] of each pole
-    ball: Array  # (N,) [m], radius of the ball that the aircraft is taken for
+    ball: Array  # (N,) [m], radius of the ball that stands for the aircraft in collisions
     seen: Array  # (N, G + P) 1 for gates and poles that have been near, 0 for others
 
     @property

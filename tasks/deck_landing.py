@@ -46,7 +46,7 @@ class DeckLanding(Landing):
     """Land on the deck of a boat; the origin of the frame is where its pad lies in calm water."""
 
     name = "deck_landing"
-    asks = "touch down on the pad of a boat that waves of sea states 2 to 5 move, and stay on it"
+    asks = "touch down on the pad of a boat in waves of sea states 2 to 5, and stay on it"
     starts = "5 m up, within 1.5 m sideways, at rest, any heading"
     ends = (
         "at rest on the pad (success); sinking faster than 2 m/s along the body's axis; rotor or "

@@ -47,15 +47,15 @@ class GateRace(Task):
         **ROTATION,
         **MOTION,
         "through": ObservationTerm(3, "1", "unit vector through the next gate, body frame"),
-        "next_goal": ObservationTerm(3, "m", "to the centre of the gate after it, body frame"),
-        "next_through": ObservationTerm(3, "1", "unit vector through that, body frame"),
+        "next_goal": ObservationTerm(3, "m", "to the centre of the gate after next, body frame"),
+        "next_through": ObservationTerm(3, "1", "unit vector through that gate, body frame"),
     }
 
     time_limit: float = 30.0
     """Time limit of an episode [s]."""
     altitude: float = 0.0
-    """Height of the origin of the track above the ground [m]; that of the aircraft on its feet at
-    least."""
+    """Height of the origin of the track above the ground [m]; at least the height of the aircraft's
+    centre when it stands on its feet."""
     progress_weight: float = 10.0
     """Reward per metre by which the distance to the centre of the next gate falls."""
     turn_weight: float = 0.1
@@ -63,7 +63,7 @@ class GateRace(Task):
     pass_weight: float = 10.0
     """Reward for each gate."""
     miss_weight: float = 50.0
-    """Cost per metre by which an opening is missed, up to 1 m."""
+    """Cost per metre by which the aircraft passes outside an opening, up to 1 m."""
     low_weight: float = 10.0
     """Cost per metre below 0.8 m above the ground, for each 0.05 s."""
     crash_weight: float = 100.0
@@ -71,7 +71,7 @@ class GateRace(Task):
     margin: float = 0.0
     """How far from the edge of an opening the aircraft's centre has to pass [m]."""
     laps: int = 1
-    """How often the track is flown."""
+    """Number of laps."""
     radius: float = 0.1
     """Largest distance from the start [m]."""
     tilt: float = 0.3

@@ -35,10 +35,14 @@ class Hover(Task):
 
     name = "hover"
     asks = "hold a static waypoint for the whole episode, heading east"
-    starts = "within 0.5 m of it, any heading, tilted up to 0.2 rad, at up to 0.3 m/s and 0.3 rad/s"
+    starts = (
+        "within 0.5 m of the waypoint, any heading, tilted up to 0.2 rad, at up to 0.3 m/s and "
+        "0.3 rad/s"
+    )
     ends = "more than 3 m away, on the ground, tilted past 90 degrees"
     solved = (
-        "in the air to the end, mean error of the last 2 s under 0.1 m, within 10 degrees of east"
+        "in the air until the end, mean error of the last 2 s under 0.1 m, within 10 degrees of "
+        "east"
     )
     targets = (
         Target("success_rate", "successful", 1.0, True),

@@ -83,22 +83,25 @@ class Landing(Task):
     contact = True
 
     altitude: float = 0.0
-    """Height of the origin above the ground [m]; that of the aircraft on its feet at least."""
+    """Height of the origin above the ground [m]; at least the height of the aircraft's centre when
+    it stands on its feet."""
     survival_weight: float = 0.0
-    """Reward per 0.05 s: none, or it would hover over the pad rather than come to rest."""
+    """Reward per 0.05 s; zero, since with a reward the policy would hover over the pad instead of
+    coming to rest."""
     speed_weight: float = 5.0
     """Reward per m/s by which the speed falls."""
     spin_weight: float = 10.0
-    """Reward per rad/s by which the body rate falls; smaller values leave a rotation."""
+    """Reward per rad/s by which the body rate falls; with smaller values the aircraft keeps
+    turning."""
     haste_weight: float = 60.0
     """Cost per 0.05 s of sinking 1 m/s faster than a gentle approach; larger than the progress
     reward."""
     gentle_speed: float = 0.1
     """Sink rate of a gentle approach at the pad [m/s]."""
     gentle_rate: float = 0.6
-    """What each metre of height adds to it [1/s]."""
+    """Increase of the gentle sink rate per metre of height [1/s]."""
     success_weight: float = 100.0
-    """Reward for coming to rest on the pad; with 200 it hurries and touches down faster."""
+    """Reward for coming to rest on the pad; with 200 the policy hurries and touches down faster."""
     failure_weight: float = 300.0
     """Cost of a failure; larger than the progress of a dive to the ground."""
     start_height: float = 3.0
@@ -106,7 +109,8 @@ class Landing(Task):
     start_offset: float = 1.5
     """Largest distance of the start from the pad's axis [m]."""
     max_sink: float = 2.0
-    """Speed along the negative body z axis that ends the episode: its own rotor wash [m/s]."""
+    """Speed along the negative body z axis that ends the episode [m/s]; beyond it the aircraft is
+    in its own rotor wash."""
     max_touchdown: float = 0.5
     """Largest speed of a touchdown [m/s]."""
     max_tilt: float = math.radians(15.0)

@@ -1,4 +1,4 @@
-"""LSY race: through four small gates among poles, which stand elsewhere in each episode."""
+"""LSY race: through four small gates among poles; their places change in each episode."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from quadrl.tasks.gates import GateRace
 from quadrl.tasks.tracks import Track, known
 
 BOX = (-2.5, 2.5), (-1.5, 1.5), (0.0, 2.0)  # [m], along x, y and z, which ends a race
-# From farther aside of a gate than STRAIGHT [m], the way to it leads through a place before it, by
-# LEAD [m] at most.
+# An aircraft farther than STRAIGHT [m] from the gate's axis is led through a point up to LEAD [m]
+# before the gate.
 STRAIGHT, LEAD = 0.05, 0.3
 ROOM = 0.15  # [m], about the ball, in which a flight costs more
 
@@ -39,7 +39,7 @@ class LsyRace(GateRace):
     """Fly the course of LSY's drone racing of summer 2026."""
 
     name = "lsy_race"
-    asks = "fly through four small gates among poles, which stand elsewhere in each episode"
+    asks = "fly through four small gates among poles; their places change in each episode"
     starts = "at rest within 0.1 m of the start, level and heading east within 6 degrees"
     solved = "through every gate"
     ends = (
@@ -79,7 +79,7 @@ class LsyRace(GateRace):
     time_limit: float = 15.0
     """Time limit of an episode [s]."""
     progress_weight: float = 20.0
-    """Reward per metre by which the way to the next gate gets shorter."""
+    """Reward for each metre that the path to the next gate gets shorter."""
     paid_speed: float = 2.0
     """Speed up to which progress is rewarded [m/s]; a higher one brings more collisions."""
     pass_weight: float = 20.0
@@ -94,21 +94,22 @@ class LsyRace(GateRace):
     time_weight: float = 0.0
     """Cost of each 0.05 s."""
     ball: float = 0.07
-    """Radius of the ball that the aircraft is taken for [m]."""
+    """Radius of the ball that stands for the aircraft in collisions [m]."""
     least_ball: float = 0.07
-    """Radius of the smallest ball [m]; each episode has another."""
+    """Smallest radius of this ball [m]; each episode draws one between `least_ball` and `ball`."""
     level: int = 2
-    """Level of the competition. At 2, gates and poles stand up to 0.15 m off their places, gates
-    lean by up to 0.1 rad, and that is seen within 0.7 m of them; at 0 and 1 they do not."""
+    """Level of the competition. At 2, gates and poles are moved by up to 0.15 m, and gates lean by
+    up to 0.1 rad and turn by up to 0.2 rad; the policy sees the true place within 0.7 m. At 0 and 1
+    they have their nominal places."""
     radius: float = 0.1
     """Largest distance from the start [m], along x and y."""
     tilt: float = 0.1
-    """Largest tilt at the start [rad], and how far from east it heads at most."""
+    """Largest tilt, and largest heading error from east, at the start [rad]."""
     flying: float = 0.0
-    """Share of the episodes that begin in the middle of one of the first gates."""
+    """Share of the episodes that begin in flight, in the middle of one of the first gates."""
     flying_speed: float = 1.0
-    """Largest speed of those, through the gate [m/s]; much faster aircraft do not get around the
-    pole behind the third gate."""
+    """Largest start speed of these episodes, through the gate [m/s]; at a much higher speed no
+    aircraft gets around the pole behind the third gate."""
 
     def __post_init__(self) -> None:
         """Validate the level."""

@@ -46,15 +46,19 @@ class Perching(Task):
     """Perch on a surface; its middle is the origin of the task's frame."""
 
     name = "perching"
-    asks = "touch a surface, from level to a vertical wall, with the feet, and stay on it"
-    starts = "2 to 3 m before it, within 0.5 m of the origin's height, at rest, facing it"
+    asks = "land with the feet on a surface, level to vertical, and stay on it"
+    starts = (
+        "2 to 3 m from the surface, in front of a wall and 45 degrees above a level one, up to 0.5 "
+        "m off sideways and in height, at rest, facing it"
+    )
     ends = (
-        "on the surface for a second (success); a touch that is too hard, aslant or spinning, or "
-        "not of the feet; off the surface again; on the ground; more than 6 m away"
+        "on the surface for a second (success); a touch that is too slow, too fast, too tilted or "
+        "with too much spin, or not with the feet; leaving the surface; on the ground; more than 6 "
+        "m away"
     )
     solved = (
-        "a second on the surface after a touch at 0.2 to 1 m/s into it, under 0.5 m/s along it, "
-        "within 20 degrees and under 2 rad/s"
+        "one second on the surface after a touch with 0.2 to 1 m/s into it, under 0.5 m/s along "
+        "it, within 20 degrees and under 2 rad/s"
     )
     targets = (Target("success_rate", "successful", 0.95, True),)
     training = {
@@ -82,13 +86,13 @@ class Perching(Task):
     most_incline: float = math.pi / 2
     """Largest incline of the surface [rad]: a vertical wall."""
     nearest: float = 2.0
-    """Smallest distance of the start before the surface [m]."""
+    """Smallest distance of the start from the surface [m]."""
     farthest: float = 3.0
-    """Largest distance of the start before the surface [m]."""
+    """Largest distance of the start from the surface [m]."""
     aside: float = 0.5
     """Largest distance of the start to the sides, and above and below [m]."""
     approach: float = 0.0
-    """Share of the episodes that begin on the way, up to the moment of a touch."""
+    """Share of the episodes that begin during the approach, on a path to a good touch."""
     attitude_weight: float = 100.0
     """Reward per unit by which the chord from the body's z axis to the normal falls."""
     speed_weight: float = 20.0
@@ -96,15 +100,15 @@ class Perching(Task):
     spin_weight: float = 5.0
     """Reward per rad/s by which the body rate falls, near the surface."""
     survival_weight: float = 0.0
-    """Reward per 0.05 s: none, or it would stay in the air."""
+    """Reward per 0.05 s; zero, since otherwise the policy would stay in the air."""
     time_weight: float = 4.0
-    """Cost of each 0.05 s, in `perching` before the touch: without it aircraft learn to wait
-    before a wall."""
+    """Cost for each 0.05 s (in `perching` before the touch): without it, policies learn to wait in
+    front of a wall."""
     success_weight: float = 250.0
     """Reward for staying on the surface."""
     touch_weight: float = 50.0
-    """Cost of each limit of a touch that it exceeds, in proportion; and of each m/s with which
-    rotors or hull strike the surface."""
+    """Cost of each limit of the touch that is exceeded, in proportion to the excess; and cost per
+    m/s at which rotors or hull strike the surface."""
     failure_weight: float = 250.0
     """Cost of a failure."""
     least_touch: float = 0.2

@@ -29,7 +29,7 @@ class Race(GateRace):
     starts = "at rest within 0.1 m of the track's start, any heading, tilted up to 0.3 rad"
     ends = (
         "through the last gate (success); through the frame of the next gate, on the ground, more "
-        "than 5 m farther from the next gate than when the last was passed"
+        "than 5 m farther from the next gate than when it passed the previous one"
     )
     solved = "through every gate of every lap"
     targets = (
@@ -55,18 +55,19 @@ class Race(GateRace):
     track: str = "split_s"
     """Name of the track: airsim, alphapilot or split_s."""
     gates: tuple[tuple[float, ...], ...] | None = None
-    """Gates of one's own: x, y, z [m], heading and climb [deg] of the way through each; by default
-    those of the track."""
+    """Your own gates: x, y, z [m], heading and climb [deg] of the way through each; by default the
+    gates of the track."""
     start: tuple[float, ...] = ()
-    """Where a race begins [m]; () for that of the track, or 5 m before the first of own gates."""
+    """Start of the race [m]; () for the start of the track, or 5 m before the first of your own
+    gates."""
     opening: float = 0.0
-    """Edge of the openings [m]; 0 for that of the track."""
+    """Edge length of the openings [m]; 0 for the value of the track."""
     frame: float = 0.0
-    """Outer edge of the frames [m]; 0 for that of the track."""
+    """Outer edge length of the frames [m]; 0 for the value of the track."""
     flying: float = 0.0
-    """Share of the episodes that begin on the way to a gate drawn anew."""
+    """Share of the episodes that begin in flight, on the way to a random gate."""
     flying_speed: float = 5.0
-    """Largest speed of those, towards the gate [m/s]."""
+    """Largest start speed of these episodes, towards the gate [m/s]."""
 
     @functools.cached_property
     def course(self) -> Track:
@@ -74,7 +75,7 @@ class Race(GateRace):
         return Track.of(self.track, self.gates, self.start, self.opening, self.frame)
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Course]:
-        """At rest at the start, tilted; or, in training, on the way to a gate drawn anew."""
+        """At rest at the start, tilted; or, in training, on the way to a random gate."""
         track, count = self.course, len(self.course.gates)
         gate = rng.uniform(0.0, float(count))
         xp = namespace(gate)

@@ -1,4 +1,4 @@
-"""Random waypoint: fly to a point drawn anew for every episode, and hover there."""
+"""Random waypoint: fly to a random point, different in every episode, and hover there."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class RandomWaypoint(Task):
     """Fly to a waypoint in a shell around the start and hold it; the heading is free."""
 
     name = "random_waypoint"
-    asks = "fly to a waypoint drawn 1 to 2.5 m away, then hover on it until the end"
+    asks = "fly to a random waypoint 1 to 2.5 m away, then hover on it until the end"
     starts = "at rest and level at the origin, any heading"
     ends = "more than 5 m from the waypoint, on the ground"
-    solved = "in the air to the end, mean error of the last 2 s under 0.1 m"
+    solved = "in the air until the end, mean error of the last 2 s under 0.1 m"
     targets = (
         Target("success_rate", "successful", 0.99, True),
         Target("position_error_m", "error over the last 2 s", 0.06),
@@ -61,7 +61,7 @@ class RandomWaypoint(Task):
     spin: float = 0.0
     """Largest body rate at the start [rad/s]."""
     faces_east: bool = False
-    """Whether the reward asks for a heading of east, too."""
+    """Whether the reward also pays for a heading of east."""
     max_distance: float = 5.0
     """Distance from the waypoint that ends the episode [m]."""
     tolerance: float = 0.1

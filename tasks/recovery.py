@@ -20,10 +20,10 @@ class Recovery(Task):
     """Level out, stop and stay off the ground, then fly back to the place above the start."""
 
     name = "recovery"
-    asks = "come to rest after being thrown in any attitude, at the origin, 3 m above the ground"
+    asks = "come to rest at the origin, 3 m above the ground, after a throw in any attitude"
     starts = "3 m above the ground, any attitude, thrown at up to 3 m/s and 6 rad/s"
     ends = "more than 20 m away, on the ground"
-    solved = "in the air to the end, then level within 10 degrees, under 0.2 m/s and 0.5 rad/s"
+    solved = "in the air until the end, then level within 10 degrees, under 0.2 m/s and 0.5 rad/s"
     targets = (Target("success_rate", "successful", 0.95, True), *STILL)
     trained_on = "crazyflie"  # which can turn over within these heights
     training = {

@@ -35,13 +35,13 @@ class StaticWaypoint(Task):
 
     name = "static_waypoint"
     asks = (
-        "fly to fixed waypoints in order (one, 1.5 m away, unless others are given), then hover on "
-        "the last until the end, heading east"
+        "fly to fixed waypoints in order (default: one, 1.5 m away), then hover on the last until "
+        "the end, heading east"
     )
     starts = "at rest at the origin, heading east, disturbed by up to 0.05 rad, m/s and rad/s"
     ends = "more than 5 m from the current waypoint, on the ground"
     solved = (
-        "in the air to the end, mean error of the last 2 s under 0.1 m, on the last waypoint, "
+        "in the air until the end, mean error of the last 2 s under 0.1 m, on the last waypoint, "
         "within 10 degrees of east"
     )
     targets = (
@@ -55,7 +55,7 @@ class StaticWaypoint(Task):
     heading_matters = True
 
     waypoints: tuple[tuple[float, float, float], ...] = ((1.0, 1.0, 0.5),)
-    """Where to fly, in order [m], task frame."""
+    """Waypoints in order [m], task frame."""
     reach: float = 0.2
     """Distance at which a waypoint counts as reached and the next one is the goal [m]."""
     disturbance: float = 0.05

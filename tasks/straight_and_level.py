@@ -38,7 +38,7 @@ class StraightAndLevel(Task):
     asks = "fly in a constant direction at constant altitude and 2 m/s for as long as possible"
     starts = "on a line in any direction, level, at 0 to 2 m/s along it, any heading"
     ends = "more than 0.7 m off the altitude or 3 m off the line, on the ground"
-    solved = "in the air, on altitude and near the line to the end"
+    solved = "in the air until the end, near the altitude and the line"
     targets = (
         Target("survival_rate", "flown to the end", 0.99, True),
         Target("altitude_rms_m", "altitude error, RMS", 0.05),
@@ -57,8 +57,8 @@ class StraightAndLevel(Task):
     time_limit: float = 20.0
     """Time limit of an episode [s]."""
     speed_weight: float = 10.0
-    """Reward for each m/s by which the speed relative to the line's falls; with 20 it speeds up so
-    hard that it may tip over."""
+    """Reward for each m/s by which the speed relative to the line's velocity falls; with 20 the
+    aircraft accelerates so hard that it may tip over."""
     line_speed: float = 2.0
     """Speed along the line [m/s]."""
     lead: float = 1.0

@@ -33,7 +33,7 @@ class TargetFollowing(Task):
     asks = "keep 1 m from a target that moves along a smooth random path at up to 1.5 m/s"
     starts = "1 m beside the target, at rest and level, any heading"
     ends = "more than 5 m from the target, on the ground"
-    solved = "in the air to the end, distance within 0.3 m of 1 m on average"
+    solved = "in the air until the end, mean error of the distance under 0.3 m"
     targets = (
         Target("survival_rate", "flown to the end", 0.99, True),
         Target("distance_rms_m", "distance off 1 m, RMS", 0.15),
@@ -61,9 +61,9 @@ class TargetFollowing(Task):
     keep: float = 1.0
     """Distance to keep [m]."""
     target_speed: float = 1.5
-    """The target is never faster [m/s]."""
+    """Largest speed of the target [m/s]."""
     climb_share: float = 0.2
-    """Share of that speed that it climbs and sinks with at most."""
+    """Largest climb or sink rate of the target, as a share of `target_speed`."""
     slowest: float = 0.25
     """Smallest angular frequency of the target's sines [rad/s]."""
     fastest: float = 0.75
@@ -73,7 +73,8 @@ class TargetFollowing(Task):
     tolerance: float = 0.3
     """Largest mean error of the distance that counts as success [m]."""
     sees_motion: bool = False
-    """Whether the target's acceleration and jerk are observed, behind the other entries."""
+    """Whether the target's acceleration and jerk are part of the observation, after the other
+    entries."""
 
     def __post_init__(self) -> None:
         """Validate the path."""

@@ -36,9 +36,12 @@ class Trajectory(Task):
 
     name = "trajectory"
     asks = "follow a reference in time, heading east: a random curve, a figure or a file"
-    starts = "in its first point, heading east, disturbed by up to 0.05 rad, m/s and rad/s"
+    starts = (
+        "at the first point of the reference, heading east, disturbed by up to 0.05 rad, m/s and "
+        "rad/s"
+    )
     ends = "more than 2 m from the reference, on the ground"
-    solved = "in the air to the end, distance under 0.1 m on average over the last 2 s"
+    solved = "in the air until the end, mean distance of the last 2 s under 0.1 m"
     targets = (
         Target("survival_rate", "flown to the end", 0.99, True),
         Target("settled_m", "distance, settled", 0.05),
@@ -71,8 +74,8 @@ class Trajectory(Task):
     distance_weight: float = 20.0
     """Cost of each metre of distance, for each 0.05 s."""
     figure: str = "random"
-    """What to follow: random, lemniscate, vertical, zigzag, pentagram, polynomial, or the path of a
-    csv file with rows of time [s], x, y and z [m], and maybe a heading from east [rad]."""
+    """The reference: random, lemniscate, vertical, zigzag, pentagram, polynomial, or the path of a
+    csv file with rows of time [s], x, y and z [m], and optionally the heading from east [rad]."""
     period: float = 0.0
     """Period of a lemniscate or a vertical figure [s]; 0 for the usual one, 5.5 or 10 s."""
     acceleration: float = 4.0

@@ -35,7 +35,7 @@ CRAZYFLIE = Vehicle(
     action_scale=480.0,  # chosen: the weakest aircraft of the randomization `full` hovers
     physics_timestep=0.005,  # chosen
     control_timestep=0.02,  # chosen
-    dead_time=0.01,  # 7 to 10 ms, beside the lag (IMRCLab flights), in whole physics steps
+    dead_time=0.01,  # 7 to 10 ms in addition to the lag (IMRCLab flights), in whole physics steps
 )
 CRAZYFLIE_BRUSHLESS = Vehicle(
     name="crazyflie_brushless",  # Crazyflie 2.1 Brushless, without the guards of its propellers
@@ -57,7 +57,7 @@ CRAZYFLIE_BRUSHLESS = Vehicle(
     action_scale=400.0,  # chosen: the weakest aircraft of the randomization `full` hovers
     physics_timestep=0.0025,  # chosen: it turns faster than the brushed one
     control_timestep=0.02,  # chosen
-    dead_time=0.005,  # beside the lag (IMRCLab flights)
+    dead_time=0.005,  # in addition to the lag (IMRCLab flights)
 )
 RACER = Vehicle(
     name="racer",  # Foehn et al. 2022, "Agilicious", Science Robotics 7: the Kingfisher
@@ -90,7 +90,7 @@ RACER = Vehicle(
 HEXA = Vehicle(
     name="hexa",  # AscTec Firefly, in the numbers of RotorS (Furrer et al. 2016), rotors included
     mass=1.53,
-    # RotorS gives 0.0977 about z, which is more than the sum of the other two: no body has that.
+    # RotorS gives 0.0977 about z, more than the sum of the other two, which no rigid body has.
     inertia=(0.0347563, 0.0458929, 0.08),
     rotors=ring(
         (30, 90, 150, 210, 270, 330),

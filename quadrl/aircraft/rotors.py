@@ -34,7 +34,7 @@ class Rotor:
     lag_up: float
     """k_c [1/s]: inverse time constant of the rotor speed while it rises."""
     lag_down: float
-    """The same while it falls [1/s]."""
+    """Inverse time constant of the rotor speed while it falls [1/s]."""
     max_speed: float
     """Largest speed that can be commanded [rad/s]."""
     spin: float = 1.0
@@ -45,7 +45,7 @@ class Rotor:
     radius: float = 0.06
     """Radius of the disc [m], drawn and used for contact with the ground."""
     disc_radius: float = 0.0
-    """Radius of the disc that moves the air [m]; 0 where it is `radius`."""
+    """Radius of the aerodynamic disc [m]; 0 means `radius`."""
 
     def __post_init__(self) -> None:
         """Validate the numbers."""

@@ -35,7 +35,7 @@ def layout(terms: Mapping[str, ObservationTerm], rotors: int) -> dict[str, slice
 MOTION = {
     "velocity": ObservationTerm(3, "m/s", "body frame"),
     "body_rate": ObservationTerm(3, "rad/s", "angular velocity, body frame"),
-    "rotor_speed": ObservationTerm(1, "1", "over the largest rotor speed", per_rotor=True),
+    "rotor_speed": ObservationTerm(1, "1", "rotor speed as a share of the largest", per_rotor=True),
     "goal": ObservationTerm(3, "m", "from the aircraft to the goal, body frame"),
 }
 """What `observed_motion` gives: the part that depends neither on a place nor on a heading."""

@@ -31,7 +31,7 @@ class Potentials:
     """Distances from what is asked; the reward is their decrease over a control step."""
 
     to_goal: Array  # (N, 3) [m], from the aircraft to the goal, world frame
-    distance: Array  # (N,) [m], what is left to the goal
+    distance: Array  # (N,) [m], distance left to the goal
     attitude: Array  # (N,) attitude error |sin zeta - sin zeta_g| + |cos zeta - cos zeta_g|
     speed: Array  # (N,) [m/s], relative to the target where there is one
     angular_speed: Array  # (N,) [rad/s]
@@ -43,13 +43,15 @@ class Snapshot:
 
     state: State
     task: Any  # the task's own TaskState
-    parameters: Parameters  # of the aircraft as it is specified, unless the task asks for the true
-    action: Array  # (N, k), that led here; zero at the start
+    parameters: Parameters  # of the specified aircraft; with `true_parameters` the drawn ones
+    action: Array  # (N, k), action of this control step; zero at the start
     rotor_command: Array  # (N, R) [rad/s], mean over the control step; the rotor speed at the start
     time: Array  # (N,) [s], since the start of the episode
     potentials: Potentials = None  # type: ignore[assignment] - what `Task.measure` gives
-    sensed: Mapping[str, Array] = dataclasses.field(default_factory=dict[str, Array])  # (N, size)
-    around: Surroundings | None = None  # in a world with solids (`Task.solids`)
+    sensed: Mapping[str, Array] = dataclasses.field(  # values of the task's sensors, (N, size) each
+        default_factory=dict[str, Array]
+    )
+    around: Surroundings | None = None  # solids around the aircraft, if the task has any
 
     @property
     def clearance(self) -> Array:
@@ -58,12 +60,12 @@ class Snapshot:
 
     @property
     def touched(self) -> Array:
-        """Which of K solids was touched fastest in this control step, (N, K) bool."""
+        """Which of K solids it touched (the fastest touch of this control step), (N, K) bool."""
         return self._surroundings.touched
 
     @property
     def touch_speed(self) -> Array:
-        """How fast it was touched, (N,) [m/s]; 0 where none was."""
+        """Speed of this touch, (N,) [m/s]; 0 without a touch."""
         return self._surroundings.touch_speed
 
     @property
@@ -73,7 +75,7 @@ class Snapshot:
 
     @property
     def touch(self) -> Array:
-        """How the first one did, (N, 4); 0 before.
+        """The first touch of a foot, (N, 4); 0 before it.
 
         Speed into the solid and along it [m/s], cosine of the angle between the body's z axis and
         its normal, body rate [rad/s].
@@ -103,10 +105,10 @@ class EpisodeEnd:
     """Where an episode stands, for the judgement of those that end now; arrays (N,)."""
 
     terminated: Array  # bool: failure, or success where the task says so
-    truncated: Array  # bool: the clock; never together with terminated
+    truncated: Array  # bool: time limit; never together with terminated
     steps: Array  # control steps so far
-    error_sum: Array  # [m], of the task's error over them
-    final_sum: Array  # [m], of those in the last `settle_steps` before the time limit
+    error_sum: Array  # [m], sum of the task's error over these steps
+    final_sum: Array  # [m], sum over the last `settle_steps` before the time limit
     settle_steps: int
     succeeded: Array = None  # bool; only the reward sees it
 

@@ -27,7 +27,7 @@ class Target:
         return value >= self.limit if self.at_least else value <= self.limit
 
 
-TURNING = Target("yaw_rate_rad_s", "turning over the last 2 s", 0.3)
+TURNING = Target("yaw_rate_rad_s", "yaw rate over the last 2 s", 0.3)
 STILL = (TURNING, Target("circling_m_s", "circling over the last 2 s", 0.05))
 """Targets of tasks that end at rest, beside the position: an aircraft that turns or circles has not
 solved the task."""

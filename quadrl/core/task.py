@@ -91,16 +91,16 @@ class Task(abc.ABC):
     time_limit: float = 10.0
     """Time limit of an episode [s]."""
     settle_time: float = 2.0
-    """Length of the stretch before the time limit over which the final error is taken [s]; the
-    default is cut to a shorter time limit."""
+    """Time before the time limit over which the final error is averaged [s]; at most the time
+    limit."""
     altitude: float = 3.0
-    """Height of the origin of the task's frame above the ground [m]; at least that of the
+    """Height of the origin of the task's frame above the ground [m]; at least the height of the
     aircraft's centre when it stands on its feet."""
     progress_weight: float = 100.0
     """Reward per metre by which the distance to the goal falls."""
     attitude_weight: float = 30.0
-    """Reward per unit by which the attitude error falls. With 10 the heading is learned
-    late or never, and such policies sometimes tip over."""
+    """Reward per unit by which the attitude error falls. With 10 a policy learns the heading late
+    or never, and sometimes tips over."""
     speed_weight: float = 2.0
     """Reward per m/s by which the speed falls, or the speed relative to a target (gym-aero has 0.1,
     with which hover takes twice the steps)."""

@@ -26,10 +26,10 @@ CODE = ("quadrl", "tasks", "assets", "scripts")  # what a result depends on
 FIGURES = {
     "success_rate": "successful",
     "position_error_m": "error over the last 2 s",
-    "yaw_rate_rad_s": "turning over the last 2 s",
+    "yaw_rate_rad_s": "yaw rate over the last 2 s",
     "circling_m_s": "circling over the last 2 s",
     "command_change_rate": "change of the commands",
-    "saturated_rate": "commands at their ends",
+    "saturated_rate": "commands at their limits",
     "least_height_m": "least height",
 }
 """Of flights, and what tables call them."""

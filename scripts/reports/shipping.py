@@ -29,8 +29,8 @@ policy is a safetensors file, with a .json of all its settings beside it, in
 
 """
 POLICIES = """The mean action in {flown} fresh episodes, in the conditions of the training. The last
-column is what the task asks and the policy misses in as many episodes where nothing disturbs it.
-{source}"""
+column lists the targets of the task that the policy misses in the same number of undisturbed
+episodes. {source}"""
 CALM: Any = {"weather": "calm", "randomization": "none"}
 
 
@@ -135,10 +135,10 @@ def policies(name: str = "") -> str:
             f"{x.words}: {quantity(x.metric, still[x.metric])}, asked {asked(x)}"
             for x in unmet(row["task"], still)
         )
-        rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "nothing"))
+        rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "none"))
     if not rows:
         return "None comes with quadrl."
-    head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "asked and missed")
+    head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "targets missed")
     note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result, flown))
     how = SHIPS.format(name=name, by=tasks.TASKS[name].trained_by) if name else ""
     return f"{how}{table(head, rows)}\n\n{note}"

@@ -42,7 +42,7 @@ and body rates, velocities or positions, and with `vehicle=` another aircraft: s
 {observations}
 
 The numbers have no bounds. dm_control gives the terms by name. World frame: x east, y north, z up;
-body frame: x forward, y left, z up. The unit 1 is none.
+body frame: x forward, y left, z up. The unit 1 means dimensionless.
 
 ## Reward
 
@@ -66,11 +66,11 @@ The reward is their sum. The weights are options: `survival_weight=5`, for examp
 ## Training
 
 `quadrl train {name}` trains with {own}the defaults that `quadrl train --help` lists. A training
-counts as successful when the mean action reaches this in {episodes} fresh episodes:
+counts as successful if the mean action meets these targets in {episodes} fresh episodes:
 
 {reached}
 
-[All trainings](results.md) says where this was measured.{curves}
+[All trainings](results.md) names the machine and the commit.{curves}
 
 ## Policies
 

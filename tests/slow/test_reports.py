@@ -185,11 +185,11 @@ def test_policies_that_ship_are_judged_where_nothing_disturbs_them(tmp_path, mon
     flown = quadrl.evaluate("random_waypoint_robust", episodes=4).metrics  # as it was trained
     assert robust["circling_m_s"] == pytest.approx(flown["circling_m_s"], 1e-4)
     assert robust["undisturbed"]["circling_m_s"] < 0.05 < robust["circling_m_s"]  # in wind
-    asked = Target("yaw_rate_rad_s", "turning over the last 2 s", 1e-6)
+    asked = Target("yaw_rate_rad_s", "yaw rate over the last 2 s", 1e-6)
     monkeypatch.setattr(RandomWaypoint, "targets", (asked,))
     head, _, first, second = shipping.policies().splitlines()[:4]
-    assert "| circling over the last 2 s |" in head and first.endswith("| nothing |")
-    assert "turning over the last 2 s: 0.0" in second and "rad/s, asked at most" in second
+    assert "| circling over the last 2 s |" in head and first.endswith("| none |")
+    assert "yaw rate over the last 2 s: 0.0" in second and "rad/s, asked at most" in second
     assert "hover" not in shipping.policies("random_waypoint")
     assert "None comes" in shipping.policies("landing")
 
