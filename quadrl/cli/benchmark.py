@@ -17,8 +17,8 @@ class Benchmark:
     seconds: float = 0.2
     """Length of each measurement; short, since the speed of a machine drifts."""
     repeats: int = 30
-    """Measurements of each layer, in turns. The rate is the fastest; the share is the median of the
-    ratios to its reference within a turn."""
+    """Measurements of each layer; the layers take turns. The rate is the fastest one; the share is
+    the median ratio to its reference in the same turn."""
     task: choices.TaskName = "hover"
     """The task that is flown."""
     json: bool = False

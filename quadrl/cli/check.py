@@ -15,7 +15,7 @@ class Check(Conditioned):
     """Check whether thrust, moments, steps and delays of an aircraft let a policy fly it."""
 
     task: choices.TaskName = "hover"
-    """The task; some ask for a turn of the heading within their time."""
+    """The task. Some tasks need a turn of the heading within their time limit."""
     json: bool = False
     """Print one JSON object and nothing else."""
 

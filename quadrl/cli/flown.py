@@ -53,11 +53,11 @@ class Flown(Conditioned):
     """Options for a policy or a controller, and for what it flies."""
 
     policy: Annotated[Positional[str], arg(metavar="[POLICY]")] = ""
-    """A run folder, a .safetensors file, or the name of a shipped policy: that of its task, or
-    one such as hover_robust (write ./NAME for a folder of that name). Conditions that are not given
+    """A run folder, a .safetensors file, or the name of a shipped policy: a task's name or, for
+    example, hover_robust (write ./NAME for a folder of that name). Conditions that are not given
     are those of its training."""
     algo: choices.Algorithm = ""
-    """Algorithm of the policy that comes with quadrl; by default that of its task's trainings."""
+    """Algorithm of the shipped policy; by default the algorithm with which its task is trained."""
     controller: choices.ControllerName = ""
     """A controller instead of a policy: geometric or lqr."""
     task: choices.TaskName = ""

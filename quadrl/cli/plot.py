@@ -18,11 +18,11 @@ class Plot:
     """Draw the learning curve of one run, or the curves of several runs in one picture."""
 
     run_folders: Positional[tuple[Path, ...]]
-    """Run folders. Several are overlaid: a picture for each task, a curve for each algorithm with
-    the spread over its runs."""
+    """Run folders. Several are drawn together: a picture for each task, with a curve for each
+    algorithm and the spread over its runs."""
     out: Path | None = None
-    """Output file; its ending (png, pdf, svg) sets the format; by default learning_curve.png in the
-    run folder, or, of several runs, learning_curves_TASK.png here."""
+    """Output file; its extension (png, pdf, svg) sets the format. By default learning_curve.png in
+    the run folder or, for several runs, learning_curves_TASK.png here."""
 
     def run(self) -> None:
         """Write the pictures."""

@@ -22,15 +22,15 @@ class Render(Flown):
     """Draw a flight of a policy or a controller, or of several side by side."""
 
     policy: Annotated[Positional[tuple[str, ...]], arg(metavar="[POLICY ...]")] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
-    """A run folder, a .safetensors file, or the name of a shipped policy: that of its task, or
-    one such as hover_robust (write ./NAME for a folder of that name). Several,
-    and controllers, are shown side by side; they fly the same episode, of the first one's task."""
+    """A run folder, a .safetensors file, or the name of a shipped policy: a task's name or, for
+    example, hover_robust (write ./NAME for a folder of that name). Several policies and controllers
+    are shown side by side in the same episode of the first one's task."""
     controller: tuple[choices.ControllerName, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
-    """Controllers, beside the policies or alone: geometric or lqr."""
+    """Controllers, in addition to the policies or alone: geometric or lqr."""
     out: Path | None = None
-    """Output file. Its ending sets the kind: .mp4, .gif, or, for moments of the flight in one
-    picture, .png or .jpg. By default flight.mp4 or, where that exists, flight-2.mp4 and so on; a
-    file that is named here is overwritten."""
+    """Output file. The extension sets the format: .mp4 or .gif for a video, .png or .jpg for
+    several moments in one picture. By default flight.mp4 or, if that exists, flight-2.mp4 and so
+    on; a file that is named here is overwritten."""
     camera: choices.Camera = "follow"
     """Camera: follow keeps the goal in view, chase is behind the aircraft."""
     width: int | None = None
@@ -41,7 +41,7 @@ class Render(Flown):
     fps: float | None = None
     """Frames per second; by default 20, and 12.5 for .gif."""
     speed_trail: bool = False
-    """Show the whole way so far, in the colours of its speeds, instead of the last seconds."""
+    """Show the whole path so far, coloured by speed, instead of the last seconds."""
 
     def run(self) -> None:
         """Fly an episode of each and draw them."""

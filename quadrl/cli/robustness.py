@@ -18,16 +18,16 @@ from quadrl.evaluation.robustness import robustness
 
 @choices.command
 class Robustness(Conditioned):
-    """Fly policies or controllers through graded disturbances, and map where they recover from."""
+    """Fly policies or controllers in graded disturbances, and map the starts they recover from."""
 
     policies: Positional[tuple[str, ...]] = ()
-    """Run folders, .safetensors files, or names of shipped policies: those of their tasks, or such
-    as hover_robust (write ./NAME for a folder of that name)."""
+    """Run folders, .safetensors files, or names of shipped policies: a task's name or, for example,
+    hover_robust (write ./NAME for a folder of that name)."""
     controller: Annotated[
         UseAppendAction[tuple[choices.ControllerName, ...]],
         arg(help_behavior_hint="(repeatable)"),
     ] = ()
-    """A controller that flies as well: geometric or lqr."""
+    """A controller to fly as well: geometric or lqr."""
     task: choices.TaskName = ""
     """The task; by default the one that the first policy was trained for, and hover for a
     controller."""
@@ -41,7 +41,7 @@ class Robustness(Conditioned):
     """Seed of the episodes, between 0 and 2^32 - 1."""
     out: Path = Path("robustness")
     """Folder for the pictures (.png, .pdf), the numbers (.json) and the table (.csv). Until they
-    are written it keeps what was flown, from which the same command goes on after a stop."""
+    are written, it keeps the finished flights, so that the same command can resume."""
     json: bool = False
     """Print the numbers as one JSON object and nothing else."""
 

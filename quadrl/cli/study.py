@@ -16,21 +16,22 @@ from quadrl.cli.console import console, going_on, make_table, own_files, print_j
 
 @choices.command
 class Study:
-    """Carry out the trainings that a file names, on all cores or on a Ray cluster, and sum up."""
+    """Run the trainings of a study file, on all cores or on a Ray cluster, and summarize."""
 
     file: Positional[Path]
     """The study: a .toml or .json file of tasks, algorithms, settings and seeds."""
     jobs: int | None = None
     """Trainings at the same time, each with one thread; by default one per core."""
     out: Path | None = None
-    """Folder of the run folders; by default runs/NAME, NAME that of the file."""
+    """Folder of the run folders; by default runs/NAME, with the NAME of the file."""
     ray: str = ""
-    """Address of a Ray cluster that carries out the trainings, such as 10.0.0.1:6379; auto for the
-    one that this machine belongs to, local for Ray on this machine alone."""
+    """Address of the Ray cluster that runs the trainings, such as 10.0.0.1:6379; auto: the cluster
+    of this machine; local: Ray on this machine alone."""
 
     compare: str = ""
-    """Compare every two algorithms and variants by a figure of study.json, such as success_rate or,
-    with the setting evaluations, solved_after_steps: by how many seeds it is smaller."""
+    """Compare all pairs of algorithms and variants by a figure of study.json, such as success_rate
+    or, with the setting evaluations, solved_after_steps: how often a seed of the one has the
+    smaller figure."""
     json: bool = False
     """Print what study.json holds as one JSON object and nothing else."""
 

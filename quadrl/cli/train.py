@@ -67,24 +67,24 @@ Settings: Any = choices.optional(TrainConfig, _default)
 class Train:
     """Train a policy from scratch, evaluate it, and write results and pictures to a run folder.
 
-    The defaults shown are those of hover, ppo and the aircraft paper; with a task, --algo,
-    --vehicle or --variant beside --help, of those. --dry-run says where each setting comes from.
+    The defaults shown are for hover, ppo and the aircraft paper. Give a task, --algo, --vehicle or
+    --variant with --help to see theirs. --dry-run says where each setting comes from.
     """
 
     settings: Annotated[Settings, arg(name="")]  # pyright: ignore[reportInvalidTypeForm]
     out: Path | None = None
-    """Folder of the run; by default runs/TASK-ALGO-SEED, numbered if that holds a run already. With
-    --seeds the folder of the runs; by default runs/TASK-ALGO-seeds."""
+    """Folder of the run; by default runs/TASK-ALGO-SEED, with a number added if that holds a run
+    already. With --seeds the folder of the runs; by default runs/TASK-ALGO-seeds."""
     resume: Path | None = None
-    """Continue the run in this folder, with its own settings; --steps may ask for more than it was
-    begun with."""
+    """Continue the run in this folder, with its own settings; --steps may be larger than at its
+    start."""
     seeds: str = ""
-    """Train several seeds side by side, as a study, and sum up: 0:5 for 0 to 4, or 3,5,8. The same
-    command goes on after a stop."""
+    """Train several seeds as a study and summarize: 0:5 for 0 to 4, or 3,5,8. The same command
+    resumes a stopped study."""
     episodes: int = 100
     """Episodes of the evaluation at the end."""
     video: bool = True
-    """Draw a flight at the end; with --seeds none is drawn."""
+    """Draw a flight at the end (not with --seeds)."""
     dry_run: bool = False
     """Print every setting with its value and the layer of defaults it comes from; train nothing."""
 

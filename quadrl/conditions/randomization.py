@@ -109,50 +109,52 @@ class Randomization:
     inertia: Range = (1.0, 1.0)
     """Factor of the moments of inertia, the same about every axis."""
     thrust: Range = (1.0, 1.0)
-    """Factor of the thrust of all rotors at a rotor speed."""
+    """Factor of the thrust of all rotors at a given rotor speed."""
     torque: Range = (1.0, 1.0)
-    """Factor of their torque; where the air acts on the discs, from what the thrust takes on."""
+    """Factor of the torque of all rotors; where the air acts on the discs, at least what the thrust
+    needs."""
     lag: Range = (1.0, 1.0)
-    """Factor of their time constants, rising and falling."""
+    """Factor of the time constants of all rotors, rising and falling."""
     drag: Range = (1.0, 1.0)
     """Factor of the aircraft's drag and aerodynamic moment, and of the drag of its rotors."""
     inflow: Range = (1.0, 1.0)
-    """Factor of the lift of the blades, with which thrust answers climb, descent and flight."""
+    """Factor of the lift of the blades: how much the thrust changes with climb, descent and
+    flight."""
     max_speed: Range = (1.0, 1.0)
-    """Factor of the largest rotor speed, at most 1: a battery that runs low."""
+    """Factor of the largest rotor speed, at most 1, as with a low battery."""
     rotors: Range = (1.0, 1.0)
-    """Further factor of the thrust, the torque and the time constant of each rotor on its own."""
+    """Further factor of the thrust, the torque and the time constant, drawn for each rotor."""
     one_rotor: Range = (1.0, 1.0)
-    """Further factor of the thrust and the torque of one rotor, any of them: a damaged one."""
+    """Further factor of the thrust and the torque of one random rotor: a damaged one."""
     wind: Range = (1.0, 1.0)
-    """Factor of the weather's mean wind, with which its turbulence grows."""
+    """Factor of the weather's mean wind; the turbulence grows with it."""
     centre_of_mass: float = 0.0
-    """Largest distance of the centre of mass from where it should be, along each axis [m]."""
+    """Largest distance of the centre of mass from its specified place, along each axis [m]."""
     command_delay: Range = (0.0, 0.0)
-    """Time from a command to the rotors that get it [s], in whole physics steps, beside the
-    aircraft's own `dead_time`."""
+    """Delay of the rotor commands [s], in whole physics steps, in addition to the aircraft's own
+    `dead_time`."""
     observation_delay: Range = (0.0, 0.0)
-    """Age of position, attitude and velocity in the state estimate, and so in all that is seen of
-    it [s], in whole physics steps."""
+    """Age of position, attitude and velocity in the state estimate, and so in all observations of
+    them [s], in whole physics steps."""
     rate_delay: Range = (0.0, 0.0)
     """Age of the body rate in the state estimate [s], in whole physics steps."""
     noise: Errors = Errors()
     """Standard deviations of the errors of the state estimate, drawn anew at each control step."""
     bias: Errors = Errors()
-    """Largest errors of it that last for the episode."""
+    """Largest constant errors of the state estimate, drawn for each episode."""
     pushes: Pushes = Pushes()
     """Impulses."""
     rotor_inertia: Range = (1.0, 1.0)
     """Factor of the moment of inertia of the rotors about their axes."""
     inertia_axes: Range = (1.0, 1.0)
-    """Further factor of the moment of inertia about each axis on its own, up to where that is the
-    sum of the other two."""
+    """Further factor of the moment of inertia about each axis, drawn for each; none gets larger
+    than the sum of the other two."""
     force: float = 0.0
-    """Largest force that acts on the aircraft for an episode, along each axis of the world, as a
+    """Largest constant force on the aircraft in an episode, along each axis of the world, as a
     share of its specified weight."""
     moment: float = 0.0
-    """Largest moment that acts on it for an episode, about each axis of its body, as a share of
-    that weight times the distance of its farthest rotor."""
+    """Largest constant moment on the aircraft in an episode, about each axis of its body, as a
+    share of that weight times the distance of its farthest rotor."""
     corners: float = 0.0
     """Share of the episodes in which lag and command_delay are both drawn from the upper quarter
     of their ranges, since slow rotors are hardest to fly where commands are late."""

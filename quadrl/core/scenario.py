@@ -42,27 +42,27 @@ class Conditions(TypedDict, total=False, extra_items=Any):
     task_options: Mapping[str, Any] | None
     """Options of the task, such as time_limit=5."""
     vehicle: str | Vehicle | Mapping[str, Any] | None
-    """The aircraft: a name of `quadrl.VEHICLES`; in Python also a Vehicle, or fields that differ
-    from one."""
+    """The aircraft: a name of `quadrl.VEHICLES`; in Python also a Vehicle, or changed fields of
+    one."""
     vehicle_options: Mapping[str, Any] | None
-    """Numbers of the aircraft that differ from it, such as mass=0.7 action_scale=90."""
+    """Changed numbers of the aircraft, such as mass=0.7 action_scale=90."""
     aerodynamics: str | Aerodynamics | Mapping[str, Any] | None
-    """Effects of the air on the rotors: none, full, or names of single ones with commas between
-    them, in Python also an Aerodynamics; by default those of the aircraft, and in wind the full set
-    where it has none."""
+    """Effects of the air on the rotors: none, full, or a comma-separated list of effects; in Python
+    also an Aerodynamics. By default the effects of the aircraft; in wind, the full set if it has
+    none."""
     weather: Weathered
     """The weather: calm, light, moderate or severe, or JSON such as '{"wind_speed": 5}'; in Python
     also a Weather, or some of its fields."""
     randomization: Randomized
-    """What is drawn for each aircraft at each reset and disturbs it: none, light or full, or JSON
-    such as '{"mass": [0.8, 1.2]}'; in Python also a Randomization, or some of its fields."""
+    """Randomization of each aircraft at each reset: none, light or full, or JSON such as '{"mass":
+    [0.8, 1.2]}'; in Python also a Randomization, or some of its fields."""
     observe: Observed
-    """Options of the observation, as `quadrl.Observing` has them, such as action_history=2."""
+    """Options of the observation: fields of `quadrl.Observing`, such as action_history=2."""
     control_mode: str | None
     """Meaning of the actions: rotor, thrust_body_rate, velocity or position."""
     engine: EngineName | Engine | None
-    """The engine: mujoco, or free_flight (MuJoCo only near what can be touched); an `Environment`
-    also takes one that is made already."""
+    """The engine: mujoco, or free_flight (which uses MuJoCo only near the ground and solids);
+    `Environment` also accepts an engine object."""
     control_timestep: float | None
     """Time between two actions [s]; by default that of the aircraft."""
     max_episode_steps: int | None

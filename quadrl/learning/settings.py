@@ -55,13 +55,13 @@ class PPOConfig(AlgorithmConfig):
     """Settings of PPO."""
 
     learning_rate: float = 4e-3
-    """Initial rate of Adam; it falls linearly to zero over the training."""
+    """Initial learning rate of Adam; it falls linearly to zero over the training."""
     beta2: float = 0.999
-    """Share of Adam's mean of the squared gradients that a step leaves; below 1."""
+    """Decay rate of Adam's mean of the squared gradients; below 1."""
     epochs: int = 5
     """Passes over each batch."""
     minibatch: int = 1024
-    """Transitions in a gradient step: few large ones, since each step costs milliseconds."""
+    """Transitions in a gradient step: few large steps, since each takes milliseconds."""
     clip: float = 0.2
     """Bound on the change of the probability ratio."""
     entropy: float = 0.0
@@ -69,10 +69,10 @@ class PPOConfig(AlgorithmConfig):
     critic: float = 1.0
     """Weight of the critic's squared error."""
     max_gradient: float = 1.0
-    """Norm to which the gradients of policy and critic are clipped, each on its own."""
+    """Norm to which the gradients of policy and critic are clipped separately."""
     fused: bool = True
-    """Whether the gradients are those written by hand, which take 0.55 of the time of TorchRL's
-    loss and are the same to rounding; they do not know a policy with a memory."""
+    """Whether to use the gradients written by hand: they take 0.55 of the time of TorchRL's loss,
+    agree with it to rounding, and do not work for a policy with a memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,9 +86,10 @@ class TRPOConfig(AlgorithmConfig):
     iterations: int = 10
     """Iterations of the conjugate gradient method."""
     backtracks: int = 10
-    """Steps tried in the line search."""
+    """Most steps tried in the line search."""
     shrink: float = 0.7
-    """Factor from a tried step within the bound, but of no gain, to the next one."""
+    """Factor by which the line search shortens a step that is within the bound but brings no
+    gain."""
     critic_rate: float = 3e-3
     """Initial learning rate of the critic; it falls linearly to zero."""
     critic_epochs: int = 8
@@ -104,7 +105,8 @@ class VPGConfig(AlgorithmConfig):
     training = {"num_envs": 128, "rollout": 8}  # one step per batch: more batches, and smaller
 
     learning_rate: float = 3e-3
-    """Initial rate of the policy's one step on each batch; it falls linearly to zero."""
+    """Initial learning rate of the policy, which takes one step on each batch; it falls linearly to
+    zero."""
     critic_rate: float = 6e-3
     """Initial learning rate of the critic; it falls linearly to zero."""
     critic_epochs: int = 8
@@ -123,10 +125,10 @@ class APGConfig(AlgorithmConfig):
     training = {"num_envs": 64, "rollout": 32, "initial_deviation": 0.5, "steps": 204_800}
 
     step: float = 0.2
-    """How far the actions of a window are moved up their gradient, where it has its median
-    length; twice as far at most."""
+    """How far the actions of a window are moved along their gradient, where the gradient has its
+    median length; at most twice as far elsewhere."""
     learning_rate: float = 5e-3
-    """Initial rate of Adam, with which the policy is fitted to the moved actions; it falls linearly
+    """Initial learning rate of Adam, which fits the policy to the moved actions; it falls linearly
     to zero."""
     epochs: int = 4
     """Passes of the policy over each window."""
@@ -174,37 +176,37 @@ class TrainSettings:
     task: str = "hover"
     """Name of the task."""
     algo: str = "ppo"
-    """Algorithm: ppo, trpo, vpg (the plain policy gradient; the paper's name gae works too), or apg
-    (the gradient goes through the physics, which the paper's algorithms do not know)."""
+    """Algorithm: ppo, trpo, vpg (the plain policy gradient; gae, the paper's name for it, works
+    too), or apg (the analytic policy gradient through the physics; not in the paper)."""
     seed: int = 0
     """Seed of the networks, the exploration and the episodes, between 0 and 2^32 - 1."""
     variant: str = "ideal"
-    """Settings that go together: ideal (the paper's episodes), or robust (an uncertain aircraft in
-    light wind, and a policy that sees what it needs for that)."""
+    """Group of settings: ideal (the paper's episodes), or robust (an uncertain aircraft in light
+    wind, and a policy that sees what it needs for that)."""
     vehicle: str = "paper"
     """Name of the aircraft."""
     vehicle_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     control_mode: str = "rotor"
     engine: str = "free_flight"
-    """Engine of the training: free_flight (MuJoCo only near the ground) or mujoco. Evaluations
-    always fly in mujoco."""
+    """Engine of the training: free_flight (which uses MuJoCo only near the ground and solids) or
+    mujoco. Evaluations always fly in mujoco."""
     task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     training_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the task in the training alone, such as farthest=3: a policy is weakest at the
+    """Options of the task for the training only, such as farthest=3: a policy is weakest at the
     edge of what it was trained on."""
     aerodynamics: str = ""
     weather: Any = "calm"
     randomization: Any = "none"
     observe: dict[str, Any] = dataclasses.field(default_factory=dict)
     num_envs: int = 256
-    """Aircraft flown together."""
+    """Aircraft simulated at the same time."""
     rollout: int = 16
     """Control steps of each aircraft in a batch."""
     steps: int = 1_310_720
-    """Control steps of all aircraft in the training."""
+    """Control steps of the training, summed over all aircraft."""
     gamma: float = 0.93
-    """Discount per control step (effective horizon 0.7 s): with a short one a lasting
-    error costs more than one that is corrected."""
+    """Discount per control step; 0.93 gives an effective horizon of 0.7 s. With a short horizon a
+    lasting error costs more than one that is corrected."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimation."""
     reward_scale: float = 0.01
@@ -219,14 +221,15 @@ class TrainSettings:
     """Numbers that a policy with a memory remembers."""
     holds_goal: bool = False
     """Whether the mean action at the goal is to hover, whatever the weights: the network's output
-    less its output there. It sees neither position nor, where the heading is free, yaw."""
+    at the goal is subtracted from its output. The policy then sees neither position nor, if the
+    heading is free, yaw."""
     initial_deviation: float = 1.0
-    """Standard deviation of the actions at the start."""
+    """Standard deviation of the actions at the start of the training."""
     from_run: str = ""
-    """Folder of a run with whose networks the training begins, those of policy and critic with the
-    mean and deviation of what they see. Their widths, memory, holds_goal and deviation are those of
-    that run; task, algorithm and all else may be others. Saved as FOLDER@DIGEST, of its checkpoint.
-    """
+    """Folder of a run whose networks the training begins with: policy and critic, with the mean and
+    deviation of what they see. Their widths, memory, holds_goal and deviation are those of that
+    run; task, algorithm and all else may differ. Saved as FOLDER@DIGEST, with the digest of its
+    checkpoint."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     """Settings of PPO."""
     trpo: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
@@ -240,7 +243,8 @@ class TrainSettings:
     num_threads: int = 0
     """Threads of the simulation; 0 for one per core. The results do not depend on it."""
     checkpoint_seconds: float = 5.0
-    """Least time between two checkpoints [s]."""
+    """Shortest time between two checkpoints [s]."""
     evaluations: int = 0
-    """Times, evenly over the training, that the policy of the moment flies 50 episodes with its
-    mean action, in free flight: the rows of evaluations.csv. Their seconds count."""
+    """Number of evaluations, evenly over the training: the policy of the moment flies 50 episodes
+    with its mean action, in free flight, for a row of evaluations.csv. They count in the seconds of
+    the training."""
