@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -76,10 +77,17 @@ def settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
 
 
 def observation_rows(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
-    """The terms of the flat observation, and the tasks that have them if not all do."""
-    for term in {t["name"]: t for task in described for t in task["observation"]}.values():
+    """The terms of the flat observation by their numbers, and the tasks that have them there."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for task in described:
+        for term in task["observation"]:
+            others = found.setdefault(term["name"], [])
+            others += [term] * (term not in others)
+    for term in itertools.chain(*found.values()):
         having = [task["name"] for task in described if term in task["observation"]]
-        where = "" if len(having) == len(described) else f" (only {', '.join(having)})"
+        rest = [task["name"] for task in described if task["name"] not in having]
+        named = f"all but {', '.join(rest)}" if len(rest) < len(having) else ", ".join(having)
+        where = f" (in {named})" if rest else ""
         numbers = f"{term['first']}..{term['last']}"
         yield term["name"], numbers, term["unit"], term["meaning"] + where
 
