@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Generator
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from rich.console import Console
 from tyro.conf import CascadeSubcommandArgs, Positional, UseAppendAction, arg
@@ -19,6 +19,7 @@ from tyro.conf import CascadeSubcommandArgs, Positional, UseAppendAction, arg
 from quadrl import __version__
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.signals import IN_ORDER, Stopped, handling
+from quadrl.base.validation import choice
 from quadrl.cli import choices, console, parsing, train
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
@@ -33,6 +34,8 @@ from quadrl.cli.train import Train
 from quadrl.cli.view import View
 from quadrl.core.rules import import_own
 
+SHELLS = ("bash", "zsh", "fish")
+
 
 @choices.command
 class Completion:
@@ -41,13 +44,14 @@ class Completion:
     bash: source <(quadrl completion bash). zsh: write it to a file _quadrl in a folder of fpath.
     """
 
-    shell: Positional[Literal["bash", "zsh", "tcsh", "fish"]] = "bash"
+    shell: Positional[Annotated[str, choices.words(SHELLS)]] = "bash"
     """The shell to complete in."""
 
     def run(self) -> None:
         """Print the script."""
+        shell = choice("shell", self.shell, SHELLS)
         with choices.enforced():
-            parse(["--tyro-print-completion", self.shell])
+            parse(["--tyro-print-completion", shell])
 
 
 Command = (Tasks | Train | Study | Evaluate | Robustness | Render | View | Plot | Check | Export

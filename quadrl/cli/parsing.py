@@ -111,18 +111,35 @@ def _in_a_line(box: str, words: Sequence[str]) -> str:
     """What the parser draws in a box of several lines, in one."""
     text = " ".join(re.sub(r"[╭╮╰╯│─|+]|-{3,}", " ", box).split())
     command = _command(words) or "-"
-    where = f"{PROGRAM} --help" if command.startswith("-") else f"{PROGRAM} {command} --help"
+    here = PROGRAM if command.startswith("-") else f"{PROGRAM} {command}"
+    where = f"{here} --help"
     if found := re.search(r"Error parsing --(\S+): .*? matching (.*?) could .*? \[(.*?)\]", text):
         name, kind, given = found.groups()
         return f"{name} = {given}: must be {KINDS.get(kind, kind)}"
-    if found := re.search(r"Unrecognized options: (.*?) (?:Perhaps|Available|For full)", text):
-        meant = re.search(r"Perhaps you meant: .*?(--[\w.-]+)", text)
-        hint = f" (did you mean {meant[1]}?)" if meant else ""
-        first = found[1].partition(",")[0]
-        kind = "an unknown option" if first.startswith("-") else "one word too many"
-        return f"{first} is {kind}{hint}; see {where}"
+    if found := re.search(r"Unrecognized (?:or misplaced )?options: ([^\s,]+)", text):
+        return f"{_unknown(found[1], box, command, here)}; see {where}"
     if found := re.search(r"Missing value for argument '(\S+)'", text):
         return f"{found[1]} needs a value; see {where}"
     if found := re.search(r"Missing from .*?: (.*?) \(required\)", text):
         return f"missing: {found[1]} See {where}"
     return f"{text.partition('For full helptext')[0].strip()}; see {where}"
+
+
+def _unknown(word: str, box: str, command: str, here: str) -> str:
+    """What is wrong with a word that the command does not take."""
+    if not word.startswith("-"):
+        return f"{word} is one word too many"
+    like = rf"(?:you meant|similar to {re.escape(word)}):(.*?)(?:similar to|For full)"
+    found = re.search(like, box, re.DOTALL)
+    similar = found[1] if found else ""
+    having: dict[str, list[str]] = {}  # options like it, and the commands that have them
+    option = ""
+    for name, other in re.findall(r"\n. {5}(--[\w.-]+)|in quadrl (\w+)", similar):
+        option = name or option
+        having.setdefault(option, []).extend([other] * bool(other))
+    if others := having.get(word):
+        more = ", ..." * ("[...]" in similar)
+        return f"{word} is no option of {here}, but of {', '.join(others)}{more}"
+    meant = next((name for name, others in having.items() if command in others), "")
+    hint = f" (did you mean {meant}?)" if meant else ""
+    return f"{word} is an unknown option{hint}"

@@ -98,6 +98,8 @@ def test_tasks(capsys):
     listed = capsys.readouterr().out
     for name in tasks.TASKS:
         assert name in listed
+    for numbers in ("3..5", "0..2"):  # deck_landing does not see the position
+        assert re.search(rf"sin_attitude +{re.escape(numbers)} ", listed)
     assert command("tasks", "hover") == 0
     shown = " ".join(capsys.readouterr().out.split())  # wherever the lines break
     for words in ("time limit 10 s", "rotor_speed 15..18 1", "tilt 0.2 ", "--gamma 0.9"):
@@ -498,6 +500,9 @@ MISTYPED = {
     "trian hover": "did you mean train?",
     "train hover --bogus": "--bogus is an unknown option; see quadrl train --help",
     "train hover --stepz 5": "did you mean --steps?",
+    "train hover --camera track": "--camera is no option of quadrl train, but of render; see",
+    "benchmark --vehicle x": "--vehicle is no option of quadrl benchmark, but of check, evaluate",
+    "completion tcsh": "shell = 'tcsh': must be one of bash, zsh, fish",
     "train hover landing": "landing is one word too many; see quadrl train --help",
     "train --steps many": "steps = 'many': must be a whole number",
     "train --steps 1.5": "steps = '1.5': must be a whole number",
