@@ -9,6 +9,7 @@ observation. `policy_file` has its file.
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ import numpy as np
 
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.presets import resolve as resolve_vehicle
-from quadrl.base.errors import QuadrlError
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
 from quadrl.control.modes import named
@@ -184,7 +185,7 @@ class Policy:
     def check_fits(self, environment: Environment) -> None:
         """Refuse an environment in which observations or actions mean something else.
 
-        `keywords` make one that fits.
+        `keywords` make one that fits. Another time between two actions is warned of.
 
         Raises:
             QuadrlError: The policy observes or commands another number of values or with other
@@ -211,15 +212,17 @@ class Policy:
         if (mode := environment.control_mode.name) != self.control_mode:
             allowed = f"{self.control_mode!r}, {as_trained}"
             raise QuadrlError(name="control_mode", value=mode, allowed=allowed)
-        if self.control_mode != "rotor":
-            return
-        if not np.array_equal(trained.layout, vehicle.layout):
+        rotors = self.control_mode == "rotor"
+        if rotors and not np.array_equal(trained.layout, vehicle.layout):
             allowed = f"one with the rotor layout of {trained.name}, which the policy has learned"
             raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
-        if trained.action_scale != vehicle.action_scale:
+        if rotors and trained.action_scale != vehicle.action_scale:
             reason = "make the environment with **policy.keywords, or its aircraft with that scale"
             scale, allowed = vehicle.action_scale, f"{trained.action_scale:g}, {as_trained}"
             raise QuadrlError(reason, name="action_scale", value=scale, allowed=allowed)
+        if trained.control_timestep != (timestep := vehicle.control_timestep):
+            said = f"control_timestep = {timestep:g}: the policy for {self.task} was trained with"
+            warnings.warn(f"{said} {trained.control_timestep:g}", QuadrlWarning, stacklevel=4)
 
     def _without_memory(self) -> np.ndarray:
         """The state of a policy that has none.

@@ -11,6 +11,7 @@ from safetensors.numpy import save
 
 import quadrl
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.base.errors import QuadrlWarning
 from quadrl.base.files import write_safetensors
 from quadrl.core.environment import Environment
 from quadrl.envs.torchrl import QuadrotorEnv
@@ -231,6 +232,11 @@ def test_its_keywords_make_what_it_fits_in_every_api():
     for _ in range(200):
         observation, _, terminated, truncated, info = single.step(policy(observation))
     assert truncated and not terminated and info["is_success"]
+
+
+def test_another_time_between_two_actions_than_in_training_is_warned_of():
+    with pytest.warns(QuadrlWarning, match="= 0.02: the policy for hover was trained with 0.05"):
+        quadrl.evaluate("hover", episodes=1, control_timestep=0.02)
 
 
 def test_a_policy_of_before_flies_the_thrust_that_it_was_trained_with():
