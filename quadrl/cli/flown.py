@@ -59,7 +59,8 @@ class Flown(Conditioned):
     algo: choices.Algorithm = ""
     """Algorithm of the shipped policy; by default the algorithm with which its task is trained."""
     controller: choices.ControllerName = ""
-    """A controller instead of a policy: geometric or lqr."""
+    """A controller instead of a policy: geometric or lqr. It flies the aircraft that the task is
+    trained on."""
     task: choices.TaskName = ""
     """The task; by default the one that the policy was trained for, and hover for a controller."""
     seed: int = 0

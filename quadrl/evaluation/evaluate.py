@@ -15,6 +15,7 @@ from quadrl.base.units import length, percent, quantity
 from quadrl.base.validation import number
 from quadrl.control import CONTROLLERS
 from quadrl.control.feasibility import warn_of_unreached
+from quadrl.core.catalogue import make
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.snapshot import Rollout
 from quadrl.core.task import Task
@@ -116,7 +117,7 @@ def evaluate(
         sampled: Whether to draw the actions of a policy, as in training, instead of their mean.
         **conditions: `vehicle`, `weather`, `randomization` and the others, as
             `quadrl.core.scenario.Conditions` has them, and options of the task; what is left out
-            is as in the training.
+            is as in the training. A controller flies the aircraft that the task is trained on.
 
     Raises:
         QuadrlError: Something is unknown, out of range, or does not fit together.
@@ -159,7 +160,7 @@ def setting(
     """
     flown: Any = getattr(controller, "policy", controller)
     if isinstance(flown, str) and flown in CONTROLLERS:
-        scenario = Scenario.of(task or "hover", **conditions)
+        scenario = Scenario.of(_on_its_aircraft(task or "hover"), **conditions)
         made = make_controller(flown, scenario.task, scenario.aircraft)
         return f"{flown} controller", made, scenario
     name = "policy" if isinstance(flown, Policy) else getattr(flown, "__name__", "controller")
@@ -169,6 +170,15 @@ def setting(
         allowed = "a policy, a run, a path, the name of a task or a controller, or a function"
         raise QuadrlError(name="controller", value=flown, allowed=allowed)
     return name, cast(Any, flown), scenario_of(flown, task, **conditions)
+
+
+def _on_its_aircraft(task: str | Task | Scenario) -> Scenario | dict[str, Any]:
+    """What a controller flies: a scenario as it is, a task with the aircraft of its training."""
+    if isinstance(task, Scenario):
+        return task
+    made = make(task)
+    options = made.training.get("vehicle_options", {})
+    return {"task": made, "vehicle": made.trained_on, "vehicle_options": options}
 
 
 def beside(

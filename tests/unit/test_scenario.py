@@ -8,6 +8,7 @@ import pytest
 from helpers import refused
 
 import quadrl
+from quadrl import tasks
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
 from quadrl.base.errors import UnknownKeyword
@@ -15,7 +16,7 @@ from quadrl.conditions.weather import WEATHERS, Weather
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario, as_saved
 from quadrl.evaluation import robustness
-from quadrl.evaluation.evaluate import beside
+from quadrl.evaluation.evaluate import beside, setting
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig
 from quadrl.tasks import RandomWaypoint
@@ -162,6 +163,18 @@ def test_all_that_fly_beside_each_other_or_for_a_card_fly_in_the_same_air():
         drag = robustness._flown(flown, None, aerodynamics="none").values()
         gusty = [robustness.disturbed(one, Weather(gust_speed=4.0)) for _, one in drag]
         assert {one.aerodynamics for one in gusty} == {"none"}
+
+
+@pytest.mark.parametrize(
+    ("given", "vehicle", "scale"),
+    [({}, "crazyflie", 540.0), ({"vehicle": "racer"}, "racer", VEHICLES["racer"].action_scale)],
+)
+def test_a_controller_flies_the_aircraft_that_the_task_is_trained_on(given, vehicle, scale):
+    for task in ("trajectory", tasks.make("trajectory")):
+        scenario = setting("geometric", task, **given)[2]
+        assert (scenario.vehicle.name, scenario.vehicle.action_scale) == (vehicle, scale)
+    plain = Scenario.of("trajectory")
+    assert setting("geometric", plain)[2] is plain
 
 
 def test_timing_is_the_aircrafts_and_the_tasks():
