@@ -13,7 +13,7 @@ from quadrl.aircraft.aerodynamics import EFFECTS, FULL, NONE, SWITCHES, Aerodyna
 from quadrl.aircraft.rotors import Rotor, ring
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice, keys, record
+from quadrl.base.validation import IN_A_FILE, choice, keys, record
 
 CRAZYFLIE = Vehicle(
     name="crazyflie",  # Crazyflie 2.1, brushed; motors 1 to 4, clockwise from ahead on the right
@@ -179,7 +179,7 @@ def resolve(
         QuadrlError: It is something else, a name is unknown, or a number impossible.
     """
     if isinstance(vehicle, str):
-        vehicle = VEHICLES[choice("vehicle", vehicle, VEHICLES)]
+        vehicle = VEHICLES[choice("vehicle", vehicle, VEHICLES, IN_A_FILE)]
     if isinstance(vehicle, Mapping):
         vehicle = _of_fields(vehicle)
     vehicle = VEHICLES["paper"] if vehicle is None else vehicle

@@ -30,7 +30,7 @@ class QuadrlError(ValueError):
 
 
 class UnknownKeyword(QuadrlError, TypeError):
-    """An unknown keyword; worded as a TypeError, since libraries try keywords and read it."""
+    """An unknown name or keyword; a TypeError, too, as it is in Python."""
 
 
 class NativeError(QuadrlError, RuntimeError):

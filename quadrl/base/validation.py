@@ -16,6 +16,8 @@ from quadrl.base.errors import QuadrlError, UnknownKeyword
 
 MAX_SEEDS = 1000
 WHOLE = 1e-6  # of a step: tolerance with which a time is a whole number of steps
+IN_A_FILE = ", or one of a file that --import names"
+"""What else a name can be that is registered."""
 MAX_OPTION = 1e9
 """Largest number in an option of a task; with larger ones sums would lose their digits."""
 
@@ -111,8 +113,8 @@ def seeds(value: Any, largest: int) -> list[int]:
     return whole
 
 
-def choice(name: str, value: Any, choices: Iterable[str]) -> Any:
-    """A value that is one of the choices.
+def choice(name: str, value: Any, choices: Iterable[str], others: str = "") -> Any:
+    """A value that is one of the choices; `others` says what else there can be.
 
     Raises:
         QuadrlError: It is none of them; the message lists them and names the nearest.
@@ -122,11 +124,17 @@ def choice(name: str, value: Any, choices: Iterable[str]) -> Any:
         return value
     near = difflib.get_close_matches(str(value), allowed, n=1)
     hint = f" (did you mean {near[0]}?)" if near else ""
-    raise QuadrlError(name=name, value=value, allowed=f"one of {', '.join(allowed)}{hint}")
+    raise QuadrlError(name=name, value=value, allowed=f"one of {', '.join(allowed)}{hint}{others}")
 
 
-def keys(what: str, given: Iterable[str], choices: Iterable[str]) -> None:
+def keys(what: str, given: Iterable[str], choices: Iterable[str], *, tried: bool = False) -> None:
     """Refuse the first name that is not among the choices.
+
+    Args:
+        what: What they are names of.
+        given: The names.
+        choices: Those that there are.
+        tried: Whether libraries try keywords, and read in Python's words which one is unknown.
 
     Raises:
         UnknownKeyword: The message lists the choices.
@@ -136,7 +144,7 @@ def keys(what: str, given: Iterable[str], choices: Iterable[str]) -> None:
         try:
             choice(what, name, allowed)
         except QuadrlError as error:
-            reason = f"got an unexpected keyword argument {name!r}"
+            reason = f"got an unexpected keyword argument {name!r}" if tried else ""
             raise UnknownKeyword(reason, name=what, value=name, allowed=error.allowed) from None
 
 

@@ -19,6 +19,11 @@ from quadrl.evaluation.controllers import comes_with_quadrl
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.defaults import PAIRS
 
+EXAMPLES = {
+    "weather": ' such as {"wind_speed": 5}',
+    "randomization": ' such as {"mass": [0.8, 1.2]}',
+}
+"""Of JSON, by the option that takes it."""
 ConditionOptions: Any = choices.optional(Conditions, lambda name: "")
 
 
@@ -104,7 +109,7 @@ def parse_named(name: str, text: Any) -> Any:
     try:
         return tuples(json.loads(text))
     except (ValueError, RecursionError) as error:
-        allowed = 'a name, or JSON such as {"mass": [0.8, 1.2]}'
+        allowed = f"a name, or JSON{EXAMPLES.get(name, '')}"
         raise QuadrlError(f"{error}", name=name, value=text, allowed=allowed) from None
 
 

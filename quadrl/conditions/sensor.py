@@ -16,7 +16,7 @@ from quadrl.aircraft.rotors import MAX
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SENSORS as STREAMS
 from quadrl.base.rotation import Array
-from quadrl.base.validation import choice, number, record, registered, whole_steps
+from quadrl.base.validation import IN_A_FILE, choice, number, record, registered, whole_steps
 from quadrl.conditions.randomization import LONGEST_DELAY
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.engines import native
@@ -148,7 +148,7 @@ def make(name: str, options: Any) -> Sensor:
     Raises:
         QuadrlError: The sensor or an option is unknown; the message lists the choices.
     """
-    kind = SENSORS[choice("sensor", name, SENSORS)]
+    kind = SENSORS[choice("sensor", name, SENSORS, IN_A_FILE)]
     if not isinstance(options, Mapping):
         raise QuadrlError(name=f"sensor {name}", value=options, allowed="a mapping of its options")
     return record(name, options, kind, "option")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quadrl.base.validation import choice, registered
+from quadrl.base.validation import IN_A_FILE, choice, registered
 from quadrl.core.task import Task
 
 TASKS: dict[str, type[Task]] = {}
@@ -31,5 +31,5 @@ def make(name: str | Task, **options: Any) -> Task:
     Raises:
         QuadrlError: Unknown task or option; the message lists the choices.
     """
-    task = name if isinstance(name, Task) else TASKS[choice("task", name, TASKS)]()
+    task = name if isinstance(name, Task) else TASKS[choice("task", name, TASKS, IN_A_FILE)]()
     return task.replace(**options)

@@ -172,7 +172,7 @@ class Scenario:
             others["time_limit"] = steps * vehicle.control_timestep
         made = catalogue.make(whole["task"])
         known = [field.name for field in dataclasses.fields(made)]
-        validation.keys(f"{made.name} option", others, [*KEYWORDS, *also, *known])
+        validation.keys(f"{made.name} option", others, [*KEYWORDS, *also, *known], tried=bool(also))
         parts: dict[str, Any] = {k: value for k, value in whole.items() if value is not None}
         made = made.replace(**validation.tuples(options | others))
         parts |= {"task": made, "vehicle": vehicle}

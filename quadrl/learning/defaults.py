@@ -20,7 +20,7 @@ from typing import Any
 
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.base.validation import choice, keys
+from quadrl.base.validation import IN_A_FILE, choice, keys
 from quadrl.conditions.randomization import RANDOMIZATIONS
 from quadrl.core.task import Task
 from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
@@ -127,9 +127,9 @@ def training_defaults(
         QuadrlError: The task, the vehicle, the variant or a setting in `Task.training`,
             `Task.training_with` or `Task.variants` is unknown.
     """
-    kind = tasks.TASKS[choice("task", task, tasks.TASKS)]
+    kind = tasks.TASKS[choice("task", task, tasks.TASKS, IN_A_FILE)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
-    choice("vehicle", vehicle, VEHICLES)
+    choice("vehicle", vehicle, VEHICLES, IN_A_FILE)
     fields, own = dataclasses.asdict(TrainSettings()), _unusual(kind, algo)
     stated = merged(kind.training, *kind.training_with.values(), *kind.variants.values())
     keys(f"training default of {task}", stated, [name for name in fields if name not in CHOSEN])

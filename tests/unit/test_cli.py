@@ -503,6 +503,8 @@ MISTYPED = {
     "train hover --camera track": "--camera is no option of quadrl train, but of render; see",
     "benchmark --vehicle x": "--vehicle is no option of quadrl benchmark, but of check, evaluate",
     "completion tcsh": "shell = 'tcsh': must be one of bash, zsh, fish",
+    "evaluate hover --task hovr": "(did you mean hover?), or one of a file that --import names",
+    "evaluate hover --weather {": 'or JSON such as {"wind_speed": 5}; Expecting',
     "train hover landing": "landing is one word too many; see quadrl train --help",
     "train --steps many": "steps = 'many': must be a whole number",
     "train --steps 1.5": "steps = '1.5': must be a whole number",

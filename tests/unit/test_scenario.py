@@ -215,6 +215,7 @@ def test_an_unknown_name_is_refused_with_the_choices(given, name):
     with pytest.raises(UnknownKeyword) as caught:
         Scenario.of("hover", ["num_envs"], **given)
     assert caught.value.name == name
+    assert (caught.value.reason != "") == (name == "hover option")  # those may be tried
     if name == "hover option":
         assert "weather" in caught.value.allowed and "num_envs" in caught.value.allowed
         with pytest.raises(UnknownKeyword) as caught:  # those of the task alone
