@@ -20,10 +20,12 @@ from quadrl import envs, tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.shield import shield_triton
+from quadrl.base.validation import registered
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import RANDOMIZATIONS, Randomization
 from quadrl.core.task import Task
 from quadrl.evaluation.policy import Policy
+from quadrl.learning.defaults import check_stated
 
 if TYPE_CHECKING:
     from dm_control.rl.control import Environment as ControlEnvironment
@@ -75,8 +77,11 @@ def register(task: type[Task]) -> type[Task]:
     """Add a task to the catalogue and to every API; usable as a class decorator.
 
     Raises:
-        QuadrlError: Another task has the name.
+        QuadrlError: It is not a Task subclass with a name, another task has the name, or one of its
+            settings of a training is unknown.
     """
+    registered("task", task, Task, tasks.TASKS)
+    check_stated(task)
     tasks.register(task)
     envs.register_ids()
     return task

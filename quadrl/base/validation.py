@@ -187,9 +187,12 @@ def registered(what: str, kind: Any, base: type, registry: Mapping[str, Any]) ->
     """
     name = getattr(kind, "name", None)
     is_kind = isinstance(kind, type) and issubclass(kind, base)
-    if not (is_kind and isinstance(name, str) and name.isidentifier()):
+    if not (is_kind and isinstance(name, str)):
         allowed = f"a {base.__name__} subclass with a string `name` such as 'my_{what}'"
         raise QuadrlError(name=what, value=kind, allowed=allowed)
+    if not name.isidentifier():
+        allowed = f"letters, digits and underscores, such as 'my_{what}'"
+        raise QuadrlError(name=f"{what} name", value=name, allowed=allowed)
     if registry.get(name, kind) is not kind:
         allowed = f"a name that no other {what} has"
         raise QuadrlError(name=f"{what} name", value=name, allowed=allowed)

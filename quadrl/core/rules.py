@@ -49,8 +49,7 @@ def import_own(path: Path) -> None:
     sys.modules[path.stem] = module
     with _located(path):
         spec.loader.exec_module(module)
-    for name in TASKS.keys() - known:
-        kind = TASKS[name]
+    for kind in [kind for name, kind in TASKS.items() if name not in known]:
         with _located(path, inspect.getsourcelines(kind)[1]):
             check_rules(kind)
 

@@ -130,9 +130,8 @@ def training_defaults(
     kind = tasks.TASKS[choice("task", task, tasks.TASKS, IN_A_FILE)]
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
     choice("vehicle", vehicle, VEHICLES, IN_A_FILE)
+    check_stated(kind)
     fields, own = dataclasses.asdict(TrainSettings()), _unusual(kind, algo)
-    stated = merged(kind.training, *kind.training_with.values(), *kind.variants.values())
-    keys(f"training default of {task}", stated, [name for name in fields if name not in CHOSEN])
     if own.get("vehicle", "paper") != vehicle:  # the numbers of another aircraft
         own.pop("vehicle_options", None)
     varied = (shared, kind.variants.get(variant, {}), OF_VEHICLE.get((variant, vehicle), {}))
@@ -153,6 +152,17 @@ def training_defaults(
             for name, _ in flat(read)
         }
     return values, sources
+
+
+def check_stated(task: type[Task]) -> None:
+    """Refuse an unknown setting in `Task.training`, `Task.training_with` or `Task.variants`.
+
+    Raises:
+        QuadrlError: The message lists the settings.
+    """
+    stated = merged(task.training, *task.training_with.values(), *task.variants.values())
+    known = [field.name for field in dataclasses.fields(TrainSettings) if field.name not in CHOSEN]
+    keys(f"training default of {task.name}", stated, known)
 
 
 def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
