@@ -85,7 +85,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"quadrl {__version__}, mujoco {version('mujoco')}, Python {sys.version.split()[0]}")
         return
     try:
-        with _warned_in_a_line(stderr), handling(IN_ORDER):
+        with console.piped(), _warned_in_a_line(stderr), handling(IN_ORDER):
             chosen = parse(words)
             console.own_files[:] = chosen.own
             console.console.quiet = chosen.quiet

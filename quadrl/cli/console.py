@@ -59,6 +59,18 @@ def again(command: str, *folder: Path) -> str:
 
 
 @contextlib.contextmanager
+def piped() -> Generator[None]:
+    """End quietly where nobody reads the output to its end, as in `quadrl tasks | head -1`."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        console.on_broken_pipe()
+
+
+@contextlib.contextmanager
 def going_on() -> Generator[None]:
     """Say, after a Ctrl-C or a SIGTERM, that the same command goes on."""
 

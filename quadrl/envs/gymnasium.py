@@ -253,17 +253,22 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         self._pictures.close()
 
 
+MODES = ["human", "rgb_array"]
+
+
 def make_one(
     task: str | Task = "hover", render_mode: str | None = None, **settings: Any
 ) -> gym.Env[Array, Array]:
     """What `gym.make` calls: a QuadrotorEnv, in a window where the render mode is "human"."""
+    if render_mode is not None:
+        validation.choice("render_mode", render_mode, MODES)
     if render_mode == "human":
         return HumanRendering(QuadrotorEnv(task, render_mode="rgb_array", **settings))
     return QuadrotorEnv(task, render_mode=render_mode, **settings)
 
 
 # Gymnasium reads from it which wrapper a render mode needs.
-make_one.metadata = QuadrotorEnv.metadata | {"render_modes": ["human", "rgb_array"]}  # type: ignore[attr-defined]
+make_one.metadata = QuadrotorEnv.metadata | {"render_modes": MODES}  # type: ignore[attr-defined]
 
 
 def _masked(values: Info, rows: Array) -> Info:

@@ -130,7 +130,8 @@ def scenario_of(
             raise QuadrlError(name="task", value=None, allowed="given, for a function")
         scenario = Scenario.of(trained, task=task, **conditions)
     if own not in (None, mode := scenario.control_mode):
-        raise QuadrlError(name="control_mode", value=mode, allowed=f"{own!r}, as trained")
+        allowed = f"{own!r}, the mode of this policy or controller"
+        raise QuadrlError(name="control_mode", value=mode, allowed=allowed)
     return scenario
 
 

@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -504,6 +505,7 @@ MISTYPED = {
     "benchmark --vehicle x": "--vehicle is no option of quadrl benchmark, but of check, evaluate",
     "completion tcsh": "shell = 'tcsh': must be one of bash, zsh, fish",
     "evaluate hover --task hovr": "(did you mean hover?), or one of a file that --import names",
+    "robustness --controller lqr --control-mode velocity": "'rotor', the mode of this policy or",
     "evaluate hover --weather {": 'or JSON such as {"wind_speed": 5}; Expecting',
     "train hover landing": "landing is one word too many; see quadrl train --help",
     "train --steps many": "steps = 'many': must be a whole number",
@@ -556,6 +558,8 @@ BROKEN = {
         8,
     ),
     "an option without words": (OWN.replace("radius", "near").replace(WORDS, ""), 8),
+    "an unknown setting of a training": (OWN.replace("gamma", "gama"), 8),
+    "a name with a space": (OWN.replace("near_hover", "near hover"), 8),
 }
 
 
@@ -567,6 +571,26 @@ def test_a_file_that_breaks_a_rule(refusal, monkeypatch, case):
     text, line = BROKEN[case]
     Path("own.py").write_text(text)
     assert f"own.py, line {line}: " in refusal("tasks", "--import", "own.py")[1]
+
+
+def test_the_tasks_of_a_file_are_checked_in_their_order(monkeypatch):
+    names = [f"task_{letter}" for letter in "ebdac"]
+    for name in names:
+        monkeypatch.setitem(tasks.TASKS, name, None)
+        monkeypatch.delitem(tasks.TASKS, name)
+    checked = []
+    monkeypatch.setattr("quadrl.core.rules.check_rules", lambda kind: checked.append(kind.name))
+    classes = (f"class {name.upper()}(Hover):\n    name = {name!r}\n" for name in names)
+    begin = "from quadrl.tasks import register\nfrom quadrl.tasks.hover import Hover\n"
+    Path("own.py").write_text(begin + "".join(f"@register\n{kind}" for kind in classes))
+    assert command("--import", "own.py", "tasks", "hover") == 0
+    assert checked == names
+
+
+def test_output_that_nobody_reads_ends_quietly():
+    words = f"{shlex.quote(sys.executable)} -m quadrl completion | true"
+    done = subprocess.run(["bash", "-c", words], capture_output=True, text=True)
+    assert done.stderr == ""
 
 
 def test_a_disk_that_fills_up(capsys, tmp_path, monkeypatch, undrawn):

@@ -165,6 +165,7 @@ def test_vehicle_task_options_randomization_and_the_time_limit_arrive(make):
     ("kind", "name", "value"),
     [
         (envs.gymnasium.QuadrotorEnv, "render_mode", "human"),
+        (envs.gymnasium.make_one, "render_mode", "rgb"),
         (envs.gymnasium.QuadrotorEnv, "max_episode_steps", 0),
         (envs.gymnasium.QuadrotorVectorEnv, "autoreset_mode", "same"),
         (envs.gymnasium.QuadrotorVectorEnv, "num_envs", 0),
