@@ -91,10 +91,14 @@ class Train:
     def run(self) -> None:
         """Train, sum up, draw."""
         settings = parsed(dataclasses.asdict(self.settings))
+        given = dict.fromkeys(dict(flat(settings)), "given")
         task = settings.pop("task", None)
         if self.dry_run:
             config, _ = prepare(task, self.out, self.resume, settings)
-            rows = ((name, str(value), origin) for name, value, origin in config.sources())
+            rows = [
+                (name, "-" if value in ("", {}) else str(value), given.get(name, origin))
+                for name, value, origin in config.sources()
+            ]
             console.print(make_table([("setting", "value", "from"), *rows]))
             return
         if self.seeds:

@@ -530,6 +530,13 @@ def test_a_mistyped_command_is_answered_in_a_line(capsys, tmp_path, words):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_dry_run_says_what_was_given_and_steps_may_be_written_as_1e6(capsys):
+    assert command("train", "hover", "--steps", "1e6", "--dry-run") == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["steps", "1000000", "given"] in rows and ["task", "hover", "given"] in rows
+    assert ["observe", "-", "field"] in rows
+
+
 def test_folders_that_cannot_be_used(refusal, copy, tmp_path):
     file = tmp_path / "file"
     file.write_text("something")
