@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
-from typing import Any
 
 from quadrl.base.units import quantity
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, print_json, say
 from quadrl.cli.flown import Flown, flies
-from quadrl.conditions.observing import Observing
 from quadrl.evaluation.evaluate import evaluate
 
 
@@ -29,14 +26,17 @@ class Evaluate(Flown):
 
     def run(self) -> None:
         """Print the metrics, beside those of the geometric controller."""
-        flight: dict[str, Any] = {"episodes": self.episodes, "seed": self.seed}
-        name = self.controller or "policy"
-        who, given = flies(self.policy, self.controller, self.algo), self.conditions()
-        flown = evaluate(who, self.task or None, sampled=self.sampled, **flight, **given)
-        first, columns = flown.metrics, {name: flown.metrics}
-        if self.controller != "geometric" and not self.json:  # it has rotor commands, and sees all
-            other = dataclasses.replace(flown.scenario, control_mode="rotor", observe=Observing())
-            columns["geometric controller"] = evaluate("geometric", other, **flight).metrics
+        flown = evaluate(
+            flies(self.policy, self.controller, self.algo),
+            self.task or None,
+            episodes=self.episodes,
+            seed=self.seed,
+            sampled=self.sampled,
+            **self.conditions(),
+        )
+        first, columns = flown.metrics, {self.controller or "policy": flown.metrics}
+        if self.controller != "geometric" and not self.json:
+            columns["geometric controller"] = flown.yardstick().metrics
         if self.csv is not None:
             flown.save_csv(self.csv)
         if self.json:

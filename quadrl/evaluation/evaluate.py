@@ -13,6 +13,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_csv
 from quadrl.base.units import length, percent, quantity
 from quadrl.base.validation import number
+from quadrl.conditions.observing import Observing
 from quadrl.control import CONTROLLERS
 from quadrl.control.feasibility import warn_of_unreached
 from quadrl.core.catalogue import make
@@ -79,6 +80,11 @@ class Evaluation:
         """One of the flights, to be drawn; what it is drawn in carries the scenario."""
         flight = self.rollout.trajectory(self.vehicle, episode)
         return dataclasses.replace(flight, scenario=self.scenario.to_json())
+
+    def yardstick(self) -> Evaluation:
+        """The geometric controller in the same episodes; it commands rotors, and sees all."""
+        other = dataclasses.replace(self.scenario, control_mode="rotor", observe=Observing())
+        return evaluate("geometric", other, episodes=self.metrics["episodes"], seed=self.seed)
 
     def save_csv(self, path: str | Path) -> Path:
         """Write one row per flight: its seed and what `quadrl.evaluation.rollout.flights` gives."""
