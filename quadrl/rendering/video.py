@@ -53,7 +53,7 @@ def render_trajectory(
     width: int = 848,
     height: int = 480,
     fps: float = 20.0,
-    camera: str = FOLLOW,
+    camera: str | mujoco.MjvCamera = FOLLOW,
     overlay: bool = True,
     label: str = "",
     times: ArrayLike | None = None,
@@ -68,7 +68,7 @@ def render_trajectory(
         width: Width of the pictures [pixels].
         height: Height of the pictures [pixels].
         fps: Pictures a second; the recorded states are interpolated.
-        camera: "follow", "chase", or a camera of the model.
+        camera: "follow", "chase", a camera of the model, or one of your own.
         overlay: Show time, error, speed, reward, wind, horizon, rotor speeds and the outcome.
         label: Title of the panel in place of the task's name.
         times: Increasing moments to draw [s]; None for the whole flight, `fps` a second. Beyond its
@@ -111,7 +111,7 @@ def render_trajectory(
     with Renderer(model, width, height, fine=fine) as renderer:
         angles = renderer.spins * turned
         cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
-        if camera in MOVING:
+        if isinstance(camera, str) and camera in MOVING:
             seen = flight.qpos, flight.goal, markers
             views = moving_views(camera, *seen, renderer.scale, renderer.aspect)
             views = smoothed(views, SMOOTHING * rate)

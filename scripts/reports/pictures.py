@@ -24,16 +24,19 @@ from quadrl.evaluation.rollout import fly
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.train import Training
 from quadrl.rendering import render_trajectory
+from quadrl.rendering.camera import moving_camera
 from quadrl.rendering.overlay import grid
 from scripts.reports.report import IMAGES
 
 SIZE = (360, 203)  # [pixels]
 SETTLED = 0.05  # of the largest distance from the last position: little happens after that
 LONGEST = 6.0  # [s] of a task's flight that are shown
-OPTIONS: dict[str, dict[str, float]] = {  # of the task as it is shown: a wall, sea state 4
+OPTIONS: dict[str, dict[str, Any]] = {  # of the task as it is shown: a wall, sea state 4, an eight
     "perching": {"least_incline": math.pi / 2},
     "deck_landing": {"lowest_waves": 1.25, "highest_waves": 2.5},
+    "trajectory": {"figure": "lemniscate"},
 }
+NEAR = (0.0, 0.0, 2.95, 1.95, 75.0, -32.0)  # the view of an eight, on which a Crazyflie is small
 FASTEST = ("deck_landing", "lsy_race", "perching", "race")
 RACED = 300  # flights of those, the fastest of which is shown
 # The training: four policies fly the same start.
@@ -94,11 +97,18 @@ def flight(name: str) -> Iterator[Image.Image]:
     settled = flown.time[np.flatnonzero(away > SETTLED * away.max())[-1]]
     end = settled + LAST
     first = max(end - LONGEST, 0.0) if shown.contact else 0.0  # the touch is what counts
-    how: Any = {"times": np.arange(first, min(end, first + LONGEST), 1.0 / FPS)}
+    how: Any = {"speed_trail": name in ("lsy_race", "race")}
+    if name == "trajectory":  # the last round, after which the first picture fits again
+        first, end = shown.time_limit - shown.cycle, shown.time_limit
+        how["camera"] = moving_camera(np.array(NEAR))
     if name == "race":  # other cameras have gates before the aircraft
         how["camera"] = "chase"
-    how["speed_trail"] = name in ("lsy_race", "race")
-    yield from drawn(flown, scenario, SIZE, name.replace("_", " "), enlarged=2, **how)
+    how["times"] = np.arange(first, min(end, first + LONGEST), 1.0 / FPS)
+    words = name.replace("_", " ")
+    if how["speed_trail"]:
+        speed = np.linalg.norm(np.gradient(flown.qpos[:, :3], flown.time, axis=0), axis=1)
+        words += f", trail: blue at rest, yellow at {speed.max():.0f} m/s"
+    yield from drawn(flown, scenario, SIZE, words, enlarged=2, **how)
 
 
 def drawn(

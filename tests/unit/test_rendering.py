@@ -307,6 +307,9 @@ def test_a_flight_is_drawn_as_it_was_flown(model, monkeypatch):
         constant = flight(states, rotor_speed=np.full((states, 4), 31.4))
         list(render_trajectory(constant, model, **SMALL, fps=fps, overlay=False))
     assert len(asked) == 7 + 4 + 1
+    view = looking()
+    list(render_trajectory(flight(1), model, **SMALL, camera=view, overlay=False))
+    assert asked.pop()["camera"] is view
     for k, one in enumerate(asked[:7]):  # 31.4 rad/s are a quarter of a turn in a state
         np.testing.assert_allclose(one["rotor_angles"], 1.57 * k * np.array([1, -1, 1, -1]))
     for few, many in zip(asked[7:11], asked[:7:2], strict=True):  # every other picture, the same
