@@ -151,7 +151,7 @@ def maps(found: Mapping[str, Any]) -> Figure:
     bar = figure.colorbar(shown, ax=grid, shrink=min(1.0, 1.2 / len(flown) + 0.3), pad=0.015)
     bar.set_label("flights that recover [%]; white line: half")
     bar.outline.set_visible(False)
-    head(figure, f"Recovery on {found['task']}, aircraft {found['vehicle']}")
+    head(figure, f"Starts that recover, task {found['task']}, aircraft {found['vehicle']}")
     return figure
 
 
