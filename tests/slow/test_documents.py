@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 from processes import python, run
 
+import quadrl
 from quadrl import tasks
 from quadrl.learning.plan import read_plan
 from scripts.reports import pages, report
@@ -158,6 +159,18 @@ def test_pip_command_names_what_there_is(command):
 def test_every_task_has_a_page():
     for name in tasks.TASKS:
         assert f"<!-- begin task-{name} -->" in TEXTS[f"docs/tasks/{name}.md"]
+
+
+def test_pages_count_the_tasks_and_the_aircraft():
+    counted = f"[{len(tasks.TASKS)} tasks](tasks.md)"
+    assert counted in TEXTS["docs/index.md"] and counted in TEXTS["docs/clients.md"]
+    assert f"[{len(quadrl.VEHICLES)} aircraft](aircraft.md)" in TEXTS["docs/index.md"]
+
+
+def test_actions_of_workflows_are_pinned():
+    for file in (REPOSITORY / ".github" / "workflows").glob("*.yml"):
+        for use in re.findall(r"uses: (.*)", file.read_text()):
+            assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}  # v[\d.]+", use), (file, use)
 
 
 @pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)
