@@ -24,7 +24,8 @@ class Render(Flown):
     policy: Annotated[Positional[tuple[str, ...]], arg(metavar="[POLICY ...]")] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
     """A run folder, a .safetensors file, or the name of a shipped policy: a task's name or, for
     example, hover_robust (write ./NAME for a folder of that name). Several policies and controllers
-    are shown side by side in the same episode of the first one's task."""
+    are shown side by side in the same episode of the first one's task, in the weather and with the
+    randomization of the first one that was trained with any."""
     controller: tuple[choices.ControllerName, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
     """Controllers, in addition to the policies or alone: geometric or lqr."""
     out: Path | None = None
