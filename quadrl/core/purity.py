@@ -1,8 +1,9 @@
 """What functions read besides their arguments, found by a look at their code.
 
 A compiled step keeps what its functions read when they were traced. Functions, classes and modules
-are taken as fixed. A number or a text is watched, since its name may be given another value.
-Everything else may change unnoticed, and a step that reads it is not compiled.
+are taken as fixed, those of some libraries as functions of their arguments alone. A number or a
+text is watched, since its name may be given another value. Everything else may change unnoticed,
+and a step that reads it is not compiled.
 """
 
 # pyright: standard
@@ -10,6 +11,7 @@ Everything else may change unnoticed, and a step that reads it is not compiled.
 from __future__ import annotations
 
 import dataclasses
+import dis
 import enum
 import functools
 import reprlib
@@ -22,12 +24,23 @@ import numpy as np
 
 from quadrl.base.trace import NotCompilable
 
-TRUSTED = {*sys.stdlib_module_names, "numpy", "array_api_compat", "torch"} - {"abc"}
-"""Packages whose functions are not looked into; tasks that `type` makes call themselves abc's."""
+TRUSTED = {
+    "array_api_compat", "builtins", "cmath", "collections", "copy", "dataclasses", "difflib",
+    "enum", "functools", "itertools", "math", "numbers", "numpy", "operator", "reprlib", "torch",
+    "types", "typing",
+}  # fmt: skip
+"""Packages whose functions are not looked into, since they read nothing but their arguments."""
+READING = (
+    "numpy.random", "numpy.fromfile", "numpy.fromregex", "numpy.genfromtxt", "numpy.get",
+    "numpy.load", "numpy.memmap", "torch.get", "torch.load", "torch.rand",
+)  # fmt: skip
+"""What the names of those begin with that do read something else: files, settings, a state."""
+REFUSED = {*sys.stdlib_module_names, "numpy", "torch"} - {"abc"}
+"""Packages whose other functions are refused; tasks that `type` makes call themselves abc's."""
 PLAIN = (int, float, complex, str, bytes, type(None), type(...), np.generic, np.dtype, enum.Enum)
 DESCRIPTORS = (types.MemberDescriptorType, types.GetSetDescriptorType)
-BY_NAME = {"globals", "vars", "eval", "exec", "__import__"}
-"""Built-in functions that read what a look at the code cannot tell."""
+BY_NAME = {"globals", "vars", "eval", "exec", "open", "__import__", "import"}
+"""What is built in and reads what a look at the code cannot tell."""
 CALLED = {"__new__", "__init__", "__post_init__", "__call__"}
 """What a call of a class or of an object runs."""
 Place = tuple[Mapping[str, Any], bool]
@@ -62,13 +75,13 @@ class Reads:
                 return name
         return ""
 
-    def _look(self, names: set[str], places: list[Place]) -> None:
-        """Look names up in some places, and as attributes of the owner and of what is found."""
+    def _look(self, names: set[str], places: list[tuple[Place, set[str]]]) -> None:
+        """Look names up in some places, and all as attributes of the owner and of what is found."""
         for name in names & self._own.keys():
             self._judge(f"self.{name}", self._own[name])
         inherited = names - self._own.keys()  # the class has the defaults of options
         found: set[int] = set()
-        todo = [*((place, names) for place in places), *((p, inherited) for p in self._places)]
+        todo = [*places, *((place, inherited) for place in self._places)]
         for (place, watched), wanted in todo:  # which grows
             for name in wanted & place.keys():
                 value = place[name]
@@ -81,14 +94,13 @@ class Reads:
 
     def _judge(self, name: str, value: Any) -> None:
         """Refuse what may change; look into functions, and into what fixed objects are made of."""
-        if isinstance(value, PLAIN) or id(value) in self._seen:
+        if isinstance(value, PLAIN) or id(value) in self._seen or _trusted(value):
             return
         self._seen.add(id(value))
-        if callable(value) and _trusted(value) and not isinstance(value, functools.partial):
-            return
-        if isinstance(value, types.FunctionType):
+        own = _full_name(value).partition(".")[0] not in REFUSED
+        if own and isinstance(value, types.FunctionType):
             self._look_into(value)
-        elif isinstance(value, type):
+        elif own and isinstance(value, type):
             for member in CALLED & vars(value).keys():
                 self._judge(f"{name}.{member}", vars(value)[member])
         else:
@@ -98,18 +110,17 @@ class Reads:
     def _look_into(self, function: types.FunctionType) -> None:
         """Look up what a function names: globals, attributes, its closure and its defaults."""
         names, codes = set[str](), [function.__code__]
-        if codes[0].co_filename == "<string>":
+        if function.__name__ in CALLED and codes[0].co_filename == "<string>":
             return  # what `dataclasses` writes
         for code in codes:  # which grows by the functions in it
             names |= {*code.co_names}
             codes += [x for x in code.co_consts if isinstance(x, types.CodeType)]
         if "getattr" in names:
             names |= {x for code in codes for x in code.co_consts if isinstance(x, str)}
-        known = function.__globals__
-        if unseen := names & BY_NAME - known.keys():
-            raise NotCompilable(f"{function.__qualname__} calls {min(unseen)}")
-        imported = [sys.modules[name] for name in names - known.keys() if name in sys.modules]
-        self._look(names, [(known, True), *(p for module in imported for p in _inside(module))])
+        loaded, known = set[str]().union(*map(_loaded, codes)), function.__globals__
+        if unseen := loaded & BY_NAME - known.keys():
+            raise NotCompilable(f"{function.__qualname__} uses {min(unseen)}")
+        self._look(names, [((known, True), loaded)])
         cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
         for name, cell in cells:
             if name != "__class__":  # that of `super()`
@@ -120,9 +131,27 @@ class Reads:
             self._judge(f"a default of {function.__qualname__}", default)
 
 
+@functools.cache
+def _loaded(code: types.CodeType) -> set[str]:
+    """Names of globals that code looks up, and "import" where it imports some."""
+    steps = [*dis.get_instructions(code)]
+    imports = {"import" for step in steps if step.opname == "IMPORT_NAME"}
+    return imports | {x.argval for x in steps if x.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
+
+
+def _full_name(value: Any) -> str:
+    """Module and name of a function or class; empty where what it is bound to says more."""
+    module = getattr(value, "__module__", None)
+    functions = types.FunctionType, types.BuiltinMethodType
+    if isinstance(value, functools.partial) or (isinstance(value, functions) and not module):
+        return ""
+    # C has modules with an underscore for Python's.
+    return f"{module or type(value).__module__}.{getattr(value, '__name__', '')}".lstrip("_")
+
+
 def _trusted(value: Any) -> bool:
-    module = getattr(value, "__module__", None) or type(value).__module__
-    return str(module).partition(".")[0] in TRUSTED
+    name = _full_name(value) if callable(value) else ""
+    return name.partition(".")[0] in TRUSTED and not name.startswith(READING)
 
 
 def _inside(value: Any) -> list[Place]:
@@ -153,6 +182,8 @@ def _parts(name: str, value: Any) -> Iterable[Any]:
         return ()
     if isinstance(value, functools.partial):
         return value.func, *value.args, *value.keywords.values()
+    if isinstance(value, types.BuiltinMethodType) and not _full_name(value):
+        return (value.__self__,)
     if isinstance(value, types.MethodType):
         return value.__func__, value.__self__
     if isinstance(value, (property, functools.cached_property)):

@@ -3,10 +3,17 @@
 import ctypes
 import dataclasses
 import functools
+import math
+import os
+import random
+import sys
+import threading
+import time
 
 import helpers
 import numpy as np
 import pytest
+import torch
 from helpers import variant
 
 from quadrl import tasks
@@ -136,7 +143,7 @@ def test_solids_are_seen_and_touched(count, engine):
 
 
 def noisy(self, now):
-    return np.random.default_rng().normal(size=now.state.height.shape) + now.potentials.distance
+    return now.potentials.distance + torch.normal(0.0, 1.0, (1,)).item()
 
 
 def branching(self, now):
@@ -311,9 +318,44 @@ def test_a_reward_follows_what_it_reads_elsewhere(case):
     change(1.0)
 
 
+LIBRARIES = {m.__name__: m for m in (math, os, random, sys, threading, time)} | {"np": np}
+ELSEWHERE = {
+    "os.getenv('WEIGHT')": "it reads getenv",
+    "open(os.devnull).close()": "uses open",
+    "os.path.exists('weight')": "it reads exists",
+    "threading.active_count()": "it reads active_count",
+    "sys.getrecursionlimit()": "it reads getrecursionlimit",
+    "np.geterr()['over'] == 'warn'": "it reads geterr",
+    "np.fromfile(os.devnull)": "it reads fromfile",
+    "time.time() > 0": "it reads time",
+    "random.random()": "it reads random",
+    "np.random.rand()": "it reads rand",
+    "__import__('os').getpid()": "uses __import__",
+}
+
+
+@pytest.mark.parametrize("expression", ELSEWHERE)
+def test_a_library_that_reads_something_else_is_recognized(expression):
+    function = f"lambda self, now: now.potentials.distance + 0 * len([{expression}])"
+    task = variant(error=eval(function, LIBRARIES))
+    with pytest.warns(QuadrlWarning, match=ELSEWHERE[expression]):
+        assert helpers.begun(task, 2).not_compiled
+
+
+def test_a_module_that_is_imported_in_a_function_is_not_looked_for():
+    def error(self, now):
+        import math as chosen
+
+        return now.potentials.distance * chosen.pi
+
+    with pytest.warns(QuadrlWarning, match="error uses import"):
+        assert helpers.begun(variant(error=error), 2).not_compiled
+
+
 def test_what_cannot_change_is_compiled():
     def error(self, now):
-        return now.potentials.distance * FIXED * np.pi * self.radius * PAIR[0]
+        length = math.hypot(*PAIR) + np.linalg.norm(np.zeros(3)) + functools.partial(max)(1, 2)
+        return now.potentials.distance * FIXED * np.pi * self.radius * PAIR[0] * length
 
     assert not helpers.begun(variant(error=error), 2).not_compiled
 
