@@ -85,7 +85,7 @@ class NotCompilable(TypeError):
 
 @contextlib.contextmanager
 def symbolic() -> Generator[None]:
-    """Turn any error of a function that is called with symbols into `NotCompilable`."""
+    """Raise `NotCompilable` for any error of a function that has run with numbers before."""
     try:
         yield
     except NotCompilable:

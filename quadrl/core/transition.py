@@ -274,6 +274,7 @@ def check_task(
     for name, term in task.observation.items():
         shape = (rows, term.width(rotors))
         _check_array(task, f"observation {name!r}", observation[name], shape, "f")
+    task.update(now, now)  # so that a fault of any function shows before symbols call it
     return tuple(terms)
 
 

@@ -21,6 +21,7 @@ from quadrl.base import trace
 from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace, look_up
 from quadrl.conditions.solids import Cylinder, Gate, Pose
+from quadrl.core.compiled import METHODS
 from quadrl.core.environment import Environment
 from quadrl.engines.native import compiling
 from quadrl.tasks.hover import Hover
@@ -218,14 +219,23 @@ def test_what_is_more_than_arithmetic_is_run_as_it_is_written(name, function, re
     helpers.begun(task, 2)  # it is said once for a class of tasks
 
 
-def test_a_fault_of_the_task_is_raised_as_if_it_was_not_compiled():
-    def update(self, before, now):
+@pytest.mark.parametrize("method", METHODS)
+def test_a_fault_of_the_task_is_raised_as_it_is(method):
+    def fail(self, *given):
         raise ZeroDivisionError("mine")
 
-    with pytest.warns(QuadrlWarning, match="with symbols it raises ZeroDivisionError: mine"):
-        environment = helpers.begun(variant(update=update))
     with pytest.raises(ZeroDivisionError, match="mine"):
-        helpers.idle(environment)
+        Environment(variant(**{method: fail}))
+
+
+def test_a_fault_with_symbols_alone_is_the_reason_for_which_it_is_not_compiled():
+    def error(self, now):
+        if now.potentials.distance.dtype != np.float64:
+            raise KeyError("mine")
+        return now.potentials.distance
+
+    with pytest.warns(QuadrlWarning, match="with symbols it raises KeyError: 'mine'"):
+        helpers.idle(helpers.begun(variant(error=error)))
 
 
 def test_options_change_the_numbers_and_not_the_code(monkeypatch):
