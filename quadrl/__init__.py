@@ -17,6 +17,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from quadrl import envs, tasks
+from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.shield import shield_triton
@@ -41,9 +42,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "RANDOMIZATIONS", "VEHICLES", "Observing", "Policy", "Randomization", "Task", "Vehicle",
-    "check", "envs", "evaluate", "export", "load", "plot", "register", "render", "rendering",
-    "robustness", "study", "suite", "tasks", "testing", "train",
+    "RANDOMIZATIONS", "VEHICLES", "Aerodynamics", "Observing", "Policy", "Randomization", "Task",
+    "Vehicle", "check", "envs", "evaluate", "export", "load", "plot", "register", "render",
+    "rendering", "robustness", "study", "suite", "tasks", "testing", "train",
 ]  # fmt: skip
 LAZY = {
     "train": "quadrl.learning.run",

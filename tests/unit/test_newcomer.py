@@ -46,9 +46,9 @@ def test_a_discount_of_one_is_warned_of():
         TrainConfig("hover", gamma=1.0)
 
 
-PUBLIC = """Observing Policy RANDOMIZATIONS Randomization Task VEHICLES Vehicle __version__ check
-envs evaluate export load plot register render rendering robustness study suite tasks testing
-train"""
+PUBLIC = """Aerodynamics Observing Policy RANDOMIZATIONS Randomization Task VEHICLES Vehicle
+__version__ check envs evaluate export load plot register render rendering robustness study suite
+tasks testing train"""
 
 
 def test_tab_completion_shows_the_public_names_alone():
