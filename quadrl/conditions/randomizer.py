@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.philox import NOISE, PARAMETERS, PUSHES
+from quadrl.base.philox import PARAMETERS, PUSHES
 from quadrl.base.rotation import Array
-from quadrl.conditions.randomization import AGES, NONE
+from quadrl.conditions.randomization import AGES
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.engines import native
@@ -160,37 +159,20 @@ class Randomizer:
         self.newest[0] = (first + steps - 1) % length
         return arrived
 
-    def estimated(self, rows: np.ndarray | None, rotor_speed: Array) -> Array:
-        """Coordinates with the ages, the noise and the bias of the randomization, (n, 13 + R).
-
-        Args:
-            rows: Which aircraft (n,); None for all.
-            rotor_speed: Estimated rotor speeds (n, R) [rad/s].
+    def aged(self) -> tuple[Array, Array]:
+        """Coordinates of the drawn ages: as old as the motion, and as the body rate, (N, 13) each.
 
         Returns:
             Position [m], world frame, quaternion, velocity [m/s], world frame, body rate [rad/s],
-            body frame, rotor speeds.
+            body frame.
         """
-        chosen: Any = slice(None) if rows is None else rows
-        given, true = self.sampler.randomization, self._coordinates
-        if self._aged:
-            # Each physics step remembers the coordinates before it.
-            places = (self.newest - self._ages + 1) % len(self.past)
-            old = np.where(self._ages[..., None], self.past[places, self._rows], true)
-            true = np.concatenate([old[0][:, :10], old[1][:, 10:]], axis=1)
-        true = np.ascontiguousarray(true[chosen])
-        count, rotors = rotor_speed.shape
-        found = np.empty((count, 13 + rotors))
-        bias = self.sampler.columns(self.drawn[chosen], "position_bias_x", 12)
-        rotor_speed = np.ascontiguousarray(rotor_speed)
-        place = (part[chosen] for part in (*self.place, self.steps))
-        noise = given.noise.sizes
-        arrays = *place, true, true[:, 7:], rotor_speed, noise, bias, found
-        strides = (array.strides[0] // 8 for array in (true, rotor_speed, bias, found))
-        # As `Rows` in native/disturbances.c.
-        where = native.struct(*arrays, *strides, rotors, given.noise != NONE.noise, NOISE)
-        native.library().quadrl_estimate(where.ctypes.data, count)
-        return found
+        now = self._coordinates
+        if not self._aged:
+            return now, now
+        # Each physics step remembers the coordinates before it.
+        past = self.past[(self.newest - self._ages + 1) % len(self.past), self._rows]
+        motion, rate = np.where(self._ages[..., None], past, now)
+        return motion, rate
 
     def begin_step(self) -> None:
         """Count a control step that begins, and push the aircraft that are drawn for it."""

@@ -17,11 +17,14 @@ import numpy as np
 from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY, MAX
 from quadrl.base.errors import QuadrlError
+from quadrl.base.philox import NOISE
 from quadrl.base.rotation import Array, norm, to_body, to_world
 from quadrl.base.validation import choice, number
+from quadrl.conditions.randomization import NONE
 from quadrl.conditions.sensor import SENSORS as SENSORS
 from quadrl.conditions.sensor import Memory, Moment, Sensor, Sizes, register_sensor
 from quadrl.conditions.sensor import make as make
+from quadrl.engines import native
 from quadrl.engines.dynamics import thrust_wrench
 from quadrl.engines.state import State
 
@@ -82,8 +85,8 @@ class RotorSpeed(Sensor):
 class StateEstimate(Sensor):
     """Coordinates of the state as they are estimated on board, which all that is seen follows from.
 
-    Its errors are the randomization's `noise` and `bias`, its ages `observation_delay` and
-    `rate_delay`.
+    Its errors are the randomization's `noise` and `bias`, three of each of position, attitude,
+    velocity and body rate. Its age is `observation_delay`, that of the body rate `rate_delay`.
     """
 
     name, unit, measured, shown = "estimate", "", False, False
@@ -101,8 +104,22 @@ class StateEstimate(Sensor):
         return 13 + sizes.rotors
 
     def sense(self, now: Moment) -> Array:
-        """The coordinates with errors."""
-        return now.randomizer.estimated(now.rows, now.rotor_speed)
+        """The coordinates of the drawn ages with the drawn bias and with noise."""
+        source, rows = now.randomizer, slice(None) if now.rows is None else now.rows
+        motion, rate = source.aged()
+        aged = np.concatenate([motion[:, :10], rate[:, 10:]], axis=1)[rows]
+        bias = source.sampler.columns(source.drawn[rows], "position_bias_x", 12)
+        noise = source.sampler.randomization.noise
+        rotor_speed = np.ascontiguousarray(now.rotor_speed)
+        count, rotors = rotor_speed.shape
+        found = np.empty((count, 13 + rotors))
+        place = (part[rows] for part in (*source.place, source.steps))
+        arrays = *place, aged, aged[:, 7:], rotor_speed, noise.sizes, bias, found
+        strides = (array.strides[0] // 8 for array in (aged, rotor_speed, bias, found))
+        # As `Rows` in native/disturbances.c.
+        where = native.struct(*arrays, *strides, rotors, noise != NONE.noise, NOISE)
+        native.library().quadrl_estimate(where.ctypes.data, count)
+        return found
 
     def tell(self, now: Moment, seen: Array) -> None:
         """Make the estimate the state that the other sensors and the task see."""

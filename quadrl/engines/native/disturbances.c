@@ -10,7 +10,7 @@
 
 enum { ERRORS = 12, NOISE_BLOCKS = 6, PUSH_BLOCKS = 2 };
 
-// Addresses of the rows. Filled by quadrl/conditions/randomizer.py.
+// Addresses of the rows. Filled by quadrl/conditions/sensors.py.
 typedef struct {
   const int64_t *keys, *episodes, *steps;
   const double *qpos, *qvel, *act;  // of aircraft i at i * stride doubles, act at i * act_stride
