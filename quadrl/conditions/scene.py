@@ -67,9 +67,10 @@ class Scene:
         counts = [len(solid.parts) for solid in self.solids]
         self._first = (np.cumsum(counts) - counts).astype(int).tolist()
         """Number of the first geom of each solid."""
-        parts = [(solid.position, part.offset) for solid in self.solids for part in solid.parts]
-        self._declared = np.array(parts, dtype=float).reshape(-1, 2, 3).swapaxes(0, 1)
-        """Centres (K, 3) of the geoms' solids, task frame, and the geoms' offsets from them [m]."""
+        parts = [(s.position, part.size, part.offset) for s in self.solids for part in s.parts]
+        self._declared = np.array(parts, dtype=float).reshape(-1, 3, 3).swapaxes(0, 1)
+        """Centres (K, 3) of the geoms' solids, task frame, and the geoms' sizes and offsets from
+        them [m]."""
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the geoms to a world; each row has poses of its own."""
@@ -101,7 +102,7 @@ class Scene:
         origin: np.ndarray,
         last: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Poses (n, K, 7) of the geoms in the world, as engines take them.
+        """Poses of the geoms in the world, as engines take them, (n, K, 7), with sizes (n, K, 13).
 
         Args:
             placed: Poses of solids by name.
@@ -115,9 +116,12 @@ class Scene:
         if unknown := set(placed) - set(self.names):
             raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(self.names))
         if last is None:
-            centres, offsets = self._declared
-            made = np.zeros((count, len(centres), 7))
+            centres, sizes, offsets = self._declared
+            made = np.zeros((count, len(centres), 13))
             made[..., :3], made[..., 3] = centres + origin + offsets, 1.0
+            made[..., 7:10], made[..., 10:] = sizes, offsets
+            if all(pose.size is None for pose in placed.values()):
+                made = made[..., :7].copy()
         else:
             made = last.copy()
         for solid, first in zip(self.solids, self._first, strict=True):
@@ -131,10 +135,17 @@ class Scene:
                     allowed = f"finite arrays, position ({count}, 3) and quaternion ({count}, 4)"
                     raise QuadrlError(name=f"pose of {solid.name}", value=array, allowed=allowed)
             turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
-            for k, part in enumerate(solid.parts, first):
-                offset = np.asarray(part.offset, dtype=float)
+            own = solid
+            if pose.size is not None:
+                own = solid.sized(_checked_size(solid, pose.size, made))
+            for k, part in enumerate(own.parts, first):
+                if pose.size is not None:
+                    numbers = np.broadcast_arrays(*part.size, *part.offset)
+                    made[:, k, 7:] = np.stack(numbers, axis=-1)
+                has_sizes = made.shape[-1] > 7
+                offset = made[:, k, 10:] if has_sizes else np.asarray(part.offset, dtype=float)
                 made[:, k, :3] = position + origin + _rotated(turn, offset)
-                made[:, k, 3:] = turn
+                made[:, k, 3:7] = turn
         return made
 
     def check_start(
@@ -175,9 +186,10 @@ class Scene:
         """The solids as pictures show them, at their poses in a row."""
         parts = ((solid, part) for solid in self.solids for part in solid.parts)
         poses = engine.solids.poses[row].copy()
+        sizes = engine.solids.table["size"][row].copy()
         return tuple(
-            Primitive(KINDS[part.kind], part.size, pose[:3], pose[3:], solid.rgba, glow=0.0)
-            for (solid, part), pose in zip(parts, poses, strict=True)
+            Primitive(KINDS[part.kind], size, pose[:3], pose[3:7], solid.rgba, glow=0.0)
+            for (solid, part), pose, size in zip(parts, poses, sizes, strict=True)
         )
 
     def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
@@ -199,8 +211,18 @@ class Scene:
         return Surroundings(self.names, *measured)
 
 
+def _checked_size(solid: Solid, size: Array, poses: np.ndarray) -> np.ndarray:
+    found, shape = np.asarray(size, dtype=float), (len(poses), len(solid.lengths))
+    has_sizes = poses.shape[-1] > 7
+    if not has_sizes or found.shape != shape or not ((found > 0) & (found < np.inf)).all():
+        lengths = f"finite, positive, {shape}: {', '.join(solid.lengths)}"
+        allowed = lengths if has_sizes else "None in `move` where `place` gives none"
+        raise QuadrlError(name=f"size of {solid.name}", value=size, allowed=allowed)
+    return found
+
+
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """A vector (3,) turned by unit quaternions (n, 4)."""
+    """A vector (3,) or vectors (n, 3) turned by unit quaternions (n, 4)."""
     if not vector.any():
         return vector
     w, axis = quaternion[:, :1], quaternion[:, 1:]

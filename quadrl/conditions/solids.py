@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import abc
+import copy
 import dataclasses
 from typing import Any, cast
 
 import mujoco
+import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
@@ -46,9 +48,21 @@ class Solid(abc.ABC):
         if not isinstance(name := cast(Any, self.name), str) or not name.isidentifier():
             raise QuadrlError(name="solid", value=self.name, allowed="a name such as 'post'")
         number(f"{self.name} grip", self.grip, 0)
-        for field in dataclasses.fields(self):
-            if field.type == "float" and field.name != "grip":
-                number(f"{self.name} {field.name}", getattr(self, field.name), positive=True)
+        for name in self.lengths:
+            number(f"{self.name} {name}", getattr(self, name), positive=True)
+
+    @property
+    def lengths(self) -> tuple[str, ...]:
+        """Names of its lengths, in the order of a `Pose.size`."""
+        fields = dataclasses.fields(self)
+        return tuple(f.name for f in fields if f.type in ("float", float) and f.name != "grip")
+
+    def sized(self, size: np.ndarray) -> Solid:
+        """The same with lengths (n, k) [m]: sizes and offsets of its parts are of arrays (n,)."""
+        made = copy.copy(self)
+        for name, length in zip(self.lengths, size.T, strict=True):
+            object.__setattr__(made, name, length)
+        return made
 
     @property
     @abc.abstractmethod
@@ -128,10 +142,11 @@ class Gate(Solid):
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """Where a solid stands in each episode."""
+    """Where a solid stands in each episode, and how large it is."""
 
     position: Array  # (n, 3) [m] of its centre, task frame
     quaternion: Array = None  # (n, 4) (w, x, y, z); None for upright, its x axis to the east
+    size: Array = None  # (n, k) [m], its lengths in their order; None for the declared ones
 
 
 def heading(angle: Array) -> Array:

@@ -1,9 +1,9 @@
 """Solids in the world of N aircraft: their poses in each row, and clearances.
 
-A solid is one or more geoms of the world with which MuJoCo lets aircraft collide. The model has
-their sizes; each row has poses of its own, which change at a reset or, if they move, at each
-physics step. `native/solids.h` computes the distance of a point from a solid, so that free flight
-can hand an aircraft that comes near one to MuJoCo.
+A solid is one or more geoms of the world with which MuJoCo lets aircraft collide. Each row has
+poses of its own, which change at a reset or, if they move, at each physics step; the sizes are the
+model's, or a row's own, too. `native/solids.h` computes the distance of a point from a solid, so
+that free flight can hand an aircraft that comes near one to MuJoCo.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Solids:
         self._threads, self._kernel = threads, native.library().quadrl_clearance
         _, which, *offset = model.geom_user[self.geoms].T[:5] if len(self.geoms) else [[]] * 5
         self._first = np.unique(which, return_index=True)[1]  # geom of each solid
-        self._offsets = np.transpose(offset)[self._first]
+        self._declared = np.hstack([model.geom_size[self.geoms], np.transpose(offset)])  # (K, 6)
         self.centres = np.zeros((count, len(self._first), 3))
         """Centres of the S solids, (N, S, 3) [m], task frame, live."""
         self.table = np.zeros((count, len(self.geoms)), dtype=SOLID)
@@ -76,7 +76,7 @@ class Solids:
         """Lists of the solids nearest to each aircraft; unknown where the place is NaN."""
         self.nearby["place"] = np.nan
         self.poses = np.zeros((count, len(self.geoms), 7))
-        """Present poses (N, K, 7), as `place` takes them."""
+        """Present poses (N, K, 7 or 13), as `place` takes them."""
         self.motion = np.zeros((count, len(self.geoms), 6))
         """Velocity [m/s] and angular velocity [rad/s] of the last move (N, K, 6), world frame."""
         self.moves = False
@@ -87,33 +87,47 @@ class Solids:
 
         Args:
             rows: Which rows.
-            poses: Position [m], world frame, and quaternion (w, x, y, z), (n, K, 7).
+            poses: Position [m], world frame, and quaternion (w, x, y, z), (n, K, 7); where sizes
+                differ by row (n, K, 13), with the size, as MuJoCo has it, and the offset of the
+                geom from its solid's centre, solid's frame [m].
         """
+        if poses.shape[-1] != self.poses.shape[-1]:
+            self.poses, poses = self._with_sizes(self.poses), self._with_sizes(poses)
         if self.moves or not np.array_equal(self.poses[rows], poses):  # most stand where they stood
             self.poses[rows], self.motion[rows] = poses, 0.0
             self._stand(rows, poses)
 
+    def _with_sizes(self, poses: np.ndarray) -> np.ndarray:
+        """The poses with the declared sizes and offsets where they have none, (n, K, 13)."""
+        own = np.broadcast_to(self._declared, (len(poses), *self._declared.shape))
+        return poses if poses.shape[-1] > 7 else np.concatenate([poses, own], axis=-1)
+
     def _stand(self, rows: np.ndarray, poses: np.ndarray) -> None:
         """Write poses of the geoms of some rows for both engines."""
-        position, quaternion = poses[..., :3], poses[..., 3:]
+        position, quaternion, own = poses[..., :3], poses[..., 3:7], poses[..., 7:]
         turn = rotation_matrix(quaternion)
         self.nearby["place"][rows] = np.nan
         self.table["position"][rows] = position
         self.table["turn"][rows] = turn.reshape(*turn.shape[:-2], 9)
-        offset = turn[:, self._first] @ self._offsets[..., None]
+        places, offset = np.ix_(rows, self.geoms), self._declared[self._first, 3:]
+        if own.size:
+            offset, sizes = own[:, self._first, 3:], own[..., :3]
+            self.table["size"][rows] = self._field("geom_size")[places] = sizes
+            self._field("geom_rbound")[places] = np.linalg.norm(sizes, axis=-1)
+        offset = turn[:, self._first] @ offset[..., None]
         self.centres[rows] = position[:, self._first] - offset[..., 0] - self._origin
-        self._field("geom_pos")[np.ix_(rows, self.geoms)] = position
-        self._field("geom_quat")[np.ix_(rows, self.geoms)] = quaternion
+        self._field("geom_pos")[places] = position
+        self._field("geom_quat")[places] = quaternion
 
     def move(self, poses: np.ndarray, timestep: float) -> None:
-        """Move the solids of all rows to poses (N, K, 7) within a physics step [s].
+        """Move the solids of all rows to poses, as `place` takes them, within a physics step [s].
 
         During the step they stand half-way; contacts take into account the mean velocity and the
         acceleration since the step before, which MuJoCo does not know.
         """
         last, self.moves = self.poses.copy(), True
         half = (last + poses) / 2
-        half[..., 3:] /= np.linalg.norm(half[..., 3:], axis=-1, keepdims=True)
+        half[..., 3:7] /= np.linalg.norm(half[..., 3:7], axis=-1, keepdims=True)
         self._stand(np.arange(len(poses)), half)
         self.poses[:] = poses
         velocity = (poses[..., :3] - last[..., :3]) / timestep
@@ -130,12 +144,12 @@ class Solids:
             self._stand(np.arange(len(self.poses)), self.poses)
 
     def save(self) -> np.ndarray:
-        """Poses and velocities, (N, K, 13)."""
+        """Poses and velocities, (N, K, 13 or 19)."""
         return np.concatenate([self.poses, self.motion], axis=-1)
 
     def restore(self, saved: np.ndarray) -> None:
         """Restore what `save` returned."""
-        poses, motion = np.split(saved, [7], axis=-1)
+        poses, motion = np.split(saved, [-6], axis=-1)
         self.place(np.arange(len(poses)), poses)
         self.motion[:] = motion
 
@@ -179,14 +193,15 @@ class Solids:
         then.table, then.nearby = self.table[rows], np.zeros(count, NEARBY)
         then.nearby["place"] = np.nan
         if poses is not None:
-            then.table["position"] = poses[..., :3]
-            then.table["turn"] = rotation_matrix(poses[..., 3:]).reshape(count, -1, 9)
+            poses = self._with_sizes(poses)
+            then.table["position"], then.table["size"] = poses[..., :3], poses[..., 7:10]
+            then.table["turn"] = rotation_matrix(poses[..., 3:7]).reshape(count, -1, 9)
         return then.clearance(qpos, parameters, rotors, np.arange(count))
 
 
 def _turn_rate(last: np.ndarray, poses: np.ndarray, timestep: float) -> np.ndarray:
-    """Angular velocity (N, K, 3) [rad/s], world frame, between two poses (N, K, 7)."""
-    was, now = last[..., 3:], poses[..., 3:]
+    """Angular velocity (N, K, 3) [rad/s], world frame, between poses (N, K, 7 or 13)."""
+    was, now = last[..., 3:7], poses[..., 3:7]
     half = was[..., :1] * now[..., 1:] - now[..., :1] * was[..., 1:]
     half = half + cross(was[..., 1:], now[..., 1:])
     near = (was * now).sum(axis=-1, keepdims=True)  # the cosine of half the angle

@@ -113,6 +113,32 @@ def test_both_engines_stop_at_a_post_and_say_how_fast_it_was_hit(count):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("solid", EVERY.solids, ids=EVERY.names)
+def test_a_size_of_a_row_acts_as_the_declared_one(solid, engine):
+    count, name = 4, solid.name
+    declared = [getattr(solid, length) for length in solid.lengths]
+    size = np.random.default_rng(0).uniform(0.6, 1.5, (count, len(declared))) * declared
+    place = np.tile([1.3, 0.65 if name == "gate" else 0.0, 0.0], (count, 1))
+    pose = Pose(place, heading(np.full(count, 0.2)), size)
+    velocity = np.tile([3.0, 0.0, 0.0], (count, 1))
+    made, track, hits = flown(Scene([solid]), {name: pose}, velocity, engine=engine)
+    assert hits[:, 0].any()
+    for row in range(count):
+        own = dataclasses.replace(solid, **dict(zip(solid.lengths, size[row], strict=True)))
+        one = Pose(place[:1], pose.quaternion[:1])
+        sized = dataclasses.replace(one, size=size[row : row + 1])
+        for scene, where in ((Scene([own]), one), (Scene([solid]), sized)):
+            alone, path, hit = flown(scene, {name: where}, velocity[:1], engine=engine)
+            np.testing.assert_array_equal(path[:, 0], track[:, row])
+            np.testing.assert_array_equal(hit[0], hits[row])
+            np.testing.assert_array_equal(alone.clearances, np.array(made.clearances)[:, [row]])
+            np.testing.assert_array_equal(alone.solids.centres[0], made.solids.centres[row])
+            pictures = [s.primitives(e, k)[0].size for s, e, k in ((scene, alone, 0),
+                        (Scene([solid]), made, row))]  # fmt: skip
+            np.testing.assert_array_equal(*pictures)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 def test_among_many_posts_the_nearest_is_known_all_the_way(engine):
     draw, count, many = np.random.default_rng(2).uniform, 3, 14
     places = np.stack([draw(-3, 9, (many, count)), draw(0.7, 4, (many, count))], axis=-1)
@@ -142,6 +168,12 @@ def test_among_many_posts_the_nearest_is_known_all_the_way(engine):
     flight.solids.place(np.arange(count), scene.poses(aside, count, flight.origin))
     there = flown(scene, aside, velocity, steps=0)[0]
     there.qpos[:] = flight.qpos
+    np.testing.assert_array_equal(flight.clearance(), there.clearance())
+    # Some wider, and then again as they are declared.
+    wide = {k: Pose(aside[k].position, size=np.tile([0.4, 5.0], (count, 1))) for k in aside}
+    flight.solids.place(np.arange(count), scene.poses(wide, count, flight.origin))
+    assert (flight.clearance() < there.clearance()).all()
+    flight.solids.place(np.arange(count), scene.poses(aside, count, flight.origin))
     np.testing.assert_array_equal(flight.clearance(), there.clearance())
 
 
@@ -180,6 +212,10 @@ def test_a_gate_is_open_in_its_middle_and_turns_with_its_pose():
     np.testing.assert_allclose(bars[0, 2, :3], ahead[0] + turned[0], atol=1e-12)
 
 
+def of_size(*lengths, count=1):
+    return Pose(np.zeros((count, 3)), size=np.tile(lengths, (count, 1)))
+
+
 @pytest.mark.parametrize(
     ("make_it", "name"),
     [
@@ -192,6 +228,12 @@ def test_a_gate_is_open_in_its_middle_and_turns_with_its_pose():
         (lambda: EVERY.poses({"bal": Pose(np.zeros((1, 3)))}, 1, np.zeros(3)), "place"),
         (lambda: EVERY.poses({"ball": Pose(np.zeros(3))}, 1, np.zeros(3)), "pose of ball"),
         (lambda: EVERY.poses({"ball": Pose(np.full((1, 3), np.nan))}, 1, np.zeros(3)), "pose"),
+        (lambda: EVERY.poses({"ball": of_size(0.0)}, 1, np.zeros(3)), "size of ball"),
+        (lambda: EVERY.poses({"post": of_size(0.1)}, 1, np.zeros(3)), "size of post"),
+        (
+            lambda: EVERY.poses({"ball": of_size(0.1)}, 1, np.zeros(3), last=np.ones((1, 7, 7))),
+            "size of ball = .* None in `move`",
+        ),
     ],
 )
 def test_what_no_world_can_hold_is_refused(make_it, name):
@@ -235,8 +277,21 @@ def test_pictures_have_solids_where_they_stand_in_the_episode():
     assert len(flight.markers) == len(flight.time) and flight.markers[5][-2].shape == "cylinder"
 
 
-def test_a_task_with_solids_keeps_the_contract_in_every_api():
-    check_task(Posted)
+@dataclasses.dataclass(frozen=True)
+class Sized(Posted):
+    """The post is of another thickness in each episode."""
+
+    name = "sized"
+
+    def place(self, rng, start, state):
+        radius = rng.uniform(0.1, 0.3)
+        size = np.stack([radius, 0.0 * radius + 8.0], axis=-1)
+        return {"post": dataclasses.replace(super().place(rng, start, state)["post"], size=size)}
+
+
+@pytest.mark.parametrize("task", [Posted, Sized])
+def test_a_task_with_solids_keeps_the_contract_in_every_api(task):
+    check_task(task)
 
 
 def test_tasks_see_the_same_in_both_engines_and_a_touch_ends_the_episode():
@@ -293,9 +348,14 @@ def test_a_start_in_a_solid_is_refused_and_changes_nothing(engine):
         np.testing.assert_array_equal(array, before[name])
     # The edge of a rotor may be in it: whoever touches a solid is no fault of the scene.
     environment.reset(start=level | {"position": [0.0, 9.45, 0.0]})
-    with refused("position at the start", lists="ball"):
-        solids = {"solids": lambda self: [Sphere("ball", radius=2.0)]}
-        begun(type("InBall", (Hover,), solids)(), num_envs=3, engine=engine)
+    declared = {"solids": lambda self: [Sphere("ball", radius=2.0)]}
+    sized = {
+        "solids": lambda self: [Sphere("ball")],
+        "place": lambda self, rng, start, state: {"ball": of_size(2.0, count=len(state.goal))},
+    }
+    for solids in (declared, sized):
+        with refused("position at the start", lists="ball"):
+            begun(type("InBall", (Hover,), solids)(), num_envs=3, engine=engine)
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
@@ -308,6 +368,18 @@ def test_aircraft_may_begin_on_their_feet(vehicle):
     environment.step(np.full((1, environment.action_size), -0.1))
     assert environment.snapshot.landed.all()
     np.testing.assert_allclose(environment.snapshot.state.position, [[0, 0, height]], atol=0.01)
+
+
+def test_sizes_come_from_the_seed_of_the_row_and_stay_with_a_saved_state():
+    batch = begun(Sized(), num_envs=4, seed=7)
+    table, saved = batch.engine.solids.table.copy(), batch.save()
+    assert len({*table["size"][:, 0, 0]}) == 4
+    for row in range(4):
+        alone = begun(Sized(), seed=7 + row)
+        np.testing.assert_array_equal(alone.engine.solids.table[0], table[row])
+    other = Environment(Sized(), num_envs=4, seed=99)
+    other.restore(saved)
+    np.testing.assert_array_equal(other.engine.solids.table, table)
 
 
 def test_a_task_without_solids_says_so_when_one_is_asked_for():
