@@ -131,13 +131,12 @@ class GateRace(Task):
             **{name: to_body(state.rotation, vector) for name, vector in seen.items()},
         }
 
-    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
-        """Nearer to the next gate and through it, without turning more than it takes."""
+    def passage(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Terms of a reward: through the next gate, without turning more than it takes."""
         passes, _, missed, _ = self._crossed(now)
         below = namespace(missed).clip(LOW - now.state.height, 0.0, LOW)
         time = rewards.time_share(now.parameters)
         return {
-            **rewards.weighted(self, ["progress"], before, now),
             "turn": -self.turn_weight * time * now.potentials.angular_speed,
             "pass": rewards.once(self.pass_weight, passes, now),
             "miss": -self.miss_weight * missed,

@@ -162,14 +162,15 @@ class LsyRace(GateRace):
         return seen | {"poles": arena.ways_to_poles(state)}
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
-        """As in a race, and away from poles and frames."""
+        """Nearer to the next gate, what its passage is worth, and away from poles and frames."""
         time, xp = rewards.time_share(now.parameters), namespace(now.time)
         close = xp.clip(1 - (self._room(now) - now.task.ball) / ROOM, 0.0, 1.0)
         nearer = self._way_left(now.task, before.state.position)
         nearer = nearer - self._way_left(now.task, now.state.position)
         nearer = xp.minimum(nearer, self.paid_speed * now.parameters.control_timestep)
-        return super().reward(before, now, end) | {
+        return {
             "progress": self.progress_weight * nearer,
+            **self.passage(before, now, end),
             "room": -self.room_weight * time * close,
             "time": 0.0 * close - self.time_weight * time,
         }

@@ -13,7 +13,8 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, namespace, norm
 from quadrl.base.trace import look_up
-from quadrl.core.task import Snapshot, Target
+from quadrl.core import rewards
+from quadrl.core.task import EpisodeEnd, Snapshot, Target
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
 from quadrl.tasks.gates import Course, GateRace
@@ -99,6 +100,11 @@ class Race(GateRace):
         none = 0.0 * gate
         through, left = (look_up(track.axes[:, k], gate) for k in range(2))
         return start, Course(goal, gate, through, left, none, none, position, leg)
+
+    def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
+        """Nearer to the next gate, and what its passage is worth."""
+        progress = rewards.weighted(self, ["progress"], before, now)
+        return progress | self.passage(before, now, end)
 
     def markers(self, now: Snapshot) -> Sequence[Primitive]:
         """The gates; the next one in another colour."""
