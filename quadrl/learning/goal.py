@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,12 @@ def goal_state(config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         QuadrlError: The observations of the task's goal states differ in anything else.
     """
-    calm: Any = {"weather": "calm", "randomization": "none", "observe": config.observe}
-    environment = Environment(config.scenario, num_envs=DRAWN, seed=0, **calm)
+    scenario = config.scenario
+    sensors = {**scenario.task.sensors, **scenario.observe.sensors}
+    exact = {name: {**options, "noise": 0.0, "bias": 0.0} for name, options in sensors.items()}
+    observe = dataclasses.replace(scenario.observe, sensors=exact)
+    calm: Any = {"weather": "calm", "randomization": "none", "observe": observe}
+    environment = Environment(scenario, num_envs=DRAWN, seed=0, **calm)
     task, vehicle = environment.task, environment.vehicle
     environment.reset()
     goals = environment.goals() - environment.origin

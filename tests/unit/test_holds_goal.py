@@ -9,6 +9,7 @@ from tensordict import TensorDict
 
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import make_env
+from quadrl.learning.goal import goal_state
 from quadrl.learning.networks import export, make_actor_critic
 
 HELD = ("hover", "static_waypoint", "random_waypoint")
@@ -48,6 +49,15 @@ def test_at_the_goal_it_hovers_and_stays(task):
     for _ in range(20):
         seen = environment.flatten(environment.step(policy(seen)).observation)
     np.testing.assert_allclose(environment.engine.qpos[:, :3], environment.goals(), atol=1e-4)
+
+
+def test_errors_of_a_sensor_do_not_move_the_goal():
+    exact, noisy = (
+        goal_state(TrainConfig("hover", observe={"sensors": {"airspeed": errors}}))
+        for errors in ({}, {"noise": 0.5, "bias": 0.2})
+    )
+    for one, other in zip(exact, noisy, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("variant", ["ideal", "robust"])
