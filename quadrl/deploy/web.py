@@ -55,7 +55,11 @@ KERNELS = {
 """Of quadrl/native, with what they export."""
 MODULES = ("flight", "policy", "episode", "link", "scene", "plot", "main")
 """Of docs/fly, each after those that it imports."""
-FLOWN = tuple(name for name, task in TASKS.items() if not (task.contact or name == "lsy_race"))
+FLOWN = tuple(
+    name
+    for name, task in TASKS.items()
+    if not (task.contact or name == "lsy_race" or task().solids())
+)
 """Tasks of the page: without contact, which MuJoCo computes, and with a scene that stays."""
 MEMORY = """// Written by quadrl/deploy/flights.py.
 #include <math.h>

@@ -211,11 +211,12 @@ class TrainConfig(TrainSettings):
         Raises:
             QuadrlError: The folder holds no run, or the values behind its names have changed since.
         """
-        saved = {"from_run": "", "evaluations": 0} | as_saved(read_config(folder))
-        names = [field.name for field in dataclasses.fields(cls)]
-        if missing := set(names) - set(saved):
-            raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks {sorted(missing)[0]}")
-        config = cls(**{name: saved[name] for name in names})
+        saved = as_saved(read_config(folder))
+        if "task" not in saved:
+            raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks task")
+        names = (field.name for field in dataclasses.fields(cls))
+        # What it lacks was added since then, and has its default.
+        config = cls(**{name: saved[name] for name in names if name in saved})
         now = config.resolved()
         for part in ("task", "vehicle", "weather", "randomization"):
             if saved.get(f"resolved_{part}") != now[f"resolved_{part}"]:
