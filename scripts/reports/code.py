@@ -98,8 +98,7 @@ def aircraft(name: str) -> str:
             label = f"`{field}`" if kind is Vehicle else f"rotor: `{field}`"
             meaning = text.replace(f" ({FIRST_SOURCE})", "")
             rows.append((label, shown(getattr(owner, field)), meaning, sources.get(field, first)))
-    speed = shown(float(vehicle.hover_speed[0]))
-    rows.append(("hover speed", speed, "Of a rotor [rad/s]", "follows"))
+    rows.append(("hover speed", shown(vehicle.hover_speed[0]), "Of a rotor [rad/s]", "follows"))
     ratio = f"{thrust_over_weight(vehicle):.3g}"
     rows.append(("thrust over weight", ratio, "At the largest rotor speeds", "follows"))
     for k, rotor in enumerate(vehicle.rotors):

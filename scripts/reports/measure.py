@@ -38,8 +38,7 @@ def training(runs: Runs) -> None:
     yardstick: dict[tuple[str, str], Result] = {}
     curves: dict[str, list[Any]] = {}
     for run, config in configs.items():
-        names = ("task", "vehicle", "engine", "algo", "seed")
-        known = {name: getattr(config, name) for name in names}
+        known = {x: getattr(config, x) for x in ("task", "vehicle", "engine", "algo", "seed")}
         took = json.loads((run / EVALUATION).read_text())["training_s"]
         steps = config.iterations * config.num_envs * config.rollout
         found.append(known | {"steps": steps, "training_s": took, "metrics": flown(run, config)})

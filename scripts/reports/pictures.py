@@ -36,7 +36,10 @@ OPTIONS: dict[str, dict[str, Any]] = {  # of the task as it is shown: a wall, se
     "deck_landing": {"lowest_waves": 1.25, "highest_waves": 2.5},
     "trajectory": {"figure": "lemniscate"},
 }
-NEAR = (0.0, 0.0, 2.95, 1.95, 75.0, -32.0)  # the view of an eight, on which a Crazyflie is small
+CAMERA: dict[str, Any] = {  # follow has gates before the racer, and shows a small Crazyflie
+    "race": "chase",
+    "trajectory": moving_camera(np.array((0.0, 0.0, 2.95, 1.95, 75.0, -32.0))),
+}
 FASTEST = ("deck_landing", "lsy_race", "perching", "race")
 RACED = 300  # flights of those, the fastest of which is shown
 # The training: four policies fly the same start.
@@ -97,12 +100,9 @@ def flight(name: str) -> Iterator[Image.Image]:
     settled = flown.time[np.flatnonzero(away > SETTLED * away.max())[-1]]
     end = settled + LAST
     first = max(end - LONGEST, 0.0) if shown.contact else 0.0  # the touch is what counts
-    how: Any = {"speed_trail": name in ("lsy_race", "race")}
+    how: Any = {"speed_trail": name in ("lsy_race", "race"), "camera": CAMERA.get(name, "follow")}
     if name == "trajectory":  # the last round, after which the first picture fits again
         first, end = shown.time_limit - shown.cycle, shown.time_limit
-        how["camera"] = moving_camera(np.array(NEAR))
-    if name == "race":  # other cameras have gates before the aircraft
-        how["camera"] = "chase"
     how["times"] = np.arange(first, min(end, first + LONGEST), 1.0 / FPS)
     words = name.replace("_", " ")
     if how["speed_trail"]:

@@ -103,11 +103,8 @@ def beside(name: str, rows: Mapping[str, list[Result]], only: Collection[str]) -
 
 def source(result: Result, rows: Iterable[Result] = ()) -> str:
     """Where and at which commits a result, or rows of it, was measured, in one line."""
-    at = (
-        " and ".join(sorted({row.get("commit", result["commit"]) for row in rows}))
-        or result["commit"]
-    )
-    return f"Machine: {in_a_line(result['machine'])}. Measured at commit {at}."
+    commits = sorted({row.get("commit", result["commit"]) for row in rows} or [result["commit"]])
+    return f"Machine: {in_a_line(result['machine'])}. Measured at commit {' and '.join(commits)}."
 
 
 def table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:

@@ -144,11 +144,8 @@ def robustness(only: tuple[str, ...] = (), episodes: int = 100) -> None:
     alone, half = [], []
     for task in only or report.load("tuning")["tasks"]:
         say(task)
-        flyers: Result = {
-            "policy": task,
-            "robust policy": f"{task}_robust",
-            "controller": "geometric",
-        }
+        flyers: Result = {"policy": task, "robust policy": f"{task}_robust"}
+        flyers["controller"] = "geometric"
         for name, condition in conditions().items():
             shares = {k: flown(flyer, task, condition, episodes) for k, flyer in flyers.items()}
             wider = WIDER | condition  # as the robust policy commands
@@ -210,10 +207,8 @@ def robust_table() -> str:
         words += f", {length(np.median(errors))}, {np.median(turning):.2f} rad/s"
         who = "geometric controller, tuned" if controller else "robust policies"
         cells.setdefault((f"`{task}`", who), []).append(words)
-    note = (
-        "Successful flights [%] of all seeds, in brackets the worst and the best; medians of the "
-    )
-    note += "error and of the yaw rate over the last 2 s. "
+    note = "Successful flights [%] of all seeds, in brackets the worst and the best; medians of "
+    note += "the error and the yaw rate over the last 2 s. "
     note += f"{result['episodes']} flights for each seed and condition. "
     note += report.source(result, result["rows"])
     rows = ((*key, *own) for key, own in cells.items())

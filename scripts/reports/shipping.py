@@ -66,9 +66,8 @@ def unmet(task: str, metrics: Result) -> list[Target]:
 
 def copied(run: Path, config: TrainConfig, file: Path) -> str:
     """Copy a policy with its configuration, its metrics and the command that makes it again."""
-    usual = TrainConfig(
-        config.task, algo=config.algo, vehicle=config.vehicle, variant=config.variant
-    )
+    kind: Any = {name: getattr(config, name) for name in ("algo", "vehicle", "variant")}
+    usual = TrainConfig(config.task, **kind)
     named = (*FREE, "seed", "engine", "from_run")
     if config.from_run:  # a second training
         named += ("randomization", "training_options")
@@ -79,9 +78,8 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     metrics = summarize(fly(policy, episodes=EPISODES))
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES}"
     still = summarize(fly(policy, episodes=EPISODES, **CALM))
-    missed = unmet(config.task, still)
-    ways = "".join(f", {x.words} {quantity(x.metric, still[x.metric])}" for x in missed)
-    if missed:
+    if missed := unmet(config.task, still):
+        ways = "".join(f", {x.words} {quantity(x.metric, still[x.metric])}" for x in missed)
         for old in (file, file.with_suffix(".json")):
             old.unlink(missing_ok=True)
         return f"left out, misses what its task asks: {said} successful{ways}"
@@ -129,9 +127,8 @@ def policies(name: str = "") -> str:
     flown = [row for row in result["rows"] if name in ("", row["task"])]
     for row in flown:
         made = json.loads((SHIPPED / f"{row['policy']}.json").read_text())["command"]
-        if row["task"] in RACES:
-            del row["position_error_m"]
-        cells = [quantity(x, row[x]) if x in row else "" for x in FIGURES]
+        without = "position_error_m" if row["task"] in RACES else ""
+        cells = [quantity(x, row[x]) if x in row and x != without else "" for x in FIGURES]
         cells += [quantity(x.metric, row[x.metric]) for x in own]
         still = row["undisturbed"]
         missed = (
