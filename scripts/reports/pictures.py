@@ -36,8 +36,8 @@ OPTIONS: dict[str, dict[str, Any]] = {  # of the task as it is shown: a wall, se
     "deck_landing": {"lowest_waves": 1.25, "highest_waves": 2.5},
     "trajectory": {"figure": "lemniscate"},
 }
-CAMERA: dict[str, Any] = {  # follow has gates before the racer, and shows a small Crazyflie
-    "race": "chase",
+CAMERA: dict[str, Any] = {  # of a whole track, and near the eight of a small aircraft
+    "race": moving_camera(np.array((2.3, 0.0, 1.5, 20.0, 120.0, -25.0))),
     "trajectory": moving_camera(np.array((0.0, 0.0, 2.95, 1.95, 75.0, -32.0))),
 }
 FASTEST = ("deck_landing", "lsy_race", "perching", "race")
