@@ -26,12 +26,8 @@ from quadrl.tasks.hover import Hover
 
 # ------------------------------------------------------------------- motions, flown by an engine
 
-PARAMETERS = ("mass", "inertia", "drag_coefficient", "moment_coefficient")
-AIR_PARAMETERS = (
-    *("rotor_drag", "flapping_moment", "vortex_ring", "vortex_ring_noise", "rotor_inertia"),
-    *("blade_lift", "translational_lift", "body_lift", "air_density"),
-)
-ROTOR_PARAMETERS = ("thrust_coefficient", "torque_coefficient", "lag_up", "lag_down", "max_speed")
+ALIKE = ("mark", "size", "rotor_count", "effects", *parameters.DERIVED)
+"""Numbers of a row that are the same in all: what kind of row it is, and what no force reads."""
 UP = np.array([0.0, 0.0, 100.0])  # [m]; where nothing is near
 _ROTOR = dict(thrust_coefficient=1.1e-5, torque_coefficient=2e-7, lag_up=20.0, lag_down=12.0)
 LAYOUTS = VEHICLES | {
@@ -162,18 +158,18 @@ def coordinates(engine):
     return np.concatenate([engine.qpos, engine.qvel, engine.act], axis=-1)
 
 
-def parameter_rows(vehicle, count, seed=2, spread=0.2):
-    """Rows of parameters (n,) that differ: each number of each rotor and body by up to `spread`."""
-    rng = np.random.default_rng(seed)
-    table = parameters.rows(vehicle, count)
-    for name in PARAMETERS:
-        table[name] *= rng.uniform(1 - spread, 1 + spread, table[name].shape)
-    for name in ROTOR_PARAMETERS:
-        table["rotor"][name] *= rng.uniform(1 - spread, 1 + spread, table["rotor"][name].shape)
-    for name in AIR_PARAMETERS:
-        table[name] *= rng.uniform(1 - spread, 1 + spread, table[name].shape)
-    disc = table["rotor"]["disc_radius"]
-    disc *= rng.uniform(1 - spread, 1 + spread, disc.shape)
+def parameter_rows(vehicle, count):
+    """Rows of parameters (n,) that differ: each number that may act, by up to a fifth.
+
+    What is 0 gets a size, unless it is of an `Aerodynamics` without effect: no force is left out.
+    """
+    own, table = parameters.rows(vehicle), parameters.rows(vehicle, count)
+    numbers, air = parameters.numbers(table), vehicle.aerodynamics
+    numbers[numbers == 0] = 1e-2 * vehicle.inertia[0]
+    numbers *= np.random.default_rng(2).uniform(0.8, 1.2, numbers.shape)
+    table["rotor"]["axis"] = own["rotor"]["axis"]  # MuJoCo's models have one for all rows
+    for name in (*ALIKE, *(() if air.effects else vars(air))):
+        table[name] = own[name]
     parameters.refresh(table, vehicle.physics_timestep)
     return table
 

@@ -40,8 +40,8 @@ def flying(name, *, per_row=True, count=COUNT):
     """Aircraft that differ, in motions that differ, some near the ground where it has an effect."""
     vehicle, rng = EVERY[name], np.random.default_rng(5)
     batch = BatchEngine(vehicle, count, altitude=3.0, engine="free_flight", per_row=per_row)
-    if per_row:
-        batch.write_parameters(np.arange(count), helpers.parameter_rows(vehicle, count))
+    own = len(batch.parameters)  # 1 where all are the same
+    batch.write_parameters(np.arange(own), helpers.parameter_rows(vehicle, own))
     motion = helpers.random_motion(vehicle, count, speed=6.0, turn=6.0, wind=5.0, rotor=0.4)
     motion.velocity[::4] *= 3.0  # out of the range of the inflow
     motion.velocity[1::4] *= 0.1

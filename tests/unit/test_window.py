@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import helpers
 import numpy as np
 import pytest
 import torch
@@ -34,6 +35,8 @@ def flown(name, weights, shifts):
     task = tasks.make(name if name in tasks.TASKS else "hover", **options)
     environment = Environment(task, num_envs=COUNT, seed=3, engine="free_flight", **settings)
     environment.reset()
+    own, engine = len(environment.engine.parameters), environment.engine
+    engine.write_parameters(np.arange(own), helpers.parameter_rows(engine.vehicle, own))
     moments, total, share = [], 0.0, np.ones(COUNT)
     for shift in shifts:
         terms = environment.task.observe(environment.snapshot).values()
