@@ -21,7 +21,7 @@ from quadrl.evaluation.controllers import make_controller
 VEHICLE = Vehicle()
 CLOCK = transition.Clock(control_timestep=0.05, time_limit_steps=200, settle_steps=40)
 FEET = np.array(VEHICLE.foot)  # [m]
-ON_SOLIDS = ("deck_landing", "perching")  # which need their deck or wall
+ON_SOLIDS = {name for name in tasks.TASKS if tasks.make(name).solids()}  # which they need
 RACES = ("lsy_race", "race")
 
 
