@@ -82,8 +82,8 @@ def _condition(default: Any, parse: Callable[[Any], Any]) -> Any:
 class Scenario:
     """What is flown and how; `of` makes one, and `to_json` gives back what `of` takes.
 
-    To add a condition, add a field with the function that parses it, and its keyword to
-    `Conditions`.
+    To add a condition, add a field with the function that parses it, its keyword to `Conditions`,
+    and a field to `quadrl.learning.settings.TrainSettings`.
     """
 
     task: Task = dataclasses.field(metadata={"parse": catalogue.make})
