@@ -277,10 +277,16 @@ def _among_posts(task: Task) -> Task:
 
 
 def _clearance(task: Task) -> Work:
+    """Compute the clearance of aircraft in flight, where they are after each of some steps."""
     environment = Environment(task, num_envs=FREE_FLIGHT_ENVS, seed=0, engine="free_flight")
     environment.reset()
-    while True:
-        environment.engine.clearance()
+    engine, flown = environment.engine, list[np.ndarray]()
+    for action in itertools.islice(_actions(FREE_FLIGHT_ENVS, environment.action_size), FLIGHT):
+        environment.step(action)
+        flown.append(engine.qpos.copy())
+    for places in itertools.cycle(flown):
+        engine.qpos[:] = places
+        engine.clearance()
         yield FREE_FLIGHT_ENVS
 
 
