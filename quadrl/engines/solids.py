@@ -189,6 +189,10 @@ class Solids:
 
         Poses are as `place` takes them; None for where the solids are.
         """
+        if poses is None and len(parameters) == 1:  # the lists of the nearest serve the start, too
+            places = np.empty((len(self.table), 7))
+            places[rows] = qpos
+            return self.clearance(places, parameters, rotors, rows)
         then, count = copy.copy(self), len(rows)
         then.table, then.nearby = self.table[rows], np.zeros(count, NEARBY)
         then.nearby["place"] = np.nan
