@@ -242,7 +242,7 @@ class Perching(Task):
         return now.touched[..., 0] & ~now.held
 
     def _shares(self, now: Snapshot) -> list[Array]:
-        """How hard the touch is, as shares of what is allowed, (N,): 1 is the limit."""
+        """Speeds, tilt and spin of the touch, (N,) each as a share of what is allowed."""
         into, along, cosine, rate = (now.touch[..., k] for k in range(4))
         middle = (self.most_touch + self.least_touch) / 2
         half = (self.most_touch - self.least_touch) / 2

@@ -139,7 +139,7 @@ def _unknown(word: str, box: str, command: str, here: str) -> str:
         having.setdefault(option, []).extend([other] * bool(other))
     if others := having.get(word):
         more = ", ..." * ("[...]" in similar)
-        return f"{word} is no option of {here}, but of {', '.join(others)}{more}"
+        return f"{word} is not an option of {here}; commands with it: {', '.join(others)}{more}"
     meant = next((name for name, others in having.items() if command in others), "")
     hint = f" (did you mean {meant}?)" if meant else ""
     return f"{word} is an unknown option{hint}"

@@ -140,21 +140,19 @@ class Environment(saving.Copied):
         self._flown = 0  # physics steps of this control step that `control` has commanded
         self.seed(seed)
 
-    def seed(self, seed: Seed = None, rows: np.ndarray | None = None) -> Seed:
+    def seed(self, seed: Seed = None) -> Seed:
         """Let the next reset begin the first episode of a seed; return the seed.
 
         Args:
-            seed: A number: row i gets seed + i. A sequence: row i gets seed[i], or keeps its own
-                where that is None. None: a number from the operating system.
-            rows: Numbers (n,) or mask (N,) of the aircraft that are seeded; None for all.
+            seed: With a number row i gets seed + i; with a sequence seed[i], or keeps its own where
+                that is None. Without one the operating system gives a number.
 
         Raises:
             QuadrlError: A seed is not a whole number from 0 on, or there are not N of them.
         """
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
-        chosen = self._all if rows is None else validation.rows(rows, self.num_envs)
-        self.seeds = self.seeds.renewed(seed, chosen)
+        self.seeds = self.seeds.renewed(seed, self._all)
         return seed
 
     def reset(

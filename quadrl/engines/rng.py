@@ -1,7 +1,7 @@
 """Keyed random numbers: any number of any stream, the same for one aircraft and for a batch.
 
 Row i of a batch with seed s has the key s + i, whatever its neighbours and the threads do, and
-there is no state of a generator to save. NumPy uses the C of `native/random.c`;
+no generator has a state to save. NumPy uses the C of `native/random.c`;
 `quadrl.base.philox` draws the same numbers in every array namespace.
 """
 

@@ -178,13 +178,13 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
 
 
 def _actions(*shape: int) -> Iterator[np.ndarray]:
-    """Repeat 64 random actions (*shape) float32 for ever, so that no drawing is measured."""
+    """Cycle through 64 random actions (*shape) float32, so that drawing them is not measured."""
     drawn = np.random.default_rng(0).uniform(-1, 1, (64, *shape))
     return itertools.cycle(drawn.astype(np.float32))
 
 
 def _commands(vehicle: Vehicle, *shape: int) -> Iterator[np.ndarray]:
-    """Repeat the rotor commands (*shape, R) [rad/s] of random actions for ever."""
+    """Cycle through the rotor commands (*shape, R) [rad/s] of random actions."""
     shape = (64, *shape, vehicle.rotor_count)
     return itertools.cycle(vehicle.rotor_command(np.random.default_rng(0).uniform(-1, 1, shape)))
 

@@ -153,6 +153,13 @@ def test_a_run_in_wind_says_what_the_air_does_and_an_older_one_flew_by_drag_alon
     assert again.aerodynamics == "none" and again.scenario.aircraft.aerodynamics.effects == 0
 
 
+def test_a_setting_that_an_older_run_lacks_has_its_default(tmp_path):
+    older = TINY.resolved()
+    del older["evaluations"], older["apg"]
+    write_config(tmp_path, older)
+    assert TrainConfig.of_folder(tmp_path) == TINY
+
+
 @pytest.mark.filterwarnings("ignore:.*no digest")
 @pytest.mark.parametrize("text", [None, "", "{", "[]", "{}", '{"task": "hover"}'])
 def test_damaged_settings_are_refused(tmp_path, text):
