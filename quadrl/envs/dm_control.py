@@ -71,13 +71,13 @@ class Physics(mujoco.Physics):
         return picture
 
     def step(self, nstep: int = 1) -> None:
-        """Advance by physics steps; a NativeError if the rotor callbacks were removed."""
+        """Advance by physics steps; a NativeError if callbacks are not those of the rotors."""
+        native.check_installed()
         while nstep:
             steps = self.inner_loop(nstep) if self.inner_loop else nstep
             if self.engine is not None and self.engine.fly(steps):
                 self.forward()  # what is drawn and measured belongs to the new state
             else:
-                native.check_installed()
                 super().step(steps)
             nstep -= steps
 

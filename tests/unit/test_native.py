@@ -174,10 +174,10 @@ def test_foreign_callbacks_are_named_and_left_until_they_are_to_be_replaced():
         assert mujoco.get_mjcb_act_dyn() is somebody_elses
         with pytest.warns(UserWarning, match="mjcb_act_dyn"):
             native.install(replace=True)
-        native.check_installed()
         assert mujoco.get_mjcb_control() is somebody_elses  # of another kind
     finally:
         mujoco.set_mjcb_control(None)
+    native.check_installed()
 
 
 @pytest.mark.parametrize("name", native.CALLBACKS)
@@ -195,6 +195,43 @@ def test_without_one_of_the_callbacks_nothing_steps(name):
         with pytest.raises(native.NativeError, match=f"mjcb_{name}"):
             step()
     np.testing.assert_array_equal(environment.engine.qpos, before)
+
+
+def meddle(*given):
+    """A callback that changes the state where it is given one."""
+    for data in given[1:2]:
+        if isinstance(data, mujoco.MjData):
+            data.qpos[2] += 0.01
+            data.ctrl[:] = 0.0
+    return 0
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("name", [*native.INTERFERING, "act_bias", "sensor", "time"])
+def test_no_callback_of_other_code_changes_a_flight(name, engine):
+    environment = helpers.begun("landing", engine=engine)
+    through_dm_control = quadrl.load("landing", {"random": 0, "engine": engine})
+
+    def flown():
+        environment.reset(seed=0)
+        through_dm_control.reset()
+        for _ in range(5):
+            helpers.idle(environment)
+            through_dm_control.step(np.zeros(4))
+        both = environment.engine.qpos[0], through_dm_control.physics.data.qpos
+        return np.concatenate(both).copy()
+
+    before, clock = flown(), mujoco.get_mjcb_time()
+    through_dm_control = quadrl.load("landing", {"random": 0, "engine": engine})
+    getattr(mujoco, f"set_mjcb_{name}")(meddle)
+    try:
+        assert (flown() == before).all()
+        refused = False
+    except native.NativeError as error:
+        refused = f"mujoco.set_mjcb_{name}(None)" in str(error)
+    finally:
+        getattr(mujoco, f"set_mjcb_{name}")(clock if name == "time" else None)
+    assert refused == (name in native.INTERFERING)
 
 
 # -------------------------------------------------------------------------------- MuJoCo's warnings

@@ -23,6 +23,9 @@ from quadrl.engines.native.compiling import build, open_library
 MARK_SLOT = 9
 """Index of MARK in an actuator's `dynprm`."""
 CALLBACKS = ("act_dyn", "act_gain", "passive")
+INTERFERING = ("control", "contactfilter")
+"""Callbacks of MuJoCo that quadrl leaves empty, and with which other code would change a flight. The
+others change none: no model of quadrl's has what `act_bias` and `sensor` compute."""
 MAX_WARNINGS = 500
 """Largest number of lines in a file of MuJoCo's warnings, at most 60 kB."""
 
@@ -172,24 +175,32 @@ def install(replace: bool = False) -> None:
 
 
 def check_installed() -> None:
-    """Raise unless the rotor callbacks are in place.
+    """Raise unless the rotor callbacks are in place, and no other that acts on an aircraft.
 
     Raises:
-        NativeError: One of them was removed or replaced, so that the physics would be wrong.
+        NativeError: One of them was removed or replaced, or one of INTERFERING is installed, so
+            that the physics would be wrong.
     """
     ours = library()
     if (
         mujoco.get_mjcb_act_dyn() is ours.act_dyn
         and mujoco.get_mjcb_act_gain() is ours.act_gain
         and mujoco.get_mjcb_passive() is ours.passive
+        and mujoco.get_mjcb_control() is None
+        and mujoco.get_mjcb_contactfilter() is None
     ):
         return
-    missing = [name for name in CALLBACKS if _current(name) != getattr(ours, name)]
-    if missing:
+    if missing := [name for name in CALLBACKS if _current(name) != getattr(ours, name)]:
         raise NativeError(
             f"the rotor callback {_names(missing)} was removed or replaced by other code, and "
             "the physics would be wrong; call quadrl.engines.native.install() again"
         )
+    others = [name for name in INTERFERING if _current(name) is not None]
+    raise NativeError(
+        f"other code has installed {_names(others)}, which acts on every model in the process "
+        "and would change this flight; remove it before an aircraft of quadrl's flies: "
+        f"mujoco.set_mjcb_{others[0]}(None)"
+    )
 
 
 def _current(name: str) -> object:
