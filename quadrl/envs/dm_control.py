@@ -11,6 +11,7 @@ import contextlib
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, Unpack
 
+from quadrl.base.shield import refuse_after_fork
 from quadrl.rendering import gl
 from quadrl.rendering.camera import FOLLOW, aircraft_scale, moving_views
 
@@ -58,6 +59,7 @@ class Physics(mujoco.Physics):
         self, height: int = 240, width: int = 320, camera_id: Any = -1, **options: Any
     ) -> np.ndarray:
         """As in dm_control; "follow" moves with the aircraft and keeps the goal in view."""
+        refuse_after_fork()
         if camera_id != FOLLOW or self.in_view is None:
             return super().render(height, width, camera_id, **options)  # type: ignore[arg-type]
         goal, markers = self.in_view()

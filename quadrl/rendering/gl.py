@@ -20,6 +20,7 @@ from typing import Any
 import mujoco
 
 from quadrl.base.errors import RenderingUnavailable
+from quadrl.base.shield import refuse_after_fork
 
 GL_RENDERER = 0x1F01
 SOFTWARE = (b"llvmpipe", b"softpipe", b"swrast", b"swiftshader", b"software")
@@ -113,7 +114,11 @@ def current_context_kept() -> Generator[None]:
     """Give the thread back the EGL context that it had.
 
     dm_control makes its context current only once; without this it would go on to draw in ours.
+
+    Raises:
+        RenderingUnavailable: As `refuse_after_fork` says.
     """
+    refuse_after_fork()
     egl: Any = sys.modules.get("mujoco.egl")
     before = egl and egl.EGL_DISPLAY and egl.EGL.eglGetCurrentContext()
     try:
@@ -138,6 +143,7 @@ def _dm_control_context(max_width: int, max_height: int) -> Any:
 
 @contextlib.contextmanager
 def _failure_named() -> Generator[None]:
+    refuse_after_fork()
     try:
         yield
     except Exception as error:  # each platform fails in its own way

@@ -81,3 +81,46 @@ def test_without_a_screen_it_draws_beside_other_renderers(code):
 )
 def test_triton_can_be_imported_after_a_picture(before, code):
     run(code + "\nimport triton\n", before, MUJOCO_GL="egl")
+
+
+FORKED = """
+import os, signal, sys
+from quadrl.base.errors import RenderingUnavailable
+child = os.fork()
+if child == 0:
+    signal.alarm(30)  # kills one that hangs
+    try:
+        in_child()
+    except RenderingUnavailable as error:
+        os._exit("forked from one that had drawn" not in str(error))
+    os._exit(2)
+assert os.waitpid(child, 0)[1] == 0
+"""
+CLOSED = "other.close()\ndel other, draw\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "in_child"),
+    [
+        (OURS, "renderer.frame(pose)"),
+        (OURS + "renderer.close()", "ours()"),
+        (MUJOCO, "ours()"),
+        (MUJOCO + CLOSED, "ours()"),
+        (DM_CONTROL, "draw()"),
+        (DM_CONTROL, "ours()"),
+    ],
+)
+def test_what_is_forked_from_a_process_that_has_drawn_says_so_and_never_hangs(code, in_child):
+    run(f"{code}\nin_child = lambda: {in_child}\n{FORKED}", MUJOCO_GL="egl")
+
+
+def test_a_forked_process_draws_where_none_before_it_has():
+    run("""
+import os, signal
+child = os.fork()
+if child == 0:
+    signal.alarm(60)
+    assert ours().frame(pose).std() > 10
+    os._exit(0)
+assert os.waitpid(child, 0)[1] == 0
+""")

@@ -24,8 +24,8 @@ MARK_SLOT = 9
 """Index of MARK in an actuator's `dynprm`."""
 CALLBACKS = ("act_dyn", "act_gain", "passive")
 INTERFERING = ("control", "contactfilter")
-"""Callbacks of MuJoCo that quadrl leaves empty, and with which other code would change a flight. The
-others change none: no model of quadrl's has what `act_bias` and `sensor` compute."""
+"""Callbacks that quadrl leaves empty, and with which other code would change a flight. The others
+change none: no model of quadrl's has what `act_bias` and `sensor` compute."""
 MAX_WARNINGS = 500
 """Largest number of lines in a file of MuJoCo's warnings, at most 60 kB."""
 
