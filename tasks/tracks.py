@@ -23,6 +23,7 @@ from quadrl.base.validation import MAX_OPTION, choice, number, numbers, tuples
 
 RUN_IN = 5.0
 """Distance of the start before the first gate of a track that names no start [m]."""
+MAX_GATES = 500  # of a track of one's own: any two are looked at for whether they overlap
 DEPTH = 0.03  # of the frames that are drawn, of their outer edge
 NEXT, OTHER = (1.0, 0.55, 0.15, 1.0), (0.25, 0.45, 0.80, 1.0)
 
@@ -79,6 +80,7 @@ class Track:
             if isinstance(gates, str) or not hasattr(gates, "__len__") or not len(gates):
                 allowed = "at least one row [x, y, z, heading, climb]"
                 raise QuadrlError(name="gates", value=gates, allowed=allowed)
+            number("number of gates", len(gates), 1, MAX_GATES, whole=True)
             rows = tuple(numbers(f"gates[{k}]", gate, 5, *size) for k, gate in enumerate(gates))
             name, listed = "own", dataclasses.replace(listed, start=_before(rows[0]))
         if len(numbers("start", start)):

@@ -83,8 +83,11 @@ class Vehicle:
 
     def __post_init__(self) -> None:
         """Validate the numbers, alone and together."""
-        if not isinstance(self.name, str) or not self.name:
-            raise QuadrlError(name="name", value=self.name, allowed="a string that is not empty")
+        plain = isinstance(self.name, str) and f"_{self.name}".replace("-", "_").isidentifier()
+        if not self.name or not plain:
+            # Files are named after it, and a policy may bring it from elsewhere.
+            allowed = "letters, digits, _ and -, such as 'my-aircraft'"
+            raise QuadrlError(name="name", value=self.name, allowed=allowed)
         object.__setattr__(self, "inertia", numbers("inertia", self.inertia, 3, MIN, MAX))
         for field in ("mass", "action_scale", "physics_timestep", "control_timestep"):
             object.__setattr__(self, field, number(field, getattr(self, field), MIN, MAX))

@@ -12,6 +12,7 @@ import itertools
 import json
 import os
 import re
+import secrets
 import tomllib
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -39,10 +40,14 @@ DIGEST = re.compile(rb"digest\W{1,8}([0-9a-f]{64})")
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: the old one stays until the new one is on the disk."""
-    scratch = path.with_name(path.name + PART)
+    """Write a file whole or not at all: the old one stays until the new one is on the disk.
+
+    Nobody can guess the name under which it is written at first and put a link there.
+    """
+    scratch = path.with_name(f"{path.name}.{secrets.token_hex(8)}{PART}")
     try:
-        scratch.write_bytes(content)
+        with open(scratch, "xb") as file:
+            file.write(content)
         put(scratch, path)
     except BaseException:
         with contextlib.suppress(OSError):
@@ -141,6 +146,23 @@ def check_seal(path: Path, content: bytes, *, unsealed: bool) -> None:
         raise QuadrlError(f"{path} is damaged, or was changed after it was written: restore it")
 
 
+def check_texts(value: Any) -> None:
+    """Refuse a value of a file with a text that a terminal would not show as it is.
+
+    Raises:
+        ValueError: A text in it, at any depth, holds control characters other than line breaks.
+    """
+    if isinstance(value, str):
+        if not re.sub(r"[\n\t]", "", value).isprintable():
+            raise ValueError(f"the text {value[:60]!r} holds control characters")
+    elif isinstance(value, Mapping):
+        table = cast(Mapping[str, Any], value)
+        check_texts([*table.keys(), *table.values()])
+    elif isinstance(value, list):
+        for one in cast(list[Any], value):
+            check_texts(one)
+
+
 def write_sealed_json(path: Path, content: Mapping[str, Any], form: str) -> None:
     """Write a mapping as JSON, with its format and a digest."""
     sealed = {"digest": BLANK.decode(), "format": form, **content}
@@ -161,6 +183,7 @@ def read_sealed_json(path: Path, form: str, *, unsealed: bool = True) -> dict[st
     try:
         content = path.read_bytes()
         found = json.loads(content)
+        check_texts(found)
     except (OSError, ValueError, RecursionError) as error:
         raise QuadrlError(f"{path} cannot be read: {error}") from error
     if not isinstance(found, dict):
@@ -210,6 +233,7 @@ def read_safetensors(
         table: dict[str, Any] = json.loads(content[8 : 8 + size])
         metadata: dict[str, str] = table.get("__metadata__") or {}
         header: Any = json.loads(metadata.get(HEADER, "{}"))
+        check_texts(header)
         written = header.get("format")
         if written not in (*wanted, *unsealed):
             allowed = " or ".join(wanted)
@@ -237,9 +261,10 @@ def read_table(path: Path, what: str) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
         content: Any = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        check_texts(content)
     except OSError as error:
         raise QuadrlError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise QuadrlError(f"{path} is not {path.suffix[1:].upper()}: {reason}") from error
     if not isinstance(content, dict):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import csv_content, write_whole
+from quadrl.base.files import check_texts, csv_content, write_whole
 from quadrl.base.media import Media
 from quadrl.base.units import quantity
 from quadrl.core.scenario import as_saved
@@ -163,8 +163,9 @@ class Card:
         file = path / f"{FILE}.json" if path.is_dir() else path
         try:
             found = json.loads(file.read_text())
+            check_texts(found)
             written = found.pop("format", None)
-        except (OSError, ValueError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise QuadrlError(f"{file} holds no robustness card: {error}") from error
         if written != FORMAT:
             raise QuadrlError(name=f"format of {file}", value=written, allowed=FORMAT)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
+from quadrl.base.files import check_texts
 from quadrl.core.scenario import Scenario, as_saved
 from quadrl.rendering.overlay import require
 
@@ -44,11 +45,12 @@ def read_scenarios(path: str | os.PathLike[str]) -> list[Scenario]:
     try:
         text = _of_video(path) if path.suffix.lower() == ".mp4" else _of_picture(path)
         listed = json.loads(text)
+        check_texts(listed)
         if not listed or not all(isinstance(one, dict) and "task" in one for one in listed):
             raise ValueError("its comment holds none")
     except RenderingUnavailable:
         raise
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         reason = "give a file that quadrl render, plot or train has drawn"
         raise QuadrlError(f"{path} carries no scenario ({error}): {reason}") from error
     return [Scenario.of(as_saved(one)) for one in listed]

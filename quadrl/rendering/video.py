@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import math
 import os
+import secrets
 import sys
 from collections.abc import Callable, Generator, Iterable, Sequence
 from pathlib import Path
@@ -194,7 +195,7 @@ def write_video(
     if kind == "mp4":
         command = (*FFMPEG, "-metadata", f"{COMMENT}={carried}")
         encoding = dict(crf=20, encoded_format="yuv420p", ffmpeg_args=command)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.{kind}")
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}.{kind}")
     drawn = _together(flights, model, label, fps=fps, times=times, **options)
     with contextlib.closing(drawn) as frames:
         first = next(frames)  # what cannot be drawn fails here, before ffmpeg begins

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
+from quadrl.base.errors import QuadrlWarning
 from quadrl.engines import native
 from quadrl.engines.native import compiling
 
@@ -183,6 +184,34 @@ def test_without_a_cache_it_is_built_and_nothing_is_left(
     process = run(code, QUADRL_CACHE=str(tmp_path / place), **variables)
     assert process.wait() == (1 if compiler else 0)
     assert list((tmp_path / "tmp").iterdir()) == []
+
+
+@pytest.mark.parametrize("whose", ["writable by all", "somebody else's"])
+def test_a_cache_that_others_may_write_is_neither_read_nor_filled(
+    copying_compiler, cache, monkeypatch, whose
+):
+    planted = compiling.build()  # where nobody else could
+    if whose == "writable by all":
+        cache.chmod(0o777)
+    elif os.getuid() == 0:
+        os.chown(cache, 54321, -1)
+    else:
+        monkeypatch.setattr(os, "getuid", lambda: 54321)
+    with pytest.warns(QuadrlWarning, match="others may write"):
+        built = compiling.build()
+    assert built.parent != cache and list(cache.iterdir()) == [planted]
+
+
+def test_a_user_without_a_home_has_a_cache(monkeypatch, tmp_path):
+    for name in ("QUADRL_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(compiling.Path, "home", _no_home)
+    monkeypatch.setattr(compiling.tempfile, "tempdir", str(tmp_path))
+    assert compiling.cache_folder() == tmp_path / f"quadrl-{os.getuid()}"
+
+
+def _no_home():
+    raise RuntimeError("Could not determine home directory.")
 
 
 @pytest.mark.parametrize("where", ["cache", "temporary folder"])

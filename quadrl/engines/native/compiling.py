@@ -25,16 +25,18 @@ import os
 import platform
 import shlex
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 
 import mujoco
 
 from quadrl.aircraft.parameters import c_structs
-from quadrl.base.errors import NativeError
+from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.files import lock, put
 from quadrl.engines.air import c_weather
 from quadrl.engines.state import c_state
@@ -56,6 +58,10 @@ FLAGS = (
 _FOLDER = Path(__file__).parent
 PREBUILT = _FOLDER / "prebuilt"
 """Folder of the libraries that a wheel for this kind of machine brings; else it does not exist."""
+NOT_OWN = (
+    "keeps no compiled libraries: others may write into it, and what they put there would be run; "
+    "each process compiles anew until it belongs to you and is not writable by all"
+)
 _SCRATCH = "quadrl-build-"
 _ALONE: dict[Path, contextlib.ExitStack] = {}
 """Libraries for this process alone that are not loaded yet, and the stack that removes each."""
@@ -64,12 +70,26 @@ _NOTED: list[list[str]] = []
 
 
 def cache_folder() -> Path:
-    """The folder of compiled libraries: `$QUADRL_CACHE` or the user's cache folder."""
+    """The folder of compiled libraries: `$QUADRL_CACHE` or the user's cache folder.
+
+    A user without a home, as in a container with a number for a user, has one among the temporary
+    files.
+    """
     if chosen := os.environ.get("QUADRL_CACHE"):
         return Path(chosen)
+    try:
+        home = Path.home()
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"quadrl-{os.getuid()}"
     if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "quadrl"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "quadrl"
+        return home / "Library" / "Caches" / "quadrl"
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "quadrl"
+
+
+def _is_own(folder: Path) -> bool:
+    """Whether nobody but this user and root can put a library into a folder that exists."""
+    found = folder.stat()
+    return found.st_uid in (os.getuid(), 0) and not found.st_mode & stat.S_IWOTH
 
 
 def flags() -> tuple[str, ...]:
@@ -200,13 +220,16 @@ def _cached(name: str, arguments: list[str], written: dict[str, str], target: Ta
     for place in [folder] if target.folder else [PREBUILT, folder]:
         with contextlib.suppress(OSError):  # a folder that may not be read
             for path in place.glob(f"{name}-*.so"):
-                if path == _place(path, name):
+                if path == _place(path, name) and (place == PREBUILT or _is_own(place)):
                     return path
     with contextlib.ExitStack() as stack:
         try:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if not _is_own(folder):
+                warnings.warn(f"{folder} {NOT_OWN}", QuadrlWarning, stacklevel=2)
+                raise PermissionError
             scratch = stack.enter_context(_scratch(folder))
-        except OSError:  # a read-only home: a library for this process alone
+        except OSError:  # such as a read-only home: a library for this process alone
             scratch = stack.enter_context(_scratch(Path(tempfile.gettempdir())))
             folder = scratch
         for file, text in written.items():
