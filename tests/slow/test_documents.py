@@ -1,9 +1,12 @@
 """What README.md and docs/ show works as it stands there.
 
 Python snippets run as they are, those of a page one after the other in one process. Commands run as
-they are too, with SHORTER appended; of an option that is given twice the last counts.
+they are too, with SHORTER appended; of an option that is given twice the last counts. Those of a
+block that makes a run of its own run one after the other in one folder. Commands in sentences and
+studies, which would take hours, are parsed, and the settings of trainings are checked.
 """
 
+import dataclasses
 import os
 import re
 import shlex
@@ -20,7 +23,8 @@ import pytest
 from processes import python, run
 
 import quadrl
-from quadrl import tasks
+from quadrl import cli, tasks
+from quadrl.cli.flown import parse_options
 from quadrl.learning.plan import read_plan
 from scripts.reports import pages, report
 
@@ -39,6 +43,8 @@ SHORTER = {
 }
 STUDIES = sorted((REPOSITORY / "docs" / "studies").glob("*.toml"))
 RUN = "runs/hover"  # what the pages call their run
+UNRUN = ("quadrl view ", "quadrl study ")  # tested in another way
+FENCE = re.compile(r"^( *)```(.*)\n((?:.*\n)*?)\1```$", re.MULTILINE)  # indent, language, block
 
 
 RUNNER = "import runpy, sys\nfor path in sys.argv[1:]: runpy.run_path(path, run_name='__main__')"
@@ -46,25 +52,40 @@ RUNNER = "import runpy, sys\nfor path in sys.argv[1:]: runpy.run_path(path, run_
 
 def blocks(language):
     """The fenced blocks of each page that has any, also those of its tabs."""
-    pattern = re.compile(rf"^( *)```{language}\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
     found = {
-        page: [textwrap.dedent(block) for _, block in pattern.findall(text)]
+        page: [textwrap.dedent(block) for _, own, block in FENCE.findall(text) if own == language]
         for page, text in TEXTS.items()
     }
     return {page: blocks for page, blocks in found.items() if blocks}
 
 
+def commands(block):
+    """The commands of a block; a line may go on in the next one."""
+    return [line for line in re.sub(r"\\\n *", "", block).splitlines() if line]
+
+
+def in_turn(block):
+    """Its commands of quadrl, those together that need a run which another of them makes."""
+    found = [x for x in commands(block) if x.startswith("quadrl ") and not x.startswith(UNRUN)]
+    alone = {*re.findall(r"--out (runs/\S+)", block)} <= {RUN}
+    return [(command,) for command in found] if alone else [tuple(found)] * bool(found)
+
+
 PYTHON = blocks("python")
-COMMANDS = [
-    line
-    for page in blocks("bash").values()
-    for block in page
-    for line in block.splitlines()
-    if line
-]
+BASH = [block for page in blocks("bash").values() for block in page]
+COMMANDS = [command for block in BASH for command in commands(block)]
 PIP = [command for command in COMMANDS if command.startswith("python -m pip ")]
-QUADRL = list(dict.fromkeys(command for command in COMMANDS if command.startswith("quadrl ")))
-VIEWS = [command for command in QUADRL if command.startswith("quadrl view ")]
+VIEWS = [command for command in COMMANDS if command.startswith("quadrl view ")]
+QUADRL = list(dict.fromkeys(some for block in BASH for some in in_turn(block)))
+STARTS_RAY = [command for command in COMMANDS if command.startswith("ray ")]
+PLACEHOLDER = re.compile(r"\b(COMMAND|FOLDER|NAME|TASK|N)\b")
+WRITTEN = {
+    " ".join(command.split())
+    for text in TEXTS.values()
+    for command in re.findall(r"`(quadrl [^`]*)`", FENCE.sub("", text))
+}
+SENTENCES = sorted(x for x in WRITTEN if not PLACEHOLDER.search(x) and "--help" not in x)
+STUDIED = [command for command in COMMANDS if command.startswith("quadrl study ")]
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +116,16 @@ def folder(trained, tmp_path):
     return tmp_path
 
 
+def shortened(arguments):
+    """The arguments of a command with those of SHORTER, each given once."""
+    arguments, shorter = [*arguments], SHORTER.get(arguments[0], ())
+    for option in shorter:
+        if option.startswith("--") and option in arguments:
+            at = arguments.index(option)
+            del arguments[at : at + (1 if option.startswith("--no-") else 2)]
+    return [*arguments, *shorter]
+
+
 @pytest.mark.parametrize("page", PYTHON)
 def test_python_snippets_run(page, folder):
     names = [f"snippet_{k}.py" for k in range(len(PYTHON[page]))]
@@ -103,17 +134,43 @@ def test_python_snippets_run(page, folder):
     python("-c", RUNNER, *names, cwd=folder)
 
 
-@pytest.mark.parametrize("command", [command for command in QUADRL if command not in VIEWS])
-def test_quadrl_command_runs(command, folder):
-    _, *arguments = shlex.split(command)
-    if RUN in arguments and arguments[arguments.index(RUN) - 1] == "--out":
-        shutil.rmtree(folder / RUN)  # this command makes it
-    shorter = SHORTER.get(arguments[0], ())
-    for option in shorter:  # each is given once
-        if option.startswith("--") and option in arguments:
-            at = arguments.index(option)
-            del arguments[at : at + (1 if option.startswith("--no-") else 2)]
-    python("-m", "quadrl", *arguments, *shorter, cwd=folder)
+@pytest.mark.parametrize("commands", QUADRL, ids=" ".join)
+def test_quadrl_commands_run(commands, folder):
+    for command in commands:
+        _, *arguments = shlex.split(command, comments=True)
+        if RUN in arguments and arguments[arguments.index(RUN) - 1] == "--out":
+            shutil.rmtree(folder / RUN)  # this command makes it
+        python("-m", "quadrl", *shortened(arguments), cwd=folder)
+
+
+@pytest.mark.parametrize("command", [*SENTENCES, *STUDIED])
+def test_command_that_is_not_run_is_understood(command):
+    _, *arguments = shlex.split(command, comments=True)
+    made_before = {"--import", "--resume", "--from", "--seeds"} & {*arguments}
+    if len(arguments) == 1:
+        assert arguments[0] in (*cli.COMMANDS, "--version")
+    elif arguments[0] == "train" and not made_before:
+        cli.main([*arguments, *{"--dry-run"} - {*arguments}])
+    elif arguments[0] == "evaluate" and not made_before:
+        cli.main(shortened(arguments))
+    else:
+        cli.parse(arguments)
+
+
+@pytest.mark.parametrize("name", tasks.TASKS)
+def test_options_in_sentences_of_a_task_are_what_it_takes(name):
+    known = {field.name for field in dataclasses.fields(tasks.TASKS[name])}
+    page, _, _ = TEXTS[f"docs/tasks/{name}.md"].partition("## Trained")  # and what was tried
+    for span in re.findall(r"`((?:\w+=[\w.]+\s*)+)`", FENCE.sub("", page)):
+        given = parse_options(tuple(span.split()))
+        if given.keys() <= known and ".csv" not in span:
+            tasks.make(name, **given)
+
+
+def test_the_study_of_the_page_can_be_read(tmp_path):
+    (text,) = (block for page in blocks("toml").values() for block in page)
+    (tmp_path / "study.toml").write_text(text)
+    assert len(read_plan(tmp_path / "study.toml", tmp_path).runs) == 2 * 2 * 2 * 5  # as it says
 
 
 @pytest.mark.parametrize("command", VIEWS)
@@ -134,8 +191,10 @@ def test_every_command_is_checked():
     for page, text in TEXTS.items():
         fences = re.findall(r"^ *```(.*)$", text, re.MULTILINE)
         assert set(fences[::2]) <= LANGUAGES, page
-    for command in COMMANDS:
-        assert command in (*QUADRL, *SCRIPTS, *PIP), command
+        for block in blocks("").get(page, ()):  # which nothing runs
+            assert not re.search(r"^ *(quadrl|python -m) ", block, re.MULTILINE), page
+    tested = {command for some in QUADRL for command in some}
+    assert {*COMMANDS} <= tested | {*VIEWS, *STUDIED, *SCRIPTS, *PIP, *STARTS_RAY}
     for script in SCRIPTS:
         assert os.access(REPOSITORY / script, os.X_OK)
         run("bash", "-n", REPOSITORY / script)
