@@ -13,7 +13,6 @@ The import registers the Gymnasium ids; dm_control, torch and rendering are impo
 from __future__ import annotations
 
 import importlib
-import sys
 from typing import TYPE_CHECKING, Any
 
 from quadrl import envs, tasks
@@ -57,18 +56,6 @@ LAZY = {
     "export": "quadrl.deploy.export",
 }
 """Functions that are imported on first use, and their modules."""
-
-MOVED = {
-    "rotation": "base.rotation",
-    "native": "engines.native",
-    "weather": "conditions.weather",
-    "randomization": "conditions.randomization",
-    "task": "core.task",
-    "contact": "core.contact",
-}
-"""Modules that have moved, by the names under which users' files import them, until 0.2."""
-for _old, _new in MOVED.items():
-    sys.modules[f"quadrl.{_old}"] = globals()[_old] = importlib.import_module(f"quadrl.{_new}")
 
 envs.register_ids()
 shield_triton()  # whoever imports triton later may have drawn before

@@ -66,7 +66,7 @@ export class Policy {
       // The format below is missing then.
     }
     if (`${header.format}`.startsWith("quadrl-checkpoint")) throw new Error(CHECKPOINT);
-    if (!rules.formats.includes(header.format)) throw new Error("The file holds no policy of quadrl.");
+    if (header.format !== rules.format) throw new Error("The file holds no policy of quadrl.");
     const arrays = readArrays(table);
     const length = Math.max(1, Math.floor(Object.keys(arrays).length / 2) - 1);
     const names = Array.from({ length }, (_, k) => LAYERS.map((name) => `${name}_${k}`));

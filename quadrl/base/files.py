@@ -14,14 +14,13 @@ import os
 import re
 import secrets
 import tomllib
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 from safetensors import SafetensorError
 
-from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.errors import QuadrlError
 
 UNREADABLE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError,
               RecursionError)  # fmt: skip
@@ -119,30 +118,21 @@ def write_sealed(path: Path, content: bytes) -> None:
     write_whole(path, content.replace(BLANK, digest, 1))
 
 
-def is_sealed(content: bytes) -> bool | None:
-    """Whether the digest in a file matches its other bytes; None where it has no digest."""
+def is_sealed(content: bytes) -> bool:
+    """Whether a file has a digest, and it matches its other bytes."""
     if (found := DIGEST.search(content)) is None:
-        return None
+        return False
     blank = content[: found.start(1)] + BLANK + content[found.end(1) :]
     return hashlib.sha256(blank).hexdigest().encode() == found[1]
 
 
-def check_seal(path: Path, content: bytes, *, unsealed: bool) -> None:
+def check_seal(path: Path, content: bytes) -> None:
     """Refuse a file whose content does not match its digest.
-
-    Args:
-        path: Its path.
-        content: Its bytes.
-        unsealed: Whether its format is an earlier one, which has no digest.
 
     Raises:
         QuadrlError: The digest is missing or does not match.
     """
-    sound = is_sealed(content)
-    if sound is None and unsealed:
-        text = f"{path} is of an earlier quadrl and has no digest: damage to it would not be seen"
-        warnings.warn(text, QuadrlWarning, stacklevel=3)
-    elif not sound:
+    if not is_sealed(content):
         raise QuadrlError(f"{path} is damaged, or was changed after it was written: restore it")
 
 
@@ -169,13 +159,8 @@ def write_sealed_json(path: Path, content: Mapping[str, Any], form: str) -> None
     write_sealed(path, json.dumps(sealed, indent=2).encode())
 
 
-def read_sealed_json(path: Path, form: str, *, unsealed: bool = True) -> dict[str, Any]:
+def read_sealed_json(path: Path, form: str) -> dict[str, Any]:
     """Read what `write_sealed_json` wrote.
-
-    Args:
-        path: The file.
-        form: Its format.
-        unsealed: Whether it may be of an earlier quadrl, without a digest.
 
     Raises:
         QuadrlError: The file cannot be read, is damaged, holds no mapping, or has another format.
@@ -189,9 +174,9 @@ def read_sealed_json(path: Path, form: str, *, unsealed: bool = True) -> dict[st
     if not isinstance(found, dict):
         raise QuadrlError(f"{path} must hold a table")
     table = cast(dict[str, Any], found)
-    check_seal(path, content, unsealed=unsealed and "format" not in table)
-    if (written := table.get("format", form)) != form:
+    if (written := table.get("format")) != form:
         raise QuadrlError(name=f"format of {path}", value=written, allowed=form)
+    check_seal(path, content)
     return {name: value for name, value in table.items() if name not in ("digest", "format")}
 
 
@@ -211,17 +196,13 @@ def write_safetensors(
 
 
 def read_safetensors(
-    path: Path,
-    wanted: Sequence[str],
-    unsealed: Sequence[str],
-    of_bytes: Callable[[bytes], dict[str, Any]],
+    path: Path, wanted: Sequence[str], of_bytes: Callable[[bytes], dict[str, Any]]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read the arrays of a safetensors file, and the header that quadrl wrote into its metadata.
 
     Args:
         path: The file.
         wanted: Formats that the header may name.
-        unsealed: Earlier formats, whose files have no digest.
         of_bytes: `load` of the safetensors module for a framework.
 
     Raises:
@@ -235,10 +216,10 @@ def read_safetensors(
         header: Any = json.loads(metadata.get(HEADER, "{}"))
         check_texts(header)
         written = header.get("format")
-        if written not in (*wanted, *unsealed):
+        if written not in wanted:
             allowed = " or ".join(wanted)
             raise QuadrlError(name=f"format of {path}", value=written, allowed=allowed)
-        check_seal(path, content, unsealed=written in unsealed)
+        check_seal(path, content)
         return of_bytes(content), header
     except QuadrlError:
         raise

@@ -171,28 +171,6 @@ class ThrustBodyRate(_Looped):
         return self._loops.body_rate_command(state, thrust, setpoint[:, 1:])
 
 
-class ScaledThrustBodyRate(ThrustBodyRate):
-    """An earlier version within the range of `rotor`, for policies saved then."""
-
-    name = "thrust_body_rate-v1"
-
-    @classmethod
-    def reach(cls, vehicle: Vehicle) -> Vehicle:
-        """Keep the vehicle's action scale."""
-        return vehicle
-
-
-class EvenThrustBodyRate(ScaledThrustBodyRate):
-    """A still earlier version with the same scale of thrust up and down."""
-
-    name = "thrust_body_rate-v0"
-
-    def __init__(self, vehicle: Vehicle) -> None:
-        """Scale thrust to the largest vertical acceleration that the loops ask for."""
-        super().__init__(vehicle)
-        self.scale[0] = self.scale_down[0] = self._loops.max_acceleration[2] / GRAVITY
-
-
 class Velocity(_Looped):
     """A velocity along the heading, and the rate of the heading."""
 
@@ -261,11 +239,6 @@ CONTROL_MODES: dict[str, type[ControlMode]] = {
     mode.name: mode for mode in (Rotor, ThrustBodyRate, Velocity, Position)
 }
 """Every control mode by name."""
-EARLIER = {mode.name: mode for mode in (EvenThrustBodyRate, ScaledThrustBodyRate)}
-"""Earlier versions of modes by the name that files have for them."""
-RENAMED = {ThrustBodyRate.name: (EvenThrustBodyRate.name, "thrust_body_rate-v2")}
-"""Modes whose actions had another meaning before: the earlier mode that the bare name in a file
-means, and the name by which files call the present one."""
 
 
 def named(given: Any) -> str:
@@ -274,20 +247,7 @@ def named(given: Any) -> str:
     Raises:
         QuadrlError: Unknown name; the message lists the choices.
     """
-    for name, (_, saved) in RENAMED.items():
-        if given == saved:
-            return name
-    return given if given in [*EARLIER] else choice("control_mode", given, CONTROL_MODES)
-
-
-def to_save(name: str) -> str:
-    """The name by which files call a control mode; `named` knows it."""
-    return RENAMED[name][1] if name in RENAMED else name
-
-
-def as_saved(given: Any) -> Any:
-    """The control mode that a file names; a name that was reused means the earlier mode."""
-    return RENAMED[given][0] if given in RENAMED else given
+    return choice("control_mode", given, CONTROL_MODES)
 
 
 def kind(name: str) -> type[ControlMode]:
@@ -296,4 +256,4 @@ def kind(name: str) -> type[ControlMode]:
     Raises:
         QuadrlError: Unknown name; the message lists the choices.
     """
-    return (EARLIER | CONTROL_MODES)[named(name)]
+    return CONTROL_MODES[named(name)]

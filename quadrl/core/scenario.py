@@ -188,8 +188,6 @@ class Scenario:
             value = getattr(self, field.name)
             if value != field.default:
                 found[field.name] = _differing(value) if dataclasses.is_dataclass(value) else value
-        if "control_mode" in found:
-            found["control_mode"] = modes.to_save(self.control_mode)
         return found
 
     @functools.cached_property
@@ -219,23 +217,6 @@ class Scenario:
 FIELDS = dataclasses.fields(Scenario)
 KEYWORDS = ("task", *Conditions.__annotations__)
 """The keywords of `Scenario.of`."""
-
-
-def as_saved(conditions: Mapping[str, Any]) -> dict[str, Any]:
-    """Conditions from a file, as `Scenario.of` takes them.
-
-    Where the air acts on the rotors in wind, `Scenario.to_json` writes that down. Files without it
-    are of versions in which wind acted by drag alone, and keep that. A control mode whose actions
-    had another meaning in an older version keeps that meaning, too.
-    """
-    found = dict(conditions)
-    if "control_mode" in found:
-        found["control_mode"] = modes.as_saved(found["control_mode"])
-    vehicle: Any = found.get("vehicle")
-    own: Any = isinstance(vehicle, dict) and vehicle.get("aerodynamics")  # pyright: ignore
-    if "aerodynamics" in found or (own and _effects(own).effects):
-        return found
-    return found if Weather.of(found.get("weather")).calm else found | {"aerodynamics": "none"}
 
 
 def _in_wind(vehicle: Vehicle) -> str | None:

@@ -36,7 +36,7 @@ from quadrl.engines.free_flight import world
 from quadrl.engines.native import compiling
 from quadrl.engines.state import c_state
 from quadrl.evaluation.policy import Policy, shipped
-from quadrl.evaluation.policy_file import CLIP, FORMAT, UNSEALED
+from quadrl.evaluation.policy_file import CLIP, FORMAT
 from quadrl.rendering import drawing
 from quadrl.tasks import TASKS
 
@@ -114,7 +114,7 @@ def make_book() -> tuple[dict[str, Any], str]:
         "startStream": START,
         "gustTime": GUST_TIME,
         "smoothing": Disturbance.smoothing,
-        "policy": {"formats": [FORMAT, UNSEALED], "header": HEADER, "clip": CLIP},
+        "policy": {"format": FORMAT, "header": HEADER, "clip": CLIP},
         "tasks": {
             name: {
                 **{word: getattr(task, word) for word in ("asks", "starts", "ends", "solved")},

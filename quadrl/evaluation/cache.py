@@ -40,7 +40,7 @@ class ResultCache:
         if self._file is None or not self._file.exists():
             return
         try:
-            self._found = read_sealed_json(self._file, FORMAT, unsealed=False)["flown"]
+            self._found = read_sealed_json(self._file, FORMAT)["flown"]
         except QuadrlError:
             aside = self._file.with_suffix(".unused")
             os.replace(self._file, aside)

@@ -14,7 +14,6 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import check_texts, csv_content, write_whole
 from quadrl.base.media import Media
 from quadrl.base.units import quantity
-from quadrl.core.scenario import as_saved
 from quadrl.evaluation.cache import ResultCache
 from quadrl.evaluation.evaluate import html_table
 from quadrl.evaluation.rollout import BEHAVIOUR
@@ -66,8 +65,7 @@ class Card:
     `quadrl.evaluation.rollout.BEHAVIOUR` names (None where the task does not ask for it), and
     `half`, the levels under and over the usual one at which half of the flights fail, and `reach`,
     for each that flew those from which on no policy can hover within its actions; by recovery map
-    the shares of the flights that recover. Older files have no
-    `reach`, `scenarios` or behaviour."""
+    the shares of the flights that recover."""
     kept: ResultCache | None = dataclasses.field(default=None, compare=False)
     """What was kept of the flights until the card is saved."""
 
@@ -97,7 +95,7 @@ class Card:
         for axis in [*self.found["axes"].values()][:1]:
             k = axis["levels"].index(axis["usual"])
             for metric, word in (("yaw_rate_rad_s", "turning"), ("circling_m_s", "circling")):
-                values = [axis["flown"][name].get(metric, {k: None})[k] for name in flown]
+                values = [axis["flown"][name][metric][k] for name in flown]
                 if values != [None] * len(flown):
                     cells = (quantity(metric, "" if x is None else x) for x in values)
                     rows.append((f"{word}, undisturbed", *cells))
@@ -109,7 +107,7 @@ class Card:
         said = []
         for axis in self.found["axes"].values():
             alike: dict[str, list[str]] = {}
-            for name, ends in axis.get("reach", {}).items():
+            for name, ends in axis["reach"].items():
                 words = zip(("under", "over"), ends, strict=True)
                 given = " or ".join(f"{word} {end:.3g}" for word, end in words if end is not None)
                 alike.setdefault(given, []).append(name)
@@ -169,8 +167,6 @@ class Card:
             raise QuadrlError(f"{file} holds no robustness card: {error}") from error
         if written != FORMAT:
             raise QuadrlError(name=f"format of {file}", value=written, allowed=FORMAT)
-        scenarios = found.get("scenarios", {})
-        found |= {"scenarios": {name: as_saved(one) for name, one in scenarios.items()}}
         return cls(found)
 
     def _picture(self, name: str) -> Media:
@@ -194,7 +190,7 @@ class Card:
                 for k, level in enumerate(axis["levels"]):
                     errors = reached["error_m"][k] or ["", "", ""]
                     known = (reached[which][k] for which in shares)
-                    ways = (reached[which][k] if which in reached else None for which in rest)
+                    ways = (reached[which][k] for which in rest)
                     yield [name, axis["unit"], flown, level, *known, *errors, *ways]
 
 

@@ -97,7 +97,7 @@ def _view(axis: Mapping[str, Any]) -> tuple[float, float]:
     """The levels with a margin on both sides, and with where actions end if that is near."""
     first, last = axis["levels"][0], axis["levels"][-1]
     margin, far = 0.03 * (last - first), NEAR * (last - first)
-    ends = (end for pair in axis.get("reach", {}).values() for end in pair if end is not None)
+    ends = (end for pair in axis["reach"].values() for end in pair if end is not None)
     near = [end for end in ends if first - far < end < last + far]
     low = min([first - margin, *(end - 3 * margin for end in near if end < axis["usual"])])
     high = max([last + margin, *(end + 3 * margin for end in near if end > axis["usual"])])
@@ -106,7 +106,7 @@ def _view(axis: Mapping[str, Any]) -> tuple[float, float]:
 
 def _beyond(axis: Mapping[str, Any], name: str) -> list[tuple[float, float]]:
     """Stretches of the view that the actions of one that flew do not reach."""
-    (start, end), (low, high) = _view(axis), axis.get("reach", {}).get(name, (None, None))
+    (start, end), (low, high) = _view(axis), axis["reach"].get(name, (None, None))
     return _outside(start, end, start if low is None else low, end if high is None else high)
 
 

@@ -22,7 +22,7 @@ from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
 from quadrl.control.modes import named
-from quadrl.core.scenario import KEYWORDS, Scenario, as_saved
+from quadrl.core.scenario import KEYWORDS, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation import policy_file
 from quadrl.evaluation.memory import GRU, PolicyInFlight
@@ -67,13 +67,13 @@ class Policy:
     @property
     def control_mode(self) -> str:
         """What its actions mean."""
-        return named(as_saved(self.metadata).get("control_mode", "rotor"))
+        return named(self.metadata.get("control_mode", "rotor"))
 
     @property
     def conditions(self) -> dict[str, Any]:
         """What it was trained for and in, as `Scenario.of` takes it; it may have unknown names."""
         known = {name: self.metadata[name] for name in KEYWORDS if name in self.metadata}
-        return as_saved(known | {"task": self.task})
+        return known | {"task": self.task}
 
     @property
     def scenario(self) -> Scenario:

@@ -15,8 +15,6 @@ from quadrl.base.files import read_safetensors, read_sealed_json, write_safetens
 from quadrl.evaluation.memory import GRU, NAMES, PREFIX
 
 FORMAT, RECURRENT_FORMAT = "quadrl-policy-3", "quadrl-policy-gru-2"
-UNSEALED, RECURRENT_UNSEALED = "quadrl-policy-2", "quadrl-policy-gru-1"
-"""Formats of files without a digest."""
 FILE, RUN, RUN_FORMAT = "policy.safetensors", "config.json", "quadrl-run-2"
 """In the folder of a run: its policy, and its settings."""
 SHIPPED = Path(__file__).parents[1] / "assets" / "policies"
@@ -60,13 +58,12 @@ def read(path: Path) -> dict[str, Any]:
             f"there is no policy at {file}; give a run folder (quadrl train ... --out FOLDER "
             "makes one) or a .safetensors file"
         )
-    unsealed = UNSEALED, RECURRENT_UNSEALED
-    arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), unsealed, of_bytes)
+    arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), of_bytes)
     task, metadata = header.get("task"), header.get("metadata")
     options = metadata.get("task_options", {}) if isinstance(metadata, dict) else None
     if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
         raise QuadrlError(f"{file} does not say what its policy was trained for")
-    own = NAMES if header["format"] in (RECURRENT_FORMAT, RECURRENT_UNSEALED) else ()
+    own = NAMES if header["format"] == RECURRENT_FORMAT else ()
     layers = max(1, (len(arrays) - len(own)) // 2 - 1)
     names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS), *own)
     if set(arrays) != set(names):

@@ -22,7 +22,7 @@ from quadrl.learning.folder import CHECKPOINT as CHECKPOINT
 from quadrl.learning.settings import ALGORITHM_CONFIGS
 
 AT_GOAL = ("at_goal", "looks")
-FORMAT, UNSEALED = "quadrl-checkpoint-6", "quadrl-checkpoint-5"
+FORMAT = "quadrl-checkpoint-6"
 
 
 def save(path: Path, tensors: dict[str, Any], numbers: dict[str, Any]) -> None:
@@ -46,7 +46,7 @@ def load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     if not path.is_file():
         raise QuadrlError(f"there is no checkpoint at {path}")
-    flat, header = read_safetensors(path, (FORMAT,), (UNSEALED,), of_bytes)
+    flat, header = read_safetensors(path, (FORMAT,), of_bytes)
     try:
         tensors = TensorDict(flat).unflatten_keys("/").to_dict()
     except (KeyError, RuntimeError, TypeError, ValueError) as error:

@@ -25,7 +25,6 @@ from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control import modes
 from quadrl.core.scenario import KEYWORDS, Scenario
-from quadrl.core.scenario import as_saved as conditions_as_saved
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
@@ -42,8 +41,6 @@ MAX_BATCH = 1 << 24
 """Most transitions in a batch, which are some GB."""
 MAX_WIDTH = 1 << 16
 MEMORIES = ("none", "gru")
-OLD_NAMES = {"practice": "training_options"}
-"""Former names of settings, as older runs have them, and the present ones."""
 
 
 @dataclasses.dataclass(frozen=True, init=False)
@@ -61,7 +58,7 @@ class TrainConfig(TrainSettings):
         Raises:
             QuadrlError: A setting is unknown or out of range.
         """
-        settings = _given(renamed(settings))
+        settings = _given(settings)
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
         settings = with_networks(settings)
         kind = TASKS.get(task, Task)  # an unknown task is refused with the defaults
@@ -193,15 +190,12 @@ class TrainConfig(TrainSettings):
         """Return the settings and the values behind their names, as they come back from JSON."""
         flown = self.training_scenario
         whole = dataclasses.asdict(self) | {
-            "control_mode": modes.to_save(self.control_mode),
             "resolved_task": dataclasses.asdict(flown.task),
             "resolved_vehicle": dataclasses.asdict(flown.aircraft),
             "resolved_weather": dataclasses.asdict(flown.weather),
             "resolved_randomization": dataclasses.asdict(flown.randomization),
             "versions": _versions(),
         }
-        if not self.from_run:  # as in runs from before this setting existed
-            del whole["from_run"]
         return json.loads(json.dumps(whole))
 
     @classmethod
@@ -211,7 +205,7 @@ class TrainConfig(TrainSettings):
         Raises:
             QuadrlError: The folder holds no run, or the values behind its names have changed since.
         """
-        saved = as_saved(read_config(folder))
+        saved = read_config(folder)
         if "task" not in saved:
             raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks task")
         names = (field.name for field in dataclasses.fields(cls))
@@ -252,20 +246,6 @@ def prepare(
         config = TrainConfig(task or "hover", **settings)
     named = Path("runs") / f"{config.task}-{config.algo}-{config.seed}"
     return config, free_name(named, CONFIG) if out is None else Path(out)
-
-
-def renamed(settings: dict[str, Any]) -> dict[str, Any]:
-    """Rename the settings that a run was saved with under an old name."""
-    return {OLD_NAMES.get(name, name): value for name, value in settings.items()}
-
-
-def as_saved(settings: dict[str, Any]) -> dict[str, Any]:
-    """Convert settings from the file of a run, which may be of an earlier version.
-
-    `quadrl.core.scenario.as_saved` decides what an empty `aerodynamics` means in wind.
-    """
-    given = {k: v for k, v in renamed(settings).items() if (k, v) != ("aerodynamics", "")}
-    return {"aerodynamics": ""} | conditions_as_saved(given)
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:

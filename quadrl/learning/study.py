@@ -21,7 +21,6 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_csv, write_json
 from quadrl.base.units import quantity
 from quadrl.base.validation import number
-from quadrl.core.scenario import as_saved
 from quadrl.evaluation.evaluate import html_table
 from quadrl.learning.cluster import on_ray
 from quadrl.learning.comparison import LEVEL, Comparison, arm, compare
@@ -176,7 +175,7 @@ def sum_up(plan: Plan, failed: dict[str, str]) -> StudyResult:
             metrics |= along(run.folder)
             known = {"name": run.name, "task": config.task, "algo": config.algo}
             known |= {"variant": run.variant, "seed": config.seed}
-            known |= {"scenario": as_saved(metrics.pop("scenario")), "metrics": metrics}
+            known |= {"scenario": metrics.pop("scenario"), "metrics": metrics}
             runs.append(known | {"settings": dataclasses.asdict(config)})
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for run in runs:

@@ -32,7 +32,7 @@ from quadrl.evaluation.policy_file import FILE as POLICY_FILE
 from quadrl.learning import checkpoint, environments, networks
 from quadrl.learning.algorithm import Algorithm, generators, one_thread, set_generators
 from quadrl.learning.apg import APG
-from quadrl.learning.config import TrainConfig, as_saved
+from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import (
     EVALUATION,
     WARNINGS,
@@ -269,7 +269,7 @@ class Training:
         path = self.folder / checkpoint.CHECKPOINT
         tensors, numbers = checkpoint.load(path)
         try:
-            checkpoint.check_same(path, as_saved(numbers["config"]), self.config.resolved())
+            checkpoint.check_same(path, numbers["config"], self.config.resolved())
             self.actor.load_state_dict(tensors["actor"])
             self.critic.load_state_dict(tensors["critic"])
             self.algorithm.restore(tensors.get("optimisers", {}))

@@ -13,7 +13,7 @@ from typing import Any
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.files import check_texts
-from quadrl.core.scenario import Scenario, as_saved
+from quadrl.core.scenario import Scenario
 from quadrl.rendering.overlay import require
 
 COMMENT = "comment"
@@ -53,7 +53,7 @@ def read_scenarios(path: str | os.PathLike[str]) -> list[Scenario]:
     except (OSError, ValueError, TypeError, RecursionError) as error:
         reason = "give a file that quadrl render, plot or train has drawn"
         raise QuadrlError(f"{path} carries no scenario ({error}): {reason}") from error
-    return [Scenario.of(as_saved(one)) for one in listed]
+    return [Scenario.of(one) for one in listed]
 
 
 def ffmpeg() -> str:

@@ -26,14 +26,12 @@ from quadrl.control.loops import (
     turned,
 )
 from quadrl.core.environment import Environment
-from quadrl.core.scenario import Scenario, as_saved
+from quadrl.core.scenario import Scenario
 from quadrl.core.task import Snapshot, TaskState
 from quadrl.engines.native import compiling
 from quadrl.engines.state import Start, State
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.rollout import fly, summarize
-from quadrl.learning.config import TrainConfig
-from quadrl.learning.config import as_saved as config_as_saved
 from quadrl.tasks.hover import Hover
 
 PAPER = Vehicle()
@@ -340,28 +338,6 @@ def test_the_largest_thrust_is_that_of_all_rotors_and_the_least_is_none():
     for action, expected in ((1.0, full.max_speed), (-1.0, 0.0)):
         flyer.fly(np.array([[action, 0.0, 0.0, 0.0]]), 1.0)
         np.testing.assert_allclose(flyer.state.rotor_speed[0], expected, atol=1.0)
-
-
-def test_what_was_saved_asks_for_as_much_thrust_as_it_did():
-    before, later, now = "thrust_body_rate-v0", "thrust_body_rate-v1", "thrust_body_rate"
-    racer = VEHICLES["racer"]
-    old, scaled = (modes.kind(name)(racer) for name in (before, later))
-    ends = np.array([[1.0, 1.0, -1.0, 1.0], [-1.0] * 4])
-    high, low = (racer.rotor_command(ends) / racer.hover_speed)[:, 0] ** 2
-    np.testing.assert_allclose(scaled.values(ends)[:, 0], [high, low], atol=1e-12)
-    share = Gains().authority * (1 - low)  # of what can be taken away, both ways
-    np.testing.assert_allclose(old.values(ends)[:, 0], [1 + share, 1 - share], atol=1e-12)
-    np.testing.assert_array_equal(old.values(ends)[:, 1:], scaled.values(ends)[:, 1:])
-    scenario = Scenario.of("hover", control_mode=now)
-    assert Scenario.of(as_saved(scenario.to_json())) == scenario
-    assert Scenario.of(scenario.to_json()) == scenario
-    saved = scenario.to_json() | {"control_mode": now}  # as files of before have it
-    flown = Scenario.of(as_saved(saved))
-    assert flown.control_mode == before and Scenario.of(as_saved(flown.to_json())) == flown
-    for name, value in ((now, before), (later, later), (scenario.to_json()["control_mode"], now)):
-        config = TrainConfig("hover", control_mode=now).resolved() | {"control_mode": name}
-        config = TrainConfig(control_mode=config_as_saved(config)["control_mode"])
-        assert config.control_mode == config.scenario.control_mode == value
 
 
 def settling(vehicle, poles, share, limit):

@@ -1,14 +1,11 @@
 """What is said of a task is what it does."""
 
 import dataclasses
-import importlib
 import json
 
 import numpy as np
 import pytest
-from processes import python
 
-import quadrl
 from quadrl import tasks
 from quadrl.base.docstrings import docstrings
 from quadrl.core.environment import Environment
@@ -66,11 +63,3 @@ def test_the_layout_is_that_of_the_aircraft():
     speeds = next(t for t in describe_observation(environment) if t["name"] == "rotor_speed")
     assert (speeds["first"], speeds["last"]) == (15, 20)
     assert describe_action(environment.vehicle).startswith("6 numbers")
-
-
-def test_modules_that_have_moved_are_found_under_their_old_names():
-    for old, new in quadrl.MOVED.items():
-        module = importlib.import_module(f"quadrl.{old}")
-        assert module is importlib.import_module(f"quadrl.{new}") is getattr(quadrl, old)
-    code = "from quadrl.rotation import namespace; from quadrl.base.errors import QuadrlError"
-    python("-W", "error", "-c", code)

@@ -1,6 +1,5 @@
 """What actions reach: exactly, in warnings, on the robustness card, and in `quadrl check`."""
 
-import copy
 import csv
 import dataclasses
 import json
@@ -29,7 +28,6 @@ from quadrl.evaluation.card import Card
 from quadrl.evaluation.check import OK, angular_acceleration, height_to_turn_over
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.robustness import DISTURBANCES
-from quadrl.evaluation.rollout import BEHAVIOUR
 from quadrl.learning.defaults import VARIANTS
 
 PAPER = Vehicle()
@@ -247,13 +245,6 @@ def test_a_card_says_who_turns_and_circles(card, tmp_path):
         assert row[1] == units.quantity(name, undisturbed) and len(row) == 3
         usual = [float(row[name]) for row in rows if row["flown"] == "usual"]
         assert usual == [undisturbed] * 2
-    older = copy.deepcopy(card.found)
-    for axis in older["axes"].values():
-        for reached in axis["flown"].values():
-            for name in BEHAVIOUR:
-                del reached[name]
-    assert len(Card(older).table) == len(card.table) - 2
-    Card(older).save(tmp_path / "older")
 
 
 def drawn(found):

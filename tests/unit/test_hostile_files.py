@@ -1,5 +1,6 @@
 """Hostile files: each is read, or refused with one clear line; none runs anything."""
 
+import hashlib
 import json
 import math
 import os
@@ -15,15 +16,13 @@ from hypothesis import strategies as st
 from policies import make_remembering
 from test_hostile import EXAMPLES, profile, refusal
 
+from quadrl.base.files import BLANK, DIGEST
 from quadrl.evaluation.policy import SHIPPED, Policy
-from quadrl.evaluation.policy_file import RECURRENT_UNSEALED, UNSEALED
+from quadrl.evaluation.policy_file import FORMAT, RECURRENT_FORMAT
 from quadrl.learning import checkpoint
 
-# Of files without a digest: a digest would keep the rest of the reader from seeing them.
-pytestmark = pytest.mark.filterwarnings("ignore:.*has no digest")
-FORMATS = {"policy": UNSEALED, "memory": RECURRENT_UNSEALED, "checkpoint": checkpoint.UNSEALED}
-SEALED = {"quadrl-policy-3": UNSEALED, "quadrl-policy-gru-2": RECURRENT_UNSEALED,
-          "quadrl-checkpoint-6": checkpoint.UNSEALED}  # fmt: skip
+FORMATS = {"policy": FORMAT, "memory": RECURRENT_FORMAT, "checkpoint": checkpoint.FORMAT}
+OURS = {"digest": BLANK.decode(), "format": checkpoint.FORMAT, "numbers": {}}
 LOADERS = {"policy": Policy.load, "memory": Policy.load, "checkpoint": checkpoint.load}
 every_reader = pytest.mark.parametrize("reader", FORMATS)
 
@@ -36,24 +35,20 @@ def sound_files(folder):
     policy = (SHIPPED / "hover_ppo.safetensors").read_bytes()
     make_remembering().save(folder / "memory")
     remembers = (folder / "memory").read_bytes()
-    files = {"policy": policy, "memory": remembers, "checkpoint": path.read_bytes()}
-    return {name: unsealed(content) for name, content in files.items()}
+    return {"policy": policy, "memory": remembers, "checkpoint": path.read_bytes()}
 
 
-def unsealed(content):
-    """A file as an earlier quadrl wrote it: of another format, and without a digest."""
-    size = int.from_bytes(content[:8], "little")
-    table = json.loads(content[8 : 8 + size])
-    header = json.loads(table["__metadata__"]["quadrl"])
-    del header["digest"]
-    header["format"] = SEALED[header["format"]]
-    table["__metadata__"]["quadrl"] = json.dumps(header)
-    return of_header(table, content[8 + size :])
+def sealed(content):
+    """A file with the digest of what it holds: another would keep the reader from the rest."""
+    if (found := DIGEST.search(content)) is None:
+        return content
+    before, after = content[: found.start(1)], content[found.end(1) :]
+    return before + hashlib.sha256(before + BLANK + after).hexdigest().encode() + after
 
 
 def read_hostile(reader, path, content):
     """Read; a policy that is read gives finite actions."""
-    path.write_bytes(content)
+    path.write_bytes(sealed(content))
     with refusal():
         read = LOADERS[reader](path)
         if isinstance(read, Policy):
@@ -127,7 +122,7 @@ TENSORS = st.dictionaries(
 
 @every_reader
 def test_a_file_of_any_header_is_read_or_refused(reader, tmp_path):
-    ours = {"format": FORMATS[reader], "task": "hover", "metadata": {}, "numbers": {}}
+    ours = OURS | {"format": FORMATS[reader], "task": "hover", "metadata": {}}
     keys = st.dictionaries(st.sampled_from(list(ours)), JSON, max_size=2)
 
     @settings(profile, max_examples=2 * EXAMPLES)
@@ -155,7 +150,7 @@ def nested(*names):
         name: {"dtype": "F32", "shape": [1], "data_offsets": [4 * k, 4 * k + 4]}
         for k, name in enumerate(names)
     }
-    table = {"quadrl": json.dumps({"format": checkpoint.UNSEALED, "numbers": {}})}
+    table = {"quadrl": json.dumps(OURS)}
     return of_header({"__metadata__": table} | place, b"\0" * 8)
 
 
@@ -170,7 +165,7 @@ def nested(*names):
         of_header(b'{"a":' * 100_000),
         of_header({"__metadata__": {"quadrl": "[" * 200_000}}),
         of_header({"__metadata__": {"quadrl": "1" * 5000}}),
-        of_header({"__metadata__": {"quadrl": json.dumps({"format": checkpoint.UNSEALED})}}),
+        of_header({"__metadata__": {"quadrl": json.dumps({**OURS, "numbers": None})}}),
         nested("a", "a/b"),
         nested("a/b", "a"),
         nested("/", "//"),
@@ -178,7 +173,7 @@ def nested(*names):
     ],
 )
 def test_a_file_made_to_break_the_reader_is_refused_and_runs_nothing(reader, content, tmp_path):
-    (path := tmp_path / "file.safetensors").write_bytes(content)
+    (path := tmp_path / "file.safetensors").write_bytes(sealed(content))
     with refused():
         LOADERS[reader](path)
     assert not (tmp_path / "ran").exists()

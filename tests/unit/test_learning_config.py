@@ -127,10 +127,8 @@ def test_an_unknown_training_default_of_a_task_is_refused(tuned, monkeypatch):
 
 def test_the_settings_of_a_run_are_found_again(tmp_path):
     config = TINY.resolved()
-    old_name = {k: v for k, v in config.items() if k != "training_options"}
-    for written in (old_name | {"practice": config["training_options"]}, config):
-        write_config(tmp_path, written)
-        assert TrainConfig.of_folder(tmp_path) == TINY
+    write_config(tmp_path, config)
+    assert TrainConfig.of_folder(tmp_path) == TINY
     saved = read_config(tmp_path)
     assert saved["resolved_task"]["time_limit"] == 0.5
     assert saved["resolved_task"]["radius"] == 0.75  # as it is practised
@@ -139,18 +137,12 @@ def test_the_settings_of_a_run_are_found_again(tmp_path):
     assert set(saved["versions"]) == {"quadrl", "mujoco", "torch", "torchrl", "numpy"}
 
 
-def test_a_run_in_wind_says_what_the_air_does_and_an_older_one_flew_by_drag_alone(tmp_path):
+def test_a_run_in_wind_says_what_the_air_does(tmp_path):
     windy = TrainConfig("hover", weather="light")
     assert windy.aerodynamics == "full" and TINY.aerodynamics == ""
     assert ("aerodynamics", "full", "in wind") in windy.sources()
-    for name in ("new", "old"):
-        (tmp_path / name).mkdir()
-    write_config(tmp_path / "new", windy.resolved())
-    assert TrainConfig.of_folder(tmp_path / "new") == windy
-    old = TrainConfig("hover", weather="light", aerodynamics="none").resolved()
-    write_config(tmp_path / "old", old | {"aerodynamics": ""})
-    again = TrainConfig.of_folder(tmp_path / "old")
-    assert again.aerodynamics == "none" and again.scenario.aircraft.aerodynamics.effects == 0
+    write_config(tmp_path, windy.resolved())
+    assert TrainConfig.of_folder(tmp_path) == windy
 
 
 def test_a_setting_that_an_older_run_lacks_has_its_default(tmp_path):
@@ -160,7 +152,6 @@ def test_a_setting_that_an_older_run_lacks_has_its_default(tmp_path):
     assert TrainConfig.of_folder(tmp_path) == TINY
 
 
-@pytest.mark.filterwarnings("ignore:.*no digest")
 @pytest.mark.parametrize("text", [None, "", "{", "[]", "{}", '{"task": "hover"}'])
 def test_damaged_settings_are_refused(tmp_path, text):
     if text is not None:
@@ -193,9 +184,6 @@ def test_a_task_may_be_trained_with_other_options_than_it_is_flown_with():
     assert dataclasses.replace(asked, seed=3).training_scenario.task == asked.training_scenario.task
     both = dataclasses.replace(asked, training_options={"farthest": 5})
     assert both.training_scenario.task.farthest == 5 and both.scenario.task.farthest == 4
-    assert (
-        TrainConfig("random_waypoint", practice={"farthest": 5}).training_options["farthest"] == 5
-    )
 
 
 def test_a_variant_is_settings_that_go_together():

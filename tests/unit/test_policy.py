@@ -237,12 +237,3 @@ def test_its_keywords_make_what_it_fits_in_every_api():
 def test_another_time_between_two_actions_than_in_training_is_warned_of():
     with pytest.warns(QuadrlWarning, match="= 0.02: the policy for hover was trained with 0.05"):
         quadrl.evaluate("hover", episodes=1, control_timestep=0.02)
-
-
-def test_a_policy_of_before_flies_the_thrust_that_it_was_trained_with():
-    policy = linear(22, 4, control_mode="thrust_body_rate")
-    flown = Environment(policy.scenario)
-    policy.check_fits(flown)
-    assert flown.control_mode.name == "thrust_body_rate-v0"
-    with refused("control_mode", "thrust_body_rate", lists="'thrust_body_rate-v0'"):
-        policy.check_fits(Environment("hover", control_mode="thrust_body_rate"))

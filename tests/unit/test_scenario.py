@@ -14,7 +14,7 @@ from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
 from quadrl.base.errors import UnknownKeyword
 from quadrl.conditions.weather import WEATHERS, Weather
 from quadrl.core.environment import Environment
-from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario, as_saved
+from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario
 from quadrl.evaluation import robustness
 from quadrl.evaluation.evaluate import beside, setting
 from quadrl.evaluation.policy import Policy
@@ -133,19 +133,8 @@ def test_an_aircraft_without_numbers_for_real_air_is_told_so_in_wind(vehicle, wh
     Scenario.of("hover", vehicle=vehicle)
 
 
-def test_what_was_saved_before_wind_acted_on_rotors_flies_as_it_did():
-    windy = {"task": "hover", "weather": {"wind_speed": 5.0}}
-    assert Scenario.of(as_saved(windy)).aircraft == VEHICLES["paper"]
-    for as_it_is in (
-        {"task": "hover"},
-        windy | {"aerodynamics": "full"},
-        Scenario.of("hover", weather="light", vehicle=MINE).to_json(),
-    ):
-        assert as_saved(as_it_is) == as_it_is
-    thin = {"name": "thin", "aerodynamics": {"air_density": 1.0}}
-    assert Scenario.of(as_saved(windy | {"vehicle": thin})).aircraft.aerodynamics.effects == 0
-    # Also with a Vehicle that has no effects; one that has brings them.
-    before = Scenario.of(as_saved(windy))
+def test_wind_that_acts_by_drag_alone_goes_on_doing_so_with_an_aircraft_without_effects():
+    before = Scenario.of("hover", weather="light", aerodynamics="none")
     assert Scenario.of(before, vehicle=VEHICLES["paper"]) == before
     in_air = in_real_air(VEHICLES["paper"])
     assert Scenario.of(before, vehicle=in_air).aircraft == in_air

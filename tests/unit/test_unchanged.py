@@ -14,9 +14,9 @@ import pytest
 from flights import flat
 
 from quadrl import tasks
-from quadrl.aircraft.rotors import plus
+from quadrl.aircraft.rotors import GRAVITY, plus
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.control.modes import as_saved
+from quadrl.control import modes
 from quadrl.core.environment import Environment
 from quadrl.engines.state import Start
 
@@ -33,6 +33,23 @@ def recorded():
     with np.load(Path(__file__).parents[1] / "data" / "episodes.npz") as file:
         arrays = {name: file[name] for name in file.files}
     return json.loads(str(arrays.pop("cases"))), arrays
+
+
+class AsRecorded(modes.ThrustBodyRate):
+    """Thrust and body rates as they were then: within the action scale, alike up and down."""
+
+    def __init__(self, vehicle):
+        super().__init__(vehicle)
+        self.scale[0] = self.scale_down[0] = self._loops.max_acceleration[2] / GRAVITY
+
+    @classmethod
+    def reach(cls, vehicle):
+        return vehicle
+
+
+@pytest.fixture(autouse=True)
+def as_recorded(monkeypatch):
+    monkeypatch.setitem(modes.CONTROL_MODES, AsRecorded.name, AsRecorded)
 
 
 def vehicle_of(old):
@@ -65,7 +82,7 @@ def flown(case, arrays):
         seed=0,
         vehicle=vehicle_of(case["vehicle"]),
         engine=case["engine"],
-        control_mode=as_saved(case["control_mode"]),
+        control_mode=case["control_mode"],
     )
 
     seen = [flat(environment.reset())]
