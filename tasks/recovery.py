@@ -54,6 +54,7 @@ class Recovery(Task):
             },
         },
     }
+    trainings = {"algo": "apg"}, {"algo": "ppo"}
     observation = ROTATION | MOTION
 
     time_limit: float = 5.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,7 +12,7 @@ from tyro.conf import Positional
 from quadrl import tasks
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, print_json, say
-from quadrl.learning.defaults import PAIRS
+from quadrl.learning.defaults import written
 from quadrl.learning.description import describe
 
 
@@ -54,26 +53,8 @@ def _texts(described: list[dict[str, Any]]) -> Iterator[tuple[str, str, str]]:
         yield "", "ends early", task["ends"]
         yield "", "solved", task["solved"]
         yield "", "time limit", f"{task['time_limit']:g} s"
-        yield "", "trained with", ", ".join(settings(task["training"])) or "the usual settings"
+        yield "", "trained with", ", ".join(written(task["training"])) or "the usual settings"
         yield "", "", ""
-
-
-def settings(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
-    """Nested settings as `quadrl train` takes them."""
-    for name, value in values.items():
-        word = prefix + name.replace("_", "-")
-        if name in PAIRS:
-            yield " ".join((word, *(f"{option}={given}" for option, given in value.items())))
-        elif name in ("weather", "randomization") and isinstance(value, dict):
-            yield f"{word} '{json.dumps(value)}'"
-        elif isinstance(value, dict):
-            yield from settings(value, f"{word}.")
-        elif isinstance(value, bool):
-            yield prefix + "no-" * (not value) + word.removeprefix(prefix)
-        elif isinstance(value, tuple | list):
-            yield " ".join((word, *map(str, value)))
-        else:
-            yield f"{word} {value}"
 
 
 def observation_rows(described: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:

@@ -107,6 +107,8 @@ class Train:
         run = self._train(*prepare(task, self.out, self.resume, settings))
         _draw(run, video=self.video)
         _list_files(run)
+        if run.misses:
+            say(f"\n{run.misses}")
 
     def _study(self, task: str | None, settings: dict[str, Any]) -> None:
         """Train the seeds as a study of one configuration."""
@@ -149,7 +151,7 @@ class Train:
             kept = (folder / names.CONFIG).exists()
             advice = f"the run is kept, {go_on}" if kept else "choose another --out"
             raise QuadrlError(f"{reason(error)}; {advice}") from error
-        say(f"\n{run} (imports: {imports:.1f} s; engine: {config.engine})\n")
+        say(f"\n{run.summary} (imports: {imports:.1f} s; engine: {config.engine})\n")
         if run.late:
             shares = ", ".join(f"{1000 * s:g} ms {percent(x)}" for s, x in run.late.items())
             say(f"successful by the aircraft's dead time: {shares}\n")

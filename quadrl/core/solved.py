@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
+
+from quadrl.base.units import quantity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +27,25 @@ class Target:
         """Whether an evaluation reaches it; a figure that is missing or no number does not."""
         value = math.nan if (found := metrics.get(self.metric)) is None else found
         return value >= self.limit if self.at_least else value <= self.limit
+
+    @property
+    def asked(self) -> str:
+        """What it asks, in its unit."""
+        word = "at least" if self.at_least else "at most"
+        return f"{word} {quantity(self.metric, float(self.limit))}"
+
+
+def missed(targets: Iterable[Target], metrics: Mapping[str, Any]) -> str:
+    """Which of some targets an evaluation misses, and by how much; "" if none."""
+    words: list[str] = []
+    for target in (target for target in targets if not target.met(metrics)):
+        found = metrics.get(target.metric)
+        said = f"{target.words} {quantity(target.metric, found)}, asked {target.asked}"
+        if found is not None:
+            gap = quantity(target.metric, float(abs(found - target.limit)))
+            said += f": {gap} {'short' if target.at_least else 'over'}"
+        words.append(said)
+    return "; ".join(words)
 
 
 TURNING = Target("yaw_rate_rad_s", "yaw rate over the last 2 s", 0.3)

@@ -15,6 +15,7 @@ batch, and trains for as many: `at_rate` reads a layer for it.
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -209,3 +210,21 @@ def flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
             yield from flat(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
+
+
+def written(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
+    """Nested settings as `quadrl train` takes them."""
+    for name, value in values.items():
+        word = prefix + name.replace("_", "-")
+        if name in PAIRS:
+            yield " ".join((word, *(f"{option}={given}" for option, given in value.items())))
+        elif name in ("weather", "randomization") and isinstance(value, dict):
+            yield f"{word} '{json.dumps(value)}'"
+        elif isinstance(value, dict):
+            yield from written(value, f"{word}.")
+        elif isinstance(value, bool):
+            yield prefix + "no-" * (not value) + word.removeprefix(prefix)
+        elif isinstance(value, tuple | list):
+            yield " ".join((word, *map(str, value)))
+        else:
+            yield f"{word} {value}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -13,10 +14,12 @@ from quadrl.base.files import write_csv, write_json
 from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.validation import number
 from quadrl.control.feasibility import warn_of_unreached
+from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning.config import TrainConfig, prepare
+from quadrl.learning.defaults import written
 from quadrl.learning.folder import (
     EVALUATION,
     EVALUATIONS,
@@ -63,13 +66,39 @@ class Run:
     none."""
 
     def __repr__(self) -> str:
+        return f"{self.summary}\n{self.misses}".rstrip()
+
+    @property
+    def summary(self) -> str:
+        """What it reached, in a line."""
         trained = f"trained with {self.config.algo.upper()} in {self.seconds:.1f} s"
         return f"{self.evaluation}; {trained}; in {self.folder}"
+
+    @property
+    def misses(self) -> str:
+        """What it misses of what the task asks, and what to do next, in a line; "" if nothing."""
+        what = missed(self.evaluation.task.targets, self.evaluation.metrics)
+        return f"misses: {what}. {self._next()}" if what else ""
+
+    def _next(self) -> str:
+        """The command that goes on where targets are missed."""
+        config, run, flown = self.config, shlex.quote(str(self.folder)), self.config.scenario
+        usual = TrainConfig(config.task, algo=config.algo).scenario
+        if (flown.weather, flown.randomization) != (usual.weather, usual.randomization):
+            calm = f"quadrl evaluate {run} --weather calm --randomization none"
+            return f"They count undisturbed: {calm}"
+        if flown.task.trainings and flown == usual and not config.from_run:
+            first, second = flown.task.trainings
+            begun = config.algo == first.get("algo", flown.task.trained_by)
+            settings = {"seed": config.seed, **({"from": run, **second} if begun else first)}
+            return f"Next: quadrl train {config.task} {' '.join(written(settings))}"
+        return f"Next: quadrl train --resume {run} --steps {2 * config.steps}"
 
     def _repr_html_(self) -> str:
         config = self.config
         head = f"{config.task}, {config.algo.upper()}, seed {config.seed}, {config.vehicle}"
         rows = [("trained", head), ("folder", str(self.folder)), ("seconds", f"{self.seconds:.1f}")]
+        rows += [("", self.misses)] * bool(self.misses)
         return html_table(rows) + self.evaluation._repr_html_()
 
     def draw(

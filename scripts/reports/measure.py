@@ -16,7 +16,7 @@ from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import EVALUATION, METRICS, read_metrics
 from scripts.reports import report
-from scripts.reports.report import FIGURES, Result, Runs, asked, table
+from scripts.reports.report import FIGURES, Result, Runs, table
 
 EPISODES = 100  # of an evaluation
 LONGEST = {"race": 3600, "lsy_race": 3600} | dict.fromkeys(
@@ -120,7 +120,7 @@ def reached(name: str) -> tuple[list[tuple[str, ...]], list[int]]:
     for target in task.targets:  # older trainings were not asked for all
         values = (x["metrics"].get(target.metric, "not measured") for x in (*runs, *known))
         cells = (quantity(target.metric, value) for value in values)
-        rows.append((target.words, asked(target), *cells))
+        rows.append((target.words, target.asked, *cells))
     seeds = [run["seed"] for run in runs]
     if runs:
         words = f"training, {runs[0]['steps']:,} steps, seeds {', '.join(map(str, seeds))}"

@@ -15,8 +15,6 @@ import tyro
 
 from quadrl import tasks
 from quadrl.base.machine import in_a_line, machine
-from quadrl.base.units import quantity
-from quadrl.core.task import Target
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS, RUNS = REPOSITORY / "docs", REPOSITORY / "runs"
@@ -112,9 +110,3 @@ def table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     lines = [[str(cell).replace("|", "\\|") for cell in row] for row in (head, *rows)]
     lines.insert(1, ["---"] * len(lines[0]))
     return "\n".join(f"| {' | '.join(cells)} |".replace("|  |", "| |") for cells in lines)
-
-
-def asked(target: Target) -> str:
-    """What a target asks, in its unit."""
-    word = "at least" if target.at_least else "at most"
-    return f"{word} {quantity(target.metric, float(target.limit))}"

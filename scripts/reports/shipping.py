@@ -11,16 +11,16 @@ from typing import Any
 from quadrl import tasks
 from quadrl.base.files import write_json
 from quadrl.base.units import quantity
-from quadrl.cli.tasks import settings
-from quadrl.core.task import Target
+from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED, SHIPPED_AS, Policy
 from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import fly, summarize
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.defaults import written
 from quadrl.learning.folder import FREE
 from scripts.reports import report
-from scripts.reports.report import FIGURES, Result, Runs, asked, say, table
+from scripts.reports.report import FIGURES, Runs, say, table
 
 EPISODES = 2000
 RACES = ("lsy_race", "race")  # the goal is the next gate: the distance from it is no error
@@ -59,11 +59,6 @@ def ship(runs: Runs, out: Path = SHIPPED) -> None:
         say(f"{name}: {copied(run, config, out / f'{name}.safetensors')}")
 
 
-def unmet(task: str, metrics: Result) -> list[Target]:
-    """The targets of a task that an evaluation misses."""
-    return [target for target in tasks.TASKS[task].targets if not target.met(metrics)]
-
-
 def copied(run: Path, config: TrainConfig, file: Path) -> str:
     """Copy a policy with its configuration, its metrics and the command that makes it again."""
     kind: Any = {name: getattr(config, name) for name in ("algo", "vehicle", "variant")}
@@ -78,11 +73,10 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     metrics = summarize(fly(policy, episodes=EPISODES))
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES}"
     still = summarize(fly(policy, episodes=EPISODES, **CALM))
-    if missed := unmet(config.task, still):
-        ways = "".join(f", {x.words} {quantity(x.metric, still[x.metric])}" for x in missed)
+    if short := missed(tasks.TASKS[config.task].targets, still):
         for old in (file, file.with_suffix(".json")):
             old.unlink(missing_ok=True)
-        return f"left out, misses what its task asks: {said} successful{ways}"
+        return f"left out, misses what its task asks: {said} successful; {short}"
     told = {
         "algo": (config.algo, None),
         "seed": (config.seed, None),
@@ -93,7 +87,7 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
         "engine": (config.engine, usual.engine),
         "variant": (config.variant, "ideal"),
     }
-    words = settings({name: value for name, (value, given) in told.items() if value != given})
+    words = written({name: value for name, (value, given) in told.items() if value != given})
     command = " ".join(("quadrl train", config.task, *words))
     file.parent.mkdir(parents=True, exist_ok=True)
     policy.save(file)
@@ -114,7 +108,7 @@ def shipped(episodes: int = 300, only: tuple[str, ...] = ()) -> None:
     for name in sorted(file.stem for file in files):
         found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, CALM))
         rows.append({"policy": name} | found | {"undisturbed": still})
-        say(f"{name}: {[x.words for x in unmet(found['task'], still)]}")
+        say(f"{name}: {missed(tasks.TASKS[found['task']].targets, still)}")
     rows = report.beside("shipped", {"rows": rows}, only)["rows"]
     report.save("shipped", {"rows": sorted(rows, key=lambda row: row["policy"])})
 
@@ -130,12 +124,8 @@ def policies(name: str = "") -> str:
         without = "position_error_m" if row["task"] in RACES else ""
         cells = [quantity(x, row[x]) if x in row and x != without else "" for x in FIGURES]
         cells += [quantity(x.metric, row[x.metric]) for x in own]
-        still = row["undisturbed"]
-        missed = (
-            f"{x.words}: {quantity(x.metric, still[x.metric])}, asked {asked(x)}"
-            for x in unmet(row["task"], still)
-        )
-        rows.append((f"`{row['policy']}`", f"`{made}`", *cells, "; ".join(missed) or "none"))
+        cells += [missed(tasks.TASKS[row["task"]].targets, row["undisturbed"]) or "none"]
+        rows.append((f"`{row['policy']}`", f"`{made}`", *cells))
     if not rows:
         return "None comes with quadrl."
     head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "targets missed")

@@ -7,10 +7,9 @@ from typing import Any
 
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.cli.tasks import settings
 from quadrl.core.task import Task
 from quadrl.evaluation.policy import SHIPPED
-from quadrl.learning.defaults import own_settings
+from quadrl.learning.defaults import own_settings, written
 from quadrl.learning.description import describe, describe_action
 from scripts.reports import measure, report, shipping
 from scripts.reports.code import shown
@@ -111,7 +110,7 @@ def page(name: str) -> str:
         (f"`{x['name']}`", f"`{shown(x['value'])}`", line(x["meaning"]))
         for x in (usual, *known["options"])
     ]
-    own = " ".join(f"`{setting}`" for setting in settings(own_settings(task)))
+    own = " ".join(f"`{setting}`" for setting in written(own_settings(task)))
     other = "vehicle_options" in task.training  # its policy flies no other aircraft
     flies = (SHIPPED / f"{name}_{task.trained_by}.safetensors").exists()
     moving = f"![A flight of a policy that comes with quadrl](images/tasks/{name}.webp)\n\n"

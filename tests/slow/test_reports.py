@@ -189,7 +189,7 @@ def test_policies_that_ship_are_judged_where_nothing_disturbs_them(tmp_path, mon
     monkeypatch.setattr(RandomWaypoint, "targets", (asked,))
     head, _, first, second = shipping.policies().splitlines()[:4]
     assert "| circling over the last 2 s |" in head and first.endswith("| none |")
-    assert "yaw rate over the last 2 s: 0.0" in second and "rad/s, asked at most" in second
+    assert "yaw rate over the last 2 s 0.0" in second and "rad/s, asked at most" in second
     assert "hover" not in shipping.policies("random_waypoint")
     assert "None comes" in shipping.policies("landing")
 
@@ -222,5 +222,5 @@ def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch, capsys):
     shipping.ship((tmp_path / "a", tmp_path / "b"), tmp_path / "out")
     told = capsys.readouterr().err
     assert told.count(f"misses what its task asks: seed {seed}") == 1
-    assert f"successful, {asked.words} " in told
+    assert f"successful; {asked.words} " in told
     assert not list((tmp_path / "out").iterdir())

@@ -25,7 +25,7 @@ from quadrl.cli.flown import parse_options
 from quadrl.conditions.weather import Weather
 from quadrl.evaluation.rollout import BEHAVIOUR
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.defaults import own_settings
+from quadrl.learning.defaults import own_settings, written
 from quadrl.learning.folder import read_config, write_config
 
 SIZE = ["--num-envs", "8", "--rollout", "4", "--steps", "192", "--hidden", "16"]
@@ -352,7 +352,7 @@ def test_the_settings_that_are_shown_are_those_of_the_command(refusal, monkeypat
 
     monkeypatch.setattr(cli.train, "prepare", prepared)
     own = own_settings(tasks.TASKS[name])
-    refusal("train", name, *shlex.split(" ".join(cli.tasks.settings(own))))
+    refusal("train", name, *shlex.split(" ".join(written(own))))
     assert set(seen) == set(own)
     assert TrainConfig(name, **seen) == TrainConfig(name)
 

@@ -1,0 +1,95 @@
+"""What a training says that misses what its task asks, and what to type next."""
+
+import re
+import shlex
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from quadrl import cli, tasks
+from quadrl.cli.flown import parse_options
+from quadrl.core.solved import Target, missed
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.run import Run
+
+PAGES = Path(__file__).parents[2] / "docs" / "tasks"
+SUCCESS = Target("success_rate", "successful", 0.95, True)
+TIME = Target("time_s", "to the last gate", 4.65)
+
+
+def run(task, metrics, **settings):
+    """A finished training that reached these figures."""
+    config = TrainConfig(task, **settings)
+    own = {"task": config.scenario.task, "metrics": metrics, "_repr_html_": str}
+    flown = SimpleNamespace(**own)
+    return Run(Path("runs/own run"), config, None, flown, 1.0)
+
+
+def reached(task, share):
+    """Figures of which each is off its target by this share, on the side that misses it."""
+    return {
+        x.metric: x.limit * (1 - share if x.at_least else 1 + share) + share / 1000 * (not x.limit)
+        for x in tasks.TASKS[task].targets
+    }
+
+
+def test_it_is_said_by_how_much_a_target_is_missed_also_where_rounding_hides_it():
+    said = missed((SUCCESS, TIME), {"success_rate": 0.79, "time_s": 4.71})
+    assert said == (
+        "successful 79 %, asked at least 95 %: 16 % short; "
+        "to the last gate 4.7 s, asked at most 4.7 s: 0.060 s over"
+    )
+    assert missed((SUCCESS, TIME), {"success_rate": 0.95, "time_s": 4.65}) == ""
+    # No flight came to the last gate.
+    assert missed((TIME,), {"time_s": None}) == "to the last gate none, asked at most 4.7 s"
+
+
+@pytest.mark.parametrize("task", tasks.TASKS)
+def test_every_task_says_each_target_that_it_misses_and_a_command_that_is_understood(task):
+    assert run(task, reached(task, 0.0)).misses == ""
+    training = run(task, reached(task, 0.5))
+    assert all(f"{x.words} " in training.misses for x in tasks.TASKS[task].targets)
+    said, command = training.misses.split(". Next: ")
+    assert said.startswith("misses: ") and "\n" not in training.misses
+    cli.parse(shlex.split(command)[1:])
+    assert ("--from 'runs/own run'" in command) == (task == "lsy_race")
+
+
+def next_of(training):
+    return training.misses.split(". Next: ")[1]
+
+
+def test_trainings_in_turn_are_the_commands_of_the_page():
+    figures = reached("recovery", 0.5)
+    assert next_of(run("recovery", figures, seed=7)) == (
+        "quadrl train recovery --seed 7 --algo apg"  # with PPO from nothing nobody gets there
+    )
+    assert next_of(run("recovery", figures, algo="apg")) == (
+        "quadrl train recovery --seed 0 --from 'runs/own run' --algo ppo"
+    )
+    for task in ("recovery", "lsy_race"):
+        page = re.sub(r"\\\n *", "", (PAGES / f"{task}.md").read_text())
+        (command,) = re.findall(rf"^quadrl (train {task} .*--from .*)$", page, re.MULTILINE)
+        given = cli.parse(shlex.split(command)).command.settings
+        first, second = tasks.TASKS[task].trainings
+        assert given.algo in ("", second.get("algo"))
+        shown = parse_options(given.training_options or ())
+        assert shown == second.get("training_options", {})
+        assert TrainConfig(task, **first) != TrainConfig(task, **second)
+
+
+def test_other_conditions_go_on_with_their_own_run():
+    figures = reached("recovery", 0.5)
+    late = run("recovery", figures, vehicle_options={"dead_time": 0.02}, steps=1000)
+    assert next_of(late) == "quadrl train --resume 'runs/own run' --steps 2000"
+    disturbed = run("hover", reached("hover", 0.5), variant="robust").misses
+    calm = "quadrl evaluate 'runs/own run' --weather calm --randomization none"
+    assert disturbed.endswith(f". They count undisturbed: {calm}")
+
+
+def test_python_and_notebooks_say_it():
+    for share, lines in ((0.5, 2), (0.0, 1)):
+        training = run("hover", reached("hover", share))
+        assert len(repr(training).splitlines()) == lines
+        assert ("misses: " in training._repr_html_()) == (lines == 2)
