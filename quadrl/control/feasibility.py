@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.aircraft import parameters
+from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY, mixer
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
@@ -26,6 +27,7 @@ from quadrl.conditions.randomization import AFFECTS, Randomization, Randomized
 from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control import modes, trim
+from quadrl.engines.dynamics import Motion, derivative
 from quadrl.engines.rng import uniform
 
 MARGIN = 1.2
@@ -35,6 +37,8 @@ FEW = 0.02
 """Share of drawn aircraft that may be unable to hover without a warning. Tasks ask for a success of
 98 to 100 %, which a larger share rules out."""
 SAMPLES, CORNERS = 1024, 256
+LANDS = 0.9
+"""Lift over weight on the ground, at an action of -1, that is suggested for an aircraft to land."""
 SURE = 1e-9
 """Relative tolerance for rounding."""
 BISECTIONS = 24
@@ -170,13 +174,17 @@ def held_command(vehicle: Vehicle, control_mode: str) -> float:
 
 
 def warn_of_unreached(
-    vehicle: Vehicle, randomization: Randomized, control_mode: str = "rotor", wind: float = 0.0
+    vehicle: Vehicle,
+    randomization: Randomized,
+    control_mode: str = "rotor",
+    wind: float = 0.0,
+    lands: bool = False,
 ) -> None:
     """Warn the caller's caller of faults that no policy can compensate.
 
     More than a FEW of the drawn aircraft cannot hover, at least half of the actions are clipped at
-    the largest speed, an action lasts longer than the rotors take to follow it, or the mean wind
-    [m/s] is stronger than the rotors can hold against.
+    the largest speed, an action lasts longer than the rotors take to follow it, the mean wind
+    [m/s] is stronger than actions can hold against, or the aircraft is to land and cannot.
 
     Raises:
         QuadrlError: The randomization does not fit the aircraft.
@@ -186,10 +194,13 @@ def warn_of_unreached(
     if 2 * reach.room < scale:
         said = f"action_scale = {scale:g}: actions over {reach.room / scale:.2g} change nothing"
         _warn(f"{said}, since the rotors turn no faster; quadrl check suggests another")
-    carries = float(reach.loads(vehicle.action_scale)[1][0])
-    if wind and wind > (held := min(held_wind(vehicle, carries), trim.fastest_held(vehicle))):
+    if wind and wind > (held := held_wind(vehicle, vehicle.action_scale)):
         said = f"the mean wind of {wind:.3g} m/s carries every aircraft off, whatever the policy"
-        _warn(f"{said}: the rotors hold it in {held:.3g} m/s at most; ask for weaker weather")
+        said += f": an action of 1 holds it in {held:.3g} m/s at most"
+        limits = held_wind(vehicle, reach.most)
+        _warn(f"{said}, the rotors at their limits in {limits:.3g} m/s; ask for weaker weather")
+    if lands and (lack := cannot_land(vehicle)):
+        _warn(f"action_scale = {vehicle.action_scale:g}: {lack}")
     lag = max(1 / min(rotor.lag_up, rotor.lag_down) for rotor in vehicle.rotors)
     if held_command(vehicle, control_mode) > lag:
         said = f"control_timestep = {vehicle.control_timestep:g}: an action lasts longer"
@@ -250,16 +261,35 @@ def limit(
     return None
 
 
-def held_wind(vehicle: Vehicle, load: float) -> float:
-    """Strongest steady wind [m/s] against which a thrust of `load` times the weight can hover.
+def held_wind(vehicle: Vehicle, scale: float) -> float:
+    """Strongest steady wind [m/s] that the actions of an action scale [rad/s] hold.
 
-    Tilted until its vertical part is the weight, the thrust has a horizontal part of
-    sqrt(load^2 - 1) times the weight; the drag of the aircraft and its rotors is
-    k_D v^2 + k_H sum(Omega) v.
+    With the scale `Reach.most` it is that of the rotors at their limits.
     """
-    if load <= 1:
-        return 0.0
-    sideways = vehicle.mass * GRAVITY * math.sqrt(load**2 - 1)  # [N]
-    linear = vehicle.aerodynamics.rotor_drag * math.sqrt(load) * float(vehicle.hover_speed.sum())
-    root = math.sqrt(linear**2 + 4 * vehicle.drag_coefficient * sideways)
-    return 2 * sideways / (linear + root) if linear + root > 0 else math.inf
+    low, high = (tuple(speed[0].tolist()) for speed in Reach(vehicle).speeds(scale))
+    return trim.held_wind(vehicle, low, high)
+
+
+def cannot_land(vehicle: Vehicle) -> str:
+    """What keeps an aircraft off the ground, and the cure, in words; empty if nothing does."""
+    lift, over = lift_on_feet(vehicle, vehicle.action_scale), lift_on_feet(vehicle, 0.0)
+    if lift < 1:
+        return ""
+    enough = 1 - math.sqrt(LANDS / over)  # of the hover speed, since lift follows its square
+    enough = 2 * math.ceil(enough * float(vehicle.hover_speed.max()) / 2)
+    lifts = f"on the ground an action of -1 still lifts {lift:.2f} times the weight"
+    return f"{lifts}, so that no policy can land; give action_scale={enough} or more"
+
+
+def lift_on_feet(vehicle: Vehicle, scale: float) -> float:
+    """Lift of an aircraft that stands on its feet in calm air at an action of -1, over its weight.
+
+    Actions have the scale [rad/s]. In real air the ground adds to the lift.
+    """
+    p = Parameters.of(parameters.rows(vehicle), vehicle.control_timestep)
+    low, _ = Reach(vehicle).speeds(scale)
+    still = np.zeros((1, 3))
+    height = np.array([[0.0, 0.0, vehicle.ground_clearance]])
+    motion = Motion(height, np.array([[1.0, 0.0, 0.0, 0.0]]), still, still, low)
+    rate = derivative(p, motion, low, still, -GRAVITY, vehicle.aerodynamics.effects)
+    return 1 + float(rate.velocity[0, 2]) / GRAVITY

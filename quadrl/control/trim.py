@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -12,17 +14,22 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.rotation import norm, rotation_matrix, stack
-from quadrl.engines.dynamics import Motion, derivative, thrust_wrench
+from quadrl.base.rotation import norm, stack
+from quadrl.engines.dynamics import Motion, derivative
 from quadrl.engines.state import Start
 
-FASTEST, HIGH = 25.0, 1e3  # [m/s]; [m], where no ground is near
-SPEEDS, BEARINGS = 51, 32
-"""Winds in a table: speeds from 0 to FASTEST, and bearings all around the aircraft."""
-ITERATIONS, SHARE = 16, 0.7
-"""Share of the correction that each iteration makes. Lift grows faster than the square of the rotor
-speed, so that the whole correction would oscillate."""
-STILL, STEADY = 0.01, 0.1  # [m/s^2], [rad/s^2], below which an aircraft is in trim
+FASTEST, STEP, BEARINGS = 30.0, 0.5, 32
+"""Winds in a table: from 0 to FASTEST in steps [m/s], and from all around the aircraft."""
+HIGH = 1e3  # [m], where no ground is near
+SOUND = 340.0  # [m/s]
+CLOSE = 0.02  # [m/s], to which the strongest wind that is held is found
+ITERATIONS, NUDGE, STEEPEST = 10, 1e-6, 0.999
+"""Newton's method: how often, how far it moves an unknown to see what follows, the largest sine of
+a tilt."""
+BALANCED = 1e-5
+"""Acceleration over that of gravity, and of turning over g / size, below which it is in trim."""
+SURE = 1e-9
+"""Tolerance for rounding, relative."""
 
 
 def trimmed(vehicle: Vehicle, start: Start, wind: np.ndarray) -> Start:
@@ -40,10 +47,10 @@ def trimmed(vehicle: Vehicle, start: Start, wind: np.ndarray) -> Start:
     tilt, turn = start.quaternion[:, 1:3], 2 * np.arctan2(*start.quaternion[:, [3, 0]].T)
     moves = np.concatenate([tilt, start.velocity, start.body_rate], axis=1)
     across = np.arctan2(wind[:, 1], wind[:, 0]) - turn
-    place = speed * (SPEEDS - 1) / FASTEST, across % math.tau * BEARINGS / math.tau
+    place = speed / STEP, across % math.tau * BEARINGS / math.tau
     (low, over), (left, beside) = ((np.floor(x).astype(int), x % 1.0) for x in place)
-    low = np.minimum(low, SPEEDS)  # the last two rows of the table hold no trim
     table, found = _table(vehicle), 0.0
+    low = np.minimum(low, len(table) - 2)  # the last two rows of the table hold no trim
     for i, along in enumerate((1 - over, over)):
         for k, around in enumerate((1 - beside, beside)):
             part = table[low + i, (left + k) % BEARINGS]
@@ -59,46 +66,93 @@ def trimmed(vehicle: Vehicle, start: Start, wind: np.ndarray) -> Start:
     )
 
 
-@functools.lru_cache(maxsize=8)
+class Balances:
+    """Attitudes and rotor speeds without limits that hold an aircraft in winds from all around.
+
+    The unknowns (BEARINGS, 6) are the components of the body's z axis along x and y of the level
+    aircraft, and thrust and moments beyond those of hover, over the weight and the weight times the
+    size; NaN where Newton's method has found no balance.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Begin in calm air."""
+        self._vehicle = vehicle
+        self._parameters = Parameters.of(parameters.rows(vehicle), vehicle.control_timestep)
+        weight, size = vehicle.mass * GRAVITY, vehicle.size
+        self._units = np.linalg.pinv(vehicle.mixer) * (weight * np.array([1.0, size, size, size]))
+        self._accelerations = np.repeat([GRAVITY, GRAVITY / size], 3)
+        self._bearing = math.tau / BEARINGS * np.arange(BEARINGS)
+        self._rising = [np.zeros((BEARINGS, 6))]  # in winds of 0, STEP, ...
+
+    def rising(self) -> Iterator[tuple[float, np.ndarray]]:
+        """Winds of 0, STEP, ... [m/s] and the unknowns, until there is no balance from any side.
+
+        From one wind to the next they go on as they have changed so far.
+        """
+        for step in itertools.count():
+            if step == len(self._rising):
+                last, before, first = (self._rising[max(step - k, 0)] for k in (1, 2, 3))
+                self._rising.append(self.at(step * STEP, 3 * last - 3 * before + first))
+            if not np.isfinite(self._rising[step]).any():
+                return
+            yield step * STEP, self._rising[step]
+
+    def at(self, speed: float, guess: np.ndarray) -> np.ndarray:
+        """The unknowns in a wind [m/s], by Newton's method from a guess."""
+        wind = speed * stack(np.cos(self._bearing), np.sin(self._bearing), 0 * self._bearing)
+        nudges = np.concatenate([np.zeros((1, 6)), NUDGE * np.eye(6)])[:, None]
+        unknown, balance = guess + 0.0, np.zeros(BEARINGS, dtype=bool)
+        for _ in range(ITERATIONS):
+            tilt = norm(unknown[:, :2])[:, None]
+            unknown[:, :2] *= np.minimum(1.0, STEEPEST / np.maximum(tilt, STEEPEST))
+            found = self._lacking(unknown + nudges, wind)
+            balance = (abs(found[0]) < BALANCED).all(-1)
+            if balance[np.isfinite(guess).all(-1)].all():
+                break
+            slopes = np.moveaxis(found[1:] - found[0], 0, -1) / NUDGE
+            slopes[~np.isfinite(slopes).all((1, 2))] = np.eye(6)
+            unknown = unknown - (np.linalg.pinv(slopes) @ found[0][..., None])[..., 0]
+        return np.where(balance[:, None], unknown, np.nan)
+
+    def _lacking(self, unknown: np.ndarray, wind: np.ndarray) -> np.ndarray:
+        """Accelerations and angular ones that are left, over BALANCED's, (k, BEARINGS, 6)."""
+        flat, winds = unknown.reshape(-1, 6), np.tile(wind, (len(unknown), 1))
+        still, level = np.zeros((len(flat), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(flat), 1))
+        quaternion = _attitude(level, flat[:, 0], flat[:, 1])
+        turning = np.sqrt(np.maximum(self.squares(flat), 0.0))
+        motion = Motion(still + [0.0, 0.0, HIGH], quaternion, still, still, turning)
+        effects = self._vehicle.aerodynamics.effects
+        rate = derivative(self._parameters, motion, turning, winds, -GRAVITY, effects)
+        both = np.concatenate([rate.velocity, rate.body_rate], axis=1) / self._accelerations
+        return both.reshape(unknown.shape)
+
+    def squares(self, unknown: np.ndarray) -> np.ndarray:
+        """Squares (n, R) of the rotor speeds [rad^2/s^2]."""
+        return self._vehicle.hover_speed**2 + unknown[:, 2:] @ self._units.T
+
+    def tilt(self, unknown: np.ndarray) -> np.ndarray:
+        """The body's z axis along the wind and to its left, (BEARINGS, 2)."""
+        return stack(*_turned(unknown[:, 0], unknown[:, 1], -self._bearing))
+
+
+_balances = functools.lru_cache(maxsize=32)(Balances)
+
+
+@functools.lru_cache(maxsize=32)
 def _table(vehicle: Vehicle) -> np.ndarray:
-    """Trims in winds up to FASTEST.
+    """Trims in winds of 0, STEP, ... up to FASTEST that the rotors hold at their limits.
 
     Returns:
-        (SPEEDS + 2, BEARINGS, 2 + R): the body's z axis along the wind and to its left, and squares
-        of the rotor speeds over those of hover; NaN where there is no trim.
+        (S + 2, BEARINGS, 2 + R): the body's z axis along the wind and to its left, and squares of
+        the rotor speeds over those of hover; NaN where there is no trim, as in the last two rows.
     """
-    p = Parameters.of(parameters.rows(vehicle), vehicle.control_timestep)
-    speed, bearing = np.meshgrid(
-        np.linspace(0, FASTEST, SPEEDS), math.tau / BEARINGS * np.arange(BEARINGS), indexing="ij"
-    )
-    speed, bearing = speed.reshape(-1), bearing.reshape(-1)
-    still = np.zeros((len(speed), 3))
-    wind = stack(speed * np.cos(bearing), speed * np.sin(bearing), 0 * speed)
-    level, high = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, HIGH])
-    hover, most = vehicle.hover_speed**2, vehicle.max_speed**2
-    east = north = 0 * speed
-    square, allocation = hover + 0 * speed[:, None], np.linalg.pinv(vehicle.mixer).T
-    balance = speed < 0
-    for _ in range(ITERATIONS):
-        quaternion, turning = _attitude(level + 0 * wind[:, :1], east, north), np.sqrt(square)
-        motion = Motion(still + high, quaternion, still, still, turning)
-        effects = vehicle.aerodynamics.effects
-        rate = derivative(p, motion, turning, wind, -GRAVITY, effects)
-        balance = (norm(rate.velocity) < STILL) & (norm(rate.body_rate) < STEADY)
-        up = rotation_matrix(quaternion)[:, :, 2]
-        lift = p.mass * ((rate.velocity + [0, 0, GRAVITY]) * up).sum(-1)
-        # The force that would balance the others, if body z pointed along it.
-        needed = lift[:, None] * up - p.mass[..., None] * rate.velocity
-        force = norm(needed)
-        east, north = needed[:, 0] / force, needed[:, 1] / force
-        lacking = np.concatenate([(force - lift)[:, None], -rate.body_rate * p.inertia], axis=1)
-        thrust = thrust_wrench(p, turning)[0][:, 2]
-        per_square = np.clip(lift / np.maximum(thrust, 1e-12), 0.5, 2.0)
-        square = square + SHARE * (lacking / per_square[:, None]) @ allocation
-        square = np.clip(square, 0.0, most)
-    found = np.concatenate([stack(*_turned(east, north, -bearing)), square / hover], axis=1)
-    whole = np.where(balance[:, None], found, np.nan).reshape(SPEEDS, BEARINGS, -1)
-    return np.concatenate([whole, np.full((2, *whole.shape[1:]), np.nan)])
+    balances, rows = _balances(vehicle), list[np.ndarray]()
+    for _, unknown in itertools.takewhile(lambda one: one[0] <= FASTEST, balances.rising()):
+        square = balances.squares(unknown)
+        held = ((square >= 0) & (square <= vehicle.max_speed**2)).all(-1, keepdims=True)
+        found = np.concatenate([balances.tilt(unknown), square / vehicle.hover_speed**2], axis=1)
+        rows.append(np.where(held, found, np.nan))
+    return np.concatenate([rows, np.full((2, *rows[0].shape), np.nan)])
 
 
 def _turned(x: np.ndarray, y: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,10 +173,38 @@ def _attitude(level: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     )
 
 
-def fastest_held(vehicle: Vehicle) -> float:
-    """Fastest wind of the table [m/s] in which the aircraft can be trimmed, whatever the bearing.
+@functools.lru_cache(maxsize=32)
+def held_wind(vehicle: Vehicle, low: tuple[float, ...], high: tuple[float, ...]) -> float:
+    """Strongest steady wind [m/s] in which the aircraft can be trimmed, whatever the bearing.
 
-    Unlike `held_wind` it includes the thrust that tilted rotors lose to the wind through them.
+    It counts drag, the lift that tilted rotors lose to the wind through them, and the moments. inf
+    where it is beyond the speed of sound.
+
+    Args:
+        vehicle: The aircraft in its air.
+        low: Lowest speed of each rotor [rad/s].
+        high: Highest speed of each rotor [rad/s].
     """
-    held = np.isfinite(_table(vehicle)[..., 0]).all(1)
-    return FASTEST * (int(np.argmin(held)) - 1) / (SPEEDS - 1)
+    balances = _balances(vehicle)
+
+    def holds(unknown: np.ndarray) -> bool:
+        square, room = balances.squares(unknown), SURE * np.square(high)
+        within = (square >= np.square(low) - room) & (square <= np.square(high) + room)
+        return bool(within.all())
+
+    held, last, fast = 0.0, None, math.inf
+    for speed, unknown in balances.rising():
+        if speed > SOUND:
+            return math.inf
+        if not holds(unknown):
+            fast = speed
+            break
+        held, last = speed, unknown
+    if last is None:
+        return 0.0
+    fast = min(fast, held + STEP)
+    while fast - held > CLOSE:
+        middle = (held + fast) / 2
+        found = balances.at(middle, last)
+        held, last, fast = (middle, found, fast) if holds(found) else (held, last, middle)
+    return held

@@ -206,6 +206,11 @@ class Scenario:
         blows, height = self.weather, max(self.altitude, LOWEST)
         return float(mean_wind(blows.wind_speed, blows.roughness, height))
 
+    @property
+    def lands(self) -> bool:
+        """Whether the task is over on the ground: it may be touched, and nothing else is there."""
+        return self.task.contact and not self.task.solids()
+
     def compile_model(self, *, drawn: bool = True) -> mujoco.MjModel:
         """The model of the aircraft in the world of the task, to draw, or lean, to simulate."""
         task = self.task

@@ -19,8 +19,10 @@ from quadrl.control.feasibility import (
     MARGIN,
     SURE,
     Reach,
+    cannot_land,
     held_command,
     held_wind,
+    lift_on_feet,
     samples,
     unreached,
 )
@@ -94,10 +96,11 @@ def check(
     vehicle, task = scenario.aircraft, scenario.task
     sampler = AircraftSampler(scenario.randomization, vehicle)
     steps = _steps(vehicle, sampler, scenario.control_mode)
-    return Check(vehicle, (*_thrust(vehicle, sampler), *_moments(vehicle, task), *steps))
+    thrust = _thrust(vehicle, sampler, scenario)
+    return Check(vehicle, (*thrust, *_moments(vehicle, task), *steps))
 
 
-def _thrust(vehicle: Vehicle, sampler: AircraftSampler) -> Iterator[Row]:
+def _thrust(vehicle: Vehicle, sampler: AircraftSampler, flown: Scenario) -> Iterator[Row]:
     """Thrust, and the action scale that follows."""
     reach, scale = Reach(vehicle), vehicle.action_scale
     drawn = Reach(vehicle, np.concatenate(samples(sampler)))
@@ -119,7 +122,13 @@ def _thrust(vehicle: Vehicle, sampler: AircraftSampler) -> Iterator[Row]:
         yield Row("thrust over weight, worst drawn", worst, "", OK if worst >= MARGIN else less)
         share, lack, _ = unreached(vehicle, sampler)
         yield Row("drawn that cannot hover", 100 * share, "%", lack if share else OK)
-    yield Row("steady wind held, action 1", held_wind(vehicle, load), "m/s")
+    for end, ends in (("action 1", scale), ("limits", reach.most)):
+        held, mean = held_wind(vehicle, ends), flown.mean_wind
+        strong = f"the mean wind is {mean:.3g} m/s"
+        yield Row(f"steady wind held, {end}", held, "m/s", OK if held >= mean else strong)
+    if flown.lands:
+        lift = lift_on_feet(vehicle, scale)
+        yield Row("lift on the ground, action -1", lift, "", cannot_land(vehicle) or OK)
     wanted = max(needed, min(scale, room))
     carried = float(drawn.loads(wanted)[1].min())
     reason = f"then the worst has {carried:.2f} times its weight"

@@ -135,7 +135,7 @@ def evaluate(
         if not isinstance(flown, Policy):
             raise QuadrlError(name="sampled", value=True, allowed="False for a controller")
         flown = flown.flying(episodes, SAMPLING_SEED)
-    asked = scenario.randomization, scenario.control_mode, scenario.mean_wind
+    asked = scenario.randomization, scenario.control_mode, scenario.mean_wind, scenario.lands
     warn_of_unreached(scenario.aircraft, *asked)
     rollout = fly(flown, scenario, episodes=episodes, seed=EVALUATION_SEED + seed)
     names = {"task": scenario.task.name, "vehicle": scenario.vehicle.name, "seed": seed}

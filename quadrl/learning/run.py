@@ -171,7 +171,7 @@ def train_in(
     """Train as `train` does, with prepared settings and folder, within `heed(training.ask)`."""
     number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = config.scenario
-    asked = scenario.randomization, scenario.control_mode, scenario.mean_wind
+    asked = scenario.randomization, scenario.control_mode, scenario.mean_wind, scenario.lands
     warn_of_unreached(scenario.aircraft, *asked)
     training = Training(config, folder, resume=resume)
     with heed(training.ask):

@@ -1,19 +1,24 @@
 """Trim: in wind, a start at rest and level becomes one whose forces balance; others stay."""
 
 import dataclasses
+import math
 
 import helpers
 import numpy as np
 import pytest
+import reference
+from scipy.linalg import null_space
+from scipy.optimize import root
 
+import quadrl
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.presets import VEHICLES, in_real_air
+from quadrl.aircraft.presets import VEHICLES, in_real_air, resolve
 from quadrl.base.errors import QuadrlWarning
 from quadrl.base.rotation import heading_of, norm
 from quadrl.conditions.weather import WEATHERS, Weather
 from quadrl.control import trim
-from quadrl.control.feasibility import warn_of_unreached
+from quadrl.control.feasibility import Reach, held_wind, lift_on_feet, warn_of_unreached
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.engines.dynamics import Motion, derivative
@@ -95,8 +100,92 @@ def test_without_a_mean_wind_starts_are_those_of_calm_air():
 def test_wind_that_no_rotor_holds_is_said_with_its_speed():
     moderate = Scenario.of("hover", weather="moderate")
     assert moderate.mean_wind == pytest.approx(15.4 * 0.8583, rel=1e-3)  # ln(3.048 / z0) / 4.893
-    with pytest.warns(QuadrlWarning, match="mean wind of 13.2 m/s .* 11 m/s at most"):
+    with pytest.warns(
+        QuadrlWarning,
+        match="mean wind of 13.2 m/s .* 1 holds it in 11.3 m/s at most, .* limits in 12.7 m/s",
+    ):
         warn_of_unreached(moderate.aircraft, "none", "rotor", moderate.mean_wind)
     light = Scenario.of("hover", weather=WEATHERS["light"])
     warn_of_unreached(light.aircraft, "none", "rotor", light.mean_wind)
     assert Environment(moderate).has_begun is False
+
+
+def balance(vehicle, wind):
+    """Rotor speeds (R,) [rad/s] with which it keeps its place in wind (3,), by other equations."""
+    free = null_space(vehicle.mixer)  # with more than four rotors many speeds give a wrench
+
+    def lacking(unknown, wind):
+        angle = max(np.hypot(*unknown[:2]), 1e-12)  # [rad], of the tilt towards x and y
+        speed = vehicle.hover_speed * np.sqrt(np.maximum(unknown[2:], 0))
+        turn = np.sin(angle / 2) / angle * np.array([-unknown[1], unknown[0], 0.0])
+        level = [*(0, 0, 1e3), np.cos(angle / 2), *-turn, *np.zeros(6)]
+        state = np.array([[*level, *speed]])
+        rate = reference.derivative(state, vehicle, state[:, 13:], wind)[0]
+        square = unknown[2:] * vehicle.hover_speed**2 / vehicle.hover_speed[0] ** 2
+        return [*rate[7:10], *0.01 * rate[10:13], *(square - np.mean(square)) @ free]
+
+    unknown = [0.0, 0.0, *np.ones(vehicle.rotor_count)]
+    for share in (0.6, 0.85, 1.0):  # from calm air up to this wind
+        found = root(lacking, unknown, (share * wind,), tol=1e-9)
+        assert found.success
+        unknown = found.x
+    return vehicle.hover_speed * np.sqrt(unknown[2:])
+
+
+@pytest.mark.parametrize(
+    ("name", "end", "worst"),
+    [("paper", "action 1", 0), ("crazyflie_brushless", "limits", 4), ("racer", "limits", 0)],
+)
+def test_the_wind_that_is_held_takes_all_that_actions_and_rotors_give(name, end, worst):
+    vehicle = in_real_air(VEHICLES[name])
+    scale = vehicle.action_scale if end == "action 1" else Reach(vehicle).most
+    low, high = (speed[0] for speed in Reach(vehicle).speeds(scale))
+
+    def used(wind):
+        """How much of the room of the worst rotor the worst bearing takes; 1 is all."""
+        bearings = math.tau / 32 * np.arange(worst, 32, 8)
+        most = 0.0
+        for angle in bearings:
+            speed = balance(vehicle, wind * np.array([np.cos(angle), np.sin(angle), 0.0]))
+            middle, room = (high**2 + low**2) / 2, (high**2 - low**2) / 2
+            most = max(most, (abs(speed**2 - middle) / room).max())
+        return most
+
+    held = held_wind(vehicle, scale)
+    assert used(0.98 * held) < 1 < used(1.02 * held)
+    rows = {row.quantity: row for row in quadrl.check(vehicle).rows}
+    assert rows[f"steady wind held, {end}"].value == held
+
+
+def test_check_marks_wind_that_actions_do_not_hold():
+    name = "steady wind held, action 1"
+    for weather, verdict in (("light", "ok"), ("moderate", "the mean wind is 13.2 m/s")):
+        rows = {row.quantity: row for row in quadrl.check(weather=weather).rows}
+        assert rows[name].verdict == verdict
+
+
+# ------------------------------------------------------------------------ landing in real air
+
+
+def test_an_aircraft_that_the_ground_holds_up_is_told_the_scale_that_lands():
+    """Of 1.10 times the weight, at 190.7 of 225.7 rad/s."""
+    flown = Scenario.of("landing", weather={"wind_speed": 0.5})
+    lift = lift_on_feet(flown.aircraft, 35.0)
+    assert lift == pytest.approx(1.10, abs=0.01)
+    given = flown.aircraft, "none", "rotor", 0.0
+    with pytest.warns(QuadrlWarning, match="lifts 1.10 times .* action_scale=54 or more"):
+        warn_of_unreached(*given, lands=flown.lands)
+    with pytest.warns(QuadrlWarning, match="lifts 1.10"):
+        quadrl.evaluate("geometric", flown, episodes=1)
+    warn_of_unreached(*given, lands=Scenario.of("hover").lands)  # it flies on
+    warn_of_unreached(resolve(flown.aircraft, {"action_scale": 54}), "none", lands=True)
+    warn_of_unreached(Scenario.of("landing").aircraft, "none", lands=True)  # in still air
+    rows = {row.quantity: row for row in quadrl.check(task="landing", weather="light").rows}
+    assert rows["lift on the ground, action -1"].value == lift
+    assert "action_scale=54" in rows["lift on the ground, action -1"].verdict
+
+
+def test_with_the_scale_that_is_suggested_it_lands():
+    flown = {"weather": {"wind_speed": 0.5}, "vehicle_options": {"action_scale": 54}}
+    found = quadrl.evaluate("geometric", "landing", episodes=20, seed=5, **flown)
+    assert found.metrics["success_rate"] >= 0.95
