@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import functools
 import sys
-from typing import Any
-
-from dm_control.rl import control
-from dm_control.utils import containers
+from typing import TYPE_CHECKING, Any
 
 from quadrl import tasks
 from quadrl.base import validation
-from quadrl.envs.dm_control import make
+
+if TYPE_CHECKING:
+    from dm_control.rl import control
 
 DOMAIN = "quadrotor"
-SUITE = containers.TaggedTasks()
+SUITE: Any = None
+"""The tasks that `register` adds, as dm_control keeps them; None before."""
 BENCHMARKING: tuple[tuple[str, str], ...] = ()
 """Empty: dm_control demands that every reward of these lies in [0, 1]; the paper's do not."""
 
@@ -47,8 +47,11 @@ def load(
         visualize_reward: Colour the aircraft by its reward, clipped to [0, 1].
 
     Raises:
+        ImportError: dm-control is not installed.
         QuadrlError: Unknown name or impossible value.
     """
+    from quadrl.envs.dm_control import make
+
     validation.choice("domain_name", domain_name, [DOMAIN])
     validation.choice("task_name", task_name, tasks.TASKS)
     given: Any = task_kwargs or {}
@@ -58,14 +61,22 @@ def load(
 
 
 def register() -> None:
-    """Add the domain, with every task of the catalogue, to dm_control's own (idempotent)."""
-    from dm_control import suite
+    """Add the domain, with every task of the catalogue, to dm_control's own (idempotent).
 
+    Raises:
+        ImportError: dm-control is not installed.
+    """
+    from quadrl.envs.dm_control import make  # first: it says what it needs, and what draws
+
+    from dm_control import suite  # isort: skip
+    from dm_control.utils import containers  # isort: skip
+
+    global SUITE
+    SUITE = containers.TaggedTasks()
     for name in tasks.TASKS:
-        if name not in SUITE:
-            factory = functools.partial(make, name)
-            factory.__name__ = name  # type: ignore[attr-defined]
-            SUITE.add()(factory)
+        factory = functools.partial(make, name)
+        factory.__name__ = name  # type: ignore[attr-defined]
+        SUITE.add()(factory)
     suite._DOMAINS[DOMAIN] = sys.modules[__name__]
     suite.ALL_TASKS = suite._get_tasks(tag=None)
     suite.BENCHMARKING = suite._get_tasks("benchmarking")

@@ -3,8 +3,8 @@
     from quadrl.testing import check_task
     check_task(MyTask)
 
-A task that keeps it can be registered. The checks need no pytest; those of PyTorch and TorchRL are
-made where these are installed.
+A task that keeps it can be registered. The checks need no pytest; those of PyTorch, TorchRL and
+dm_control are made where these are installed.
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ def check_task(task: str | Task | type[Task]) -> None:
     environment = Environment(short)
     steps = environment.time_limit_steps + 1  # past the end
     actions = varied_actions(steps, ROWS, environment.action_size)[:, 3]
-    check_flight(short, actions)
-    check_dm_control(short, actions)
+    if _optional("dm_control"):
+        check_flight(short, actions)
+        check_dm_control(short, actions)
     check_gymnasium(short)
     if _optional("torchrl"):
         check_torchrl(short)

@@ -6,8 +6,8 @@ ENVIRONMENT="$REPOSITORY/.venv"
 ENVIRONMENT_PYTHON="$ENVIRONMENT/bin/python"
 # First line: the fingerprint of what was installed. Second line: the extras.
 STAMP="$ENVIRONMENT/quadrl-environment"
-# Python: ends with 0 in a version that pyproject.toml allows.
-SUPPORTED='import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))'
+# Python: ends with 0 in a version that constraints.txt is for.
+SUPPORTED='import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))'
 
 say() { printf 'quadrl: %s\n' "$*" >&2; }
 
@@ -30,9 +30,9 @@ install_packages() {
         DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >&2
 }
 
-# find_python: prints the command of a Python that the dependencies have wheels for; $PYTHON overrules the choice.
+# find_python: prints the command of a Python that quadrl is tested with; $PYTHON overrules the choice.
 find_python() {
-    local candidate candidates=(python3 python3.12 python3.11 python)
+    local candidate candidates=(python3 python3.13 python3.12 python3.11 python)
     [ -z "${PYTHON:-}" ] || candidates=("$PYTHON")
     for candidate in "${candidates[@]}"; do
         if "$candidate" -c "$SUPPORTED" 2>/dev/null; then
@@ -40,10 +40,9 @@ find_python() {
             return
         fi
     done
-    [ -z "${PYTHON:-}" ] || die "PYTHON=$PYTHON is not a Python 3.11 or 3.12"
-    die "needs Python 3.11 or 3.12, and found $(python3 --version 2>/dev/null || echo none)." \
-        "(labmaze, which dm-control needs, has no wheels for later versions.)" \
-        "Install one, or name it: PYTHON=/path/to/python3.12 $0"
+    [ -z "${PYTHON:-}" ] || die "PYTHON=$PYTHON is not a Python 3.11, 3.12 or 3.13"
+    die "needs Python 3.11, 3.12 or 3.13, and found $(python3 --version 2>/dev/null || echo none)." \
+        "Install one, or name it: PYTHON=/path/to/python3.13 $0"
 }
 
 # has_compiler: whether the C compiler that quadrl.native will pick makes a shared library; C's headers belong to it.
@@ -117,7 +116,7 @@ ensure_environment() {
     ensure_compiler
     [ -f "$ENVIRONMENT/pyvenv.cfg" ] || make_venv
     "$ENVIRONMENT_PYTHON" -c "import pip; $SUPPORTED" 2>/dev/null ||
-        die "$ENVIRONMENT has no Python 3.11 or 3.12 that works: remove it and run again"
+        die "$ENVIRONMENT has no Python 3.11, 3.12 or 3.13 that works: remove it and run again"
     installed="$(sed -n 2p "$STAMP" 2>/dev/null || true)"
     for extra in "$@"; do
         case " $installed " in

@@ -4,6 +4,7 @@ import importlib.util
 
 import numpy as np
 import torch
+from helpers import needs_dm_control
 
 from quadrl import envs
 from quadrl.envs.gymnasium import QuadrotorEnv, QuadrotorVectorEnv
@@ -17,6 +18,7 @@ class DmControl:
     rows = 1
 
     def __init__(self, task="hover", seed=None, **settings):
+        needs_dm_control()
         self.environment = envs.dm_control.make(task, random=seed, **settings)
         self.core = self.environment.task.environment
 

@@ -1,6 +1,7 @@
 """Flights through every API, and by bare mj_step."""
 
 import dataclasses
+import importlib.util
 import itertools
 import types
 
@@ -227,7 +228,7 @@ def by_torchrl(task, seed, count, mode):
 APIS = {
     "mj_step": together(by_mj_step),
     "environment": by_environment,
-    "dm_control": together(by_dm_control),
+    **({"dm_control": together(by_dm_control)} if importlib.util.find_spec("dm_control") else {}),
     "gymnasium": together(by_gymnasium),
     "gymnasium_vector": by_gymnasium_vector,
     "torchrl": by_torchrl,

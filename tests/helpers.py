@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import math
+import sys
 
 import mujoco
 import numpy as np
@@ -23,6 +24,16 @@ from quadrl.engines.mjcf import compile_model
 from quadrl.engines.mujoco import BatchEngine
 from quadrl.engines.state import Start
 from quadrl.tasks.hover import Hover
+
+# ------------------------------------------------------------------------------ where a test runs
+
+
+def needs_dm_control():
+    """Skip a test, or the rest of its file, where dm-control cannot be: from Python 3.13 on."""
+    if sys.version_info >= (3, 13):
+        reason = "dm-control needs labmaze, which cannot be installed with this Python"
+        pytest.importorskip("dm_control", reason=reason)
+
 
 # ------------------------------------------------------------------- motions, flown by an engine
 

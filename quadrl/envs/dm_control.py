@@ -15,7 +15,12 @@ from quadrl.base.shield import refuse_after_fork
 from quadrl.rendering import gl
 from quadrl.rendering.camera import FOLLOW, aircraft_scale, moving_views
 
-gl.choose()
+try:
+    gl.choose()
+except ModuleNotFoundError as error:
+    reason = "python -m pip install dm-control, with Python 3.12 or older"
+    reason = f"dm_control's API needs dm-control: {reason}; every other API works without it"
+    raise ImportError(reason) from error
 
 import mujoco as _mujoco
 import numpy as np

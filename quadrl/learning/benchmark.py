@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from quadrl import suite, tasks
+from quadrl import envs, tasks
 from quadrl.aircraft.presets import in_real_air
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.machine import cores, machine
@@ -134,9 +134,9 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
     vehicle, size, free = Vehicle(), f"{num_envs:,}", f"{FREE_FLIGHT_ENVS:,}"
     air = in_real_air(vehicle)
     model = Scenario.of(task, vehicle=vehicle).compile_model(drawn=False)
-    alone, loaded = gym.make(gymnasium_id), suite.make(task, random=0)
+    alone = gym.make(gymnasium_id)
     vectors: Any = gym.make_vec(gymnasium_id, num_envs=num_envs)
-    for env in (alone, loaded, vectors):
+    for env in (alone, vectors):
         stack.callback(env.close)
     batch = _batched_mj_step(vehicle, model, num_envs)
     flying = partial(_environment, num_envs=FREE_FLIGHT_ENVS, engine="free_flight")
@@ -161,14 +161,19 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
     if importlib.util.find_spec("torchrl"):
         what = f"TorchRL collector of {size} with a policy"
         layers.append(Layer(what, ALL_CORES, _collector(task, num_envs, stack), 0.75))
-    return [
-        *layers,
+    layers += [
         Layer("mj_step, a loop on one core", ONE_CORE,
               _mj_step(vehicle, model, 1), None, ONE_CORE),
         Layer("Gymnasium make, one aircraft", ONE_CORE,
               _single(alone, model.nu, lambda step: step[2] or step[3]), 0.35),
-        Layer("dm_control load, one aircraft", ONE_CORE,
-              _single(loaded, model.nu, lambda step: step.last())),
+    ]  # fmt: skip
+    if importlib.util.find_spec("dm_control"):
+        loaded = envs.dm_control.make(task, random=0)
+        stack.callback(loaded.close)
+        flown = _single(loaded, model.nu, lambda step: step.last())
+        layers.append(Layer("dm_control load, one aircraft", ONE_CORE, flown))
+    return [
+        *layers,
         Layer(KERNEL, ONE_CORE, _free_flight(vehicle, HEIGHT), None, KERNEL),
         Layer(f"{KERNEL} in air", KERNEL, _free_flight(air, HEIGHT), 1 / 3),
         Layer(f"{KERNEL} near the ground", KERNEL, _free_flight(air, LOW), 1 / 3),

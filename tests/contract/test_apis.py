@@ -132,6 +132,23 @@ def test_the_import_and_a_policy_are_light_and_set_no_variable():
         "import quadrl.evaluation.rollout; quadrl.Policy.pretrained('hover')([0.0] * 22);"
         "heavy |= {'tensordict', 'torchrl', 'mediapy', 'PIL'};"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules);"
-        "quadrl.suite, quadrl.rendering, quadrl.testing, quadrl.envs.dm_control"
+        "quadrl.suite, quadrl.rendering, quadrl.testing"
     )
     python("-W", "error", "-c", code)
+
+
+def test_without_dm_control_its_own_api_alone_is_missing_and_says_so_in_a_line():
+    code = (
+        "import sys; sys.modules.update(dm_control=None, dm_env=None);"
+        "from quadrl import *; import gymnasium, quadrl;"
+        "from quadrl.learning import benchmark;"
+        "flown = gymnasium.make('quadrl/Hover-v0'); flown.reset(seed=0);"
+        "flown.step(quadrl.Policy.pretrained('hover')([0.0] * 22));"
+        "calls = (lambda: quadrl.load('hover'), suite.register, lambda: envs.dm_control);"
+        "\nfor call in calls:"
+        "\n    try: call()"
+        "\n    except ImportError as error: print(error)"
+    )
+    line = "dm_control's API needs dm-control: python -m pip install dm-control, "
+    line += "with Python 3.12 or older; every other API works without it"
+    assert python("-W", "error", "-c", code).stdout.splitlines() == [line] * 3

@@ -7,6 +7,7 @@ import cloudpickle
 import numpy as np
 import pytest
 from apis import APIS
+from helpers import needs_dm_control
 
 import quadrl
 from quadrl.testing import varied_actions
@@ -64,6 +65,7 @@ def test_a_copy_goes_on_bit_for_bit(api, settings):
 
 
 def test_a_copied_physics_of_dm_control_is_drawn_and_measured_as_the_other():
+    needs_dm_control()
     environment = quadrl.load("hover", {"random": 0})
     environment.reset()
     environment.step(np.full(4, 0.3))

@@ -5,6 +5,7 @@ import dataclasses
 import flights
 import numpy as np
 import pytest
+from helpers import needs_dm_control
 
 from quadrl.base.rotation import namespace
 from quadrl.control.modes import CONTROL_MODES
@@ -236,6 +237,7 @@ def test_a_faulty_declaration_is_noticed(kind, message):
 
 
 def test_an_unfair_api_is_noticed(monkeypatch):
+    needs_dm_control()
     from quadrl.envs.dm_control import QuadrotorTask
 
     fair = QuadrotorTask.get_reward
@@ -245,12 +247,16 @@ def test_an_unfair_api_is_noticed(monkeypatch):
         check_flight(Landing(), ACTIONS[:, 3])
 
 
-def test_the_checks_of_the_frameworks_notice_a_fault(monkeypatch):
+def test_the_check_of_dm_control_notices_a_fault(monkeypatch):
+    needs_dm_control()
     from quadrl.envs import dm_control
 
     monkeypatch.setattr(dm_control.QuadrotorTask, "get_reward", lambda self, physics: "much")
     with pytest.raises(AssertionError, match="dm_env"):
         check_dm_control(Hover(time_limit=0.5), ACTIONS[:15, 0])
+
+
+def test_the_check_of_gymnasium_notices_a_fault(monkeypatch):
     monkeypatch.setattr(QuadrotorEnv, "reset", lambda self, **_: (np.zeros(22), {}))
     with pytest.raises(AssertionError, match="check_env"):
         check_gymnasium(Hover(time_limit=0.5))

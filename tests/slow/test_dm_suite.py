@@ -5,9 +5,12 @@ import re
 from pathlib import Path
 
 import pytest
+from helpers import needs_dm_control
 from processes import python
 
 from quadrl.tasks import TASKS
+
+needs_dm_control()
 
 run = functools.partial(python, "-W", "error", without=("MUJOCO_GL",))
 

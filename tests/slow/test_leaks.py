@@ -17,6 +17,7 @@ from scipy import stats
 sys.path.append(str(Path(__file__).parents[1]))  # this file is run, too
 
 import apis  # noqa: E402
+from helpers import needs_dm_control  # noqa: E402
 
 from quadrl.core.environment import Environment  # noqa: E402
 
@@ -99,6 +100,8 @@ def measure(name):
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
 @pytest.mark.parametrize("name", WORK)
 def test_nothing_is_kept(name):
+    if name == "dm_control":
+        needs_dm_control()
     command = [sys.executable, "-W", "ignore", __file__, name]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

@@ -4,6 +4,7 @@ import importlib.util
 import sys
 
 import pytest
+from helpers import needs_dm_control
 from processes import python
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux draws without a screen")
@@ -58,6 +59,8 @@ def run(code, before="", **variables):
 
     Some of it may come before `import quadrl`.
     """
+    if DM_CONTROL in code:
+        needs_dm_control()
     names = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")
     done = python("-W", "error", "-c", before + PREAMBLE + code, without=names, **variables)
     assert (done.stderr, done.stdout) == ("", "")
@@ -65,8 +68,12 @@ def run(code, before="", **variables):
 
 @pytest.mark.parametrize(
     "code",
-    [OURS + MUJOCO + BOTH + "other.close()" + DM_CONTROL + BOTH, DM_CONTROL + OURS + BOTH],
-    ids=["first", "second"],
+    [
+        OURS + MUJOCO + BOTH + "other.close()",
+        OURS + MUJOCO + BOTH + "other.close()" + DM_CONTROL + BOTH,
+        DM_CONTROL + OURS + BOTH,
+    ],
+    ids=["mujoco", "first", "second"],
 )
 def test_without_a_screen_it_draws_beside_other_renderers(code):
     """Each draws what it should and none spoils another's end, though mujoco was imported first."""

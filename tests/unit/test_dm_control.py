@@ -1,10 +1,14 @@
+# ruff: noqa: E402 - where there is no dm_control nothing of it is imported
 """dm_control; what all APIs have in common is in contract/."""
 
 import numpy as np
 import pytest
-from helpers import level, refused, starting
+from helpers import level, needs_dm_control, refused, starting
 
 import quadrl
+
+needs_dm_control()
+
 from quadrl import suite  # before dm_control: it chooses what draws
 from quadrl.envs import dm_control
 from quadrl.tasks import TASKS, make

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import pytest
 import torch
+from helpers import needs_dm_control
 from tensordict.nn import TensorDictModule
 from torchrl.envs import DMControlEnv, EnvBase, GymWrapper
 from torchrl.envs.utils import check_env_specs
@@ -71,6 +72,7 @@ def test_torchrls_gymnasium_wrapper_sees_the_same_episodes(name, mode):
 
 
 def test_torchrls_dm_control_environment_after_register():
+    needs_dm_control()
     quadrl.suite.register()
     for name in TASKS:
         environment = DMControlEnv("quadrotor", name)
