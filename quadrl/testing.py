@@ -9,6 +9,7 @@ dm_control are made where these are installed.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import importlib.util
 import unittest
@@ -41,6 +42,8 @@ def check_task(task: str | Task | type[Task]) -> None:
     check_rules(task, _optional("torch"))
     check_episodes(task)
     check_saving(task)
+    if vars(type(task)).get("compiled"):
+        check_compiled(task)
     short = task.replace(time_limit=min(task.time_limit, EPISODE))
     environment = Environment(short)
     steps = environment.time_limit_steps + 1  # past the end
@@ -91,6 +94,28 @@ def check_saving(task: Task) -> None:
         got, expected = (environment.step(action) for environment in (other, one))
         seen = [{"reward": now.reward} | now.observation for now in (got, expected)]
         require_equal(seen[0], seen[1], f"{task.name}: a restored episode goes on otherwise")
+
+
+def check_compiled(task: Task) -> None:
+    """The step that the class has compiled gives what its functions give, episode after episode."""
+    kind = dataclasses.dataclass(frozen=True)(type("Written", (type(task),), {"compiled": False}))
+    options = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+    pair = [Environment(one, num_envs=ROWS, seed=1) for one in (task, kind(**options))]
+    for environment in pair:
+        environment.reset()
+    said = f"{task.name}: with `compiled = True` it gives something else than its functions"
+    steps = 2 * pair[0].time_limit_steps
+    for action in varied_actions(steps, ROWS, pair[0].action_size):
+        with blame(task, "a flight"):
+            got, expected = (environment.step(action) for environment in pair)
+        for name in ("reward_terms", "observation"):
+            require_equal(getattr(got, name), getattr(expected, name), f"{said}: {name}")
+        for name in ("error", "terminated", "is_success"):
+            one, other = ({name: getattr(done, name)} for done in (got, expected))
+            require_equal(one, other, said)
+        if (over := np.logical_or(expected.terminated, expected.truncated)).any():
+            for environment in pair:
+                environment.reset(over)
 
 
 def check_flight(task: Task, actions: np.ndarray) -> None:

@@ -46,6 +46,7 @@ class DeckLanding(Landing):
     """Land on the deck of a boat; the origin of the frame is where its pad lies in calm water."""
 
     name = "deck_landing"
+    compiled = True
     asks = "touch down on the pad of a boat in waves of sea states 2 to 5, and stay on it"
     starts = "5 m up, within 1.5 m sideways, at rest, any heading"
     ends = (

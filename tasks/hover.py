@@ -34,6 +34,7 @@ class Hover(Task):
     """Hold the origin of the task's frame, heading east."""
 
     name = "hover"
+    compiled = True
     asks = "hold a static waypoint for the whole episode, heading east"
     starts = (
         "within 0.5 m of the waypoint, any heading, tilted up to 0.2 rad, at up to 0.3 m/s and "

@@ -42,6 +42,7 @@ class LsyRace(GateRace):
     """Fly the course of LSY's drone racing of summer 2026."""
 
     name = "lsy_race"
+    compiled = True
     asks = "fly through four small gates among poles; their places change in each episode"
     starts = "at rest within 0.1 m of the start, level and heading east within 6 degrees"
     solved = "through every gate"

@@ -46,6 +46,7 @@ class Perching(Task):
     """Perch on a surface; its middle is the origin of the task's frame."""
 
     name = "perching"
+    compiled = True
     asks = "land with the feet on a surface, level to vertical, and stay on it"
     starts = (
         "2 to 3 m from the surface, in front of a wall and 45 degrees above a level one, up to 0.5 "

@@ -26,6 +26,7 @@ class Race(GateRace):
     """Fly through all gates of a track, in order and in their direction, for some laps."""
 
     name = "race"
+    compiled = True
     asks = "fly through the gates of a track in order, as fast as possible"
     starts = "at rest within 0.1 m of the track's start, any heading, tilted up to 0.3 rad"
     ends = (

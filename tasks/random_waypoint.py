@@ -26,6 +26,7 @@ class RandomWaypoint(Task):
     """Fly to a waypoint in a shell around the start and hold it; the heading is free."""
 
     name = "random_waypoint"
+    compiled = True
     asks = "fly to a random waypoint 1 to 2.5 m away, then hover on it until the end"
     starts = "at rest and level at the origin, any heading"
     ends = "more than 5 m from the waypoint, on the ground"

@@ -20,6 +20,7 @@ class Recovery(Task):
     """Level out, stop and stay off the ground, then fly back to the place above the start."""
 
     name = "recovery"
+    compiled = True
     asks = "come to rest at the origin, 3 m above the ground, after a throw in any attitude"
     starts = "3 m above the ground, any attitude, thrown at up to 3 m/s and 6 rad/s"
     ends = "more than 20 m away, on the ground"

@@ -34,6 +34,7 @@ class StaticWaypoint(Task):
     """Fly to a list of waypoints in order, heading east, and hold the last."""
 
     name = "static_waypoint"
+    compiled = True
     asks = (
         "fly to fixed waypoints in order (default: one, 1.5 m away), then hover on the last until "
         "the end, heading east"

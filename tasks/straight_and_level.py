@@ -35,6 +35,7 @@ class StraightAndLevel(Task):
     """Fly along a line at a set speed; the goal runs ahead of the aircraft on the line."""
 
     name = "straight_and_level"
+    compiled = True
     asks = "fly in a constant direction at constant altitude and 2 m/s for as long as possible"
     starts = "on a line in any direction, level, at 0 to 2 m/s along it, any heading"
     ends = "more than 0.7 m off the altitude or 3 m off the line, on the ground"

@@ -30,6 +30,7 @@ class TargetFollowing(Task):
     """Stay 1 m from a target on a smooth random path; from which side is free."""
 
     name = "target_following"
+    compiled = True
     asks = "keep 1 m from a target that moves along a smooth random path at up to 1.5 m/s"
     starts = "1 m beside the target, at rest and level, any heading"
     ends = "more than 5 m from the target, on the ground"

@@ -35,6 +35,7 @@ class Trajectory(Task):
     curve: ClassVar[Figure]  # each task has its own
 
     name = "trajectory"
+    compiled = True
     asks = "follow a reference in time, heading east: a random curve, a figure or a file"
     starts = (
         "at the first point of the reference, heading east, disturbed by up to 0.05 rad, m/s and "

@@ -279,8 +279,8 @@ def starting(task, start, task_state=None):
 
 
 def variant(base=Hover, options=None, **members):
-    """A task with some methods or members replaced."""
-    body = {"name": base.name, "__annotations__": {}, **members}
+    """A task with some methods or members replaced; compiled where that is possible."""
+    body = {"name": base.name, "__annotations__": {}, "compiled": True, **members}
     return dataclasses.dataclass(frozen=True)(type("Variant", (base,), body))(**(options or {}))
 
 

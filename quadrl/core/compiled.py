@@ -2,8 +2,9 @@
 
 The functions of a task are called twice, with symbols (`quadrl.base.trace`); what they compute
 becomes a C function, and NumPy's rows fly with it. One aircraft alone would spend more time in
-eighty calls of NumPy than in its simulation. A task whose functions do more than arithmetic, or
-look at what may change (`core/purity.py`), runs as it is written, with the same results.
+eighty calls of NumPy than in its simulation. A class of tasks asks for it with `compiled = True`:
+what the functions read besides their arguments then stays as it is when they are called. A task
+whose functions do more than arithmetic runs as it is written, with the same results.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.rotation import Array
 from quadrl.base.trace import NotCompilable, Trace, symbolic
 from quadrl.conditions.scene import Surroundings
-from quadrl.core.purity import Reads
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.step import Step, WrittenStep
 from quadrl.core.step_source import FLAGS, SOURCE, Rows
@@ -34,14 +34,14 @@ from quadrl.engines import native
 from quadrl.engines.native import compiling
 from quadrl.engines.state import State, padded
 
-METHODS = ("measure", "terminated", "error", "succeeded", "reward", "update", "observe")
-"""Functions of a task that a step calls."""
 _REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
 """Tasks that were reported as not compiled."""
 
 
 def compiled(step: WrittenStep, now: Snapshot, episode: Episode, parameters: np.ndarray) -> Step:
-    """Compile the step of a task if that is possible; report a task once for which it is not.
+    """Compile the step of a task that asks for it; report a task once for which it is not possible.
+
+    A class asks for itself, not for those that change its functions.
 
     Args:
         step: The step as it is written.
@@ -49,8 +49,8 @@ def compiled(step: WrittenStep, now: Snapshot, episode: Episode, parameters: np.
         episode: Any of its episodes.
         parameters: Rows that the task sees, (N,) or (1,), read live.
     """
-    if not step.task.compiled:
-        step.not_compiled = "the task has `compiled = False`"
+    if not vars(type(step.task)).get("compiled", False):
+        step.not_compiled = "its class does not say `compiled = True`"
         return step
     try:
         return CompiledStep(step, now, episode, parameters)
@@ -63,7 +63,7 @@ def _reported(step: WrittenStep, reason: str) -> WrittenStep:
     step.not_compiled, task = reason, type(step.task)
     if task not in _REPORTED:
         _REPORTED.add(task)
-        advice = "NumPy runs it; `compiled = False` in the class says that this is meant"
+        advice = "NumPy runs it; without `compiled = True` in the class nobody asks for more"
         message = f"the step of the task {task.name} is not compiled: {reason}; {advice}"
         warnings.warn(message, QuadrlWarning, stacklevel=2)
     return step
@@ -103,8 +103,7 @@ class CompiledStep(Step):
         """Trace and compile.
 
         Args:
-            written: The same step as it is written, which takes over when a number that was read
-                in tracing changes.
+            written: The same step as it is written.
             now: Any snapshot of the task, with those parameters.
             episode: Any of its episodes.
             parameters: Rows that the task sees, (N,) or (1,), read live.
@@ -115,7 +114,7 @@ class CompiledStep(Step):
         """
         world = written.engine, written.inputs, written.estimate, written.scene
         super().__init__(written.task, written.clock, *world)
-        self._written, self._parameters = written, now.parameters
+        self._parameters = now.parameters
         self.count, self.columns = self.engine.num_envs, padded(self.engine.num_envs)
         # State, parameters and surroundings have tables of their own.
         like = dataclasses.replace(now, state=None, parameters=None, around=None)
@@ -128,10 +127,9 @@ class CompiledStep(Step):
         self._around = now.around
         around = records.leaves(now.around) if now.around else []
         self.sensed = records.Columns(0, [*(now.sensed[name] for name in self._shown), *around])
-        kinds = now.task.__class__, now.potentials.__class__
-        self._reads = Reads(self.task, METHODS, kinds)
         (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
-        if (body, trace.constants) != (other, again.constants) or self._reads.changed:
+        constants = np.array([*trace.constants, 0.0])
+        if body != other or constants.tobytes() != np.array([*again.constants, 0.0]).tobytes():
             raise NotCompilable("it gives something else each time")
         try:
             source = SOURCE.format(flags=self.flags, body=body)
@@ -139,7 +137,7 @@ class CompiledStep(Step):
         except NativeError as error:
             raise NotCompilable(str(error).partition("\n")[0]) from error
         self._call.argtypes, self._call.restype = [ctypes.c_void_p, ctypes.c_int64], None
-        self._constants = np.array([*trace.constants, 0.0])
+        self._constants = constants
         # Only what the body reads is copied: of a hundred solids a task may look at one.
         self._wanted = [
             (places[0], np.array([k for k in places if f"sensed[{k} * columns" in body], int))
@@ -280,13 +278,6 @@ class CompiledStep(Step):
         page.now.sensed, page.now.around = sensed, around
         page.now.state, page.now.parameters = self.engine.state, self._parameters
         self.snapshot, self.episode = page.now, page.episode
-
-    def renewed(self) -> Step:
-        """The step as it is written, once a number that was read in tracing has changed."""
-        if not (name := self._reads.changed):
-            return self
-        self._written.begin(self.snapshot, self.episode)
-        return _reported(self._written, f"{name}, which it reads, has changed")
 
     def flatten(self, observation: dict[str, Array]) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""

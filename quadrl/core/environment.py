@@ -305,8 +305,8 @@ class Environment(saving.Copied):
         """Do the first half of a step: command the rotors, or set the setpoint of the loops."""
         if self.engine.forked:
             self.make_anew()
-        self._step = self._begun.renewed()
-        taken, command = self._inputs.action, self._inputs.command
+        inputs = self._begun.inputs
+        taken, command = inputs.action, inputs.command
         taken[:] = validation.action(action, (self.num_envs, self.action_size))
         if self.blowing:
             self.blowing.advance()

@@ -59,10 +59,6 @@ class Step(abc.ABC):
             sensed: What the sensors give now, (N, size) by name.
         """
 
-    def renewed(self) -> Step:
-        """The step to continue with: itself, unless something that it was made from has changed."""
-        return self
-
     def flatten(self, observation: Observation) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""
         return np.concatenate(list(observation.values()), axis=-1, dtype=np.float32)

@@ -77,9 +77,9 @@ class Task(abc.ABC):
     """Whether it asks to stay at the goal, or with one that moves: speed relative to it counts."""
     contact: ClassVar[bool] = False
     """Whether the aircraft can touch anything without the episode being over."""
-    compiled: ClassVar[bool] = True
-    """Whether its step may be compiled (`core/compiled.py`); False for a task whose functions look
-    at anything but their arguments."""
+    compiled: ClassVar[bool] = False
+    """Whether its step is compiled (`core/compiled.py`), which a class asks for itself: what its
+    functions read besides their arguments and options must not change."""
     true_parameters: ClassVar[bool] = False
     """Whether snapshots show the parameters that were drawn, instead of the specified ones."""
     sensors: ClassVar[dict[str, dict[str, Any]]] = {}

@@ -49,6 +49,7 @@ from quadrl.tasks.hover import Hover
 @dataclasses.dataclass(frozen=True)
 class Mine(Hover):
     name = "mine"
+    compiled = True
     def reward(self, before, now, end):
         return super().reward(before, now, end) | {"slow": -np.abs(now.state.velocity[..., 0])}
 

@@ -5,10 +5,6 @@ import dataclasses
 import functools
 import math
 import os
-import random
-import sys
-import threading
-import time
 
 import helpers
 import numpy as np
@@ -21,10 +17,10 @@ from quadrl.base import trace
 from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace, look_up
 from quadrl.conditions.solids import Cylinder, Gate, Pose
-from quadrl.core.compiled import METHODS
 from quadrl.core.environment import Environment
 from quadrl.engines.native import compiling
 from quadrl.tasks.hover import Hover
+from quadrl.testing import check_compiled
 
 STEPS = 40
 SEEN = {"rotor_speed": "estimated", "airspeed": True, "disturbance": True, "action_history": 2}
@@ -219,7 +215,9 @@ def test_what_is_more_than_arithmetic_is_run_as_it_is_written(name, function, re
     helpers.begun(task, 2)  # it is said once for a class of tasks
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", ["measure", "terminated", "error", "succeeded", "reward", "update", "observe"]
+)
 def test_a_fault_of_the_task_is_raised_as_it_is(method):
     def fail(self, *given):
         raise ZeroDivisionError("mine")
@@ -256,110 +254,101 @@ def test_options_change_the_numbers_and_not_the_code(monkeypatch):
     assert len(sources) == 1
 
 
-# --------------------------------------------------------------------- what may change elsewhere
-
-WEIGHT = 1.0
-MAP = {"weight": 1.0}
-PAIR = (1.0, 2.0)
-FIXED = np.array([1.0])
-FIXED.flags.writeable = False
+# ------------------------------------------------------------------------------ who is compiled
 
 
-class Stage:
-    weight = 1.0
+class Lazy:
+    """Answers to every name with what it holds now."""
+
+    held = {"weight": 1.0}
+
+    def __getattr__(self, name):
+        return Lazy.held[name]
 
 
-STAGE = Stage()
+class AttrDict(dict):
+    __getattr__ = dict.__getitem__
 
 
-def weight_of_default(stage=STAGE):
-    return stage.own
+PROXY, SETTINGS_OF = Lazy(), AttrDict(weight=1.0)
+NUMBERS_OF = np.array([1.0])
+VIEW = np.broadcast_to(NUMBERS_OF, 3)  # read-only, of what may change
+LINE = np.polynomial.Polynomial([0.0, 1.0])
 
 
-def put_global(weight):
-    globals().update(WEIGHT=weight)
+def put_number(weight):
+    NUMBERS_OF[:] = weight
 
 
-def closed_over(value):
-    def weight():
-        return value
-
-    def put(fresh):
-        nonlocal value
-        value = fresh
-
-    return weight, put
+def put_slope(weight):
+    LINE.coef[1] = weight
 
 
-CLOSED, PUT = closed_over(1.0)
-FOLLOWED = {  # what a reward reads, how it changes, and what is said of it
-    "a global": (lambda: WEIGHT, put_global, "WEIGHT, which it reads"),
-    "through a function": (lambda: through_a_function(), put_global, "WEIGHT, which it reads"),
-    "by name": (lambda: globals()["WEIGHT"], put_global, "globals"),
-    "a class": (lambda: Stage.weight, lambda w: setattr(Stage, "weight", w), "weight, which"),
-    "a closure": (CLOSED, PUT, "value, which it reads"),
-    "a mapping": (lambda: MAP["weight"], lambda w: MAP.update(weight=w), "it reads MAP"),
-    "an object": (lambda: STAGE.own, lambda w: setattr(STAGE, "own", w), "it reads STAGE"),
-    "a default": (weight_of_default, lambda w: setattr(STAGE, "own", w), "a default of"),
+FOLLOWED = {  # what a reward reads, and how it changes
+    "a lazy proxy": (lambda: PROXY.weight, lambda weight: Lazy.held.update(weight=weight)),
+    "an AttrDict": (lambda: SETTINGS_OF.weight, lambda weight: SETTINGS_OF.update(weight=weight)),
+    "a view": (lambda: VIEW[0], put_number),
+    "a polynomial": (lambda: LINE(1.0), put_slope),
+    "a library": (
+        lambda: float(os.environ["WEIGHT"]),
+        lambda weight: os.environ.update(WEIGHT=str(weight)),
+    ),
 }
-
-
-def through_a_function():
-    return [WEIGHT for _ in range(1)][0]
 
 
 @pytest.mark.parametrize("case", FOLLOWED)
-def test_a_reward_follows_what_it_reads_elsewhere(case):
-    weight, change, said = FOLLOWED[case]
+def test_a_task_of_ones_own_follows_what_it_reads_elsewhere(case):
+    weight, change = FOLLOWED[case]
 
-    def reward(self, before, now, end):
-        return {"own": weight() * (1 + 0 * now.state.speed)}
+    @dataclasses.dataclass(frozen=True)
+    class Mine(Hover):
+        def reward(self, before, now, end):
+            return {"own": weight() * (1 + 0 * now.state.speed)}
 
     change(1.0)
-    task = variant(reward=reward)
-    with pytest.warns(QuadrlWarning, match=said):
-        environment = helpers.begun(task, 2)
-        other = helpers.begun(variant(compiled=False), 2)
-        for value in (1.0, 2.0, 3.0):
-            change(value)
-            done, expected = (helpers.idle(each) for each in (environment, other))
-            np.testing.assert_array_equal(done.reward, value)
-            np.testing.assert_array_equal(done.error, expected.error)
-    change(1.0)
+    environment = helpers.begun(Mine(), 2)  # without a warning
+    assert "`compiled = True`" in environment.not_compiled
+    for value in (1.0, 2.0, 3.0):
+        change(value)
+        np.testing.assert_array_equal(helpers.idle(environment).reward, value)
 
 
-LIBRARIES = {m.__name__: m for m in (math, os, random, sys, threading, time)} | {"np": np}
-ELSEWHERE = {
-    "os.getenv('WEIGHT')": "it reads getenv",
-    "open(os.devnull).close()": "uses open",
-    "os.path.exists('weight')": "it reads exists",
-    "threading.active_count()": "it reads active_count",
-    "sys.getrecursionlimit()": "it reads getrecursionlimit",
-    "np.geterr()['over'] == 'warn'": "it reads geterr",
-    "np.fromfile(os.devnull)": "it reads fromfile",
-    "time.time() > 0": "it reads time",
-    "random.random()": "it reads random",
-    "np.random.rand()": "it reads rand",
-    "__import__('os').getpid()": "uses __import__",
-}
+def test_a_class_asks_for_itself_and_not_for_those_that_change_it():
+    assert not helpers.begun(Hover(), 2).not_compiled
+    assert not helpers.begun(variant(error=lambda self, now: now.time), 2).not_compiled
+    inherited = type("Mine", (Hover,), {"error": lambda self, now: now.time})
+    assert helpers.begun(inherited(), 2).not_compiled
 
 
-@pytest.mark.parametrize("expression", ELSEWHERE)
-def test_a_library_that_reads_something_else_is_recognized(expression):
-    function = f"lambda self, now: now.potentials.distance + 0 * len([{expression}])"
-    task = variant(error=eval(function, LIBRARIES))
-    with pytest.warns(QuadrlWarning, match=ELSEWHERE[expression]):
-        assert helpers.begun(task, 2).not_compiled
+def test_every_task_of_quadrl_is_compiled():
+    for task in tasks.TASKS.values():
+        assert vars(task)["compiled"] is True
 
 
-def test_a_module_that_is_imported_in_a_function_is_not_looked_for():
+def test_a_constant_that_is_not_a_number_is_the_same_each_time():
     def error(self, now):
-        import math as chosen
+        return np.where(now.time > 100.0, np.nan, now.potentials.distance)
 
-        return now.potentials.distance * chosen.pi
+    one, other = pair(members={"error": error}, num_envs=2)
+    assert not one.not_compiled
+    same_flights(one, other)
 
-    with pytest.warns(QuadrlWarning, match="error uses import"):
-        assert helpers.begun(variant(error=error), 2).not_compiled
+
+COUNTED = []
+
+
+def test_the_contract_flies_the_compiled_step_beside_the_written_one():
+    def reward(self, before, now, end):
+        COUNTED.append(1)
+        return {"own": (1.0 if len(COUNTED) < 60 else 2.0) + 0 * now.state.speed}
+
+    check_compiled(variant(options={"time_limit": 1.0}))
+    with pytest.raises(AssertionError, match="compiled = True.*reward"):
+        check_compiled(variant(reward=reward))
+
+
+PAIR = (1.0, 2.0)
+FIXED = np.array([1.0])
 
 
 def test_what_cannot_change_is_compiled():
