@@ -14,6 +14,7 @@ from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, namespace, norm
 from quadrl.base.trace import look_up
 from quadrl.core import rewards
+from quadrl.core.snapshot import Rollout
 from quadrl.core.task import EpisodeEnd, Snapshot, Target
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
@@ -36,6 +37,7 @@ class Race(GateRace):
     solved = "through every gate of every lap"
     targets = (
         Target("success_rate", "successful", 0.95, True),
+        Target("in_time_rate", "within 6 s", 0.95, True),
         Target("race_time_mean_s", "to the last gate", 6.0),
     )
     # No aircraft has the thrust for it within its usual action scale.
@@ -106,6 +108,14 @@ class Race(GateRace):
         """Nearer to the next gate, and what its passage is worth."""
         progress = rewards.weighted(self, ["progress"], before, now)
         return progress | self.passage(before, now, end)
+
+    def metrics(self, rollout: Rollout) -> dict[str, float]:
+        """Also the share that is through within 6 s, and the largest body rates."""
+        in_time = rollout.is_success & (np.nanmax(rollout.remembered["time"], 0) <= 6.0)
+        rates = np.nanmax(np.abs(rollout.body_rate), (0, 1)).tolist()
+        names = (f"largest_{axis}_rate_rad_s" for axis in ("roll", "pitch", "yaw"))
+        whole = dict(zip(names, rates, strict=True)) | {"in_time_rate": float(in_time.mean())}
+        return super().metrics(rollout) | whole
 
     def markers(self, now: Snapshot) -> Sequence[Primitive]:
         """The gates; the next one in another colour."""

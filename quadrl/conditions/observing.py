@@ -96,6 +96,10 @@ class Observing:
         usual = vars(Observing())
         return {name: value for name, value in vars(self).items() if value != usual[name]}
 
+    def for_controller(self) -> Observing:
+        """What a controller observes beside such a policy: rotor speeds as it does, if any."""
+        return Observing(rotor_speed="true" if self.rotor_speed == "true" else "estimated")
+
     def for_policy(self) -> dict[str, Any]:
         """The options that change what a policy observes."""
         own = {name: options for name, options in self.sensors.items() if name != "privileged"}

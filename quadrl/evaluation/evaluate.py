@@ -13,7 +13,6 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_csv
 from quadrl.base.units import length, percent, quantity
 from quadrl.base.validation import number
-from quadrl.conditions.observing import Observing
 from quadrl.control import CONTROLLERS
 from quadrl.control.feasibility import warn_of_unreached
 from quadrl.core.catalogue import make
@@ -82,8 +81,9 @@ class Evaluation:
         return dataclasses.replace(flight, scenario=self.scenario.to_json())
 
     def yardstick(self) -> Evaluation:
-        """The geometric controller in the same episodes; it commands rotors, and sees all."""
-        other = dataclasses.replace(self.scenario, control_mode="rotor", observe=Observing())
+        """The geometric controller in the same episodes; it commands rotors."""
+        seen = self.scenario.observe.for_controller()
+        other = dataclasses.replace(self.scenario, control_mode="rotor", observe=seen)
         return evaluate("geometric", other, episodes=self.metrics["episodes"], seed=self.seed)
 
     def save_csv(self, path: str | Path) -> Path:

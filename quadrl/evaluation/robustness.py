@@ -10,6 +10,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from quadrl import control
 from quadrl.aircraft.aerodynamics import NONE
 from quadrl.aircraft.presets import resolve
 from quadrl.base.errors import QuadrlError
@@ -258,7 +259,8 @@ def _flown(
     """What flies and what it flies, by names that differ.
 
     Task and aircraft are those of the first, but an action means what it meant in a policy's
-    training, and a policy observes what it observed there.
+    training, and a policy observes what it observed there. Controllers know the rotor speeds as
+    the policy does that knows least.
     """
     named = controller.items() if isinstance(controller, Mapping) else None
     several = controller if isinstance(controller, (list, tuple)) else [controller]
@@ -291,4 +293,9 @@ def _flown(
         while name in flown:
             name, k = f"{own} {k}", k + 1
         flown[str(name)] = flies, scenario
+    seen = [scenario.observe for _, scenario in flown.values()]
+    seen = next((one for one in seen if one.rotor_speed != "true"), seen[0]).for_controller()
+    for name, (flies, scenario) in flown.items():
+        if isinstance(flies, control.Controller) and given.get("observe") is None:
+            flown[name] = flies, dataclasses.replace(scenario, observe=seen)
     return flown

@@ -31,6 +31,7 @@ from quadrl.learning.defaults import WIDE
 from scripts.reports import report
 from scripts.reports.report import FIGURES, Result, Runs, say, table
 
+SEEN: Conditions = {"observe": {"rotor_speed": "estimated"}}  # by controllers, as by the policies
 NOISE = RANDOMIZATIONS["light"].noise  # of the state estimate
 NEAR, MOST = 0.5, 1.0  # [m]: errors within are summed up, a long way is none; the largest sum
 NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
@@ -101,6 +102,7 @@ def flown(flyer: Any, task: str, condition: Conditions, episodes: int) -> Result
     made = tasks.make(task)
     engine = "mujoco" if made.contact else "free_flight"
     given: Any = UNDISTURBED | condition | {"engine": engine}
+    given |= SEEN if flyer == "geometric" or isinstance(flyer, Integrating) else {}
     _, controller, scenario = setting(flyer, made, **given)
     each = flights(fly(controller, scenario, episodes=episodes, seed=FRESH))
     reached = {"success": float(each["success"].mean())}
@@ -109,17 +111,19 @@ def flown(flyer: Any, task: str, condition: Conditions, episodes: int) -> Result
     return reached | {"least_height_m": means_of_behaviour(each)["least_height_m"]}
 
 
-def robust(runs: Runs, episodes: int = 1000) -> None:
+def robust(runs: Runs = (), episodes: int = 1000) -> None:
     """Fly policies for uncertain aircraft, of several seeds, beside the tuned controller.
 
     `quadrl train TASK --variant robust --seeds 645:650 --out runs/robust` trains those of a task.
 
     Args:
-        runs: Run folders; what was measured of tasks that none of them has is kept.
+        runs: Run folders; what was measured of tasks that none of them has is kept. Without any,
+            the controller alone flies, in every task.
         episodes: Flights of each seed in each condition.
     """
-    rows, trained = [], [Policy.load(run) for run in runs if (run / FILE).is_file()]
-    only = [*dict.fromkeys(policy.task for policy in trained)]
+    trained = [Policy.load(run) for run in runs if (run / FILE).is_file()]
+    only = [*dict.fromkeys(policy.task for policy in trained)] or report.load("tuning")["tasks"]
+    rows = [x for x in report.load("robust")["rows"] if not trained and x["seed"] != "controller"]
     for task in only:
         seeds: Result = {str(x.metadata["seed"]): x for x in trained if x.task == task}
         for seed in (*seeds, "controller"):

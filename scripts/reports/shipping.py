@@ -31,8 +31,14 @@ policy is a safetensors file, with a .json of all its settings beside it, in
 """
 POLICIES = """The mean action in {flown} fresh episodes, in the conditions of the training. The last
 column lists the targets of the task that the policy misses in the same number of undisturbed
-episodes. {source}"""
+episodes. Rows "as flown" have one disturbance that real aircraft meet. {source}"""
 CALM: Any = {"weather": "calm", "randomization": "none"}
+AS_FLOWN: dict[str, Any] = {  # each alone, by the policies of tasks that have no robust one
+    "as flown, 10 ms late": {"randomization": {"command_delay": 0.01}},
+    "as flown, 20 ms late": {"randomization": {"command_delay": 0.02}},
+    "as flown, real air": {"aerodynamics": "full"},
+    "as flown, randomization `light`": {"randomization": "light"},
+}
 
 
 def ship(runs: Runs, out: Path = SHIPPED) -> None:
@@ -96,36 +102,47 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     return f"{said} successful"
 
 
-def shipped(episodes: int = 300, only: tuple[str, ...] = ()) -> None:
+def shipped(episodes: int = EPISODES, only: tuple[str, ...] = ()) -> None:
     """Fly every policy that comes with quadrl, as it was trained and where nothing disturbs it.
 
     Args:
-        episodes: Flights of each in each of the two conditions.
+        episodes: Flights of each in each condition.
         only: Names of tasks, beside what was measured of the others; by default all.
     """
     rows = []
     files = (file for task in only or [""] for file in SHIPPED.glob(f"{task}*.safetensors"))
     for name in sorted(file.stem for file in files):
         found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, CALM))
-        rows.append({"policy": name} | found | {"undisturbed": still})
-        say(f"{name}: {missed(tasks.TASKS[found['task']].targets, still)}")
+        targets = tasks.TASKS[found["task"]].targets
+        alone = {} if (SHIPPED / f"{found['task']}_robust.safetensors").exists() else AS_FLOWN
+        late = {k: evaluate(name, episodes=episodes, **x).metrics for k, x in alone.items()}
+        shown = {"task", *FIGURES, *(target.metric for target in targets)}
+        late = {words: {x: of[x] for x in of if x in shown} for words, of in late.items()}
+        rows.append({"policy": name} | found | {"undisturbed": still, "as_flown": late})
+        say(f"{name}: {missed(targets, still)}")
     rows = report.beside("shipped", {"rows": rows}, only)["rows"]
     report.save("shipped", {"rows": sorted(rows, key=lambda row: row["policy"])})
 
 
 def policies(name: str = "") -> str:
     """The policies that ship for a task, or for every one: how they fly and what they miss."""
-    result = report.load("shipped")
-    targets = tasks.TASKS[name].targets if name else ()
-    own, rows = [x for x in targets if x.metric not in FIGURES], []
+    result, rows = report.load("shipped"), []
+    own = [x for x in tasks.TASKS[name].targets if x.metric not in FIGURES] if name else []
+    figures = (*FIGURES, *(x.metric for x in own))
     flown = [row for row in result["rows"] if name in ("", row["task"])]
+
+    def cells(found: Any) -> list[str]:
+        without = "position_error_m" * (found.get("task") in RACES)
+        return [quantity(x, found[x]) if x in found and x != without else "" for x in figures]
+
     for row in flown:
         made = json.loads((SHIPPED / f"{row['policy']}.json").read_text())["command"]
-        without = "position_error_m" if row["task"] in RACES else ""
-        cells = [quantity(x, row[x]) if x in row and x != without else "" for x in FIGURES]
-        cells += [quantity(x.metric, row[x.metric]) for x in own]
-        cells += [missed(tasks.TASKS[row["task"]].targets, row["undisturbed"]) or "none"]
-        rows.append((f"`{row['policy']}`", f"`{made}`", *cells))
+        still = missed(tasks.TASKS[row["task"]].targets, row["undisturbed"]) or "none"
+        rows.append((f"`{row['policy']}`", f"`{made}`", *cells(row), still))
+        if name:
+            rows += [(words, "", *cells(of), "") for words, of in row["as_flown"].items()]
+    if name == "race":
+        rows += [(x["who"], "", *cells(x), "") for x in report.load("race")["published"]]
     if not rows:
         return "None comes with quadrl."
     head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "targets missed")

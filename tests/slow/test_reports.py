@@ -124,6 +124,11 @@ def test_policies_for_uncertain_aircraft_fly_beside_the_controller():
     robustness.robust((*report.RUNS.iterdir(),), episodes=3)
     rows = report.load("robust")["rows"]
     assert len(rows) == 3 * len(robustness.UNSURE)
+    robustness.robust(episodes=4)  # the controller alone, beside what is known of the policies
+    again = report.load("robust")["rows"]
+    assert [row["seed"] for row in again] == [row["seed"] for row in rows]
+    assert again[: 2 * len(robustness.UNSURE)] == rows[: 2 * len(robustness.UNSURE)]
+    assert again[-1] != rows[-1]  # in four flights instead of three
     calm = {row["seed"]: row["success"] for row in rows if row["condition"] == "nothing"}
     assert calm.pop("controller") == 1.0
     assert set(calm.values()) == {0.0} and len(calm) == 2  # two batches teach nothing
@@ -175,19 +180,27 @@ def test_an_integral_takes_away_the_lasting_error_of_an_unknown_mass():
 
 
 def test_policies_that_ship_are_judged_where_nothing_disturbs_them(tmp_path, monkeypatch):
-    for name in ("hover_ppo", "random_waypoint_robust"):
+    for name in ("hover_ppo", "random_waypoint_robust", "race_apg"):
         for end in (".json", ".safetensors"):
             shutil.copy(SHIPPED / f"{name}{end}", tmp_path)
     monkeypatch.setattr(shipping, "SHIPPED", tmp_path)
     shipping.shipped(episodes=4)
-    hover, robust = report.load("shipped")["rows"]
+    hover, race, robust = report.load("shipped")["rows"]
+    assert robust["as_flown"] == {} and [*race["as_flown"]] == [*hover["as_flown"]]
+    late = quadrl.evaluate("race", episodes=4, randomization={"command_delay": 0.02}).metrics
+    assert race["as_flown"]["as flown, 20 ms late"]["in_time_rate"] == late["in_time_rate"] == 0
+    report.save("race", {"published": [{"who": "others", "race_time_mean_s": 5.14}]})
+    said = shipping.policies("race").splitlines()
+    assert any(line.startswith("| as flown, 20 ms late | | 0 % |") for line in said)
+    (others,) = (line for line in said if line.startswith("| others | |"))
+    assert "5.1 s" in others
     assert hover["undisturbed"]["episodes"] == 4
     flown = quadrl.evaluate("random_waypoint_robust", episodes=4).metrics  # as it was trained
     assert robust["circling_m_s"] == pytest.approx(flown["circling_m_s"], 1e-4)
     assert robust["undisturbed"]["circling_m_s"] < 0.05 < robust["circling_m_s"]  # in wind
     asked = Target("yaw_rate_rad_s", "yaw rate over the last 2 s", 1e-6)
     monkeypatch.setattr(RandomWaypoint, "targets", (asked,))
-    head, _, first, second = shipping.policies().splitlines()[:4]
+    head, _, first, _, second = shipping.policies().splitlines()[:5]
     assert "| circling over the last 2 s |" in head and first.endswith("| none |")
     assert "yaw rate over the last 2 s 0.0" in second and "rad/s, asked at most" in second
     assert "hover" not in shipping.policies("random_waypoint")

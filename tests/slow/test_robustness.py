@@ -96,6 +96,23 @@ def test_all_fly_the_same_episodes(card):
     assert axis["flown"]["a"]["success"][axis["levels"].index(1.0)] == flown["success_rate"]
 
 
+@pytest.mark.parametrize(
+    ("policies", "seen"), [(["hover"], "true"), (["hover", "hover_robust"], "estimated")]
+)
+def test_a_controller_knows_the_rotor_speeds_as_the_policies_beside_it_do(policies, seen):
+    what = {"episodes": 1, "disturbances": [], "recovery": False, "progress": False}
+    flown = quadrl.robustness(["geometric", *policies], "hover", **what).found["scenarios"]
+    own = Scenario.of(flown.pop("geometric controller")).observe
+    assert own.given() == ({} if seen == "true" else {"rotor_speed": seen})
+    for name, scenario in flown.items():  # as in their trainings
+        assert Scenario.of(scenario).observe.given() == quadrl.Policy.pretrained(
+            "hover", variant="robust" if "robust" in name else "ideal"
+        ).conditions.get("observe", {})
+    if seen == "estimated":  # as the command's comparison does
+        beside = quadrl.evaluate("hover_robust", episodes=1).yardstick().scenario.observe
+        assert beside.given() == {"rotor_speed": seen}
+
+
 def test_an_action_means_what_it_meant_in_training():
     usual = quadrl.Policy.pretrained("hover")
     options = {"vehicle_options": {"action_scale": 50.0}}

@@ -186,6 +186,11 @@ def test_figures_of_races_by_hand():
     assert figures["gates_passed_mean"] == pytest.approx(11 / 3)
     # Second laps: 6.5 - 2 and 5 - 3.
     assert figures["flying_lap_mean_s"] == pytest.approx(3.25)
+    assert figures["in_time_rate"] == pytest.approx(1 / 3)  # 5 s, of 6.5 s, a crash and 5 s
+    rates = np.array([[[1.0, -9.0, 0.0], [0.0, 2.0, 3.0]], [[-4.0, 0.0, 1.0], [np.nan] * 3]])
+    turning = rollout.task.metrics(dataclasses.replace(rollout, body_rate=rates))
+    largest = [turning[f"largest_{axis}_rate_rad_s"] for axis in ("roll", "pitch", "yaw")]
+    assert largest == [4.0, 9.0, 3.0]
     none = dataclasses.replace(rollout, is_success=~done & done)
     assert math.isnan(none.task.metrics(none)["race_time_mean_s"])
     assert "flying_lap_mean_s" not in summarize(dataclasses.replace(rollout, task=Race(**OWN)))
