@@ -64,13 +64,14 @@ def test_velocity_turn_and_normal_of_the_deck_are_those_of_its_way():
     np.testing.assert_allclose(slope, lean, atol=2e-3)
 
 
-def on_the_deck(count, engine="mujoco", falls=0.0, aside=0.0, **waves):
-    """Aircraft just above the pad, which they approach at a speed [m/s]."""
+def on_the_deck(count, engine="mujoco", falls=0.0, aside=0.0, slips=0.0, **waves):
+    """Aircraft just above the pad, which they approach at a speed [m/s], and slip over at one."""
     made = Environment("deck_landing", num_envs=count, engine=engine, **waves)
     made.reset(seed=1)
     deck = deck_of(made.snapshot.task, made.snapshot.time)
     place = made.task.goal(made.snapshot) + 0.003 * deck.normal + [aside, 0.0, 0.0]
     velocity = deck.velocity - np.reshape(falls, (-1, 1)) * deck.normal
+    velocity = velocity + np.reshape(slips, (-1, 1)) * [0.0, 1.0, 0.0]
     start = {"position": place, "velocity": velocity, "quaternion": upright(deck.normal)}
     made.reset(seed=1, start=start)
     return made
@@ -110,6 +111,14 @@ def test_a_touchdown_is_remembered_and_a_hard_one_fails():
     np.testing.assert_allclose(seen.speed, [0.2, 0.8], atol=0.05)
     np.testing.assert_allclose(seen.miss, 0.1, atol=0.02)
     np.testing.assert_allclose(seen.upright, 1.0, atol=1e-3)
+
+
+def test_a_touchdown_sideways_is_as_hard_as_a_straight_one():
+    """At 0.2 m/s down and 0.3 or 0.6 m/s aside: 0.36 or 0.63 m/s in all, where 0.5 is the most."""
+    made = on_the_deck(2, falls=0.2, slips=[0.3, 0.6], lowest_waves=0.1, highest_waves=0.1)
+    done = made.step(np.full((2, 4), -1.0))
+    assert (made.snapshot.task.down == 1).all()
+    assert done.terminated.tolist() == [False, True] and not done.is_success.any()
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,28 @@ def test_a_hold_ends_with_the_episode_and_stays_with_a_saved_state():
     np.testing.assert_array_equal(made.snapshot.touch, touch)
 
 
+def test_an_aircraft_that_comes_off_the_surface_has_failed():
+    made, place = touching(90)
+    done = fly(made, 3)
+    assert made.snapshot.held.all() and not done.terminated.any()
+    made.engine.qpos[1, :3] += 1.2 * perching.OFF * normal(90)  # the other one stays
+    done = made.step(np.zeros((2, made.action_size)))
+    assert made.snapshot.held.all()
+    assert done.terminated.tolist() == [False, True] and not done.is_success.any()
+
+
+def test_success_takes_the_time_at_rest_and_no_control_step_more():
+    made, _ = touching(60, lean=(0.0, 0.0))
+    held = 0
+    for _ in range(60):
+        done = made.step(np.zeros((2, made.action_size)))
+        held += made.snapshot.held[0]
+        if done.terminated.all():
+            break
+    assert done.is_success.all()
+    assert held == math.ceil(made.task.rest_time / made.vehicle.control_timestep - 1e-9)
+
+
 def test_episodes_begin_before_the_surface():
     made = Environment("perching", num_envs=200, seed=3)
     made.reset()

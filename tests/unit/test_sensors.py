@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from test_observing import ACTIONS, seen
 
+from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.rotation import to_body, to_world
 from quadrl.conditions import sensors
-from quadrl.conditions.sensors import Sensor, register_sensor
+from quadrl.conditions.sensors import Sensor, felt, register_sensor
 from quadrl.core.environment import Environment
 from quadrl.tasks.hover import Hover
 
@@ -29,6 +30,13 @@ class Compass(Sensor):
         return self.strength * to_body(
             now.true.rotation, np.broadcast_to(NORTH, (len(now.wind), 3))
         )
+
+
+@register_sensor
+class Pole(Compass):
+    """Another compass."""
+
+    name = "pole"
 
 
 @register_sensor
@@ -174,6 +182,26 @@ def test_noise_is_new_in_each_sample_and_a_bias_lasts():
     assert abs(noise.std() - 1) < 0.05  # of 7200 numbers
     # Of numbers that are less their mean of six, two go together by -1/5; 1200 pairs.
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1] + 0.2) < 5 / np.sqrt(1200)
+
+
+def test_no_two_streams_of_errors_are_the_same():
+    """Noise and bias of two sensors, in the first samples of 2,000 episodes, go apart."""
+    count, errors = 2000, []
+    for given in ({"noise": 0.1}, {"bias": 0.1}):
+        both = {"sensors": {"compass": given, "pole": given}}
+        environment = helpers.begun("hover", count, observe=both)
+        state = environment.engine.state
+        exact = to_body(state.rotation, np.broadcast_to(NORTH, (count, 3)))
+        errors += [(environment.sensed[name] - exact)[:, 0] for name in ("compass", "pole")]
+    together = np.corrcoef(errors)
+    assert abs(together - np.eye(4)).max() < 5 / np.sqrt(count)
+
+
+def test_the_disturbance_compares_a_step_with_the_mean_of_its_thrusts():
+    """Thrust rises from nothing to 2 g within the step: it gained g, so nothing else acted."""
+    last = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    now = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 2 * GRAVITY]])
+    np.testing.assert_allclose(felt(np.zeros((1, 3)), last, now, 0.05, 1.0), 0.0, atol=1e-12)
 
 
 def test_another_sensor_beside_it_changes_nothing():
