@@ -35,6 +35,10 @@ def needs_dm_control():
         pytest.importorskip("dm_control", reason=reason)
 
 
+FOURTH_ORDER = mujoco.mj_version() >= 4_000_000
+"""Whether MuJoCo's RK4 turns a free body with fourth order; before MuJoCo 4 it was second."""
+
+
 # ------------------------------------------------------------------- motions, flown by an engine
 
 ALIKE = ("mark", "size", "rotor_count", "effects", *parameters.DERIVED)

@@ -339,8 +339,8 @@ def test_flights_are_those_of_the_exact_solution(name):
     start = np.concatenate(start, axis=-1)
     end = reference.fly(vehicle, start, command, 0.3, motion.wind, tolerance=1e-9)
     calm = dataclasses.replace(vehicle, aerodynamics=Aerodynamics())
-    # 1e-4 of the thrust, what the Newton steps lack, is 3e-4 m/s after 0.3 s at most. MuJoCo turns
-    # the attitude with second order.
+    # 1e-4 of the thrust, what the Newton steps lack, is 3e-4 m/s after 0.3 s at most. MuJoCo 3
+    # turns the attitude with second order.
     for engine, limit in (("mujoco", 5e-4), ("free_flight", 1e-4)):
         apart = []
         for flown in (vehicle, calm):
