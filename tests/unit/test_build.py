@@ -1,6 +1,7 @@
 """The build of the compiled part: its cache, and what it leaves behind."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -134,8 +135,9 @@ def test_what_a_wheel_brings_is_checked_as_well(prebuilt, cache):
 
 
 def test_for_another_mujoco_it_is_said_which_one_needs_no_compiler(no_compiler, monkeypatch):
+    brought = re.escape(mujoco.__version__)
     monkeypatch.setattr(mujoco, "__version__", "3.99.0")
-    with pytest.raises(native.NativeError, match=r"with mujoco 3\.\d+\.\d+ none would be needed"):
+    with pytest.raises(native.NativeError, match=rf"with mujoco {brought} none would be needed"):
         compiling.build()
 
 

@@ -10,10 +10,10 @@ import pytest
 import reference
 import solutions
 
-# Ratios of the errors of a step and of a quarter of it. Before 4, MuJoCo's RK4 turns the attitude
-# once a step by the mean of the stages' body rates, so the attitude and what follows from it are of
-# second order, 1/16; body rates and rotor speeds know no attitude and are of fourth order, 1/256, as
-# all of free flight and of MuJoCo 4 is. A wrong coefficient would leave an error that stays.
+# Ratios of the errors of a step and of a quarter of it. The RK4 of MuJoCo 3 turns the attitude once
+# a step by the mean of the stages' body rates, so the attitude and what follows from it are of
+# second order, 1/16; body rates and rotor speeds know no attitude and are of fourth order, 1/256,
+# as all of free flight and of MuJoCo 4 is. A wrong coefficient would leave an error that stays.
 FOURTH = dict.fromkeys(reference.QUANTITIES[:5], 256)
 SECOND = dict.fromkeys(("position", "attitude", "velocity", "body_velocity"), 16)
 ORDERS = {"mujoco": FOURTH if helpers.FOURTH_ORDER else SECOND, "free_flight": FOURTH}
