@@ -11,9 +11,9 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, stack
-from quadrl.base.validation import choice
 from quadrl.engines.rng import FULL_TURN, Rng
-from quadrl.tasks.references import AXES, PIECE, WAVES, Reference, Table, pieces, read
+from quadrl.tasks.recordings import SURE, Recorded, apart, smoothed
+from quadrl.tasks.references import AXES, PIECE, WAVES, Reference, Table, pieces
 
 SINES = {
     # SimpleFlight: 2 m x 1 m, begun in the crossing, where it is fastest.
@@ -27,6 +27,7 @@ FIGURES = ("random", *SINES, "zigzag", "pentagram", "polynomial")
 SHORTEST, LOWEST = 1.0, 0.3  # period of a figure [s]; height of a reference above the ground [m]
 TRACKS, SEED = 32, 0  # curves of a figure that is drawn once and for all
 SLOWEST, FASTEST = 0.2, 4.5  # [rad/s], sines of a random curve
+ROUNDING = 1e-3  # [m], by which smoothing may bring a curve out of its room
 CLIMB = 0.3  # share of the largest acceleration with which it climbs and sinks
 
 
@@ -34,23 +35,19 @@ CLIMB = 0.3  # share of the largest acceleration with which it climbs and sinks
 class Figure(Table):
     """A figure, the curve of a file, or random curves."""
 
-    name: str  # one of FIGURES, or the path of a file
+    name: str  # one of FIGURES, or the file of a record
     cycle: float  # [s], a period, for which it is looked at
     acceleration: float  # [m/s^2], the largest of a random curve
     extent: float  # [m], its largest distance from its middle along each axis
 
     @classmethod
-    def of(cls, figure: str, seconds: float, name: str, *others: float) -> Figure:
+    def of(cls, figure: str | Recorded, seconds: float, *others: float) -> Figure:
         """Make the curves of a figure, or the one of a csv file.
 
         Args:
-            figure: One of FIGURES, or a path.
+            figure: One of FIGURES, or what was recorded of a file.
             seconds: For which it is flown.
-            name: What a refusal calls the figure.
             *others: Cycle, acceleration and extent.
-
-        Raises:
-            QuadrlError: There is no such figure or file, or the file has a gap or a jump.
         """
         made, count, turns = np.zeros((1, 4, AXES)), 1, None
         if figure in ("zigzag", "pentagram"):
@@ -58,16 +55,16 @@ class Figure(Table):
             made, count = pieces(*points, 1, seconds)
         elif figure == "polynomial":
             made, count = pieces(*_drawn(1.5, 4.0, 0.5, seconds), 5, seconds)
-        elif figure not in FIGURES:
-            if not figure.endswith(".csv"):
-                choice(name, figure, [*FIGURES, "the path of a .csv file"])
-            times, rows = read(name, figure)
-            made, count = pieces(times, rows[..., :AXES], 3, seconds)
-            if rows.shape[-1] > AXES:
-                turns = pieces(times, np.unwrap(rows[..., AXES:], axis=1), 3, seconds)[0][..., 0]
+        elif isinstance(figure, Recorded):
+            times, points = figure.points()
+            whole, count = pieces(times[None], points[None], 3, seconds)
+            made = np.ascontiguousarray(whole[..., :AXES])
+            if whole.shape[-1] > AXES:
+                turns = np.ascontiguousarray(whole[..., AXES])
                 turns.flags.writeable = False
         made.flags.writeable = False
-        return cls(made, count, turns, figure, *others)
+        name = figure.file if isinstance(figure, Recorded) else figure
+        return cls(made, count, turns, name, *others)
 
     def reference(self, rng: Rng, like: Array) -> Reference:
         """The references of episodes, rows as in an array (N, 3)."""
@@ -87,7 +84,10 @@ class Figure(Table):
             none = np.zeros(1, dtype=int)
             one = self.reference(Rng(none, none), np.zeros((1, AXES)))
             return self.at(one, np.linspace(0.0, self.cycle, 400), order)
-        return self.pieces[:, order] * math.factorial(order)
+        if not order:
+            return self.pieces[:, 0]
+        first = 2 * self.pieces[:, 2]  # linear in each piece
+        return np.concatenate([first, first + 6 * PIECE * self.pieces[:, 3]])
 
     def check_room(self, task: str, box: float, lowest: float) -> None:
         """Refuse what leaves the box [m] of a task or sinks below a height [m].
@@ -97,8 +97,9 @@ class Figure(Table):
         """
         place = self.sampled(0)
         most = np.abs(place).max(axis=0)
-        if most.max() > box or place[:, 2].min() < lowest:
-            reason = f"it goes {', '.join(f'{x:.3g}' for x in most)} m far in x, y and z"
+        if most.max() > box + ROUNDING or place[:, 2].min() < lowest - ROUNDING:
+            texts = (max(apart(x, box), apart(x, -lowest), key=len) for x in most)
+            reason = f"it goes {', '.join(texts)} m far in x, y and z"
             allowed = f"such that it stays within {box:g} m (box), {LOWEST:g} m above the ground"
             random = self.name == "random"
             option, value = ("extent", self.extent) if random else ("figure", self.name)
@@ -112,14 +113,32 @@ class Figure(Table):
         """
         rotor, up = parameters.rotor, np.array([0.0, 0.0, GRAVITY])
         thrust = (rotor.thrust_coefficient * rotor.max_speed**2).sum(axis=-1) / parameters.mass
-        asked = np.linalg.norm(self.sampled(2) + up, axis=-1).max() / GRAVITY
-        if asked > (there := float(thrust.min()) / GRAVITY):
-            reason = f"it asks for {asked:.3g} weights of thrust, and the aircraft has {there:.3g}"
+        asked, there = self._weights(up), float(thrust.min()) / GRAVITY
+        if asked > there * (1 + SURE):
+            texts = apart(asked, there), apart(there, asked)
+            reason = f"it asks for {texts[0]} weights of thrust, and the aircraft has {texts[1]}"
             blamed = {"random": ("acceleration", self.acceleration, "smaller")}
             blamed |= dict.fromkeys(SINES, ("period", self.cycle, "longer"))
             usual = "figure", self.name, "a slower one"
+            if self.name not in FIGURES and (calm := self._calm(up, there)):
+                remedy = f"without noise or corners, as figure_tolerance={calm:g} makes it"
+                usual = "figure", self.name, remedy
             option, value, allowed = blamed.get(self.name, usual)
             raise QuadrlError(reason, name=f"{task} {option}", value=value, allowed=allowed)
+
+    def _weights(self, up: np.ndarray) -> float:
+        return float(np.linalg.norm(self.sampled(2) + up, axis=-1).max()) / GRAVITY
+
+    def _calm(self, up: np.ndarray, there: float) -> float:
+        """The first tolerance [m] with which the curve of a file is feasible; 0 for too fast."""
+        last = max(5, np.flatnonzero(self.pieces[:, 1].any(axis=-1)).max(initial=0) + 2)
+        times, place = PIECE * np.arange(last), self.pieces[:last, 0]
+        for tolerance in (1e-3, 2e-3, 5e-3, 1e-2):
+            calmer = smoothed(times, place, tolerance)[2]
+            made, count = pieces(times[None], calmer[None], 3, times[-1])
+            if dataclasses.replace(self, pieces=made, count=count)._weights(up) <= there:
+                return tolerance
+        return 0.0
 
     def _random(self, rng: Rng) -> Reference:
         """Two sines in each coordinate, from slow ones to those of the largest acceleration."""

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
-import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, stack
 from quadrl.base.trace import look_up
 from quadrl.core.snapshot import TaskState
@@ -19,9 +15,6 @@ from quadrl.engines.state import State
 
 AXES, WAVES = 3, 2  # sines in each coordinate
 PIECE = 0.02  # [s], length of a piece of a table
-# From one row of a file to the next [s], [m/s], [rad/s].
-LONGEST_GAP, FASTEST, FASTEST_TURN = 0.5, 20.0, 10.0
-FILE = "a csv file: a line of names, then at least 4 rows of time [s], x, y, z [m], maybe yaw [rad]"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,43 +117,3 @@ def pieces(
         pieces[-1, 1:] = 0.0
         tracks.append(pieces)
     return np.concatenate(tracks), count
-
-
-def read(name: str, path: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times (1, n) [s] and rows (1, n, 3 or 4) of a csv file: place [m], maybe heading [rad].
-
-    Raises:
-        QuadrlError: There is no such file, or it has a gap or a jump. `name` is what it is called.
-    """
-
-    def refusal(reason: str, allowed: str = FILE) -> QuadrlError:
-        return QuadrlError(reason, name=name, value=path, allowed=allowed)
-
-    try:
-        head, *lines = Path(path).read_text(encoding="utf-8-sig").splitlines() or [""]
-        with warnings.catch_warnings(action="ignore"):  # there may be no rows
-            rows = np.loadtxt(lines, delimiter=",", ndmin=2)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
-        raise refusal(reason) from error
-    if re.match(r"\s*[-+.\d]", head):
-        raise refusal(f"its first line, {head}, has no names")
-    if rows.shape[1] not in (4, 5) or len(rows) < 4:
-        each = f" of {rows.shape[1]} numbers" if len(rows) else ""
-        raise refusal(f"it has {len(rows)} rows{each}")
-    for k in np.flatnonzero(~np.isfinite(rows).all(axis=1))[:1]:
-        raise refusal(f"row {k + 1} is {rows[k].tolist()}", "finite numbers")
-    if rows[0, 0] != 0:
-        raise refusal(f"row 1 is at {rows[0, 0]:g} s", "from time 0 on")
-    step = np.diff(rows[:, 0])
-    for k in np.flatnonzero(step <= 0)[:1]:
-        reason = f"from row {k + 1} to {k + 2} it goes from {rows[k, 0]:g} to {rows[k + 1, 0]:g} s"
-        raise refusal(reason, "times that grow from row to row")
-    speed = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1) / step
-    turn = abs(np.diff(np.unwrap(rows[:, 4:], axis=0), axis=0)).sum(axis=1) / step  # 0 without yaw
-    wrong = (step > LONGEST_GAP) | (speed > FASTEST) | (turn > FASTEST_TURN)
-    for k in np.flatnonzero(wrong)[:1]:
-        how = f"{step[k]:.3g} s at {speed[k]:.3g} m/s and {turn[k]:.3g} rad/s"
-        allowed = f"of up to {LONGEST_GAP:g} s at up to {FASTEST:g} m/s and {FASTEST_TURN:g} rad/s"
-        raise refusal(f"from row {k + 1} to {k + 2} it takes {how}", f"steps {allowed}")
-    return rows[None, :, 0], rows[None, :, 1:]

@@ -19,7 +19,8 @@ from quadrl.core.snapshot import Rollout, statistic
 from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Snapshot, Target, Task
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
-from quadrl.tasks.figures import LOWEST, SHORTEST, SINES, Figure
+from quadrl.tasks.figures import FIGURES, LOWEST, SHORTEST, SINES, Figure
+from quadrl.tasks.recordings import Recorded, recorded
 from quadrl.tasks.references import AXES, Reference
 
 AHEAD, EVERY = 10, 0.1  # samples of the reference, and the time between them [s]
@@ -74,9 +75,12 @@ class Trajectory(Task):
     """Reward for each m/s by which the speed relative to the reference falls."""
     distance_weight: float = 20.0
     """Cost of each metre of distance, for each 0.05 s."""
-    figure: str = "random"
+    figure: str | Recorded = dataclasses.field(default_factory=lambda: "random")
     """The reference: random, lemniscate, vertical, zigzag, pentagram, polynomial, or the path of a
-    csv file with rows of time [s], x, y and z [m], and optionally the heading from east [rad]."""
+    csv file, whose curve is then kept."""
+    figure_tolerance: float = 0.0
+    """Distance at which the curve may pass the rows of a csv file, as a root mean square [m]; 0 for
+    that of their last digit, 0.1 mm at least."""
     period: float = 0.0
     """Period of a lemniscate or a vertical figure [s]; 0 for the usual one, 5.5 or 10 s."""
     acceleration: float = 4.0
@@ -94,13 +98,15 @@ class Trajectory(Task):
 
     def __post_init__(self) -> None:
         """Make the reference and validate it."""
+        name, given = f"{self.name} figure", (self.figure, FIGURES, self.figure_tolerance)
+        object.__setattr__(self, "figure", recorded(name, *given))
         super().__post_init__()
         if self.period and (self.figure not in SINES or self.period < SHORTEST):
             allowed = f"0, or at least {SHORTEST:g} s with the figures {', '.join(SINES)}"
             raise QuadrlError(name=f"{self.name} period", value=self.period, allowed=allowed)
-        name, seconds = f"{self.name} figure", self.time_limit + AHEAD * EVERY
+        seconds = self.time_limit + AHEAD * EVERY
         known = self.cycle, self.acceleration, self.extent
-        object.__setattr__(self, "curve", Figure.of(self.figure, seconds, name, *known))
+        object.__setattr__(self, "curve", Figure.of(self.figure, seconds, *known))
         self.curve.check_room(self.name, self.box, LOWEST - self.altitude)
 
     def check(self, parameters: Parameters) -> None:
@@ -110,7 +116,7 @@ class Trajectory(Task):
     @property
     def cycle(self) -> float:
         """Time from which a flight counts as settled [s]: a period, or half of the time limit."""
-        usual = SINES[self.figure][0] if self.figure in SINES else self.time_limit / 2
+        usual, _ = SINES.get(str(self.figure), (self.time_limit / 2, ()))
         return self.period or usual
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Reference]:

@@ -77,8 +77,8 @@ def test_a_star_is_flown_at_its_speed_and_a_zigzag_through_its_corners():
     assert not environment.not_compiled
 
 
-def write(path, rows):
-    path.write_text("time,x,y,z\n" + "\n".join(",".join(map(str, row)) for row in rows))
+def write(path, rows, names="time,x,y,z"):
+    path.write_text(names + "\n" + "\n".join(",".join(map(str, row)) for row in rows))
     return str(path)
 
 
@@ -101,15 +101,16 @@ STEADY = [(0.1 * k, 0.01 * k, 0, 0) for k in range(9)]
     ("rows", "message"),
     [
         (STEADY[:5] + [(1.5, 0.05, 0, 0)], "from row 5 to 6 it takes 1.1 s"),  # a gap
-        (STEADY[:5] + [(0.5, 9.0, 0, 0)], "from row 5 to 6 it takes 0.1 s at 89.6 m/s"),  # a jump
-        ([(*row, 3.0 * (row[0] > 0.4)) for row in STEADY], "from row 5 to 6 it .* and 30 rad/s"),
-        (STEADY[:5] + [(0.3, 0.05, 0, 0)], "from row 5 to 6 it goes from 0.4 to 0.3 s"),
+        (STEADY[:5] + [(0.5, 9.0, 0, 0)], "from 0.4 to 0.5 s it goes at 89.6 m/s"),  # a jump
+        (STEADY[:5] + [(0.3, 0.05, 0, 0)], "from row 5 to 6 it takes -0.1 s"),
         ([], "it has 0 rows$"),
         (STEADY[:5] + [(0.5, "", 0, 0)], "could not convert"),
-        (STEADY[:5] + [(0.5, "nan", 0, 0)], "finite numbers; row 6 is .0.5, nan, 0.0, 0.0"),
+        (STEADY[:5] + [(0.5, "nan", 0, 0)], "finite numbers .*; row 6 is .0.5, nan, 0.0, 0.0"),
+        (STEADY[:5] + [(0.5, 1e300, 0, 0)], "of up to 1e.09; row 6"),
         (STEADY[1:], "from time 0 on; row 1 is at 0.1 s"),
-        (STEADY[:3], "at least 4 rows"),
-        ([row[:3] for row in STEADY], "9 rows of 3 numbers"),
+        (STEADY[:3], "must be 5 rows at least; it has 3 rows"),
+        ([row[:3] for row in STEADY], "invalid column index"),
+        ([(*row, 0.0) for row in STEADY], "a row has more numbers than time,x,y,z has names"),
         ([(t, 50 * x, y, z) for t, x, y, z in STEADY], "within 3 m"),
         ([(t, x, y, -2.9) for t, x, y, _ in STEADY], "0.3 m above the ground"),
     ],
@@ -136,11 +137,16 @@ def test_an_impossible_reference_is_refused(options, name, message):
         tasks.make("trajectory", **options)
 
 
-@pytest.mark.parametrize("head", ["0,0,0,0", ""])
-def test_a_file_without_names_or_rows_is_refused_and_nothing_else_is_said(head, tmp_path, recwarn):
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [("0,0,0,0", "no names"), ("", "no column x, but $"), ("t,x,y,z", "0 rows")],
+)
+def test_a_file_without_names_or_rows_is_refused_and_nothing_else_is_said(
+    head, message, tmp_path, recwarn
+):
     path = tmp_path / "own.csv"
-    path.write_text(head + "\n0.1,0,0,0" * 5 * bool(head))
-    with refused("trajectory figure", str(path), match="no names" if head else "0 rows"):
+    path.write_text(head + "\n0.1,0,0,0" * 5 * head.startswith("0"))
+    with refused("trajectory figure", str(path), match=message):
         tasks.make("trajectory", figure=str(path))
     assert not recwarn
 
@@ -169,7 +175,7 @@ def test_a_file_may_have_headings_which_a_policy_follows_that_knows_only_east(tm
     heading = 2.0 + 0.5 * time  # past 180 degrees more than once
     wrapped = np.angle(np.exp(1j * heading))
     rows = np.stack([time, np.sin(time), np.cos(time), 0.1 * time, wrapped], axis=-1)
-    figure = write(tmp_path / "own.csv", rows)
+    figure = write(tmp_path / "own.csv", rows, "time,x,y,z,yaw")
     environment, at = flown(figure=figure)
     np.testing.assert_allclose(environment.task.curve.heading(np.array([7.77])), 5.885, atol=1e-6)
     seen = environment.task.observe(environment.snapshot)
