@@ -27,7 +27,7 @@ from quadrl.tasks.landing import PAD, Landing
 from quadrl.tasks.sea import DECK, Waves
 
 WASH_MARGIN = 0.3  # [m/s], which the yardstick controllers keep from the fastest sinking
-NORMAL = ObservationTerm(3, "1", "unit vector out of the deck, body frame")
+NORMAL = ObservationTerm(3, "1", "unit vector out of the deck, body frame", "R^T normal")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -46,9 +46,15 @@ class GateRace(Task):
     observation = {
         **ROTATION,
         **MOTION,
-        "through": ObservationTerm(3, "1", "unit vector through the next gate, body frame"),
-        "next_goal": ObservationTerm(3, "m", "to the centre of the gate after next, body frame"),
-        "next_through": ObservationTerm(3, "1", "unit vector through that gate, body frame"),
+        "through": ObservationTerm(
+            3, "1", "unit vector through the next gate, body frame", "R^T n"
+        ),
+        "next_goal": ObservationTerm(
+            3, "m", "to the centre of the gate after next, body frame", "R^T (centre - p)"
+        ),
+        "next_through": ObservationTerm(
+            3, "1", "unit vector through that gate, body frame", "R^T n"
+        ),
     }
 
     time_limit: float = 30.0

@@ -78,7 +78,7 @@ class LsyRace(GateRace):
     trainings = {}, {"training_options": WITH_ROOM}
     observation = {
         **GateRace.observation,
-        "poles": ObservationTerm(12, "m", "to each pole, x, y and z, body frame"),
+        "poles": ObservationTerm(12, "m", "to each pole, x, y and z, body frame", "R^T (top - p)"),
     }
 
     time_limit: float = 15.0

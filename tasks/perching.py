@@ -30,7 +30,7 @@ SPREAD = 0.2  # of what is beside a way, as a share of what is beside a start
 WORST = 3.0  # times what a limit is exceeded by, or [m/s] of what strikes: more costs no more
 OFF = 1.0  # [m], from the middle of the surface
 ROOM = 0.3  # [m], between the surface and the centre of an aircraft at the start
-NORMAL = ObservationTerm(3, "1", "unit vector out of the surface, body frame")
+NORMAL = ObservationTerm(3, "1", "unit vector out of the surface, body frame", "R^T normal")
 
 
 @dataclasses.dataclass(frozen=True)

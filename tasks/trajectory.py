@@ -25,7 +25,8 @@ from quadrl.tasks.references import AXES, Reference
 
 AHEAD, EVERY = 10, 0.1  # samples of the reference, and the time between them [s]
 MEANING = "from the aircraft to the reference in 0.1 s, 0.2 s and so on to 1 s, body frame"
-PREVIEW = {"ahead": ObservationTerm(AXES * AHEAD, "m", MEANING)}
+FORMULA = "R^T (reference(time + 0.1 k) - p), k = 1 to 10"
+PREVIEW = {"ahead": ObservationTerm(AXES * AHEAD, "m", MEANING, FORMULA)}
 LINE = (0.95, 0.55, 0.20, 0.35)
 
 

@@ -104,7 +104,7 @@ export class Flight {
   // What is seen first, from where the aircraft is.
   first() {
     this.#read();
-    this.modelled.set(this.act);
+    this.modelled.set(this.estimates ? this.vehicle.hoverSpeed : this.act);
     this.late = Array.from({ length: this.vehicle.deadSteps }, () => this.act.slice());
     this.call("first");
     this.call("rest");

@@ -23,7 +23,7 @@ class Export:
     """Format: mjcf for the aircraft as a MuJoCo model; onnx or torch for the policy."""
     out: Path | None = None
     """Output file, with the extension of the format: .xml, .onnx or .pt2. By default the name of
-    the aircraft or the task or, if that exists, NAME-2 and so on; a file that is named here is
+    the aircraft or the policy or, if that exists, NAME-2 and so on; a file that is named here is
     overwritten."""
 
     def run(self) -> None:

@@ -24,6 +24,14 @@ from quadrl.engines.engine import Engine
 from quadrl.engines.rng import normal, uniform
 from quadrl.engines.state import Frame, State
 
+SYMBOLS = {
+    "R": "rotation matrix from body to world, R^T its transpose; of the estimated attitude",
+    "T": "control_timestep [s]",
+    "command": "of an action: clip(at_0 + action (change where action > 0, else -change_down), "
+    "least, most)",
+    "p, v": "position [m] and velocity [m/s], estimated; in the world frame, as goal and wind are",
+}
+"""What the letters in the formulas of exports mean."""
 Memory = dict[str, Array]
 Kind = TypeVar("Kind", bound=type)
 
@@ -77,6 +85,9 @@ class Sensor(abc.ABC):
     """Whether it is an entry of the observation."""
     last: ClassVar[bool] = False
     """Whether it reads the task's entries or what is observed; a task cannot see such a sensor."""
+    formula: ClassVar[str] = ""
+    """How a sample follows, step by step, for those who fly without quadrl: exports say it beside
+    the sensor's options. `SYMBOLS` has its letters."""
 
     noise: float = 0.0
     """Standard deviation of the error of each sample, in the sensor's unit."""

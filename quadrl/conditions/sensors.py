@@ -37,6 +37,12 @@ class RotorSpeed(Sensor):
     """Rotor speeds, for the estimate."""
 
     name, unit, measured, shown = "rotor_speed", "rad/s", False, False
+    formula = (
+        "source true: speed as measured. estimated: speed = hover_speed as an episode begins, and "
+        "in each control step speed += (1 - exp(-T lag)) (asked - speed), asked = min(command, "
+        "max_speed), lag = lag_up where asked > speed, else lag_down; at once: neither dead_time "
+        "nor a delay is in it. Where loops command the rotors, T is the physics_timestep"
+    )
 
     source: Literal["true", "estimated"] = "true"
     """True, or what follows from the commands with the lag that is specified."""
@@ -58,8 +64,11 @@ class RotorSpeed(Sensor):
         return sizes.rotors
 
     def begin(self, now: Moment) -> Memory:
-        """A model starts from the true speeds."""
-        return {} if self.source == "true" else {"speed": now.true.rotor_speed}
+        """A model starts from hover: no aircraft knows its true speeds."""
+        if self.source == "true":
+            return {}
+        hover = now.parameters.rotor.hover_speed
+        return {"speed": np.broadcast_to(hover, np.shape(now.true.rotor_speed))}
 
     def follow(
         self, memory: Memory, specified: Parameters, command: Array, seconds: float
@@ -90,6 +99,10 @@ class StateEstimate(Sensor):
     """
 
     name, unit, measured, shown = "estimate", "", False, False
+    formula = (
+        "position, attitude, velocity and body rate as estimated on board; their errors and ages "
+        "in training are those of the scenario's randomization"
+    )
 
     def __post_init__(self) -> None:
         """Validate the options."""
@@ -132,6 +145,7 @@ class Entries(Sensor):
     """The task's own entries of the observation."""
 
     name, unit, last = "state", "", True
+    formula = "the task's entries of the estimated state, side by side"
 
     def width(self, sizes: Sizes) -> int:
         """All entries that are seen."""
@@ -147,6 +161,7 @@ class RelativeRotorSpeed(Sensor):
     """Rotor speeds less that of hover, over that of hover; in the place of the task's own entry."""
 
     name = "relative_rotor_speed"
+    formula = "speed / hover_speed - 1, speed of the sensor rotor_speed"
 
     @property
     def hides(self) -> tuple[str, ...]:
@@ -166,7 +181,7 @@ class RelativeRotorSpeed(Sensor):
 class Rotation(Sensor):
     """Rotation matrix from body to world, row by row."""
 
-    name, size = "rotation", 9
+    name, size, formula = "rotation", 9, "R, row by row"
 
     def sense(self, now: Moment) -> Array:
         """From the estimated attitude."""
@@ -177,7 +192,7 @@ class Rotation(Sensor):
 class Airspeed(Sensor):
     """Velocity through the air, body frame."""
 
-    name, size, unit = "airspeed", 3, "m/s"
+    name, size, unit, formula = "airspeed", 3, "m/s", "R^T (v - wind)"
 
     def sense(self, now: Moment) -> Array:
         """From the estimated velocity."""
@@ -189,6 +204,12 @@ class Disturbance(Sensor):
     """Acceleration that weight and specified thrust do not explain, body frame."""
 
     name, size, unit = "disturbance", 3, "m/s^2"
+    formula = (
+        "R^T felt; felt = 0 as an episode begins, and after each control step felt += share "
+        "((v - last v) / T - (thrust + last thrust) / 2 - (0, 0, -9.81) - felt), "
+        "share = 1 - exp(-T / smoothing), or 1 with smoothing 0; thrust = R sum(thrust_coefficient "
+        "speed^2 axis) / mass, of the rotors as specified, speed of the sensor rotor_speed"
+    )
 
     smoothing: float = 0.1
     """Time constant of its low pass [s]; with 0 it is what the last control step shows."""
@@ -228,6 +249,11 @@ class Aim(Sensor):
     """
 
     name, size, unit, last = "aim", 3, "m", True
+    formula = (
+        "R^T (goal - p + sum); sum = 0 as an episode begins, and after each control step, where "
+        "|goal - p| < near, sum += gain T (goal - p); then each number of sum is clipped to "
+        "[-most, most]"
+    )
 
     gain: float = 0.5
     """What the place moves on in a second, of the offset [1/s]."""
@@ -290,6 +316,7 @@ class ActionHistory(History):
     """The last actions, the newest first."""
 
     name = "action_history"
+    formula = "the last `length` actions, clipped to [-1, 1], the newest first; zeros before them"
 
     def width(self, sizes: Sizes) -> int:
         """All numbers of all actions."""
@@ -313,6 +340,10 @@ class ObservationHistory(History):
     """The observations before, the newest first; the first one stands for those before it."""
 
     name, unit, last = "observation_history", "", True
+    formula = (
+        "the `length` observations before the present one, without histories, the newest first; "
+        "the first one stands for those before it"
+    )
 
     def width(self, sizes: Sizes) -> int:
         """All numbers of all observations."""

@@ -110,7 +110,7 @@ class Rotor(ControlMode):
             for k, rotor in enumerate(vehicle.rotors)
         )
 
-    def setpoint(self, state: State, action: Array) -> Array:
+    def values(self, action: Array) -> Array:
         """The commands of `Vehicle.rotor_command`, within the limits of the rotors."""
         return self.vehicle.rotor_command(action)
 

@@ -64,6 +64,8 @@ class Observer:
         self._channels = {k: Channel(s, sizes, randomizer, timestep) for k, s in sensors.items()}
         channels = self._channels.values()
         others = [c for c in channels if c.sensor.shown and c.sensor.name != "state"]
+        self.sensors = [*sensors.values()]
+        """The sensors in that order."""
         self._early = [channel for channel in channels if not channel.sensor.last]
         late = [channel for channel in channels if channel.sensor.last]
         # The task's entries come first; the other sensors are given what is measured.
@@ -76,7 +78,8 @@ class Observer:
                 allowed = f"a name that no entry of the task {task.name} has"
                 raise QuadrlError(name="sensor", value=sensor.name, allowed=allowed)
             meaning = str(type(sensor).__doc__).partition("\n")[0]
-            self.terms[sensor.name] = ObservationTerm(channel.width, sensor.unit, meaning)
+            term = ObservationTerm(channel.width, sensor.unit, meaning, sensor.formula)
+            self.terms[sensor.name] = term
         self.layout = layout(self.terms, rotors)
         """Where each of them stands in it."""
         self.sensed: dict[str, Array] = {}

@@ -8,15 +8,21 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from quadrl import __version__, tasks
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.rotors import Rotor
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import free_name, write_whole
 from quadrl.base.validation import choice
+from quadrl.conditions.sensor import SYMBOLS, Sensor
 from quadrl.core.environment import Environment
 from quadrl.evaluation.controllers import comes_with_quadrl, policy_of
 from quadrl.evaluation.policy import Policy, shipped
+from quadrl.evaluation.policy_file import CLIP
 from quadrl.learning.description import describe_observation
 from quadrl.rendering.video import checked
 
@@ -35,8 +41,9 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
         what: A `Policy`, what `quadrl.train` returned, a run folder, a .safetensors file, or the
             name of a policy that comes with quadrl; for "mjcf" also a Vehicle, or its name.
         to: "mjcf" for the aircraft as a model of MuJoCo, "onnx" or "torch" for the policy.
-        out: The file; one that exists is overwritten. By default NAME.xml, TASK.onnx or TASK.pt2
-            in this folder or, where that exists, NAME-2.xml and so on.
+        out: The file; one that exists is overwritten. By default NAME.xml, .onnx or .pt2 in this
+            folder, by the name of the aircraft, or of the policy, its run or else its task; where
+            that exists, NAME-2.xml and so on.
 
     Returns:
         The path of the file.
@@ -51,7 +58,9 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
         vehicle = found if isinstance(found, Vehicle) else found.scenario.vehicle
         stem, given = vehicle.name, (vehicle, __version__)
     elif isinstance(found, Policy):
-        stem, given = found.task, (found, described(found))
+        path = Path(what if isinstance(what, (str, Path)) else found.task).resolve()
+        path = path.parent if path.name == "policy.safetensors" else path
+        stem, given = path.name.removesuffix(".safetensors"), (found, described(found))
     else:
         reason = f"an aircraft has no network: give a policy for {to}"
         raise QuadrlError(reason, name="to", value=to, allowed=f"mjcf for {found.name}")
@@ -88,12 +97,14 @@ def _found(what: Any) -> Vehicle | Policy:
 
 
 def described(policy: Policy) -> dict[str, str]:
-    """Describe what the numbers of a policy mean, each entry in JSON.
+    """Describe what the numbers of a policy mean, each entry in JSON: enough to fly without quadrl.
 
     Returns:
         scenario, as `Scenario.of` takes it; observation, as `describe_observation` gives it;
-        action: name, unit, meaning, value at 0 and changes at 1 and at -1 of each number;
-        control_timestep [s]; quadrl: its version.
+        sensors: as `described_sensor` gives them, in the order in which they sense; symbols: what
+        the letters of formulas mean; normalisation, which is part of the network; action: name,
+        unit, meaning, value at 0, changes at 1 and at -1, least and largest value of each number;
+        aircraft, as `described_aircraft` gives it; control_timestep [s]; quadrl: its version.
 
     Raises:
         QuadrlError: Its task is not known here, or does not fit it.
@@ -101,16 +112,44 @@ def described(policy: Policy) -> dict[str, str]:
     environment = Environment(policy.scenario, seed=0)
     policy.check_fits(environment)
     mode = environment.control_mode
-    reach = (numbers.tolist() for numbers in (mode.centre, mode.scale, -mode.scale_down))
+    ends = mode.values(np.outer([-1.0, 1.0], np.ones(mode.size)))
+    reach = np.transpose([mode.centre, mode.scale, -mode.scale_down, *ends]).tolist()
+    names = "at_0", "change", "change_down", "least", "most"
     action = [
-        {**dataclasses.asdict(term), "at_0": at_0, "change": up, "change_down": down}
-        for term, at_0, up, down in zip(mode.terms, *reach, strict=True)
+        dataclasses.asdict(term) | dict(zip(names, numbers, strict=True))
+        for term, numbers in zip(mode.terms, reach, strict=True)
     ]
+    sensors = environment.observer.sensors if environment.observer else []
     whole = {
         "scenario": policy.scenario.to_json(),
         "observation": describe_observation(environment),
+        # What only the critic sees is left out.
+        "sensors": [described_sensor(one) for one in sensors if one.name != "privileged"],
+        "symbols": SYMBOLS,
+        "normalisation": {
+            "formula": "clip((observation - mean) / deviation, -clip, clip)",
+            **{"clip": CLIP, "mean": policy.mean.tolist(), "deviation": policy.deviation.tolist()},
+        },
         "action": action,
+        "aircraft": described_aircraft(environment.vehicle),
         "control_timestep": environment.vehicle.control_timestep,
         "quadrl": __version__,
     }
     return {name: json.dumps(value) for name, value in whole.items()}
+
+
+def described_aircraft(vehicle: Vehicle) -> dict[str, Any]:
+    """Describe an aircraft as it is specified: all its numbers, and what a rotor's mean."""
+    whole = dataclasses.asdict(vehicle)
+    for rotor, speed in zip(whole["rotors"], vehicle.hover_speed.tolist(), strict=True):
+        rotor["hover_speed"] = speed
+    own = {"hover_speed": "Speed that carries the weight [rad/s]"}
+    frame = "x forward, y left, z up, the origin at the centre of mass"
+    return whole | {"units": "SI", "frame": frame, "meaning": docstrings(Rotor) | own}
+
+
+def described_sensor(sensor: Sensor) -> dict[str, Any]:
+    """Describe a sensor: its name, formula and options, and what these mean."""
+    options, texts = dataclasses.asdict(sensor), docstrings(type(sensor))
+    meaning = {name: texts.get(name, "") for name in options}
+    return {"name": sensor.name, "formula": sensor.formula, **options, "meaning": meaning}

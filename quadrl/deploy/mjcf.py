@@ -27,7 +27,9 @@ HEAD = """<!--
   ctrl, one number a rotor, 0 to 1: the thrust that is asked for, as a share of the rotor's largest
   thrust, which is (speed / max_speed)^2; act: the share that it gives now.
   An action a of a policy of quadrl is, for a control_timestep (custom/numeric, SI units),
-  ctrl = (clip(hover_speed + action_scale * a, 0, max_speed) / max_speed)^2.
+  ctrl = (clip(hover_speed + action_scale * a, least_command, most_command) / max_speed)^2.
+  rotor_position and rotor_axis are x, y, z of one rotor after the other, in the body frame;
+  rotor_spin is 1 where a rotor turns counter-clockwise about its axis, -1 where clockwise.
   Left out: the lag is of the square of the speed, not of the speed; what the air does to rotors
   (inflow, rotor drag, flapping, ground effect, vortex ring), their gyroscopic moments, turbulence,
   the dead time (custom/numeric dead_time [s], to delay ctrl by), delays, noise, randomization.
@@ -66,8 +68,14 @@ def spec(vehicle: Vehicle) -> mujoco.MjSpec:
         actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
         actuator.gainprm[0] = rotor.thrust_coefficient * rotor.max_speed**2  # [N]
         actuator.ctrlrange = (0, 1)
-    for name in ("hover_speed", "max_speed", "action_scale", "control_timestep", "dead_time"):
-        whole.add_numeric(name=name, data=np.atleast_1d(getattr(vehicle, name)))
+    names = "hover_speed", "max_speed", "action_scale", "control_timestep", "dead_time"
+    numbers = {name: getattr(vehicle, name) for name in names}
+    ends = vehicle.rotor_command(np.outer([-1.0, 1.0], np.ones(vehicle.rotor_count)))
+    numbers |= dict(zip(("least_command", "most_command"), ends, strict=True))
+    for name in ("position", "axis", "spin"):
+        numbers[f"rotor_{name}"] = np.ravel([getattr(rotor, name) for rotor in vehicle.rotors])
+    for name, data in numbers.items():
+        whole.add_numeric(name=name, data=np.atleast_1d(data))
     whole.add_key(name="hover", qpos=(0, 0, HEIGHT, 1, 0, 0, 0), act=share, ctrl=share)
     return whole
 

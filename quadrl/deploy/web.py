@@ -169,6 +169,7 @@ def describe(vehicle: Vehicle) -> dict[str, Any]:
         "mass": vehicle.mass,
         "actionScale": vehicle.action_scale,
         "maxSpeed": vehicle.max_speed.tolist(),
+        "hoverSpeed": vehicle.hover_speed.tolist(),
         "spin": [rotor.spin for rotor in vehicle.rotors],
         "axis": [list(rotor.axis) for rotor in vehicle.rotors],
         "radius": [rotor.radius for rotor in vehicle.rotors],

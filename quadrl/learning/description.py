@@ -19,9 +19,10 @@ def describe(task: Task) -> dict[str, Any]:
 
     Returns:
         name, asks, starts, ends, solved (texts); time_limit [s]; training: settings that have other
-        defaults with this task; observation: name, first, last, unit and meaning of each
-        term of the flat vector; action (text); reward: name, weight (None if there is no option for
-        it) and meaning of each term; options: name, value and meaning of the others.
+        defaults with this task; observation: name, first, last, unit, meaning and
+        formula of each term of the flat vector; action (text); reward: name, weight (None if there
+        is no option for it) and meaning of each term; options: name, value and meaning of the
+        others.
     """
     environment, texts = Environment(task, seed=0), docstrings(type(task))
     values = dataclasses.asdict(task)
@@ -45,11 +46,11 @@ def describe(task: Task) -> dict[str, Any]:
 
 
 def describe_observation(environment: Environment) -> list[dict[str, Any]]:
-    """Describe each term of the flat observation: name, first and last index, unit and meaning."""
+    """Describe each term of the flat observation: name, place, unit, meaning and formula."""
     seen = environment.observer.terms if environment.observer else environment.task.observation
     return [
         {"name": name, "first": where.start, "last": where.stop - 1, "unit": seen[name].unit,
-         "meaning": seen[name].meaning}
+         "meaning": seen[name].meaning, "formula": seen[name].formula}
         for name, where in environment.layout.items()
     ]  # fmt: skip
 

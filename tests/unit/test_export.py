@@ -1,8 +1,11 @@
 """What leaves quadrl flies without it: MuJoCo's own actuators, ONNX and torch."""
 
+import dataclasses
 import functools
 import json
+import re
 import sys
+from pathlib import Path
 
 import helpers
 import mujoco
@@ -17,10 +20,12 @@ from processes import python
 import quadrl
 from quadrl import cli
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.control.modes import CONTROL_MODES, to_save
+from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
-from quadrl.deploy.export import export
+from quadrl.deploy.export import described, export
 from quadrl.engines.mjcf import compile_model
-from quadrl.evaluation.policy import Policy
+from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.rollout import fly
 
 LAYOUTS = pytest.mark.parametrize("vehicle", helpers.LAYOUTS.values(), ids=helpers.LAYOUTS)
@@ -218,13 +223,144 @@ def test_the_file_says_what_its_numbers_are():
     terms = {term["name"]: term for term in said["observation"]}
     assert [*terms][-2:] == ["aim", "action_history"]
     assert terms["velocity"] == {
-        "name": "velocity", "first": 6, "last": 8, "unit": "m/s", "meaning": "body frame"
+        "name": "velocity", "first": 6, "last": 8, "unit": "m/s", "meaning": "body frame",
+        "formula": "R^T v",
     }  # fmt: skip
     assert terms["action_history"]["last"] == policy.size - 1
     hover = policy.scenario.aircraft.hover_speed
     for number, speed in zip(said["action"], hover, strict=True):
         assert (number["unit"], number["at_0"]) == ("rad/s", speed)
         assert (number["change"], number["change_down"]) == (90.0, -90.0)
+
+
+def said_by(path: Path) -> dict:
+    """The metadata of an ONNX file, read by nothing of quadrl."""
+    return {entry.key: json.loads(entry.value) for entry in onnx.load(path).metadata_props}
+
+
+def commanded(said: dict, action: np.ndarray) -> np.ndarray:
+    """Commands (n, k) of actions, as the metadata say."""
+    names = "at_0", "change", "change_down", "least", "most"
+    zero, up, down, least, most = (np.array([one[k] for one in said["action"]]) for k in names)
+    return np.clip(zero + np.where(action > 0, up, -down) * action, least, most)
+
+
+@pytest.mark.parametrize("mode", CONTROL_MODES)
+@pytest.mark.parametrize("vehicle", ["racer", "hexa"])
+def test_an_action_is_the_command_that_the_file_says(mode, vehicle):
+    environment = Environment("hover", vehicle=vehicle, control_mode=mode, seed=0)
+    size, named = (environment.size, environment.action_size), to_save(mode)
+    policy = linear(*size, vehicle=vehicle, control_mode=named)
+    said = said_by(export(policy, "onnx"))
+    action = np.random.default_rng(0).uniform(-1, 1, (50, environment.action_size))
+    action = np.concatenate([action, np.sign(action)])
+    expected = environment.control_mode.values(action)
+    np.testing.assert_allclose(commanded(said, action), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_flight_by_the_metadata_alone_is_quadrls():
+    policy = Policy.pretrained("race")
+    paths = {to: export(policy, to) for to in ("onnx", "torch", "mjcf")}
+    said, extra = said_by(paths["onnx"]), {"action": "", "aircraft": ""}
+    torch.export.load(paths["torch"], extra_files=extra)
+    assert all(json.loads(text) == said[name] for name, text in extra.items())
+    model = mujoco.MjModel.from_xml_path(str(paths["mjcf"]))
+    names = "hover_speed", "action_scale", "least_command", "most_command"
+    hover, scale, least, most = (model.numeric(name).data for name in names)
+    session = onnxruntime.InferenceSession(paths["onnx"])
+    environment = Environment(policy.scenario, seed=0)
+    observation, over, at_ends = environment.reset(), False, 0
+    while not over:
+        given = {"observation": environment.flatten(observation)}
+        action = session.run(["action"], given)[0]
+        done = environment.step(action)
+        observation, flown = done.observation, environment.snapshot.rotor_command
+        np.testing.assert_allclose(commanded(said, action), flown, rtol=1e-6)
+        by_model = np.clip(hover + scale * action, least, most)
+        np.testing.assert_allclose(by_model, flown, rtol=1e-4)  # the file has six digits
+        at_ends += (flown <= 1e-9).any() + (flown >= 0.999999 * most).any()
+        over = (done.terminated | done.truncated).item()
+    assert done.is_success.all() and at_ends > 10  # it is flown to the limits of the rotors
+
+
+@LAYOUTS
+def test_rotors_stand_and_turn_as_the_files_say(vehicle):
+    """By the numbers of a file the aircraft hovers: it is carried, and nothing turns it."""
+    model, data = models(vehicle)[0], {}
+    policy = linear(14 + 4 + vehicle.rotor_count, vehicle.rotor_count, vehicle=vehicle)
+    aircraft = json.loads(described(policy)["aircraft"])
+    assert "x forward, y left, z up" in aircraft["frame"]
+    assert "counter-clockwise" in aircraft["meaning"]["spin"]
+    for name in aircraft["rotors"][0]:
+        data[name] = np.array([rotor[name] for rotor in aircraft["rotors"]])
+    for name in ("position", "axis", "spin"):
+        shape = data[name].shape
+        written = model.numeric(f"rotor_{name}").data.reshape(shape)
+        np.testing.assert_allclose(written, data[name], rtol=1e-5, atol=1e-9)
+    squares = data["hover_speed"][:, None] ** 2
+    pull = data["thrust_coefficient"][:, None] * squares * data["axis"]
+    reaction = (data["spin"] * data["torque_coefficient"])[:, None] * squares * data["axis"]
+    moment = np.cross(data["position"], pull) - reaction
+    weight = aircraft["mass"] * 9.81
+    assert pull[:, 2].sum() == pytest.approx(weight, rel=1e-9)
+    np.testing.assert_allclose(moment.sum(axis=0), 0, atol=1e-9 * weight)
+    # MuJoCo's actuators agree on which way each one turns.
+    turns = np.sign(model.actuator_gear[:, 5] * model.actuator_gear[:, 2])
+    np.testing.assert_array_equal(turns, -data["spin"])
+
+
+@pytest.mark.parametrize("name", [file.stem for file in shipped()])
+def test_every_term_of_a_shipped_policy_has_its_formula(name):
+    said = {k: json.loads(text) for k, text in described(Policy.pretrained(name)).items()}
+    assert all(term["formula"] for term in (*said["observation"], *said["sensors"]))
+    assert len(said["normalisation"]["mean"]) == 1 + said["observation"][-1]["last"]
+    sensors = {sensor["name"]: sensor for sensor in said["sensors"]}
+    assert "privileged" not in sensors and bool(sensors) == ("robust" in name)
+    if sensors:  # constants stand beside the formulas that have them, defaults too
+        for sensor, constants in (
+            ("aim", ("gain", "near", "most")),
+            ("disturbance", ("smoothing",)),
+            ("rotor_speed", ("source", "delay", "rate")),
+            ("action_history", ("length",)),
+        ):
+            assert {*constants} <= sensors[sensor].keys()
+        assert sensors["aim"]["gain"] == 0.5 and sensors["disturbance"]["smoothing"] == 0.02
+
+
+@functools.cache
+def on_the_page(name: str):
+    """A class of the page for those who fly without quadrl."""
+    text = (Path(__file__).parents[2] / "docs" / "clients.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    (code,) = [block for block in blocks if f"class {name}" in block]
+    exec(code, found := {})
+    return found[name]
+
+
+@pytest.mark.parametrize("name", [file.stem for file in shipped() if "robust" in file.stem])
+def test_a_robust_policy_flies_by_its_file_alone(name):
+    """With late commands and estimates, noise, wind, and other numbers than those specified."""
+    policy = Policy.pretrained(name)
+    late = {"command_delay": (0.02, 0.02), "observation_delay": (0.02, 0.02)}
+    drawn = dataclasses.replace(policy.scenario.randomization, **late, rate_delay=(0.01, 0.01))
+    environment = Environment(policy.scenario, seed=0, randomization=drawn)
+    alone = on_the_page("Robust")(export(name, "onnx"))
+    observation, steps, over = environment.reset(), 0, False
+    while not over:
+        state, vector = environment.observer.frame.state, np.hstack([*observation.values()])
+        target = environment.task.target_velocity(environment.snapshot)
+        rotation, offset = state.rotation[0], state.rotation[0] @ observation["goal"][0]
+        motion = np.array(state.velocity[0]), np.array(state.body_rate[0])
+        command = alone(rotation, *motion, offset, 0.0 if target is None else target[0])
+        np.testing.assert_allclose(alone.seen, vector[0], rtol=0, atol=1e-6)
+        acts = policy(environment.flatten(observation))
+        asked = environment.control_mode.values(acts)[0]
+        done = environment.step(alone.acted[None])
+        for own in (asked, environment.snapshot.rotor_command[0]):
+            np.testing.assert_allclose(command, own, rtol=1e-6)
+        observation, over = done.observation, (done.terminated | done.truncated).item()
+        steps += 1
+    assert steps > 20
 
 
 def test_the_same_policy_is_the_same_file():
@@ -239,6 +375,9 @@ def test_files_have_names_of_their_own_unless_they_are_given():
     assert export("hexa", "mjcf").name == "hexa.xml"
     assert export("hexa", "mjcf").name == "hexa-2.xml"
     assert export(Policy.pretrained("hover"), "onnx").name == "hover.onnx"
+    for name in ("hover_robust", "hover_gae", "hover"):  # of the task is one already
+        kept = "hover-2.onnx" if name == "hover" else f"{name}.onnx"
+        assert export(name, "onnx").name == kept
     kept = export("hexa", "mjcf", "hexa.xml")
     assert kept.name == "hexa.xml" and "paper" not in kept.read_text()
     assert "The aircraft paper" in export("paper", "mjcf", "hexa.xml").read_text()
@@ -253,7 +392,10 @@ def test_the_command_says_what_it_wrote(capsys, tmp_path):
 def test_a_run_is_exported_by_its_folder(tmp_path):
     (tmp_path / "run").mkdir()
     make_remembering().save(tmp_path / "run" / "policy.safetensors")
-    assert export(tmp_path / "run", "onnx").name == "hover.onnx"
+    assert export(tmp_path / "run", "onnx").name == "run.onnx"
+    assert export(tmp_path / "run" / "policy.safetensors", "onnx").name == "run-2.onnx"
+    (tmp_path / "run" / "policy.safetensors").rename("best one.safetensors")
+    assert export("best one.safetensors", "onnx").name == "best one.onnx"
 
 
 @pytest.mark.parametrize(

@@ -129,6 +129,21 @@ def test_rotor_speeds_are_estimated_with_the_lag_that_is_specified(mode):
         np.testing.assert_array_equal(slower[-1]["rotor_speed"], found[-1]["rotor_speed"])
 
 
+@pytest.mark.parametrize("weather", ["calm", "moderate"])  # in wind the start is in trim
+def test_an_estimate_begins_with_what_an_aircraft_can_know(weather):
+    observe = {"rotor_speed": "estimated", "disturbance": True}
+    environment = helpers.begun("hover", 3, observe=observe, weather=weather)
+    starts = ({}, {"rotor_speed": np.zeros(4)}, REST | {"rotor_speed": 0.9 * PAPER.max_speed})
+    for start in starts:  # the same whatever the rotors do
+        found = environment.reset(start=start)
+        hover = np.tile(PAPER.hover_speed / PAPER.max_speed, (3, 1))
+        np.testing.assert_array_equal(found["rotor_speed"], hover)
+        assert not found["disturbance"].any()
+    environment.step(np.zeros((3, 4)))
+    one = environment.reset(np.array([1]), start={"rotor_speed": np.zeros(4)})
+    np.testing.assert_array_equal(one["rotor_speed"], hover[:1])
+
+
 def test_the_rotation_is_the_matrix_of_the_attitude_row_by_row():
     found, environment = seen({"rotation": True})
     state = environment.engine.state

@@ -22,6 +22,7 @@ class Compass(Sensor):
     """Direction of a pole, body frame."""
 
     name, size, unit = "compass", 3, "1"
+    formula = "strength R^T (0, 1, 0)"
 
     strength: float = 1.0
 
