@@ -20,7 +20,7 @@ from processes import python
 import quadrl
 from quadrl import cli
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.control.modes import CONTROL_MODES, to_save
+from quadrl.control.modes import CONTROL_MODES
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.deploy.export import described, export
@@ -249,8 +249,8 @@ def commanded(said: dict, action: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("vehicle", ["racer", "hexa"])
 def test_an_action_is_the_command_that_the_file_says(mode, vehicle):
     environment = Environment("hover", vehicle=vehicle, control_mode=mode, seed=0)
-    size, named = (environment.size, environment.action_size), to_save(mode)
-    policy = linear(*size, vehicle=vehicle, control_mode=named)
+    size = environment.size, environment.action_size
+    policy = linear(*size, vehicle=vehicle, control_mode=mode)
     said = said_by(export(policy, "onnx"))
     action = np.random.default_rng(0).uniform(-1, 1, (50, environment.action_size))
     action = np.concatenate([action, np.sign(action)])

@@ -12,6 +12,8 @@ from quadrl.base.rotation import to_body, to_world
 from quadrl.conditions import sensors
 from quadrl.conditions.sensors import Sensor, felt, register_sensor
 from quadrl.core.environment import Environment
+from quadrl.deploy.export import described_sensor
+from quadrl.learning.description import describe_observation
 from quadrl.tasks.hover import Hover
 
 NORTH = np.array([0.0, 1.0, 0.0])
@@ -203,6 +205,14 @@ def test_the_disturbance_compares_a_step_with_the_mean_of_its_thrusts():
     last = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
     now = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 2 * GRAVITY]])
     np.testing.assert_allclose(felt(np.zeros((1, 3)), last, now, 0.05, 1.0), 0.0, atol=1e-12)
+
+
+def test_a_sensor_of_ones_own_says_how_its_samples_follow():
+    environment = Environment("hover", observe={"sensors": {"compass": {"strength": 2.0}}})
+    said = {term["name"]: term["formula"] for term in describe_observation(environment)}
+    assert said["compass"] == "strength R^T (0, 1, 0)" and said["velocity"] == "R^T v"
+    (told,) = (described_sensor(s) for s in environment.observer.sensors if s.name == "compass")
+    assert told["strength"] == 2.0 and told["meaning"]["rate"].startswith("Samples in a second")
 
 
 def test_another_sensor_beside_it_changes_nothing():
