@@ -327,7 +327,7 @@ class Page {
       const problem = policy.unfit(book, task, aircraft);
       if (problem) {  // then to what it was trained for
         if (Object.hasOwn(book.tasks, policy.task)) task = policy.task;
-        if (Object.hasOwn(book.vehicles, policy.metadata.vehicle)) aircraft = policy.metadata.vehicle;
+        if (Object.hasOwn(book.vehicles, policy.vehicle)) aircraft = policy.vehicle;
         if (policy.unfit(book, task, aircraft)) throw new Error(problem);
       }
       const name = `my ${file.name.replace(/\.safetensors$/, "").slice(0, 40)}`;

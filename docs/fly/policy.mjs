@@ -42,7 +42,7 @@ const SENSORS = { aim: ["beside_goal"], disturbance: ["smoothing"] };
 
 // What of the options of an observation this page does not know, in words; nothing if it knows all.
 function strange(observe) {
-  const options = Object.keys(observe).filter((name) => !(name in KNOWN));
+  const options = Object.keys(observe).filter((name) => observe[name] && !(name in KNOWN));
   const { rotor_speed: speed, sensors } = observe;
   if (!["true", "estimated"].includes(speed)) options.push(`rotor_speed ${speed}`);
   for (const [name, given] of Object.entries(sensors)) {
@@ -77,7 +77,10 @@ export class Policy {
     this.task = header.task;
     this.metadata = header.metadata ?? {};
     this.observe = { ...KNOWN, ...this.metadata.observe };
-    this.scale = this.metadata.vehicle_options?.action_scale; // of its actions, where it is its own
+    const { vehicle = {}, changed = {} } = this.metadata;
+    this.vehicle = vehicle.name;
+    this.changed = changed.vehicle ?? []; // what is not as the aircraft of that name has it
+    this.scale = this.changed.includes("action_scale") ? vehicle.action_scale : undefined;
     this.mean = arrays.mean;
     this.deviation = arrays.deviation;
     this.layers = names.map(([weight, bias]) => ({ weight: arrays[weight], bias: arrays[bias] }));
@@ -102,18 +105,18 @@ export class Policy {
     const size = single * (1 + observe.observation_history) + rotors * observe.action_history;
     const foreign = strange(observe);
     if (foreign) return `It observes ${foreign}, which this page does not know.`;
-    const other = Object.keys(metadata.vehicle_options ?? {}).find((name) => name !== "action_scale");
+    const other = this.changed.find((name) => name !== "action_scale");
     if (other) return `It has learned another ${other} than the aircraft here have.`;
     const mode = metadata.control_mode ?? "rotor";
     if (mode !== "rotor") return `Its control mode is ${mode}, and this page knows rotor alone.`;
     if (actionSize !== rotors) return `It commands ${actionSize} rotors; ${vehicleName} has ${rotors}.`;
     if (this.size !== size) return `It observes ${this.size} numbers; ${taskName} shows ${size}.`;
-    const trained = book.vehicles[metadata.vehicle] ?? book.vehicles[vehicleName];
+    const trained = book.vehicles[this.vehicle] ?? book.vehicles[vehicleName];
     const alike = JSON.stringify(trained.layout) === JSON.stringify(layout);
-    if (!alike) return `It has learned the rotor layout of ${metadata.vehicle}.`;
+    if (!alike) return `It has learned the rotor layout of ${this.vehicle}.`;
     const own = this.scale ?? trained.actionScale;
     if (this.scale || own === book.vehicles[vehicleName].actionScale) return "";
-    return `Its actions change the rotor speeds by ${own} rad/s, as those of ${metadata.vehicle}.`;
+    return `Its actions change the rotor speeds by ${own} rad/s, as those of ${this.vehicle}.`;
   }
 
   // The mean action of a flat observation (float32), within [-1, 1].

@@ -9,6 +9,7 @@ read it; free flight reads the same bytes.
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -24,6 +25,7 @@ from quadrl.aircraft.aerodynamics import (
 )
 from quadrl.aircraft.rotors import GRAVITY, Rotor, hover_squares, mixer
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle, resolved_speed, resolved_turn
+from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 
 WIND = 3
@@ -73,6 +75,8 @@ AIRCRAFT = np.dtype(
 )
 """A row. Every number is a double."""
 ROW_SIZE = AIRCRAFT.itemsize // 8
+LAYOUT = np.frombuffer(json.dumps(AIRCRAFT.descr).encode(), dtype=np.uint8)
+"""The names and shapes of its numbers, as JSON, which is saved beside rows."""
 
 
 def rows(vehicle: Vehicle, count: int = 1) -> np.ndarray:
@@ -94,6 +98,44 @@ def rows(vehicle: Vehicle, count: int = 1) -> np.ndarray:
 def numbers(table: np.ndarray) -> np.ndarray:
     """Rows (n,) as doubles (n, ROW_SIZE)."""
     return np.ascontiguousarray(table).view(np.float64).reshape(len(table), -1)
+
+
+def refitted(saved: np.ndarray, layout: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Rows (n, size) that were saved when a row had fewer numbers, as rows (n, ROW_SIZE).
+
+    Args:
+        saved: The rows, as doubles.
+        layout: The `LAYOUT` that was saved beside them.
+        own: Rows (n,) with the numbers that they lack.
+
+    Raises:
+        QuadrlError: They have a number that is not known here, or are no such rows.
+    """
+    table = own.copy()
+    try:
+        _fill(table, np.ascontiguousarray(saved).view(_dtype(json.loads(layout.tobytes())))[:, 0])
+    except QuadrlError:
+        raise
+    except (IndexError, RecursionError, TypeError, ValueError) as error:
+        raise QuadrlError(f"the rows of an aircraft cannot be read: {error}") from error
+    table["size"] = ROW_SIZE
+    return numbers(table)
+
+
+def _fill(table: np.ndarray, saved: np.ndarray) -> None:
+    for name in saved.dtype.names or ():
+        if name not in (table.dtype.names or ()):
+            raise QuadrlError(name="number of an aircraft", value=name, allowed="one known here")
+        if table[name].dtype.names:
+            _fill(table[name], saved[name])
+        else:
+            table[name] = saved[name]
+
+
+def _dtype(fields: Any) -> np.dtype:
+    return np.dtype(
+        [(n, _dtype(k) if isinstance(k, list) else k, *map(tuple, s)) for n, k, *s in fields]
+    )
 
 
 def limits(table: np.ndarray) -> np.ndarray:

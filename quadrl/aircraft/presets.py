@@ -167,13 +167,17 @@ REAL_AIR = {
 
 
 def resolve(
-    vehicle: Vehicle | str | Mapping[str, Any] | None, options: Mapping[str, Any] | None = None
+    vehicle: Vehicle | str | Mapping[str, Any] | None,
+    options: Mapping[str, Any] | None = None,
+    *,
+    whole: bool = False,
 ) -> Vehicle:
     """Make a vehicle from a name, a mapping of fields or a vehicle; None is the paper's.
 
     Args:
         vehicle: The vehicle; fields are changes to the known one of their `name`, else the paper's.
         options: Numbers that differ from it, by their fields' names.
+        whole: Whether a mapping is all of an aircraft: a field that it lacks has its default then.
 
     Raises:
         QuadrlError: It is something else, a name is unknown, or a number impossible.
@@ -181,7 +185,7 @@ def resolve(
     if isinstance(vehicle, str):
         vehicle = VEHICLES[choice("vehicle", vehicle, VEHICLES, IN_A_FILE)]
     if isinstance(vehicle, Mapping):
-        vehicle = _of_fields(vehicle)
+        vehicle = _of_fields(vehicle, whole)
     vehicle = VEHICLES["paper"] if vehicle is None else vehicle
     if not isinstance(vehicle, Vehicle):
         allowed = f"a Vehicle or a name ({', '.join(VEHICLES)})"
@@ -190,8 +194,8 @@ def resolve(
     return dataclasses.replace(vehicle, **options) if options else vehicle
 
 
-def _of_fields(given: Mapping[str, Any]) -> Vehicle:
-    """A vehicle from fields that differ from a known one's, as JSON has them."""
+def _of_fields(given: Mapping[str, Any], whole: bool) -> Vehicle:
+    """A vehicle from all its fields, or from those that differ from a known one's, as in JSON."""
     keys("field of vehicle", given, [field.name for field in dataclasses.fields(Vehicle)])
     changes = dict(given)
     rotors: Sequence[Any] | None = changes.get("rotors")
@@ -200,7 +204,7 @@ def _of_fields(given: Mapping[str, Any]) -> Vehicle:
     if "aerodynamics" in changes:
         changes["aerodynamics"] = record("aerodynamics", changes["aerodynamics"], Aerodynamics)
     known = VEHICLES.get(str(changes.get("name")), VEHICLES["paper"])
-    return dataclasses.replace(known, **changes)
+    return dataclasses.replace(Vehicle() if whole else known, **changes)
 
 
 def in_real_air(vehicle: Vehicle) -> Vehicle:

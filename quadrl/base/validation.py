@@ -153,11 +153,16 @@ def record(name: str, value: Any, kind: type, word: str = "field") -> Any:
 
     Raises:
         UnknownKeyword: The dataclass has no such field; the message lists the choices.
+        QuadrlError: A field without a default is missing.
     """
     if not isinstance(value, Mapping):
         return value
     given = cast(Mapping[str, Any], value)
-    keys(f"{word} of {name}", given, [field.name for field in dataclasses.fields(kind)])
+    fields = [field for field in dataclasses.fields(kind) if field.init]
+    keys(f"{word} of {name}", given, [field.name for field in fields])
+    for field in fields:
+        if field.default is field.default_factory and field.name not in given:  # both missing
+            raise QuadrlError(name=f"{word} {field.name} of {name}", value=None, allowed="given")
     return kind(**given)
 
 

@@ -51,8 +51,8 @@ def make_table(rows: Sequence[Sequence[str]], numbers: int = 0) -> Table:
 
 
 def again(command: str, *folder: Path) -> str:
-    """A command line for a run, with the --import options that it needs."""
-    own = [word for path in own_files for word in ("--import", str(path))]
+    """A command line for a run, which remembers its --import, or with the options of this one."""
+    own = [word for path in own_files for word in ("--import", str(path)) if not folder]
     # A bare name may be that of a policy that comes with quadrl.
     where = [f"./{path}" if comes_with_quadrl(str(path)) else str(path) for path in folder]
     return shlex.join(["quadrl", *own, *command.split(), *where])

@@ -417,6 +417,7 @@ class Environment(saving.Copied):
             self.reset()  # makes the records, which are filled below
             self.seeds.episodes[:] = 0  # that episode does not count
         try:
+            saved = self._memory().fitted(saved)
             self._memory().check(saved)
         except QuadrlError:
             self._step = None if fresh else self._step

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import importlib.util
 import inspect
 import sys
@@ -34,6 +35,10 @@ ROWS = 4
 COORDINATES = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
 
 
+IMPORTED: dict[Path, str] = {}
+"""The sha256 of each file that `import_own` has run, by its path."""
+
+
 def import_own(path: Path) -> None:
     """Run a file, which registers the user's own tasks and aircraft.
 
@@ -43,7 +48,7 @@ def import_own(path: Path) -> None:
     """
     if not path.is_file():
         raise QuadrlError(name="--import", value=str(path), allowed="the path of a Python file")
-    known = set(TASKS)
+    content, known = path.read_bytes(), set(TASKS)
     spec: Any = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[path.stem] = module
@@ -52,6 +57,7 @@ def import_own(path: Path) -> None:
     for kind in [kind for name, kind in TASKS.items() if name not in known]:
         with _located(path, inspect.getsourcelines(kind)[1]):
             check_rules(kind)
+    IMPORTED[path.resolve()] = hashlib.sha256(content).hexdigest()
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from quadrl.aircraft.parameters import LAYOUT, refitted
 from quadrl.base import records
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import MAX_SEED, Seed, seeds_of_rows
@@ -98,6 +99,17 @@ class Memory:
         for name, part in self._parts().items():
             saved |= {f"{name}.{k}": value for k, value in part.save().items()}
         return saved
+
+    def fitted(self, saved: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """What was saved, with the numbers that an aircraft's row did not have then.
+
+        Raises:
+            QuadrlError: The row has a number that is not known here.
+        """
+        table, layout, own = "engine.parameters", saved.get("engine.layout"), self.engine.parameters
+        if layout is None or table not in saved or np.array_equal(layout, LAYOUT):
+            return saved
+        return {**saved, table: refitted(saved[table], layout, own), "engine.layout": LAYOUT}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
         """Refuse the state of another environment, or one that no environment can be in.

@@ -6,11 +6,14 @@ functions of Python and on the command line. From there on only the scenario is 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import inspect
 import json
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Unpack
+from pathlib import Path
+from typing import Any, Unpack, cast
 
 import mujoco
 from typing_extensions import TypedDict
@@ -133,7 +136,9 @@ class Scenario:
         air; with one that has none, wind that acted by drag alone goes on doing so.
 
         Args:
-            given: The name of a task, a task, a scenario, or a mapping as `to_json` has it.
+            given: The name of a task, a task, a scenario, or a mapping as `to_json` has it: it is
+                flown with the numbers in it, whatever its names mean today, and a number that it
+                lacks is the default of its field.
             also: Further keywords of the caller, listed when an unknown one is refused.
             task: Another task, or its name; None for the one that is given.
             **keywords: What differs from it.
@@ -146,7 +151,8 @@ class Scenario:
                 return given
             whole: dict[str, Any] = {f.name: getattr(given, f.name) for f in FIELDS}
         else:
-            whole = dict(given) if isinstance(given, Mapping) else {"task": given}
+            whole = _recorded(given) if isinstance(given, Mapping) else {"task": given}
+        file = whole.pop("file", None)
         new: dict[str, Any] = {
             name: value
             for name, value in {"task": task, **keywords}.items()
@@ -170,6 +176,9 @@ class Scenario:
         if (steps := whole.pop("max_episode_steps", None)) is not None:
             steps = validation.number("max_episode_steps", steps, 1, whole=True)
             others["time_limit"] = steps * vehicle.control_timestep
+        if file and isinstance(wanted := whole["task"], str) and wanted not in catalogue.TASKS:
+            allowed = f"a task of {file}, with which it was saved: give --import {file}"
+            raise QuadrlError(name="task", value=wanted, allowed=allowed)
         made = catalogue.make(whole["task"])
         known = [field.name for field in dataclasses.fields(made)]
         validation.keys(f"{made.name} option", others, [*KEYWORDS, *also, *known], tried=bool(also))
@@ -179,15 +188,29 @@ class Scenario:
         return cls(**parts)
 
     def to_json(self) -> dict[str, Any]:
-        """What differs from the defaults, as JSON can hold it; `of` makes the same scenario."""
-        found: dict[str, Any] = {"task": self.task.name}
-        if options := _differing(self.task):
-            found["task_options"] = options
-        found |= _vehicle_json(self.vehicle)
-        for field in FIELDS[2:]:
-            value = getattr(self, field.name)
-            if value != field.default:
-                found[field.name] = _differing(value) if dataclasses.is_dataclass(value) else value
+        """All of it, as JSON can hold it; `of` makes the same scenario, whatever names mean then.
+
+        Returns:
+            The keywords of `of`, with every option of the task and every field of the aircraft and
+            the conditions; `aircraft`, in its air, where that was asked for by a name; `changed`,
+            what in task and vehicle was not what their names meant; and `file`, the name of that in
+            which a task of one's own is defined.
+        """
+        found: dict[str, Any] = {"task": self.task.name, "task_options": as_json(self.task)}
+        values = {field.name: getattr(self, field.name) for field in FIELDS[1:]}
+        found |= {name: as_json(value) for name, value in values.items() if value is not None}
+        if isinstance(self.aerodynamics, str):
+            found["aircraft"] = as_json(self.aircraft)
+        known = presets.VEHICLES.get(self.vehicle.name, self.vehicle)
+        usual = {field.name: _default(field) for field in dataclasses.fields(self.task)}
+        stands = {field.name: getattr(known, field.name) for field in dataclasses.fields(known)}
+        found["changed"] = {
+            "task": _differing(self.task, usual),
+            "vehicle": _differing(self.vehicle, stands),
+        }
+        if not (kind := type(self.task)).__module__.startswith("quadrl."):
+            with contextlib.suppress(OSError, TypeError):  # of a notebook
+                found["file"] = Path(inspect.getfile(kind)).name
         return found
 
     @functools.cached_property
@@ -222,6 +245,23 @@ class Scenario:
 FIELDS = dataclasses.fields(Scenario)
 KEYWORDS = ("task", *Conditions.__annotations__)
 """The keywords of `Scenario.of`."""
+RECORDED = (*KEYWORDS, "aircraft", "changed", "file")
+"""What `Scenario.to_json` may have."""
+
+
+def _recorded(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What `Scenario.to_json` gave, with its aircraft made of its own numbers alone."""
+    whole = {name: value for name, value in given.items() if name != "changed"}
+    flew, fields = whole.pop("aircraft", None), whole.get("vehicle")
+    if isinstance(fields, Mapping):
+        whole["vehicle"] = presets.resolve(cast(Mapping[str, Any], fields), whole=True)
+        if flew is not None:
+            flew = presets.resolve(flew, whole=True)
+            with contextlib.suppress(QuadrlError):
+                if presets.with_effects(whole["vehicle"], whole.get("aerodynamics")) == flew:
+                    return whole
+            whole["vehicle"] = flew  # the full set of its name is another one today
+    return whole
 
 
 def _in_wind(vehicle: Vehicle) -> str | None:
@@ -242,15 +282,9 @@ def _in_wind(vehicle: Vehicle) -> str | None:
     return FULL
 
 
-def _differing(record: Any, usual: Any = None) -> dict[str, Any]:
-    """The fields of a record that differ from those of another, by default from the defaults."""
-    differs: dict[str, Any] = {}
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        other = _default(field) if usual is None else getattr(usual, field.name)
-        if _json(value) != _json(other):
-            differs[field.name] = _json(value)
-    return differs
+def _differing(record: Any, usual: Mapping[str, Any]) -> list[str]:
+    """The names of the fields of a record whose values are not the usual ones."""
+    return [k for k, value in usual.items() if as_json(getattr(record, k)) != as_json(value)]
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:
@@ -258,7 +292,7 @@ def _default(field: dataclasses.Field[Any]) -> Any:
     return field.default if made is dataclasses.MISSING else made()
 
 
-def _json(value: Any) -> Any:
+def as_json(value: Any) -> Any:
     """A value as JSON gives it back."""
     return json.loads(json.dumps(value, default=_taken_apart))
 
@@ -267,13 +301,3 @@ def _taken_apart(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
     return value.tolist() if hasattr(value, "tolist") else str(value)
-
-
-def _vehicle_json(vehicle: Vehicle) -> dict[str, Any]:
-    """An aircraft by its name and its options where that is all, else by all that differs."""
-    if (known := presets.VEHICLES.get(vehicle.name)) is None:
-        return {"vehicle": _json(vehicle)}
-    differs = _differing(vehicle, known)
-    if set(differs) <= set(presets.OPTIONS):
-        return {"vehicle": vehicle.name} | ({"vehicle_options": differs} if differs else {})
-    return {"vehicle": {"name": vehicle.name, **differs}}

@@ -109,7 +109,7 @@ def described(policy: Policy) -> dict[str, str]:
     Raises:
         QuadrlError: Its task is not known here, or does not fit it.
     """
-    environment = Environment(policy.scenario, seed=0)
+    environment = Environment(scenario := policy.scenario, seed=0)
     policy.check_fits(environment)
     mode = environment.control_mode
     ends = mode.values(np.outer([-1.0, 1.0], np.ones(mode.size)))
@@ -121,7 +121,7 @@ def described(policy: Policy) -> dict[str, str]:
     ]
     sensors = environment.observer.sensors if environment.observer else []
     whole = {
-        "scenario": policy.scenario.to_json(),
+        "scenario": scenario.to_json(),
         "observation": describe_observation(environment),
         # What only the critic sees is left out.
         "sensors": [described_sensor(one) for one in sensors if one.name != "privileged"],

@@ -272,6 +272,7 @@ class Engine(abc.ABC):
     def _saved(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """The result of `save`, from the rows of the simulation."""
         saved = {"rows": rows, "parameters": parameters.numbers(self.parameters).copy()}
+        saved["layout"] = parameters.LAYOUT
         return saved | ({"solids": self.solids.save()} if len(self.solids.geoms) else {})
 
     def clearance(self, rows: np.ndarray | None = None) -> np.ndarray:

@@ -56,9 +56,13 @@ class PolicyInFlight:
     def __init__(self, policy: Any, count: int | None, seed: int | None) -> None:
         """Begin with the state of a policy at an episode's begin; see `Policy.flying`."""
         self.policy, self.control_mode = policy, policy.control_mode
-        self.conditions = policy.conditions
         self.state = policy.initial_state(count)
         self._generator = None if seed is None else np.random.default_rng(seed)
+
+    @property
+    def conditions(self) -> dict[str, Any]:
+        """Those of the policy."""
+        return self.policy.conditions
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Forget, before the first observation of an episode.

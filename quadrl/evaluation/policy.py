@@ -19,14 +19,16 @@ import numpy as np
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.presets import resolve as resolve_vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.files import read_sealed_json
 from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
 from quadrl.control.modes import named
-from quadrl.core.scenario import KEYWORDS, Scenario
+from quadrl.core.record import import_again, warn_of_changes
+from quadrl.core.scenario import RECORDED, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation import policy_file
 from quadrl.evaluation.memory import GRU, PolicyInFlight
-from quadrl.evaluation.policy_file import CLIP, RUN, SHIPPED, SHIPPED_AS, shipped
+from quadrl.evaluation.policy_file import CLIP, RUN, RUN_FORMAT, SHIPPED, SHIPPED_AS, shipped
 from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
@@ -60,7 +62,8 @@ class Policy:
 
     def __repr__(self) -> str:
         layers = "-".join(str(x) for x in (self.size, *(len(bias) for bias in self.biases)))
-        known = ", ".join(f"{k} {self.metadata[k]}" for k in OWN if k in self.metadata)
+        said = {k: self.metadata[k] for k in OWN if k in self.metadata}
+        known = ", ".join(f"{k} {v['name'] if isinstance(v, dict) else v}" for k, v in said.items())
         memory = f"; memory of {self.state_size}" if self.memory else ""
         return f"Policy for {self.task} ({known or 'made by hand'}; layers {layers}{memory})"
 
@@ -72,17 +75,18 @@ class Policy:
     @property
     def conditions(self) -> dict[str, Any]:
         """What it was trained for and in, as `Scenario.of` takes it; it may have unknown names."""
-        known = {name: self.metadata[name] for name in KEYWORDS if name in self.metadata}
+        known = {name: self.metadata[name] for name in RECORDED if name in self.metadata}
         return known | {"task": self.task}
 
     @property
     def scenario(self) -> Scenario:
-        """What it was trained for and in.
+        """What it was trained for and in, with the numbers of then; other ones today are warned of.
 
         Raises:
-            QuadrlError: Its task or its aircraft is not known here.
+            QuadrlError: Its task is not known here.
         """
-        return Scenario.of(self.conditions)
+        warn_of_changes(self.conditions, flown := Scenario.of(self.conditions), "policy")
+        return flown
 
     @property
     def keywords(self) -> dict[str, Any]:
@@ -94,7 +98,7 @@ class Policy:
         """
         own = self.scenario
         needed = {"vehicle": own.aircraft, "control_mode": own.control_mode, "observe": own.observe}
-        return needed | self.metadata.get("task_options", {})
+        return needed | {x.name: getattr(own.task, x.name) for x in dataclasses.fields(own.task)}
 
     @property
     def size(self) -> int:
@@ -185,7 +189,8 @@ class Policy:
     def check_fits(self, environment: Environment) -> None:
         """Refuse an environment in which observations or actions mean something else.
 
-        `keywords` make one that fits. Another time between two actions is warned of.
+        `keywords` make one that fits. Another time between two actions is warned of, and so are
+        numbers of the aircraft or the task that are others today than in the training.
 
         Raises:
             QuadrlError: The policy observes or commands another number of values or with other
@@ -196,7 +201,7 @@ class Policy:
         as_trained = f"as in the training of the policy for {self.task}"
         # One that is not known here is taken for the one that it is to fly.
         known = name if isinstance(name, dict) or name in VEHICLES else vehicle
-        trained = resolve_vehicle(known, self.metadata.get("vehicle_options"))
+        trained = resolve_vehicle(known, self.metadata.get("vehicle_options"), whole=True)
         needed = observing.resolve(self.metadata.get("observe")).for_policy()
         seen = environment.scenario.observe.for_policy()
         if needed != seen:
@@ -223,6 +228,7 @@ class Policy:
         if trained.control_timestep != (timestep := vehicle.control_timestep):
             said = f"control_timestep = {timestep:g}: the policy for {self.task} was trained with"
             warnings.warn(f"{said} {trained.control_timestep:g}", QuadrlWarning, stacklevel=4)
+        warn_of_changes(self.conditions, environment.scenario, "policy", kept=False)
 
     def _without_memory(self) -> np.ndarray:
         """The state of a policy that has none.
@@ -267,7 +273,8 @@ class Policy:
     def load(cls, path: str | Path) -> Policy:
         """Read a policy; nothing in the file is run.
 
-        A policy in the folder of a run that it is not of is read with a `QuadrlWarning`.
+        A policy in the folder of a run that it is not of is read with a `QuadrlWarning`. What this
+        user gave to `--import` in the training is imported again.
 
         Args:
             path: A .safetensors file, or a run folder that holds policy.safetensors.
@@ -278,7 +285,9 @@ class Policy:
         path = Path(path)
         policy = cls(**policy_file.read(path))
         if (path / RUN).is_file():
-            policy_file.warn_of_another_run(path, policy.metadata | {"task": policy.task})
+            run = read_sealed_json(path / RUN, RUN_FORMAT)
+            policy_file.warn_of_another_run(path, run, policy.metadata | {"task": policy.task})
+            import_again(run, path)
         return policy
 
     @classmethod

@@ -11,7 +11,7 @@ from safetensors.numpy import load as of_bytes
 from safetensors.numpy import save as to_bytes
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
-from quadrl.base.files import read_safetensors, read_sealed_json, write_safetensors
+from quadrl.base.files import read_safetensors, write_safetensors
 from quadrl.evaluation.memory import GRU, NAMES, PREFIX
 
 FORMAT, RECURRENT_FORMAT = "quadrl-policy-3", "quadrl-policy-gru-2"
@@ -77,9 +77,8 @@ def read(path: Path) -> dict[str, Any]:
     return {**parts, "task": task, "metadata": metadata}
 
 
-def warn_of_another_run(folder: Path, own: dict[str, Any]) -> None:
+def warn_of_another_run(folder: Path, run: dict[str, Any], own: dict[str, Any]) -> None:
     """Warn the caller's caller where a policy is not of the run in whose folder it is."""
-    run = read_sealed_json(folder / RUN, RUN_FORMAT)
     for name in ("task", "algo", "seed", "run"):
         if name in own and name in run and own[name] != run[name]:
             text = f"the policy in {folder} is not of the run there: its {name} is "

@@ -13,6 +13,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import roll_pitch_yaw
 from quadrl.base.validation import action
 from quadrl.core.environment import Environment
+from quadrl.core.record import warn_of_changes
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.snapshot import Rollout
 from quadrl.core.task import Task
@@ -129,6 +130,7 @@ def scenario_of(
         if task is None and "task" not in trained:
             raise QuadrlError(name="task", value=None, allowed="given, for a function")
         scenario = Scenario.of(trained, task=task, **conditions)
+        warn_of_changes(trained, scenario, "policy")
     if own not in (None, mode := scenario.control_mode):
         allowed = f"{own!r}, the mode of this policy or controller"
         raise QuadrlError(name="control_mode", value=mode, allowed=allowed)

@@ -19,9 +19,10 @@ from quadrl.base.files import read_safetensors, write_safetensors
 from quadrl.learning.defaults import flat
 from quadrl.learning.folder import CHANGEABLE
 from quadrl.learning.folder import CHECKPOINT as CHECKPOINT
-from quadrl.learning.settings import ALGORITHM_CONFIGS
 
 AT_GOAL = ("at_goal", "looks")
+CHANGED = ("scenario.changed.task", "scenario.changed.vehicle")
+"""Not what is flown, but how it differed from what its names meant when it was saved."""
 FORMAT = "quadrl-checkpoint-6"
 
 
@@ -89,9 +90,7 @@ def check_same(path: Path, saved: dict[str, Any], present: dict[str, Any]) -> No
     """
     was, now = dict(flat(saved)), dict(flat(present))
     for name in was | now:
-        if name not in was and name.partition(".")[0] in ALGORITHM_CONFIGS:
-            continue  # a setting of an algorithm that was added later
-        if was.get(name) != now.get(name) and name not in CHANGEABLE:
+        if was.get(name) != now.get(name) and name not in (*CHANGEABLE, *CHANGED):
             reason = f"{path} was trained with it; restore that setting or start a new run"
             value = now.get(name, present.get(name))
             raise QuadrlError(reason, name=name, value=value, allowed=repr(was.get(name)))

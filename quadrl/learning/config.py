@@ -8,13 +8,14 @@ import functools
 import json
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from quadrl import __version__
 from quadrl.aircraft.aerodynamics import FULL
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import free_name
 from quadrl.base.validation import choice, keys, number, resolved, tuples
@@ -24,6 +25,7 @@ from quadrl.conditions.randomization import Randomization
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control import modes
+from quadrl.core.record import import_again, warn_of_changes
 from quadrl.core.scenario import KEYWORDS, Scenario
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
@@ -47,17 +49,25 @@ MEMORIES = ("none", "gru")
 class TrainConfig(TrainSettings):
     """All settings of a training but its folder; `sources` says where each comes from."""
 
-    def __init__(self, task: str = "hover", **settings: Any) -> None:
+    recorded: ClassVar[Mapping[str, Any] | None] = None
+    """The scenario of the run that it was read from, whose numbers it keeps; a changed copy
+    (`dataclasses.replace`) is of no run, and its names mean what they do today."""
+
+    def __init__(
+        self, task: str = "hover", *, recorded: Mapping[str, Any] | None = None, **settings: Any
+    ) -> None:
         """Fill in the defaults (`quadrl.learning.defaults`) of all settings that are not given.
 
         Args:
             task: Name of the task.
+            recorded: The scenario of a run, as `Scenario.to_json` gave it.
             **settings: The other fields, None for the default; the settings of an algorithm (`ppo`)
                 may be a dict with some of them.
 
         Raises:
             QuadrlError: A setting is unknown or out of range.
         """
+        object.__setattr__(self, "recorded", recorded)
         settings = _given(settings)
         keys("setting", settings, [field.name for field in dataclasses.fields(self)])
         settings = with_networks(settings)
@@ -66,7 +76,8 @@ class TrainConfig(TrainSettings):
         algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
         vehicle = settings.setdefault("vehicle", kind.trained_on)
         variant = settings.get("variant", TrainConfig.variant)
-        values, _ = training_defaults(task, algo, vehicle, variant, settings.get("memory"))
+        known = self._known(vehicle), variant, settings.get("memory")
+        values, _ = training_defaults(task, algo, *known)
         for name, own in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
             if isinstance(given, dict):
@@ -84,7 +95,7 @@ class TrainConfig(TrainSettings):
             usual = values["training_options"]  # they do not replace options that are given
             values["training_options"] = {k: v for k, v in usual.items() if k not in given}
         for name in PAIRS:
-            if isinstance(settings.get(name), dict):
+            if isinstance(settings.get(name), dict) and recorded is None:
                 settings[name] = values[name] | settings[name]
         for name, value in (values | settings | {"task": task, "algo": algo}).items():
             object.__setattr__(self, name, tuples(value))
@@ -99,7 +110,7 @@ class TrainConfig(TrainSettings):
 
     def _defaults(self) -> tuple[dict[str, Any], dict[str, str]]:
         values, sources = training_defaults(
-            self.task, self.algo, self.vehicle, self.variant, self.memory
+            self.task, self.algo, self._known(self.vehicle), self.variant, self.memory
         )
         if not values["aerodynamics"] and (brought := self._wind_brings()):
             values["aerodynamics"], sources["aerodynamics"] = brought, "in wind"
@@ -109,6 +120,10 @@ class TrainConfig(TrainSettings):
                 values |= (networks := origin.networks())
                 sources |= dict.fromkeys(networks, f"run {origin.folder}")
         return values, sources
+
+    def _known(self, vehicle: str) -> str:
+        """The aircraft whose defaults count; a run may have one that is no longer known."""
+        return TrainConfig.vehicle if self.recorded and vehicle not in VEHICLES else vehicle
 
     def _wind_brings(self) -> str:
         """Effects of the air if none are given: the full set in wind, none in calm weather."""
@@ -169,17 +184,19 @@ class TrainConfig(TrainSettings):
     def scenario(self) -> Scenario:
         """What the policy has to fly, in MuJoCo, and what it observes."""
         observe = resolve_observing(self.observe).for_policy()
-        return Scenario.of(self._conditions(), engine="mujoco", observe=observe)
+        return Scenario.of(self.base, engine="mujoco", observe=observe)
 
     @property
     def training_scenario(self) -> Scenario:
         """What is flown in the training."""
-        return Scenario.of(self._conditions(), task_options=self.training_options)
+        return Scenario.of(self.base, task_options=self.training_options)
 
-    def _conditions(self) -> dict[str, Any]:
-        """The fields that make a scenario."""
+    @property
+    def base(self) -> Scenario:
+        """What its settings name, or the run that it was read from has recorded."""
         given = {name: getattr(self, name, None) for name in KEYWORDS}
-        return {name: value for name, value in given.items() if value not in (None, "", {})}
+        named = {name: value for name, value in given.items() if value not in (None, "", {})}
+        return Scenario.of(self.recorded or named)
 
     @property
     def iterations(self) -> int:
@@ -187,36 +204,39 @@ class TrainConfig(TrainSettings):
         return max(1, math.ceil(self.steps / (self.num_envs * self.rollout)))
 
     def resolved(self) -> dict[str, Any]:
-        """Return the settings and the values behind their names, as they come back from JSON."""
-        flown = self.training_scenario
-        whole = dataclasses.asdict(self) | {
-            "resolved_task": dataclasses.asdict(flown.task),
-            "resolved_vehicle": dataclasses.asdict(flown.aircraft),
-            "resolved_weather": dataclasses.asdict(flown.weather),
-            "resolved_randomization": dataclasses.asdict(flown.randomization),
-            "versions": _versions(),
-        }
-        return json.loads(json.dumps(whole))
+        """Return the settings and the scenario behind their names, as they come back from JSON."""
+        scenario = self.base.to_json()
+        if self.recorded:
+            scenario["changed"] = self.recorded.get("changed", {})
+        whole = {"scenario": scenario, "versions": _versions()}
+        return json.loads(json.dumps(dataclasses.asdict(self) | whole))
 
     @classmethod
     def of_folder(cls, folder: Path) -> TrainConfig:
         """Read the configuration of a run.
 
+        Where an aircraft or a task is another one today, those of the run stay, with a warning.
+
         Raises:
-            QuadrlError: The folder holds no run, or the values behind its names have changed since.
+            QuadrlError: The folder holds no run, or its task is not known here.
         """
-        saved = read_config(folder)
-        if "task" not in saved:
-            raise QuadrlError(f"{folder / CONFIG} is damaged: it lacks task")
-        names = (field.name for field in dataclasses.fields(cls))
-        # What it lacks was added since then, and has its default.
-        config = cls(**{name: saved[name] for name in names if name in saved})
-        now = config.resolved()
-        for part in ("task", "vehicle", "weather", "randomization"):
-            if saved.get(f"resolved_{part}") != now[f"resolved_{part}"]:
-                what = f"{folder} was trained with other parameters of the {part} {saved[part]}"
-                raise QuadrlError(f"{what}; start a new run")
+        import_again(saved := read_config(folder), folder)
+        config = cls.of_saved(saved)
+        warn_of_changes(saved["scenario"], config.base, "run")
         return config
+
+    @classmethod
+    def of_saved(cls, saved: Mapping[str, Any], **changes: Any) -> TrainConfig:
+        """Make it of what `resolved` gave; a setting that this lacks has its default.
+
+        Raises:
+            QuadrlError: Its task is not known here, or something in it cannot be used.
+        """
+        names = (field.name for field in dataclasses.fields(cls))
+        given = {name: saved[name] for name in names if name in saved} | changes
+        if not isinstance(recorded := saved.get("scenario"), Mapping):
+            raise QuadrlError(name="scenario of a run", value=recorded, allowed="a table")
+        return cls(**given, recorded=recorded)
 
 
 def prepare(
@@ -232,14 +252,14 @@ def prepare(
             continued.
     """
     if resume is not None:
-        config = TrainConfig.of_folder(Path(resume))
+        config = TrainConfig.of_folder(folder := Path(resume))
         given = _given({"task": task, "out": out} | settings)
         for name in given:
             if name not in CHANGEABLE:
                 reason = f"a run keeps its settings; only {', '.join(CHANGEABLE)} may change"
                 raise QuadrlError(reason, name=name, value=given[name], allowed="left out")
         number("steps", given.get("steps", config.steps), config.steps, whole=True)
-        return dataclasses.replace(config, **given), Path(resume)
+        return TrainConfig.of_saved(read_config(folder), **given), folder
     if isinstance(task, TrainConfig):
         config = dataclasses.replace(task, **settings)
     else:

@@ -55,8 +55,9 @@ class PlannedRun:
         if CONFIG not in files:
             return False
         free = {name: getattr(TrainConfig, name) for name in FREE}
-        found = dataclasses.replace(TrainConfig.of_folder(self.folder), **free)
-        if found != dataclasses.replace(self.config, **free):
+        run = TrainConfig.of_folder(self.folder)
+        found, own = (dataclasses.replace(config, **free) for config in (run, self.config))
+        if found != own or run.base != self.config.base:
             raise QuadrlError(
                 f"{self.folder} holds a run with other settings than this study's: "
                 "choose another folder (--out), or move that run away"

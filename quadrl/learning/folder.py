@@ -19,6 +19,7 @@ import numpy as np
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import NO_LOCKS, lock, read_sealed_json, write_csv, write_sealed_json
 from quadrl.base.machine import processor_kind
+from quadrl.core.record import sealed_imports
 from quadrl.evaluation.policy_file import RUN as CONFIG
 from quadrl.evaluation.policy_file import RUN_FORMAT
 
@@ -139,13 +140,13 @@ def _owner() -> str:
 
 def run_of(config: Mapping[str, Any]) -> str:
     """The identity of a run and its policies: a digest of all settings that decide its result."""
-    free = (*CHANGEABLE, "run", "processors")
+    free = (*CHANGEABLE, "run", "processors", "imports")
     fixed = {name: value for name, value in config.items() if name not in free}
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def write_config(folder: Path, config: Mapping[str, Any], processors: Sequence[str] = ()) -> None:
-    """Write the resolved configuration of a run, and the processor that it is trained on.
+    """Write the resolved configuration of a run, its files of `--import` and its processor.
 
     Args:
         folder: Folder of the run.
@@ -153,6 +154,7 @@ def write_config(folder: Path, config: Mapping[str, Any], processors: Sequence[s
         processors: Those that it was trained on earlier.
     """
     kinds = {"run": run_of(config), "processors": [*dict.fromkeys((*processors, processor_kind()))]}
+    kinds["imports"] = sealed_imports()
     write_sealed_json(folder / CONFIG, {**config, **kinds}, RUN_FORMAT)
 
 
@@ -166,7 +168,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not file.is_file():
         raise QuadrlError(f"{folder} holds no run: it has no {CONFIG}")
     config = read_sealed_json(file, RUN_FORMAT)
-    if missing := {"task", "algo", "seed"} - set(config):
+    if missing := {"task", "algo", "seed", "scenario"} - set(config):
         raise QuadrlError(f"{file} is not the configuration of a run: it lacks {min(missing)}")
     return config
 

@@ -8,6 +8,7 @@ can be continued, and ends with the same policy, bit for bit.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import gc
 import time
 import warnings
@@ -204,7 +205,9 @@ class Training:
             "variant": config.variant,
             "steps": self.steps,
             "rotors": config.scenario.vehicle.rotor_count,
-            **config.scenario.to_json(),
+            **config.resolved()["scenario"],
+            "engine": "mujoco",
+            "observe": dataclasses.asdict(config.scenario.observe),
         }
         return networks.export(self.actor, config.task, metadata)
 
@@ -269,7 +272,9 @@ class Training:
         path = self.folder / checkpoint.CHECKPOINT
         tensors, numbers = checkpoint.load(path)
         try:
-            checkpoint.check_same(path, numbers["config"], self.config.resolved())
+            saved = numbers["config"]
+            was = TrainConfig.of_saved(saved).resolved() | {"versions": saved["versions"]}
+            checkpoint.check_same(path, was, self.config.resolved())
             self.actor.load_state_dict(tensors["actor"])
             self.critic.load_state_dict(tensors["critic"])
             self.algorithm.restore(tensors.get("optimisers", {}))

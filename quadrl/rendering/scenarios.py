@@ -13,6 +13,7 @@ from typing import Any
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.files import check_texts
+from quadrl.core.record import warn_of_changes
 from quadrl.core.scenario import Scenario
 from quadrl.rendering.overlay import require
 
@@ -53,7 +54,10 @@ def read_scenarios(path: str | os.PathLike[str]) -> list[Scenario]:
     except (OSError, ValueError, TypeError, RecursionError) as error:
         reason = "give a file that quadrl render, plot or train has drawn"
         raise QuadrlError(f"{path} carries no scenario ({error}): {reason}") from error
-    return [Scenario.of(one) for one in listed]
+    scenarios = [Scenario.of(one) for one in listed]
+    for one, scenario in zip(listed, scenarios, strict=True):
+        warn_of_changes(one, scenario, "file")
+    return scenarios
 
 
 def ffmpeg() -> str:

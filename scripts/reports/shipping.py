@@ -11,6 +11,7 @@ from typing import Any
 from quadrl import tasks
 from quadrl.base.files import write_json
 from quadrl.base.units import quantity
+from quadrl.core.scenario import Scenario
 from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED, SHIPPED_AS, Policy
@@ -32,6 +33,8 @@ policy is a safetensors file, with a .json of all its settings beside it, in
 POLICIES = """The mean action in {flown} fresh episodes, in the conditions of the training. The last
 column lists the targets of the task that the policy misses in the same number of undisturbed
 episodes. Rows "as flown" have one disturbance that real aircraft meet. {source}"""
+MADE = ("algo", "seed", "run", "variant", "steps", "rotors")
+"""What a policy says of its training beside the scenario."""
 CALM: Any = {"weather": "calm", "randomization": "none"}
 AS_FLOWN: dict[str, Any] = {  # each alone, by the policies of tasks that have no robust one
     "as flown, 10 ms late": {"randomization": {"command_delay": 0.01}},
@@ -100,6 +103,25 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     beside = {"command": command, "evaluation": metrics, "config": config.resolved()}
     write_json(file.with_suffix(".json"), beside)
     return f"{said} successful"
+
+
+def renew() -> None:
+    """Write the policies in assets/policies anew, with the numbers that their names mean today.
+
+    It is for a release with other numbers of an aircraft or a task that the policies still fly.
+    What they were trained with beside those, and the networks, stay as they are.
+    """
+    for file in sorted(SHIPPED.glob("*.safetensors")):
+        policy, beside = Policy.load(file), json.loads(file.with_suffix(".json").read_text())
+        was, changed = policy.metadata, policy.metadata["changed"]
+        named = {**policy.conditions, "vehicle": was["vehicle"]["name"]}
+        for what, of in (("task", was["task_options"]), ("vehicle", was["vehicle"])):
+            named[f"{what}_options"] = {name: of[name] for name in changed[what]}
+        record = Scenario.of(named).to_json()
+        made = {name: was[name] for name in MADE if name in was}
+        dataclasses.replace(policy, metadata=made | record).save(file)
+        beside["config"]["scenario"] = record
+        write_json(file.with_suffix(".json"), beside)
 
 
 def shipped(episodes: int = EPISODES, only: tuple[str, ...] = ()) -> None:

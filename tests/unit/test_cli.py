@@ -193,7 +193,7 @@ def test_train_writes_every_file(run):
     assert {p.name for p in run.iterdir()} == FILES | {"flight.mp4"}
     config = json.loads((run / "config.json").read_text())
     assert (config["task"], config["num_envs"], config["hidden"]) == ("hover", 8, [16])
-    assert config["resolved_task"]["time_limit"] == 0.5
+    assert config["scenario"]["task_options"]["time_limit"] == 0.5
     assert [int(row["steps"]) for row in metrics(run)] == [32, 64, 96, 128, 160, 192]
     assert any(p.name.startswith("events.out.tfevents") for p in (run / "events").iterdir())
     evaluation = json.loads((run / "evaluation.json").read_text())
@@ -445,7 +445,8 @@ def test_a_file_brings_in_tasks_and_aircraft(tmp_path, capsys, monkeypatch, firs
     assert command(*(own + words if first else words + own)) == 0
     judged = json.loads(capsys.readouterr().out)
     assert judged["task"] == "near_hover" and judged["success_rate"] == 1.0
-    assert cli.console.again("render", Path("runs/x")) == "quadrl --import own.py render runs/x"
+    assert cli.console.again("tasks") == "quadrl --import own.py tasks"
+    assert cli.console.again("render", Path("runs/x")) == "quadrl render runs/x"  # it knows
     assert TrainConfig("near_hover", vehicle="heavy").gamma == 0.25
     assert NEAR_HOVER in gym.registry
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from runs import TINY
 
 import quadrl
 from quadrl import tasks
+from quadrl.core.scenario import as_json
 from quadrl.evaluation import evaluate as evaluation
-from quadrl.learning.config import TrainConfig
+from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import OF_VEHICLE, VARIANTS
 from quadrl.learning.environments import make_env
 from quadrl.learning.folder import read_config, write_config
@@ -130,10 +132,10 @@ def test_the_settings_of_a_run_are_found_again(tmp_path):
     write_config(tmp_path, config)
     assert TrainConfig.of_folder(tmp_path) == TINY
     saved = read_config(tmp_path)
-    assert saved["resolved_task"]["time_limit"] == 0.5
-    assert saved["resolved_task"]["radius"] == 0.75  # as it is practised
-    assert saved["resolved_vehicle"]["mass"] == 0.65
-    assert len(saved["resolved_vehicle"]["rotors"]) == 4
+    assert saved["scenario"]["task_options"]["time_limit"] == 0.5
+    assert saved["training_options"]["radius"] == 0.75  # as it is practised
+    assert saved["scenario"]["vehicle"]["mass"] == 0.65
+    assert len(saved["scenario"]["vehicle"]["rotors"]) == 4
     assert set(saved["versions"]) == {"quadrl", "mujoco", "torch", "torchrl", "numpy"}
 
 
@@ -160,13 +162,24 @@ def test_damaged_settings_are_refused(tmp_path, text):
         TrainConfig.of_folder(tmp_path)
 
 
-@pytest.mark.parametrize(("part", "name"), [("task", "radius"), ("vehicle", "mass")])
-def test_a_run_of_a_task_or_an_aircraft_that_has_changed_is_not_continued(tmp_path, part, name):
+@pytest.mark.parametrize(
+    ("part", "name"), [("task_options", "speed_weight"), ("vehicle", "mass"), ("vehicle", "name")]
+)
+def test_a_run_keeps_its_numbers_where_its_task_or_aircraft_has_changed(tmp_path, part, name):
     config = TINY.resolved()
-    config[f"resolved_{part}"][name] *= 2
+    was = config["scenario"][part][name] = "once" if name == "name" else 0.7
+    config["vehicle"] = config["scenario"]["vehicle"]["name"]
     write_config(tmp_path, config)
-    with refused():
-        TrainConfig.of_folder(tmp_path)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        read = TrainConfig.of_folder(tmp_path)
+        again, folder = prepare(None, None, tmp_path, {"steps": 2 * TINY.steps})
+    assert [f"{name} = {was}" in str(one.message) for one in said] == [True, True] * (
+        name != "name"
+    )
+    for flown in (read.scenario, read.training_scenario):
+        assert as_json(flown.task if part == "task_options" else flown.vehicle)[name] == was
+    assert again.resolved()["scenario"] == config["scenario"] and folder == tmp_path
 
 
 def test_a_task_may_be_trained_with_other_options_than_it_is_flown_with():
@@ -178,7 +191,7 @@ def test_a_task_may_be_trained_with_other_options_than_it_is_flown_with():
     env.reset()
     way = np.linalg.norm(env.environment.goals() - env.environment.origin, axis=1)
     assert asked.farthest < way.max() <= trained.farthest
-    assert config.resolved()["resolved_task"]["farthest"] == trained.farthest
+    assert config.resolved()["scenario"]["task_options"]["farthest"] == asked.farthest
     asked = TrainConfig("random_waypoint", task_options={"farthest": 4})  # holds in both
     assert asked.training_scenario.task.farthest == asked.scenario.task.farthest == 4
     assert dataclasses.replace(asked, seed=3).training_scenario.task == asked.training_scenario.task
@@ -223,7 +236,6 @@ def test_a_randomization_and_options_of_the_observation_are_settings():
     again = TrainConfig(**json.loads(json.dumps(dataclasses.asdict(config))))
     assert again == config
     assert again.scenario.randomization == drawn
-    assert TrainConfig("hover").scenario.to_json() == {"task": "hover", "vehicle": "paper"}
 
 
 def test_a_task_names_aircraft_and_algorithm_of_its_trainings_and_no_others_options():

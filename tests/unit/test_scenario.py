@@ -10,10 +10,12 @@ from helpers import refused
 import quadrl
 from quadrl import tasks
 from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
-from quadrl.base.errors import UnknownKeyword
-from quadrl.conditions.weather import WEATHERS, Weather
+from quadrl.aircraft.presets import REAL_AIR, VEHICLES, in_real_air, with_effects
+from quadrl.aircraft.rotors import Rotor
+from quadrl.base.errors import QuadrlWarning, UnknownKeyword
+from quadrl.conditions.weather import Weather
 from quadrl.core.environment import Environment
+from quadrl.core.record import warn_of_changes
 from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario
 from quadrl.evaluation import robustness
 from quadrl.evaluation.evaluate import beside, setting
@@ -69,12 +71,54 @@ def test_json_gives_back_the_same_scenario(scenario):
     assert pickle.loads(pickle.dumps(scenario)) == scenario
 
 
-def test_what_is_usual_is_not_written():
-    assert Scenario.of("hover").to_json() == {"task": "hover", "vehicle": "paper"}
-    options = whole().to_json()
-    assert options["task_options"] == {"farthest": 3.0}
-    assert (options["vehicle"], options["vehicle_options"]) == ("crazyflie", {"mass": 0.03})
-    assert options["weather"] == {"wind_speed": WEATHERS["light"].wind_speed}
+def test_all_of_it_is_written_and_what_is_not_as_it_is_named():
+    written = json.loads(json.dumps(whole().to_json()))
+    assert written["changed"] == {"task": ["farthest"], "vehicle": ["mass"]}
+    for name, record in (("task_options", whole().task), ("vehicle", whole().vehicle),
+                         ("weather", whole().weather)):  # fmt: skip
+        assert set(written[name]) == {field.name for field in dataclasses.fields(record)}
+    assert written["vehicle"]["mass"] == 0.03 and written["task_options"]["farthest"] == 3.0
+    assert len(written["vehicle"]["rotors"][0]) == len(dataclasses.fields(Rotor))
+
+
+def test_a_record_is_flown_with_its_own_numbers_whatever_its_names_mean_today(monkeypatch):
+    given = whole()
+    record, (air, share) = json.loads(json.dumps(given.to_json())), REAL_AIR["crazyflie"]
+    rotors = [dataclasses.replace(r, lag_up=15.0) for r in VEHICLES["crazyflie"].rotors]
+    other = dataclasses.replace(VEHICLES["crazyflie"], rotors=rotors, mass=0.035, dead_time=0.0)
+    monkeypatch.setitem(VEHICLES, "crazyflie", other)
+    assert Scenario.of(record) == given and Scenario.of(record).aircraft == given.aircraft
+    said = r"crazyflie of this policy has rotors\[0\].lag_up = 20.4.*\(and 2 more\).*is now 15.0, "
+    with pytest.warns(QuadrlWarning, match=said) as caught:
+        warn_of_changes(record, Scenario.of(record), "policy")
+    assert len(caught) == 1 and "mass" not in str(caught[0].message)  # that was its own
+    now = dataclasses.replace(air, rotor_drag=1e-9), share / 2
+    monkeypatch.setitem(REAL_AIR, "crazyflie", now)
+    assert Scenario.of(record).aircraft == given.aircraft
+    monkeypatch.setitem(VEHICLES, "crazyflie", given.vehicle)
+    with pytest.warns(QuadrlWarning, match="drag_coefficient = .*aerodynamics.rotor_drag = "):
+        warn_of_changes(record, Scenario.of(record), "policy")
+    monkeypatch.delitem(VEHICLES, "crazyflie")
+    assert Scenario.of(record).aircraft == given.aircraft
+    changed = Scenario.of(record, vehicle_options={"mass": 0.04}, task_options={"farthest": 2})
+    assert changed.vehicle.mass == 0.04 and changed.task.farthest == 2
+    assert changed.vehicle.rotors == given.vehicle.rotors
+
+
+DROPPED = {"vehicle": "dead_time", "task_options": "smoothness_weight", "weather": "gust_time",
+           "randomization": "corners", "observe": "privileged"}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [*DROPPED, "aerodynamics", "rotor"])
+def test_what_a_record_lacks_has_its_default_and_what_is_unknown_is_refused(name):
+    given = Scenario.of("hover", aerodynamics=in_real_air(VEHICLES["paper"]).aerodynamics)
+    record = json.loads(json.dumps(given.to_json()))
+    part = record["vehicle"]["rotors"][0] if name == "rotor" else record[name]
+    del part[{"aerodynamics": "body_lift", "rotor": "axis"}.get(name) or DROPPED[name]]
+    assert Scenario.of(record) == given
+    part["of_tomorrow"] = 1.0
+    with refused(match="of_tomorrow"):
+        Scenario.of(record)
 
 
 def test_it_is_the_same_environment_however_it_is_asked_for():
