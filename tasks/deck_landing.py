@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -123,6 +123,10 @@ class DeckLanding(Landing):
         waves = sea.draw(rng, height, (self.boat_length, self.boat_beam))
         touchdown = ("down", "speed", "upright", "miss", "rest")
         return start, Sea(**vars(waves), **dict.fromkeys(touchdown, 0.0 * height))
+
+    def remember(self, start: Start, drawn: Any) -> TaskState:
+        """Nothing of the start: the speed is that of the touchdown."""
+        return drawn
 
     def goal(self, now: Snapshot) -> Array:
         """Where the aircraft's centre is when it stands on the pad."""

@@ -16,6 +16,7 @@ from quadrl.core.contact import touches_ground
 from quadrl.core.observation import MOTION, ROTATION, ObservationTerm, observed_motion
 from quadrl.core.snapshot import Rollout, statistic
 from quadrl.core.task import EpisodeEnd, Snapshot, Task, TaskState
+from quadrl.engines.state import Start
 from quadrl.tasks.tracks import Track, crossing
 
 # How the yardstick controllers fly: to a place so far behind a gate [m], and so fast there [m/s].
@@ -100,6 +101,11 @@ class GateRace(Task):
     def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
         """Gates with some numbers (N,): centres [m], and unit vectors through them and left."""
         raise NotImplementedError
+
+    def remember(self, start: Start, drawn: Any) -> Course:
+        """Where the aircraft begins, and how far that is from its gate."""
+        leg = norm(drawn.goal - start.position)
+        return dataclasses.replace(drawn, position=start.position, leg=leg)
 
     def update(self, before: Snapshot, now: Snapshot) -> Course:
         """Go on to the next gate when this one is passed."""

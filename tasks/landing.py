@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -133,6 +134,10 @@ class Landing(Task):
         position = up + offset[..., None] * rng.level_direction()
         state = Touchdown(goal=0 * position, down=zero, speed=0 * zero, rest=0 * zero)
         return rng.level_start(position, parameters), state
+
+    def remember(self, start: Start, drawn: Any) -> TaskState:
+        """The speed with which it begins."""
+        return dataclasses.replace(drawn, speed=norm(start.velocity))
 
     def terminated(self, now: Snapshot) -> Array:
         """Crashed, in its own wash, away, or at rest for long enough."""

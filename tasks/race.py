@@ -102,7 +102,7 @@ class Race(GateRace):
         )
         none = 0.0 * gate
         through, left = (look_up(track.axes[:, k], gate) for k in range(2))
-        return start, Course(goal, gate, through, left, none, none, position, leg)
+        return start, Course(goal, gate, through, left, none, none, 0.0 * position, none)
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Nearer to the next gate, and what its passage is worth."""

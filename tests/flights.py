@@ -114,7 +114,8 @@ def by_mj_step(task, seed, mode):
     def begin():
         errors.clear()
         keys = np.array([seed]), np.array([next(episode)])
-        start, remembered = task.begin(Rng(*keys), own)
+        start, drawn = task.begin(Rng(*keys), own)
+        remembered = task.remember(start, drawn)
         mujoco.mj_resetData(model, data)
         if scene.solids:
             poses = scene.poses(task.place(Rng(*keys, SOLIDS), start, remembered), 1, origin)

@@ -200,6 +200,7 @@ class Environment(saving.Copied):
             height = begun.position[:, 2] + self.origin[2]
             mean = self.blowing.mean_wind(*place, height, wind_speed)
             begun = trimmed(self.vehicle, begun, mean)
+        task_state = self.task.remember(begun, task_state)
         poses = None  # of the solids, where they do not stay
         if self._solids_leave:
             placed = self.task.place(Rng(*place, SOLIDS), begun, task_state)

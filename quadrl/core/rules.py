@@ -94,6 +94,7 @@ def check_rules(task: Task | type[Task], torch: Any = None) -> None:
     check_declaration(task)
     check_begin(task, torch)
     check_functions(task, torch)
+    check_start(task)
 
 
 def check_declaration(task: Task) -> None:
@@ -124,6 +125,7 @@ def check_begin(task: Task, torch: Any = None) -> None:
     def begin(keys: Array, own: Parameters) -> dict[str, Array]:
         with blame(task, "begin"):
             start, state = task.begin(Rng(keys, 0 * keys), own)
+            state = task.remember(start, state)
         return _named(start, "start") | _named(state, "task")
 
     keys = np.arange(ROWS)
@@ -162,6 +164,36 @@ def check_functions(task: Task, torch: Any = None) -> None:
         require_equal(alone, {k: value[i : i + 1] for k, value in batch.items()}, message)
     if torch:
         check_tensors(task, before, now, batch, torch)
+
+
+def check_start(task: Task) -> None:
+    """What it remembers of every step, it remembers of a start that `reset` is given, too."""
+    with blame(task, "a reset from a given start"):
+        environment = Environment(task, num_envs=ROWS, seed=1)
+        environment.reset()
+        drawn, more = environment.snapshot.state, 0.1 * np.arange(1.0, ROWS + 1)[:, None]
+        start = {"position": drawn.position + more * [0.0, 0.0, 0.1]}  # where little can stand
+        start |= {name: getattr(drawn, name) + more for name in ("velocity", "body_rate")}
+        environment.reset(start=start)
+        begun = _remembered(environment.snapshot)
+        environment.step(np.zeros((ROWS, environment.action_size)))
+    for (name, then, was), (_, now, is_) in zip(
+        begun, _remembered(environment.snapshot), strict=True
+    ):
+        if np.array_equal(now, is_) and np.ptp(is_, axis=0).any():
+            what, cure = "at a start that reset was given", "make it in `remember`"
+            require(np.allclose(then, was), f"{task.name}: {name}, but not {what}: {cure}")
+
+
+def _remembered(now: Snapshot) -> list[tuple[str, Array, Array]]:
+    """Copies of what a task remembers beside all of the same shape that it may be a copy of."""
+    seen = records.arrays("state", now.state) | records.arrays("potentials", now.potentials)
+    return [
+        (f"{name} is {other} after every step", own, value)
+        for name, own in records.arrays("task", now.task).items()
+        for other, value in seen.items()
+        if own.shape == value.shape
+    ]
 
 
 def check_tensors(

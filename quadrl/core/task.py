@@ -142,7 +142,20 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
-        """How an episode begins, from random numbers and the aircraft's parameters alone."""
+        """How an episode begins, from random numbers and the aircraft's parameters alone.
+
+        What is remembered of the start itself, `remember` fills in.
+        """
+
+    def remember(self, start: Start, drawn: TaskState) -> TaskState:
+        """What is remembered as an episode begins: a new record, or `drawn` itself.
+
+        Args:
+            start: How it begins in fact: a caller of `reset` may have given another start than
+                `begin` drew, and wind may have trimmed it.
+            drawn: What `begin` gave.
+        """
+        return drawn
 
     def update(self, before: Snapshot, now: Snapshot) -> TaskState:
         """What is remembered after a control step: a new record, or `now.task` itself."""
@@ -240,8 +253,8 @@ class Task(abc.ABC):
 
         Args:
             rng: Random numbers of their own.
-            start: Start of the episodes, as `begin` gives it.
-            state: What the task remembers, as `begin` gives it.
+            start: Start of the episodes, as `remember` gets it.
+            state: What the task remembers, as `remember` gives it.
         """
         return self.move(state, 0.0 * state.goal[..., 0])
 

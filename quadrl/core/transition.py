@@ -233,7 +233,7 @@ def check_task(
     coordinates = {f.name: getattr(start, f.name) for f in dataclasses.fields(start)}
     for name, array in coordinates.items():
         _check_array(task, f"{name} of begin", array, (rows, SIZES[name] or rotors), "f")
-    for field in dataclasses.fields(task_state):
+    for field in dataclasses.fields(task_state := task.remember(start, task_state)):
         value: Any = getattr(task_state, field.name)
         if not isinstance(value, np.ndarray) or cast(Array, value).shape[:1] != (rows,):
             name, allowed = f"{task.name} {field.name} of begin", f"an array ({rows}, ...)"

@@ -194,7 +194,7 @@ def write(environment: Environment) -> tuple[str, int]:
     placed = np.concatenate([start.position + origin, start.quaternion], axis=-1)
     motion = np.concatenate([start.velocity, start.body_rate], axis=-1)
     places = {"qpos": placed, "qvel": motion, "act": start.rotor_speed}
-    emit("begin", memory, **places, kept=_row(task_state))
+    emit("begin", memory, **places, kept=_row(task.remember(start, task_state)))
 
     memory = _Memory(environment)
     parameters, state = memory.parameters(), memory.state()

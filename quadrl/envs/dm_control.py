@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any, Unpack
 
 from quadrl.base.shield import refuse_after_fork
@@ -116,6 +116,8 @@ class QuadrotorTask(base.Task):
         self._observation = {name: np.zeros((1, k.stop - k.start)) for name, k in layout}
         self.transition: Transition | None = None
         """The last step (N = 1) with its named reward terms and success; None after a reset."""
+        self.start_at: Mapping[str, Any] | None = None
+        """Start of the next episodes, as `Environment.reset` takes it; None for the task's."""
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """The terms of the control mode, each between -1 and 1."""
@@ -125,7 +127,8 @@ class QuadrotorTask(base.Task):
 
     def initialize_episode(self, physics: Physics) -> None:
         """Begin an episode."""
-        self._observation, self.transition = self.environment.reset(), None
+        self._observation = self.environment.reset(start=self.start_at)
+        self.transition = None
         physics.in_view = self.in_view
         super().after_step(physics)  # colours the reward
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ class QuadrotorEnv(EnvBase):
     """N aircraft, batch size [N]; observation (N, size) float32, action (N, k) in [-1, 1].
 
     Simulated on the CPU, whatever the device of the tensors. `is_success`, `error` [m] and, on
-    request, the named `reward_terms` and `pixels` stand beside the observation. TorchRL's
+    request, the named `reward_terms` and `pixels` stand beside the observation. `reset(start=...)`
+    takes a start as `quadrl.core.environment.Environment.reset` does. TorchRL's
     PixelRenderTransform and VideoRecorder draw with `render`.
     """
 
@@ -92,12 +94,18 @@ class QuadrotorEnv(EnvBase):
         self._observation = self.environment.flatten(self.environment.restore(saved))
         self._restored = True
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+    def _reset(
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        start: Mapping[str, Any] | None = None,
+        **_: Any,
+    ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None and not mask.all():
-            self._begin(mask)
-        elif not self._restored:
-            self._observation = self.environment.flatten(self.environment.reset())
+            self._begin(mask, start)
+        elif start or not self._restored:
+            self._observation = self.environment.flatten(self.environment.reset(start=start))
         flags = {name: torch.zeros(self.num_envs, 1, dtype=torch.bool) for name in DONE}
         flags["is_success"] = torch.zeros_like(flags["done"])
         zeros = {name: torch.zeros(self.num_envs, 1) for name in ("error", *self._terms)}
@@ -142,10 +150,10 @@ class QuadrotorEnv(EnvBase):
     def _fly(self, action: torch.Tensor) -> Transition:
         return self.environment.step(action)
 
-    def _begin(self, over: torch.Tensor) -> None:
+    def _begin(self, over: torch.Tensor, start: Mapping[str, Any] | None = None) -> None:
         """Begin an episode of the aircraft of a mask (N, 1)."""
         rows = over.reshape(-1).cpu().numpy()
-        self._observation[rows] = self.environment.flatten(self.environment.reset(rows))
+        self._observation[rows] = self.environment.flatten(self.environment.reset(rows, start))
 
     def _seen(self) -> dict[str, torch.Tensor]:
         """Entries of the observation now."""

@@ -47,8 +47,8 @@ class RememberingEnv(QuadrotorEnv):
         super().restore({name: value for name, value in saved.items() if name != STATE})
         self._state = torch.from_numpy(saved[STATE]).to(self.device).reshape(self._state.shape)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
-        fresh = super()._reset(tensordict)
+    def _reset(self, tensordict: TensorDictBase | None = None, **given: Any) -> TensorDictBase:
+        fresh = super()._reset(tensordict, **given)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or mask.all():  # otherwise the states of the others stay: see maybe_reset
             fresh.set(STATE, self._state if self._restored else torch.zeros_like(self._state))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import needs_dm_control
 
-from quadrl.base.rotation import namespace
+from quadrl.base.rotation import Array, namespace
 from quadrl.control.modes import CONTROL_MODES
 from quadrl.control.reading import Reading
 from quadrl.core.task import Potentials, TaskState
@@ -170,7 +170,19 @@ def error(change):
     return {"error": lambda self, now: change(now.potentials.distance)}
 
 
+@dataclasses.dataclass(frozen=True)
+class Last(TaskState):
+    place: Array
+
+
 FAULTS = {
+    "a start as it was drawn": (
+        "task.place is state.position after every step, but not at a start .*: make it in",
+        {
+            "begin": begun(lambda start, state: (start, Last(state.goal, start.position))),
+            "update": lambda self, _, now: Last(now.task.goal, now.state.position),
+        },
+    ),
     "a missing text": ("solved must be a text", {"solved": ""}),
     "other random numbers": ("two starts for one key", {"begin": begun(random_goal)}),
     "no rotation": ("quaternion of begin.*of norm 1", {"begin": begun(no_rotation)}),

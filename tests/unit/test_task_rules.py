@@ -50,6 +50,7 @@ def snapshot(task, *place, **remembered):
     """The first snapshot of episodes, and how far they are; with some memories (N, ...)."""
     where = state(task, *place)
     _, task_state, own = drawn(task, len(where.position))
+    task_state = task.remember(placed(*place), task_state)
     task_state = dataclasses.replace(task_state, **remembered)
     return transition.begin(task, where, task_state, own, 4)
 
