@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import math
 import os
+import warnings
 
 import helpers
 import numpy as np
@@ -510,3 +511,19 @@ def test_sums_and_choices_over_an_axis():
         return chosen + spread * first[..., 0] + np.sum(rest, axis=-1, keepdims=True)[..., 0]
 
     np.testing.assert_array_equal(run(compute, *columns), compute(*columns))
+
+
+def test_many_rows_of_few_operations_fly_as_they_are_written():
+    """Which is faster there, and gives the same bits; a race has many operations."""
+    assert not helpers.begun("race", 2049, engine="free_flight").not_compiled
+    few = helpers.begun("hover", 9, engine="free_flight")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        many = helpers.begun("hover", 2049, engine="free_flight")
+    assert "faster" in many.not_compiled and not few.not_compiled
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 2049, 4))
+    for action in actions:
+        one, other = few.step(action[:9]), many.step(action)
+        np.testing.assert_array_equal(one.reward, other.reward[:9])
+        for name, term in one.observation.items():
+            np.testing.assert_array_equal(term, other.observation[name][:9])
