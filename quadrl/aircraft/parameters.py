@@ -18,6 +18,7 @@ import numpy as np
 from quadrl.aircraft.aerodynamics import (
     GROUND_EFFECT,
     MOST_OFFSET,
+    MOST_TAKEN,
     ROTOR_EFFECTS,
     STILL_AIR,
     WINDMILL,
@@ -222,7 +223,7 @@ def c_structs() -> str:
     return (
         "// Written by quadrl/aircraft/parameters.py from Rotor, Vehicle and Aerodynamics.\n"
         f"#define QUADRL_MARK {MARK!r}\n#define MOST_OFFSET {MOST_OFFSET!r}\n"
-        f"#define WINDMILL {WINDMILL!r}\n"
+        f"#define WINDMILL {WINDMILL!r}\n#define MOST_TAKEN {MOST_TAKEN!r}\n"
         f"enum {{ {sizes} }};\nenum {{ {effects} }};\n"
         f"typedef struct {{\n{fields(ROTOR)}\n}} Rotor;\n"
         f"typedef struct {{\n{fields(AIRCRAFT)}\n}} Aircraft;\n"

@@ -226,7 +226,7 @@ AERO void aero_rotors(const Aircraft* a, const Disc* disc, int effects, int roto
         const double rest = rotor->thrust_coefficient[i] * omega * omega;
         const double hover = w0 * w0;
         const double taken = share[i] * hover / (hover + p_square + 1e-12);
-        const double most = taken < 0.36 ? taken : 0.36;
+        const double most = taken < MOST_TAKEN ? taken : MOST_TAKEN;
         change += (rest + change) * (most / (1 - most));  // lift / (1 - most)
       }
       const double drag = a->rotor_drag[i] * omega;
@@ -252,7 +252,7 @@ AERO void aero_rotors(const Aircraft* a, const Disc* disc, int effects, int roto
 // Bound of a rotor's lift over that of equation 7: the clip of aero_lift_change, and of aero_rotors
 // by the ground.
 AERO double aero_largest_lift(const Aircraft* a, int i) {
-  return (a->inflow[i] ? 1.6 : 1) * (a->ground_effect[i] ? 1 / (1 - 0.36) : 1);
+  return (a->inflow[i] ? 1.6 : 1) * (a->ground_effect[i] ? 1 / (1 - MOST_TAKEN) : 1);
 }
 
 // Bound of the acceleration by the drag of rotors [m/s^2]: of the sum of their speeds and an
