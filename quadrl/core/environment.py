@@ -35,7 +35,7 @@ from quadrl.core.compiled import compiled
 from quadrl.core.markers import Marker
 from quadrl.core.observation import layout
 from quadrl.core.observer import Observer
-from quadrl.core.scenario import Conditions, Scenario
+from quadrl.core.scenario import KEYWORDS, Conditions, Scenario
 from quadrl.core.step import Inputs, Step, WrittenStep
 from quadrl.core.task import Snapshot, Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
@@ -43,6 +43,9 @@ from quadrl.engines import mujoco
 from quadrl.engines.engine import Engine
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
+
+LIVE = ("seeds", "transition")
+"""Attributes of an environment that are no part of what it was made of."""
 
 
 class Environment(saving.Copied):
@@ -139,6 +142,50 @@ class Environment(saving.Copied):
         """What flies the loops of the control mode; None where it has none."""
         self._flown = 0  # physics steps of this control step that `control` has commanded
         self.seed(seed)
+        self._made = frozenset(vars(self)).difference(LIVE)  # attributes that stay
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse to assign to what an environment was made of: the rest of it would not follow."""
+        made = vars(self).get("_made")
+        if made and name[0] != "_" and (name in made or name in self.options):
+            allowed = f"given to `change`, as in change({name}=...), before a reset"
+            raise QuadrlError(name=name, value=value, allowed=allowed)
+        super().__setattr__(name, value)
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Keywords of `change`: conditions, and options of the task."""
+        return (*KEYWORDS, *(field.name for field in dataclasses.fields(self.task)))
+
+    def change(self, **conditions: Any) -> None:
+        """Change options of the task or conditions; the next call has to be a reset of all rows.
+
+        The episodes that follow are the next ones of the rows' seeds.
+
+        Args:
+            **conditions: What differs, as `Scenario.of` takes it.
+
+        Raises:
+            QuadrlError: A name is unknown, a value is impossible, or it takes another observation,
+                action, reward or control step. Nothing has changed then.
+        """
+        scenario, given = Scenario.of(self.scenario, **conditions), self._made_with[1]
+        engine = {"engine": given["engine"]} if isinstance(given.get("engine"), Engine) else {}
+        threads = given.get("num_threads", 0)
+        fresh = Environment(scenario, num_envs=self.num_envs, num_threads=threads, **engine)
+
+        def kept(made: Environment, flown: Scenario) -> tuple[Any, ...]:
+            seen, acts = (made.layout, made.term_names), (flown.control_mode, made.action_size)
+            world = type(flown.task), flown.aircraft, flown.engine, flown.altitude
+            return *seen, *acts, flown.vehicle.control_timestep, *(world if engine else ())
+
+        if kept(fresh, scenario) != kept(self, self.scenario):
+            also = ", aircraft, engine and altitude, which are its engine's" if engine else ""
+            allowed = f"such that observation, action, reward and control step{also} stay"
+            raise QuadrlError("make another one", name="change", value=conditions, allowed=allowed)
+        fresh.seeds = self.seeds
+        vars(self).clear()
+        vars(self).update(vars(fresh))
 
     def seed(self, seed: Seed = None) -> Seed:
         """Let the next reset begin the first episode of a seed; return the seed.

@@ -60,6 +60,7 @@ class Copied:
     def __setstate__(self: Any, state: Any) -> None:
         """Make it anew and continue where the other was."""
         (args, kwargs), seeds, saved = state
+        self.__dict__.clear()
         self._made_with = args, kwargs
         self.__init__(*args, **kwargs)
         if saved is not None:

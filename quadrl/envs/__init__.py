@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import WrapperSpec
 
 from quadrl import tasks
 
@@ -13,6 +14,24 @@ if TYPE_CHECKING:
     from quadrl.envs import dm_control, gymnasium, rsl_rl, sb3, torchrl
 
 __all__ = ["dm_control", "gymnasium", "register_ids", "rsl_rl", "sb3", "torchrl"]
+
+
+class ForOne(tuple[WrapperSpec, ...]):
+    """Wrappers that `gym.make` applies last; to `make_vec`, which refuses any, it is empty."""
+
+    def __len__(self) -> int:
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return other == ()
+
+    def __ne__(self, other: object) -> bool:
+        return other != ()
+
+    __hash__ = tuple.__hash__
+
+
+LAST = ForOne([WrapperSpec("TaskLimit", "quadrl.envs.gymnasium:limited", {})])
 
 
 def register_ids() -> None:
@@ -25,6 +44,7 @@ def register_ids() -> None:
                 entry_point="quadrl.envs.gymnasium:make_one",
                 vector_entry_point="quadrl.envs.gymnasium:QuadrotorVectorEnv",
                 kwargs={"task": name},
+                additional_wrappers=LAST,
                 # The environment itself refuses a step before a reset and a bad action, and the
                 # tests run Gymnasium's checks: the two wrappers would only cost time.
                 order_enforce=False,

@@ -44,6 +44,24 @@ def make(
     return Environment(scenario, num_envs=num_envs, seed=seed, num_threads=num_threads)
 
 
+class Changing:
+    """An API whose environment may be changed: by `change`, or by assigning to an option."""
+
+    environment: Environment
+
+    def change(self, **conditions: Any) -> None:
+        """Change options before the next reset, as `quadrl.core.environment.Environment.change`."""
+        self.environment.change(**conditions)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Change an option: as an attribute alone it would do nothing."""
+        own: Environment | None = vars(self).get("environment")
+        if own is not None and name[0] != "_" and name in own.options:
+            self.change(**{name: value})
+        else:
+            super().__setattr__(name, value)
+
+
 def episode_info(environment: Environment) -> dict[str, np.ndarray]:
     """Entries of `info` that last for an episode, arrays (N, k); by default there are none.
 

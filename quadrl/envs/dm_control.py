@@ -37,6 +37,7 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.engines import native
 from quadrl.engines.mujoco import DataEngine
+from quadrl.envs.common import Changing
 
 ENVIRONMENT_KWARGS = "time_limit control_timestep n_sub_steps flat_observation legacy_step".split()
 
@@ -94,7 +95,7 @@ class Physics(mujoco.Physics):
         yield
 
 
-class QuadrotorTask(base.Task):
+class QuadrotorTask(Changing, base.Task):
     """A task of the catalogue as a dm_control task."""
 
     def __init__(self, environment: Environment, random: Any = None) -> None:

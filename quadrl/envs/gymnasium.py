@@ -11,6 +11,7 @@ that of a reset hold `drawn`, and `privileged` on request. A new -vN is for new 
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import gymnasium as gym
@@ -18,21 +19,22 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from gymnasium.wrappers import HumanRendering
+from gymnasium.wrappers import HumanRendering, TimeLimit
 
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import Seed
 from quadrl.core.environment import Environment, Transition
 from quadrl.core.task import Task
-from quadrl.envs.common import PICTURE, Named, episode_info, make
+from quadrl.envs import LAST
+from quadrl.envs.common import PICTURE, Changing, Named, episode_info, make
 from quadrl.rendering.pictures import Pictures
 
 Array = np.ndarray
 Info = dict[str, Any]
 
 
-class _Shared:
+class _Shared(Changing):
     """What the single environment and the vector share."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
@@ -42,15 +44,29 @@ class _Shared:
     @property
     def spec(self) -> EnvSpec | None:
         """How `gym.make` made it, with the steps after which the task itself ends an episode."""
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.environment.time_limit_steps
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None:
-            # A spec that was registered with them would bring a TimeLimit wrapper, which calls a
-            # crash on the last step a time-out as well.
-            spec.max_episode_steps = self.environment.time_limit_steps
+            spec.additional_wrappers = () if isinstance(self, VectorEnv) else LAST
         self._spec = spec
+
+    def change(self, **conditions: Any) -> None:
+        """Change options before the next reset, as `quadrl.core.environment.Environment.change`."""
+        super().change(**conditions)
+        if self._spec is not None:
+            self._spec.kwargs |= conditions
+
+    def __getattr__(self, name: str) -> Any:
+        """What is flown, by the names of its options."""
+        own: Environment | None = vars(self).get("environment")
+        for part in (own.task, own.scenario) if own else ():
+            if name in (field.name for field in dataclasses.fields(part)):
+                return getattr(part, name)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def _make(
         self,
@@ -89,10 +105,12 @@ class _Shared:
 class QuadrotorEnv(_Shared, gym.Env):
     """One aircraft: `gym.make("quadrl/Hover-v0")`.
 
-    `gym.make` keeps its argument `max_episode_steps` for a TimeLimit wrapper that knows nothing of
-    success: give the task's option `time_limit` [s] instead. `spec.max_episode_steps` is that limit
-    in steps.
+    `spec.max_episode_steps` is the task's time limit in steps, and so is the argument
+    `max_episode_steps` of `gym.make`.
     """
+
+    in_window = False
+    """Whether `gym.make` shows it in a window."""
 
     def __init__(self, task: str | Task = "hover", **settings: Any) -> None:
         """Make the environment.
@@ -253,6 +271,23 @@ class QuadrotorVectorEnv(_Shared, VectorEnv):
         self._pictures.close()
 
 
+def limited(env: gym.Env[Array, Array]) -> gym.Env[Array, Array]:
+    """Take the steps of Gymnasium's TimeLimit for the task's time limit.
+
+    The wrapper itself knows nothing of success, cannot make an episode longer, and calls a crash on
+    the last step a time-out as well.
+    """
+    own: Any = env.unwrapped
+    if isinstance(env, TimeLimit):
+        # What its spec says, which wrappers below would note from before the change.
+        own.change(max_episode_steps=env._max_episode_steps)
+        env = env.env
+    if own.in_window:
+        own.spec.kwargs["render_mode"] = own.render_mode  # the wrapper's is noted beside it
+        env = HumanRendering(env)
+    return env
+
+
 MODES = ["human", "rgb_array"]
 
 
@@ -262,9 +297,10 @@ def make_one(
     """What `gym.make` calls: a QuadrotorEnv, in a window where the render mode is "human"."""
     if render_mode is not None:
         validation.choice("render_mode", render_mode, MODES)
-    if render_mode == "human":
-        return HumanRendering(QuadrotorEnv(task, render_mode="rgb_array", **settings))
-    return QuadrotorEnv(task, render_mode=render_mode, **settings)
+    windowed = render_mode == "human"
+    made = QuadrotorEnv(task, render_mode="rgb_array" if windowed else render_mode, **settings)
+    made.in_window = windowed  # Gymnasium's wrapper for it goes around the others
+    return made
 
 
 # Gymnasium reads from it which wrapper a render mode needs.

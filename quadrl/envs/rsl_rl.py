@@ -18,11 +18,12 @@ except ImportError as error:
     raise ImportError(reason) from error
 
 from quadrl.base.errors import QuadrlError
+from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
-from quadrl.envs.common import make
+from quadrl.envs.common import Changing, make
 
 
-class QuadrotorVecEnv(VecEnv):
+class QuadrotorVecEnv(Changing, VecEnv):
     """N aircraft on all cores: `OnPolicyRunner(QuadrotorVecEnv("hover", 256), settings)`.
 
     Observations are a TensorDict with the group `policy` (N, size) and, with
@@ -52,10 +53,19 @@ class QuadrotorVecEnv(VecEnv):
         """
         self.environment = make(task, num_envs, ("device",), seed=seed, **settings)
         self.num_envs, self.num_actions = num_envs, self.environment.action_size
-        self.max_episode_length = self.environment.time_limit_steps
-        self.device, self.cfg = torch.device(device), self.environment.scenario
+        self.device = torch.device(device)
         self._lengths = np.zeros(num_envs, np.int64)
         self._observation = np.zeros((num_envs, self.environment.size), np.float32)
+
+    @property
+    def max_episode_length(self) -> int:
+        """The time limit in control steps."""
+        return self.environment.time_limit_steps
+
+    @property
+    def cfg(self) -> Scenario:
+        """What is flown and how."""
+        return self.environment.scenario
 
     @property
     def episode_length_buf(self) -> torch.Tensor:

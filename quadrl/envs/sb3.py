@@ -15,12 +15,13 @@ except ImportError as error:
 
 from quadrl.base.errors import QuadrlError
 from quadrl.core.task import Task
+from quadrl.envs.common import Changing
 from quadrl.envs.gymnasium import QuadrotorVectorEnv
 
 Array = np.ndarray
 
 
-class QuadrotorVecEnv(VecEnv):
+class QuadrotorVecEnv(Changing, VecEnv):
     """N aircraft on all cores: `PPO("MlpPolicy", QuadrotorVecEnv("hover", 64))`.
 
     A row begins anew in the step that ends its episode. The info of a row is empty while its
@@ -52,7 +53,7 @@ class QuadrotorVecEnv(VecEnv):
         )
         single = self.envs.single_observation_space, self.envs.single_action_space
         super().__init__(num_envs, *single)
-        self.metadata = self.envs.metadata
+        self.metadata, self.environment = self.envs.metadata, self.envs.environment
         self._actions = np.zeros((num_envs, self.envs.environment.action_size))
 
     def reset(self) -> Array:

@@ -13,13 +13,13 @@ from torchrl.envs import EnvBase
 
 from quadrl.core.task import Task
 from quadrl.core.transition import Transition
-from quadrl.envs.common import PICTURE, make
+from quadrl.envs.common import PICTURE, Changing, make
 from quadrl.rendering.pictures import Pictures
 
 DONE = ("done", "terminated", "truncated")
 
 
-class QuadrotorEnv(EnvBase):
+class QuadrotorEnv(Changing, EnvBase):
     """N aircraft, batch size [N]; observation (N, size) float32, action (N, k) in [-1, 1].
 
     Simulated on the CPU, whatever the device of the tensors. `is_success`, `error` [m] and, on

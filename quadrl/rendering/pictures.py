@@ -12,6 +12,7 @@ from quadrl.base.errors import RenderingUnavailable
 from quadrl.base.rotation import Array, norm
 from quadrl.base.validation import number
 from quadrl.core.environment import Environment
+from quadrl.core.scenario import Scenario
 from quadrl.core.trajectory import outcome
 from quadrl.engines import mjcf
 from quadrl.rendering.camera import MOVING, eased, keeping, moving_camera, moving_views
@@ -33,6 +34,7 @@ class Pictures:
         self._environment, self._camera = environment, camera
         self._width = number("width", width, 1, whole=True)
         self._height = number("height", height, 1, whole=True)
+        self._drawn: Scenario | None = None
         self._renderer: Renderer | None = None
         self._panel: Panel | None = None
         self._flights: dict[int, LiveFlight] = {}  # by row
@@ -48,6 +50,9 @@ class Pictures:
             RenderingUnavailable: This machine has no graphics library.
             QuadrlError: There is no such camera.
         """
+        if self._drawn is not self._environment.scenario:  # not yet, or it was changed
+            self.close()
+            self._drawn = self._environment.scenario
         self._renderer = renderer = self._renderer or self._open()
         flight = self._flights.setdefault(row, LiveFlight(self._camera))
         picture = flight.picture(renderer, self._environment, row)
