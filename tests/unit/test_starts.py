@@ -12,7 +12,6 @@ import quadrl
 from quadrl.base.rotation import Array
 from quadrl.core.environment import Environment
 from quadrl.core.task import TaskState
-from quadrl.envs import dm_control
 from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
@@ -62,16 +61,28 @@ def test_every_api_gives_the_same_start():
     tensors.reset()
     mask = torch.tensor([[True], [False]])
     tensors.reset(tensors.reset().set("_reset", mask), start=start)
-    control = dm_control.make("race", **own)
-    control.task.start_at = start
-    control.reset()
     environments += [each.unwrapped.environment for each in (single, batch)]
-    for each in (*environments, tensors.environment, control.task.environment):
+    for each in (*environments, tensors.environment):
         np.testing.assert_array_equal(each.snapshot.task.position[0], (1, 2, 3))
         np.testing.assert_allclose(each.snapshot.state.position[0], (1, 2, 3), atol=1e-12)
     assert np.abs(tensors.environment.snapshot.task.position[1] - (1, 2, 3)).max() > 0.5
     with pytest.raises(quadrl.base.errors.QuadrlError, match="'place'.*position"):
         tensors.reset(start={"place": (0, 0, 0)})
+
+
+def test_dm_control_begins_where_it_is_told_until_it_is_told_otherwise():
+    helpers.needs_dm_control()
+    from quadrl.envs import dm_control
+
+    control = dm_control.make("race")
+    control.task.start_at = STILL | {"position": (1.0, 2.0, 3.0)}
+    for _ in range(2):
+        control.reset()
+        begun = control.task.environment.snapshot.task.position
+        np.testing.assert_array_equal(begun, [(1, 2, 3)])
+    control.task.start_at = None
+    control.reset()
+    assert (control.task.environment.snapshot.task.position != (1, 2, 3)).all()
 
 
 def test_a_touchdown_in_the_first_step_is_as_hard_as_its_start_is_fast():
