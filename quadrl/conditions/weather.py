@@ -43,6 +43,8 @@ class Weather:
 
     wind_speed: float = 0.0
     """Mean wind at a height of 6.096 m (20 ft) [m/s]; turbulence grows with it."""
+    turbulence: float = 1.0
+    """Deviation of the turbulence over the standard's for this wind; 0 for a steady wind."""
     direction: float | None = None
     """Direction in which mean wind and gust blow, from east towards north [rad]; None to draw one
     for each of them in each episode."""
@@ -57,6 +59,7 @@ class Weather:
     def __post_init__(self) -> None:
         """Validate the numbers."""
         number("wind_speed", self.wind_speed, 0, MAX_WIND)
+        number("turbulence", self.turbulence, 0, 10.0)
         if self.direction is not None:
             number("direction", self.direction)
         number("roughness", self.roughness, 1e-6, 1.0)
@@ -80,11 +83,13 @@ class Weather:
 
 WEATHERS: dict[str, Weather] = {
     "calm": Weather(),
+    "steady": Weather(wind_speed=5.0, turbulence=0.0),
     "light": Weather(wind_speed=7.72),
     "moderate": Weather(wind_speed=15.4),
     "severe": Weather(wind_speed=23.1),
 }
-"""Named weathers: those of turbulence in MIL-F-8785C, 15, 30 and 45 knots; without a gust."""
+"""Named weathers without a gust: calm, a wind without turbulence, and those with the turbulence of
+MIL-F-8785C in 15, 30 and 45 knots."""
 
 
 Weathered = str | Weather | Mapping[str, Any] | None
@@ -124,7 +129,13 @@ class WeatherProcess:
         """
         self.weather = weather
         count, step = engine.num_envs, engine.vehicle.control_timestep
-        self._setting = weather.roughness, float(engine.origin[2]), step, noise_time
+        self._setting = (
+            weather.roughness,
+            float(engine.origin[2]),
+            step,
+            noise_time,
+            weather.turbulence,
+        )
         self._latest = max(0.0, time_limit - weather.gust_time)
         # As wide as the engine's own tables, against set conflicts between rows.
         self._whole = np.zeros((len(ROWS), engine.frames[0].columns))

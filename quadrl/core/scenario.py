@@ -54,8 +54,8 @@ class Conditions(TypedDict, total=False, extra_items=Any):
     also an Aerodynamics. By default the effects of the aircraft; in wind, the full set if it has
     none."""
     weather: Weathered
-    """The weather: calm, light, moderate or severe, or JSON such as '{"wind_speed": 5}'; in Python
-    also a Weather, or some of its fields."""
+    """The weather: calm, steady, light, moderate or severe, or JSON such as '{"wind_speed": 5}'; in
+    Python also a Weather, or some of its fields."""
     randomization: Randomized
     """Randomization of each aircraft at each reset: none, light or full, or JSON such as '{"mass":
     [0.8, 1.2]}'; in Python also a Randomization, or some of its fields."""

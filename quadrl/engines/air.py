@@ -50,7 +50,12 @@ LOG_TERMS, SINE_TERMS = 11, 11
 
 
 def fixed_of(
-    wind_speed: Any, roughness: float, altitude: float, timestep: float, noise_time: float
+    wind_speed: Any,
+    roughness: float,
+    altitude: float,
+    timestep: float,
+    noise_time: float,
+    turbulence: float = 1.0,
 ) -> dict[str, Any]:
     """Compute the rows FIXED, numbers or (n,).
 
@@ -60,13 +65,14 @@ def fixed_of(
         altitude: Altitude of the task [m], for the turbulence.
         timestep: Control timestep [s].
         noise_time: Correlation time of the noise of the lift [s]; 0 for none.
+        turbulence: Its deviation over the standard's.
     """
     shear = wind_speed / math.log(REFERENCE / roughness)
     height = min(max(altitude / FOOT, 10.0), 1000.0)  # [ft], where the formulas hold
     spread = 0.177 + 0.000823 * height
     lengths = {"along": height / spread**1.2 * FOOT, "up": height * FOOT}  # [m]
     speed = np.maximum(shear * math.log(max(height * FOOT / roughness, 1)), LEAST_SPEED)
-    rows: dict[str, Any] = {"shear": shear, "upward_deviation": 0.1 * wind_speed}
+    rows: dict[str, Any] = {"shear": shear, "upward_deviation": 0.1 * wind_speed * turbulence}
     rows["level_deviation"] = rows["upward_deviation"] / spread**0.4
     rate = speed * timestep / lengths["along"]
     rows["along_keep"] = np.exp(-rate)

@@ -18,7 +18,6 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm
 from quadrl.base.units import length, quantity
 from quadrl.conditions.randomization import RANDOMIZATIONS
-from quadrl.conditions.weather import WEATHERS
 from quadrl.control import Gains, GeometricController
 from quadrl.control.reading import Reading
 from quadrl.core.scenario import Conditions, Scenario
@@ -81,7 +80,7 @@ def conditions() -> dict[str, Conditions]:
     return {
         "nothing": {},
         **{f"aerodynamics {e}": {"aerodynamics": e} for e in (*EFFECTS, "full")},
-        **{f"weather {w}": {"weather": w} for w in WEATHERS if w != "calm"},
+        **{f"weather {w}": {"weather": w} for w in ("light", "moderate", "severe")},
         **{f"{k} as in `full`": {"randomization": {k: v}} for k, v in drawn if k not in NEEDS_AIR},
         **{f"randomization {n}": {"randomization": n} for n in ("light", "full")},
         "all together": ALL_TOGETHER,

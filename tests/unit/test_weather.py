@@ -303,13 +303,36 @@ def test_what_was_saved_in_another_weather_is_not_taken_up():
     np.testing.assert_array_equal(severe.engine.air, before)
 
 
+def test_a_steady_wind_is_its_mean_and_nothing_else():
+    north = {"wind_speed": 5.0, "turbulence": 0.0, "direction": math.pi / 2}
+    for weather in ("steady", north):
+        environment = helpers.begun(num_envs=3, weather=weather)
+        for _ in range(20):
+            # As high as the aircraft is when the step begins: 5 m/s ln(h / z0) / ln(6.096 m / z0).
+            height = environment.engine.qpos[:, 2].copy()
+            helpers.idle(environment)
+            wind, mean = (
+                environment.engine.wind,
+                5 * np.log(height / 0.0457) / math.log(6.096 / 0.0457),
+            )
+            np.testing.assert_allclose(np.linalg.norm(wind, axis=1), mean, rtol=1e-12)
+            assert not wind[:, 2].any()
+        if weather is north:
+            np.testing.assert_allclose(wind[:, 0], 0.0, atol=1e-12)
+            assert (wind[:, 1] > 0).all()
+    strong = helpers.begun(weather=north | {"turbulence": 2.0}, seed=4)
+    usual = helpers.begun(weather=north | {"turbulence": 1.0}, seed=4)
+    up = [environment.engine.wind[0, 2] for environment in (strong, usual)]
+    assert up[0] == pytest.approx(2 * up[1]) and up[1] != 0
+
+
 def test_a_weather_is_found_by_name_and_by_its_fields():
     assert Weather.of("light") is LIGHT and Weather.of(GUSTY) is GUSTY
     assert Weather.of(dataclasses.asdict(GUSTY)) == GUSTY
     knots = [round(weather.wind_speed / 0.514444) for weather in WEATHERS.values()]
-    assert knots == [0, 15, 30, 45]
+    assert knots == [0, 10, 15, 30, 45]
     for given in ("windy", 3.0, ("light",)):
-        with helpers.refused("weather", lists="calm, light"):
+        with helpers.refused("weather", lists="calm, steady, light"):
             helpers.begun(weather=given)
     with helpers.refused(lists="wind_speed"):
         Weather.of({"speed": 3.0})
