@@ -21,6 +21,7 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.shield import shield_triton
 from quadrl.base.validation import registered
+from quadrl.base.version import __version__ as __version__
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import RANDOMIZATIONS, Randomization
 from quadrl.core.task import Task
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from quadrl.learning.show import plot, render
     from quadrl.learning.study import study
 
-__version__ = "0.1.0"
 __all__ = [
     "RANDOMIZATIONS", "VEHICLES", "Aerodynamics", "Observing", "Policy", "Randomization", "Task",
     "Vehicle", "check", "envs", "evaluate", "export", "load", "plot", "register", "render",

@@ -10,8 +10,8 @@ import functools
 import sys
 from typing import TYPE_CHECKING, Any
 
-from quadrl import tasks
 from quadrl.base import validation
+from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
     from dm_control.rl import control
@@ -53,7 +53,7 @@ def load(
     from quadrl.envs.dm_control import make
 
     validation.choice("domain_name", domain_name, [DOMAIN])
-    validation.choice("task_name", task_name, tasks.TASKS)
+    validation.choice("task_name", task_name, TASKS)
     given: Any = task_kwargs or {}
     environment = make(task_name, environment_kwargs=environment_kwargs, **given)
     environment.task.visualize_reward = visualize_reward
@@ -73,7 +73,7 @@ def register() -> None:
 
     global SUITE
     SUITE = containers.TaggedTasks()
-    for name in tasks.TASKS:
+    for name in TASKS:
         factory = functools.partial(make, name)
         factory.__name__ = name  # type: ignore[attr-defined]
         SUITE.add()(factory)
@@ -90,7 +90,7 @@ def register() -> None:
 def __getattr__(name: str) -> Any:
     """The two constants that grow when a task is registered."""
     if name == "ALL_TASKS":
-        return tuple((DOMAIN, task) for task in tasks.TASKS)
+        return tuple((DOMAIN, task) for task in TASKS)
     if name == "TASKS_BY_DOMAIN":
-        return {DOMAIN: tuple(tasks.TASKS)}
+        return {DOMAIN: tuple(TASKS)}
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

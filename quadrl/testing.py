@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from quadrl import tasks
 from quadrl.core.environment import Environment
 from quadrl.core.rules import ROWS, blame, check_rules, require, require_equal, varied_actions
 from quadrl.core.task import Task
+from quadrl.tasks import make
 
 EPISODE = 2.4  # [s], the longest that is flown in the APIs
 SEED = 3
@@ -38,7 +38,7 @@ def check_task(task: str | Task | type[Task]) -> None:
     Raises:
         AssertionError: The first fault that is found.
     """
-    task = task() if isinstance(task, type) else tasks.make(task)
+    task = task() if isinstance(task, type) else make(task)
     check_rules(task, _optional("torch"))
     check_episodes(task)
     check_saving(task)

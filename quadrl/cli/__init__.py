@@ -16,10 +16,10 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import CascadeSubcommandArgs, Positional, UseAppendAction, arg
 
-from quadrl import __version__
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.signals import IN_ORDER, Stopped, handling
 from quadrl.base.validation import choice
+from quadrl.base.version import __version__
 from quadrl.cli import choices, console, parsing, train
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from quadrl import tasks
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, tuples
 from quadrl.cli import choices
@@ -18,6 +17,7 @@ from quadrl.core.scenario import Conditions
 from quadrl.evaluation.controllers import comes_with_quadrl
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.defaults import PAIRS
+from quadrl.tasks import TASKS
 
 EXAMPLES = {
     "weather": ' such as {"wind_speed": 5}',
@@ -83,7 +83,7 @@ def flies(policy: str, controller: str, algo: str) -> str | Path | Policy:
             "give either a policy (a run folder, a .safetensors file, or the name of a task) "
             f"or --controller {' or '.join(CONTROLLERS)}"
         )
-    if algo and policy not in tasks.TASKS:
+    if algo and policy not in TASKS:
         raise QuadrlError(
             "--algo chooses among the policies that come with quadrl: give the name of a task, "
             "or leave it out"

@@ -9,11 +9,11 @@ from typing import Any
 from rich.markup import escape
 from tyro.conf import Positional
 
-from quadrl import tasks
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, print_json, say
 from quadrl.learning.defaults import written
 from quadrl.learning.description import describe
+from quadrl.tasks import TASKS, make
 
 
 @choices.command
@@ -27,8 +27,8 @@ class Tasks:
 
     def run(self) -> None:
         """Print goal, start, ends, observation, action and reward."""
-        chosen = [self.task] if self.task else list(tasks.TASKS)
-        described = [describe(tasks.make(name)) for name in chosen]
+        chosen = [self.task] if self.task else list(TASKS)
+        described = [describe(make(name)) for name in chosen]
         if self.json:
             whole = {task["name"]: task for task in described}
             print_json(whole[self.task] if self.task else whole)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from quadrl import __version__, tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.rotors import Rotor
 from quadrl.aircraft.vehicle import Vehicle
@@ -18,6 +17,7 @@ from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import free_name, write_whole
 from quadrl.base.validation import choice
+from quadrl.base.version import __version__
 from quadrl.conditions.sensor import SYMBOLS, Sensor
 from quadrl.core.environment import Environment
 from quadrl.evaluation.controllers import comes_with_quadrl, policy_of
@@ -25,6 +25,7 @@ from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.policy_file import CLIP
 from quadrl.learning.description import describe_observation
 from quadrl.rendering.video import checked
+from quadrl.tasks import TASKS
 
 TARGETS = {
     "mjcf": ("xml", "quadrl.deploy.mjcf", ""),
@@ -87,7 +88,7 @@ def _found(what: Any) -> Vehicle | Policy:
         return VEHICLES[what]
     found = getattr(what, "policy", what)  # of what `quadrl.train` returned
     if isinstance(found, str) and not (comes_with_quadrl(found) or Path(found).exists()):
-        known = *VEHICLES, *tasks.TASKS, *(file.stem for file in shipped())
+        known = *VEHICLES, *TASKS, *(file.stem for file in shipped())
         choice("what", found, ("a run folder", "a .safetensors file", *known))
     if isinstance(found, (str, Path)):
         return policy_of(found)

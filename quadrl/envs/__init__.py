@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.envs.registration import WrapperSpec
 
-from quadrl import tasks
+from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
     from quadrl.envs import dm_control, gymnasium, rsl_rl, sb3, torchrl
@@ -36,7 +36,7 @@ LAST = ForOne([WrapperSpec("TaskLimit", "quadrl.envs.gymnasium:limited", {})])
 
 def register_ids() -> None:
     """Register every task of the catalogue as quadrl/<CamelCase>-v0 (idempotent)."""
-    for name in tasks.TASKS:
+    for name in TASKS:
         camel = "".join(word.capitalize() for word in name.split("_"))
         if (id := f"quadrl/{camel}-v0") not in gym.registry:
             gym.register(

@@ -20,9 +20,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from quadrl import __version__
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import read_sealed_json, write_sealed_json
+from quadrl.base.version import __version__
 from quadrl.core.task import Task
 
 FILE = "flown.json"

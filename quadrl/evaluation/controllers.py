@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from quadrl import tasks
 from quadrl.aircraft.presets import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.validation import choice
 from quadrl.control import CONTROLLERS, Controller
 from quadrl.core.task import Task
 from quadrl.evaluation.policy import Policy, shipped
+from quadrl.tasks import TASKS, make
 
 
 def make_controller(
@@ -27,12 +27,12 @@ def make_controller(
         QuadrlError: Unknown controller, task or vehicle; the message lists the choices.
     """
     kind = CONTROLLERS[choice("controller", name, CONTROLLERS)]
-    return kind(resolve(vehicle), tasks.make(task))
+    return kind(resolve(vehicle), make(task))
 
 
 def comes_with_quadrl(name: str) -> bool:
     """Whether a name is that of a task, or of a policy that comes with quadrl."""
-    return name in tasks.TASKS or name in {file.stem for file in shipped()}
+    return name in TASKS or name in {file.stem for file in shipped()}
 
 
 def policy_of(given: str | Path) -> Policy:

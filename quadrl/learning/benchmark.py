@@ -23,7 +23,6 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from quadrl import envs, tasks
 from quadrl.aircraft.presets import in_real_air
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.machine import cores, machine
@@ -34,6 +33,7 @@ from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import BatchEngine
+from quadrl.tasks import make
 
 Work = Iterator[int]
 """An iterator that flies some control steps at each `next` and gives their number."""
@@ -84,7 +84,7 @@ def benchmark(
         TorchRL layer is left out where TorchRL is not installed.
     """
     with contextlib.ExitStack() as stack:
-        layers = _layers(tasks.make(task), num_envs, stack)
+        layers = _layers(make(task), num_envs, stack)
         rates = _measure([layer.work for layer in layers], seconds, repeats)
     yardsticks: dict[str, list[float]] = {}
     for layer, measured in zip(layers, rates, strict=True):
@@ -168,7 +168,9 @@ def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Laye
               _single(alone, model.nu, lambda step: step[2] or step[3]), 0.35),
     ]  # fmt: skip
     if importlib.util.find_spec("dm_control"):
-        loaded = envs.dm_control.make(task, random=0)
+        from quadrl.envs import dm_control
+
+        loaded = dm_control.make(task, random=0)
         stack.callback(loaded.close)
         flown = _single(loaded, model.nu, lambda step: step.last())
         layers.append(Layer("dm_control load, one aircraft", ONE_CORE, flown))

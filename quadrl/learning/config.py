@@ -13,12 +13,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
 
-from quadrl import __version__
 from quadrl.aircraft.aerodynamics import FULL
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import free_name
 from quadrl.base.validation import choice, keys, number, resolved, tuples
+from quadrl.base.version import __version__
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.observing import resolve as resolve_observing
 from quadrl.conditions.randomization import Randomization

@@ -1,0 +1,3 @@
+"""The version of quadrl."""
+
+__version__ = "0.1.0"
