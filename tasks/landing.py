@@ -197,7 +197,7 @@ class Landing(Task):
         first = down.argmax(0)
         flights = np.flatnonzero(down.any(0) & (first > 0))
         speed = np.linalg.norm(rollout.velocity[first[flights] - 1, flights], axis=-1)
-        last = rollout.length - 1, np.arange(len(rollout.length))
+        last = rollout.length, np.arange(len(rollout.length))
         still = norm(rollout.velocity[last]) < REST_SPEED
         crashed = rollout.terminated & ~rollout.is_success & ~(still & down[last])
         return {

@@ -130,15 +130,15 @@ class StraightAndLevel(Task):
 
     def metrics(self, rollout: Rollout) -> dict[str, float]:
         """Altitude and cross-track error over the flight, speed error over its second half."""
-        ahead = rollout.goal - rollout.position
-        goal = rollout.goal[..., :2]
+        position, goal = rollout.position[1:], rollout.goal[1:, :, :2]
+        ahead = rollout.goal[1:] - position
         direction = goal / np.linalg.norm(goal, axis=-1, keepdims=True)
         across = ahead[..., 0] * direction[..., 1] - ahead[..., 1] * direction[..., 0]
-        speed = (rollout.velocity[..., :2] * direction).sum(-1)[len(rollout.error) // 2 :]
+        speed = (rollout.velocity[1:, :, :2] * direction).sum(-1)[len(rollout.error) // 2 :]
         flown = speed[:, np.isfinite(speed).any(0)]
         off = np.abs(np.nanmean(flown, 0) / self.line_speed - 1)
         return {
-            "altitude_rms_m": float(np.sqrt(np.nanmean(rollout.position[..., 2] ** 2))),
+            "altitude_rms_m": float(np.sqrt(np.nanmean(position[..., 2] ** 2))),
             "cross_track_rms_m": float(np.sqrt(np.nanmean(across**2))),
             "speed_error_share": statistic(np.mean, off),
         }

@@ -21,6 +21,9 @@ class Evaluate(Flown):
     """Draw the actions of a policy as in training, instead of taking their mean."""
     csv: Path | None = None
     """Also write a table with one row per flight to this file."""
+    states: Path | None = None
+    """Also write the states of the flights to this file: a table with one row per control step,
+    from each start on."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -37,8 +40,8 @@ class Evaluate(Flown):
         first, columns = flown.metrics, {self.controller or "policy": flown.metrics}
         if self.controller != "geometric" and not self.json:
             columns["geometric controller"] = flown.yardstick().metrics
-        if self.csv is not None:
-            flown.save_csv(self.csv)
+        written = ((self.csv, flown.save_csv), (self.states, flown.save_states))
+        files = [save(path) for path, save in written if path is not None]
         if self.json:
             print_json(first)
             return
@@ -46,5 +49,5 @@ class Evaluate(Flown):
             (name, *(quantity(name, column[name]) for column in columns.values())) for name in first
         ]
         console.print(make_table([("", *columns), *rows], numbers=len(columns)))
-        if self.csv is not None:
-            say(f"wrote {self.csv}")
+        for path in files:
+            say(f"wrote {path}")

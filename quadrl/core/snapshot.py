@@ -132,22 +132,23 @@ class EpisodeEnd:
 class Rollout:
     """One episode of each of N aircraft, step by step; T steps are the longest of them.
 
+    There are S = T + 1 states, the start first: step t leads from state t to state t + 1.
     Everything after the end of an aircraft's episode is NaN.
     """
 
-    position: np.ndarray  # (T, N, 3) [m], task frame
-    quaternion: np.ndarray  # (T, N, 4) (w, x, y, z)
-    velocity: np.ndarray  # (T, N, 3) [m/s], world frame
-    body_rate: np.ndarray  # (T, N, 3) [rad/s], body frame
-    rotor_speed: np.ndarray  # (T, N, R) [rad/s]
-    goal: np.ndarray  # (T, N, 3) [m], task frame
-    target_velocity: np.ndarray  # (T, N, 3) [m/s], world frame; zero where nothing moves
+    position: np.ndarray  # (S, N, 3) [m], task frame
+    quaternion: np.ndarray  # (S, N, 4) (w, x, y, z)
+    velocity: np.ndarray  # (S, N, 3) [m/s], world frame
+    body_rate: np.ndarray  # (S, N, 3) [rad/s], body frame
+    rotor_speed: np.ndarray  # (S, N, R) [rad/s]
+    goal: np.ndarray  # (S, N, 3) [m], task frame
+    target_velocity: np.ndarray  # (S, N, 3) [m/s], world frame; zero where nothing moves
     action: np.ndarray  # (T, N, k), within [-1, 1]
     rotor_command: np.ndarray  # (T, N, R), mean over each step, as a share of the largest speed
     error: np.ndarray  # (T, N) [m]
     reward: np.ndarray  # (T, N)
     wind: np.ndarray  # (T, N, 3) [m/s], world frame; that of the step which led to each state
-    remembered: Mapping[str, np.ndarray]  # (T, N, ...) by name: the task's own TaskState
+    remembered: Mapping[str, np.ndarray]  # (T, N, ...) by name: the task's TaskState after a step
     length: np.ndarray  # (N,) steps of each episode
     terminated: np.ndarray  # (N,) bool
     is_success: np.ndarray  # (N,) bool
@@ -169,14 +170,15 @@ class Rollout:
     def trajectory(self, vehicle: Vehicle, episode: int = 0) -> Trajectory:
         """The flight of one aircraft, to be drawn; the markers are those of the first."""
         steps = slice(0, int(self.length[episode]))
-        position, wind = self.position[steps, episode] + self.origin, self.wind[steps, episode]
+        after = slice(1, steps.stop + 1)
+        position, wind = self.position[after, episode] + self.origin, self.wind[steps, episode]
         return Trajectory(
             time=np.arange(1, len(position) + 1) * self.control_timestep,
-            qpos=np.concatenate([position, self.quaternion[steps, episode]], axis=1),
-            rotor_speed=self.rotor_speed[steps, episode],
+            qpos=np.concatenate([position, self.quaternion[after, episode]], axis=1),
+            rotor_speed=self.rotor_speed[after, episode],
             error=self.error[steps, episode],
             reward=self.reward[steps, episode],
-            goal=self.goal[steps, episode] + self.origin,
+            goal=self.goal[after, episode] + self.origin,
             control_timestep=self.control_timestep,
             max_rotor_speed=vehicle.max_speed,
             task=self.task.name,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import html
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Unpack, cast
+
+import numpy as np
 
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
@@ -95,10 +97,47 @@ class Evaluation:
         ):
             cells = (f"{x:.6g}" if isinstance(x, float) else int(x) for x in row)
             rows.append((i, self.seed + i, *cells))
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_csv(path, ("episode", "seed", *columns), rows)
-        return path
+        return _write(path, ("episode", "seed", *columns), rows)
+
+    def save_states(self, path: str | Path) -> Path:
+        """Write one row per control step of each flight, from its start at time 0 on.
+
+        Time [s]; position x, y, z [m] and goal in the task's frame; quaternion; velocity [m/s],
+        world frame; body rate wx, wy, wz [rad/s], body frame; speeds of the rotors [rad/s]; and the
+        action that is taken there, none where a flight is over.
+        """
+        flown = self.rollout
+        none = np.full((1, *flown.action.shape[1:]), np.nan)
+        parts = (
+            (("x", "y", "z"), flown.position),
+            (("qw", "qx", "qy", "qz"), flown.quaternion),
+            (("vx", "vy", "vz"), flown.velocity),
+            (("wx", "wy", "wz"), flown.body_rate),
+            (_numbered("rotor", flown.rotor_speed), flown.rotor_speed),
+            (("goal_x", "goal_y", "goal_z"), flown.goal),
+            (_numbered("action", flown.action), np.concatenate([flown.action, none])),
+        )
+        head = "episode", "seed", "time", *(name for names, _ in parts for name in names)
+        whole = np.concatenate([values for _, values in parts], axis=-1)  # (S, N, columns)
+        rows = [
+            (i, self.seed + i, *(f"{x:.9g}" if x == x else "" for x in (t * step, *row)))
+            for step in [flown.control_timestep]
+            for i, last in enumerate(flown.length)
+            for t, row in enumerate(whole[: last + 1, i])
+        ]
+        return _write(path, head, rows)
+
+
+def _numbered(name: str, values: np.ndarray) -> list[str]:
+    return [f"{name}_{k + 1}" for k in range(values.shape[-1])]
+
+
+def _write(path: str | Path, head: Sequence[str], rows: list[Any]) -> Path:
+    """Write a table, and the folder for it."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_csv(path, head, rows)
+    return path
 
 
 def evaluate(
@@ -153,7 +192,8 @@ def setting(
         controller: A `Policy`; what `quadrl.train` returned; a run folder or a .safetensors file;
             the name of a task, for the policy for it that comes with quadrl, or of such a policy
             (hover_robust); "geometric" or "lqr";
-            or any function of flat observations (N, size) that gives actions (N, k).
+            or any function of flat observations (N, size) that gives actions (N, k): of arrays,
+            or a torch module.
         task: A task or its name, or a whole scenario; None for what the policy was trained for,
             hover for a controller.
         **conditions: As `evaluate` takes them.

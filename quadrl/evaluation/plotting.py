@@ -236,7 +236,7 @@ def trajectory(rollout: Rollout, title: str) -> Figure:
 
 
 def _quantities(rollout: Rollout, shown: int) -> tuple[dict[str, np.ndarray], ...]:
-    """Values (T, n) over time by their labels: place, wind and error; attitude and speeds."""
+    """Values (S or T, n) over time by their labels: place, wind and error; attitude and speeds."""
     wind, velocity = rollout.wind[:, :shown], rollout.velocity[:, :shown]
     windy = bool(np.nan_to_num(wind).any())
     roll, pitch, yaw = np.moveaxis(roll_pitch_yaw(rollout.quaternion[:, :shown]), -1, 0)
@@ -245,24 +245,25 @@ def _quantities(rollout: Rollout, shown: int) -> tuple[dict[str, np.ndarray], ..
     right = dict(zip(MOTION, attitude, strict=True))
     if windy:
         left["wind [m/s]"] = np.linalg.norm(wind, axis=-1)
-        right["airspeed [m/s]"] = np.linalg.norm(velocity - wind, axis=-1)
+        right["airspeed [m/s]"] = np.linalg.norm(velocity[1:] - wind, axis=-1)
     left["error [m]"] = np.maximum(rollout.error[:, :shown], LEAST_ERROR)
     right["speed [m/s]"] = np.linalg.norm(velocity, axis=-1)
     return left, right
 
 
 def _flights(axis: Any, rollout: Rollout, values: np.ndarray, **style: Any) -> None:
-    """Draw values (T, n) over time, a colour each."""
-    time = np.arange(1, len(values) + 1) * rollout.control_timestep
+    """Draw values of states (S, n) or of steps (T, n) over time, a colour each."""
+    first = len(rollout.position) - len(values)
+    time = np.arange(first, len(rollout.position)) * rollout.control_timestep
     for value, colour in zip(values.T, COLOURS, strict=False):
         axis.plot(time, value, **({"color": colour, "lw": 1.2, "alpha": 0.85} | style))
     tidy(axis)
 
 
 def _space(space: Any, rollout: Rollout, goals: np.ndarray, shared: bool) -> None:
-    """Draw the paths of flights and their goals (T, n, 3) in space."""
+    """Draw the paths of flights and their goals (S, n, 3) in space."""
     for i, colour in zip(range(goals.shape[1]), COLOURS, strict=False):
-        flown, goal = (path[: rollout.length[i], i] for path in (rollout.position, goals))
+        flown, goal = (path[: rollout.length[i] + 1, i] for path in (rollout.position, goals))
         ended = "successful" if rollout.is_success[i] else "not successful"
         space.plot(*flown.T, color=colour, lw=1.4, alpha=0.9, label=f"flight {i + 1}, {ended}")
         space.scatter(*flown[:1].T, color=colour, s=18, marker="o")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from typing import Any, Unpack
 
@@ -21,8 +22,10 @@ from quadrl.evaluation.memory import PolicyInFlight
 from quadrl.evaluation.policy import Policy
 
 Controller = Callable[[np.ndarray], np.ndarray]
-"""Flat observations (N, size) float32 to actions (N, k); its attribute `control_mode`, if it has
-one, says what they mean, and `conditions` what it was trained in, as `Scenario.of` takes it."""
+"""Flat observations (N, size) float32 to actions (N, k), or a torch module that does that.
+
+Its attribute `control_mode`, if it has one, says what actions mean, and `conditions` what it was
+trained in, as `Scenario.of` takes it."""
 
 EVALUATION_SEED = 1 << 53
 """Beyond the seeds of every training (2^32 * 2^20), so that evaluation episodes are fresh ones."""
@@ -66,10 +69,11 @@ def fly(
     numbers = 24 + 2 * len(environment.vehicle.rotors) + sum(a.size for a in known) // episodes
     machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
     own_fields = [field.name for field in dataclasses.fields(environment.snapshot.task)]
-    moments: list[dict[str, np.ndarray]] = []
+    everyone = np.ones(episodes, dtype=bool)
+    states, moments = [_while(everyone, _state(environment))], list[dict[str, np.ndarray]]()
     remembered: list[dict[str, np.ndarray]] = []
     markers = []
-    alive = np.ones(episodes, dtype=bool)
+    alive = everyone.copy()
     shape = episodes, environment.action_size
     length = np.zeros(episodes, dtype=int)
     ends = {name: np.zeros(episodes, bool) for name in ("terminated", "is_success", "diverged")}
@@ -78,11 +82,9 @@ def fly(
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         markers.append(environment.markers())
-        snapshot, goal = environment.snapshot, flown.goal(environment.snapshot)
-        velocity = flown.target_velocity(snapshot)
-        moment = {name: getattr(snapshot.state, name) for name in MOTION} | {
-            "goal": goal,
-            "target_velocity": np.zeros_like(goal) if velocity is None else velocity,
+        states.append(_while(alive, _state(environment)))
+        snapshot = environment.snapshot
+        moment = {
             "action": taken,
             "rotor_command": snapshot.rotor_command / environment.vehicle.max_speed,
             "error": now.error,
@@ -97,6 +99,7 @@ def fly(
             flag |= alive & getattr(now, name)
         alive &= ~(now.terminated | now.truncated)
     return Rollout(
+        **_stacked(states),
         **_stacked(moments),
         remembered=_stacked(remembered),
         length=length,
@@ -148,7 +151,22 @@ def begun(controller: Controller, environment: Environment) -> Controller:
     if isinstance(controller, PolicyInFlight):
         controller.policy.check_fits(environment)
         controller.reset()
+    torch: Any = sys.modules.get("torch")  # who has a module has imported it
+    if torch and isinstance(controller, torch.nn.Module):
+        return _of_module(controller, torch)
     return controller
+
+
+def _of_module(module: Any, torch: Any) -> Controller:
+    """A torch module as a function of arrays, on its device and in its precision."""
+    like = next(module.parameters(), torch.zeros(()))
+
+    def act(observation: np.ndarray) -> Any:
+        with torch.no_grad():
+            given = module(torch.from_numpy(observation).to(like))
+        return given.cpu().numpy() if isinstance(given, torch.Tensor) else given
+
+    return act
 
 
 def flights(rollout: Rollout) -> dict[str, np.ndarray]:
@@ -168,19 +186,19 @@ def flights(rollout: Rollout) -> dict[str, np.ndarray]:
     index = np.arange(len(rollout.error))[:, None]
     flown = index < rollout.length
     last = flown & (index >= rollout.length - steps)
-    yaw = np.degrees(roll_pitch_yaw(rollout.quaternion)[..., 2])
+    yaw = np.degrees(roll_pitch_yaw(rollout.quaternion[1:])[..., 2])
     heading = {"heading_error_deg": _means(np.abs(yaw), last)}
-    relative = np.linalg.norm(rollout.velocity - rollout.target_velocity, axis=-1)
+    relative = np.linalg.norm((rollout.velocity - rollout.target_velocity)[1:], axis=-1)
     circling = {"circling_m_s": _means(relative, last)}
     change = np.abs(np.diff(rollout.rotor_command, axis=0)).mean(-1)
-    height = rollout.position[..., 2] + rollout.origin[2]
+    height = rollout.position[1:, :, 2] + rollout.origin[2]
     return {
         "success": rollout.is_success,
         "survived": ~(rollout.terminated & ~rollout.is_success),
         "diverged": rollout.diverged,
         "position_error_m": _means(rollout.error, last),
         **(heading if rollout.task.heading_matters else {}),
-        "yaw_rate_rad_s": _means(np.abs(rollout.body_rate[..., 2]), last),
+        "yaw_rate_rad_s": _means(np.abs(rollout.body_rate[1:, :, 2]), last),
         **(circling if rollout.task.keeps_place else {}),
         "command_change_rate": _means(change, flown[1:]),
         "saturated_rate": _means((np.abs(rollout.action) >= 1.0).mean(-1), flown),
@@ -224,6 +242,16 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
         "length_mean_s": float(flown["length_s"].mean()),
         "diverged": int(flown["diverged"].sum()),
     } | rollout.task.metrics(rollout)
+
+
+def _state(environment: Environment) -> dict[str, np.ndarray]:
+    """The state, the goal and its velocity now, arrays (N, ...)."""
+    now, task = environment.snapshot, environment.task
+    goal, velocity = task.goal(now), task.target_velocity(now)
+    return {name: getattr(now.state, name) for name in MOTION} | {
+        "goal": goal,
+        "target_velocity": np.zeros_like(goal) if velocity is None else velocity,
+    }
 
 
 def _while(alive: np.ndarray, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

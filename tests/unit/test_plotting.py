@@ -59,7 +59,7 @@ def test_flights_are_shown_with_attitude_speed_and_commands():
 
 def test_flights_in_wind_show_it_and_the_airspeed():
     axes, rollout = drawn("hover", weather="light")
-    wind, air = rollout.wind[:, 1], rollout.velocity[:, 1] - rollout.wind[:, 1]
+    wind, air = rollout.wind[:, 1], rollout.velocity[1:, 1] - rollout.wind[:, 1]
     for name, value in (("wind [m/s]", wind), ("airspeed [m/s]", air)):
         shown = axes[name].lines[1].get_ydata()
         np.testing.assert_allclose(shown, np.linalg.norm(value, axis=1), rtol=1e-12)

@@ -1,13 +1,16 @@
 """Rollouts: the episodes that are flown, and the metrics of them."""
 
+import csv
 import dataclasses
 import json
 import math
 
 import numpy as np
 import pytest
+import torch
 from helpers import begun, refused
 
+import quadrl
 from quadrl import tasks
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.core.environment import Environment
@@ -23,8 +26,14 @@ def brake(observation: np.ndarray) -> np.ndarray:
     return np.tanh(0.3 * observation[..., 0:4] - 0.2 * observation[..., 9:13])
 
 
+STATES = "position quaternion velocity body_rate rotor_speed goal target_velocity".split()
+
+
 def make_rollout(**changes) -> Rollout:
-    """Three aircraft over 5 s of 100 steps: one to the end, one crashed, one done early."""
+    """Three aircraft over 5 s of 100 steps: one to the end, one crashed, one done early.
+
+    States are given as after the steps; before them is a start of no numbers, which counts nowhere.
+    """
     steps, episodes = 100, 3
     length = np.array([100, 20, 60])
     number = np.arange(steps)[:, None]
@@ -49,7 +58,10 @@ def make_rollout(**changes) -> Rollout:
         control_timestep=0.05,
         task=tasks.make("hover"),
     )
-    return Rollout(**{**nothing, **values, **changes})
+    made = {**nothing, **values, **changes}
+    for name in STATES:
+        made[name] = np.concatenate([np.full_like(made[name][:1], np.nan), made[name]])
+    return Rollout(**made)
 
 
 def test_metrics_by_hand():
@@ -160,6 +172,18 @@ def test_a_task_is_not_solved_by_who_turns_or_circles():
         assert not any(x.met({}) or x.met({x.metric: None}) for x in targets)
 
 
+def at(alone, rollout, t, i):
+    """Check that a single environment is in state t of flight i."""
+    velocity = alone.task.target_velocity(alone.snapshot)
+    for name, value in (
+        ("position", alone.snapshot.state.position),
+        ("rotor_speed", alone.snapshot.state.rotor_speed),
+        ("goal", alone.task.goal(alone.snapshot)),
+        ("target_velocity", np.zeros((1, 3)) if velocity is None else velocity),
+    ):
+        np.testing.assert_array_equal(getattr(rollout, name)[t, i], value[0], err_msg=name)
+
+
 @pytest.mark.parametrize(
     ("task", "settings"),
     [
@@ -175,17 +199,16 @@ def test_episode_i_is_the_single_environment_of_its_seed(task, settings):
     for i in range(4):
         alone = Environment(task, seed=EVALUATION_SEED + 7 + i, **settings)
         observation = alone.flatten(alone.reset())
+        at(alone, rollout, 0, i)
         for t in range(rollout.length[i]):
             now = alone.step(brake(observation))
             observation = alone.flatten(now.observation)
             assert now.reward[0] == rollout.reward[t, i] and now.error[0] == rollout.error[t, i]
+            at(alone, rollout, t + 1, i)
             for name, value in (
-                ("position", alone.snapshot.state.position),
                 ("rotor_command", alone.snapshot.rotor_command / alone.vehicle.max_speed),
-                ("target_velocity", alone.task.target_velocity(alone.snapshot)),
                 ("wind", alone.engine.wind),
             ):
-                value = np.zeros((1, 3)) if value is None else value
                 np.testing.assert_array_equal(getattr(rollout, name)[t, i], value[0], err_msg=name)
         assert now.terminated[0] == rollout.terminated[i]
         assert now.terminated[0] or now.truncated[0]
@@ -222,7 +245,7 @@ def test_a_trajectory_is_in_the_world_frame():
     assert len(trajectory.time) == steps
     assert trajectory.time[[0, -1]] == pytest.approx([0.05, 0.05 * steps])
     up = [0, 0, 3]  # the task's altitude
-    np.testing.assert_allclose(trajectory.qpos[:, :3], rollout.position[:steps, 1] + up)
+    np.testing.assert_allclose(trajectory.qpos[:, :3], rollout.position[1 : steps + 1, 1] + up)
     np.testing.assert_allclose(trajectory.goal, np.tile(up, (steps, 1)))
     np.testing.assert_array_equal(trajectory.max_rotor_speed, vehicle.max_speed)
     assert trajectory.task == "hover"
@@ -260,3 +283,39 @@ def test_actions_with_another_meaning_are_refused():
         fly(Hovering(), "hover", episodes=1, control_mode="rotor")
     with refused("weather", "windy"):
         fly(Hovering(), "hover", episodes=1, weather="windy")
+
+
+def test_a_torch_module_flies_as_the_arrays_that_it_was_made_of():
+    policy = quadrl.Policy.pretrained("hover")
+    own = quadrl.evaluate(policy, episodes=2)
+    for module in (policy.to_torch(), policy.to_torch().double()):  # with parameters that learn
+        found = quadrl.evaluate(module, "hover", episodes=2)
+        np.testing.assert_allclose(found.rollout.action, own.rollout.action, atol=1e-4)
+    with refused(match="action"):
+        quadrl.evaluate(torch.nn.GRU(22, 4, batch_first=True), "hover", episodes=2)
+
+
+def test_states_are_a_row_per_control_step_from_the_start_on(tmp_path):
+    found = quadrl.evaluate("geometric", "hover", episodes=2, seed=3, vehicle="hexa", time_limit=1)
+    with open(found.save_states(tmp_path / "new" / "states.csv"), newline="") as file:
+        rows = list(csv.DictReader(file))
+    flown, length = found.rollout, found.rollout.length
+    assert len(rows) == length.sum() + 2
+    names = "episode seed time x y z qw qx qy qz vx vy vz wx wy wz".split()
+    names += [f"rotor_{k}" for k in range(1, 7)] + ["goal_x", "goal_y", "goal_z"]
+    assert list(rows[0]) == names + [f"action_{k}" for k in range(1, 7)]
+    second = rows[length[0] + 1 :]
+    assert [row["seed"] for row in second] == ["4"] * (length[1] + 1)
+    for t, row in enumerate(second):
+        assert float(row["time"]) == pytest.approx(t * flown.control_timestep)
+        for name, value in (
+            ("x", flown.position[t, 1, 0]),
+            ("qz", flown.quaternion[t, 1, 3]),
+            ("vy", flown.velocity[t, 1, 1]),
+            ("wx", flown.body_rate[t, 1, 0]),
+            ("rotor_6", flown.rotor_speed[t, 1, 5]),
+            ("goal_z", flown.goal[t, 1, 2]),
+        ):
+            assert float(row[name]) == pytest.approx(value, rel=1e-8, abs=1e-12)
+    assert float(second[0]["action_2"]) == pytest.approx(flown.action[0, 1, 1], rel=1e-8)
+    assert second[-1]["action_2"] == ""

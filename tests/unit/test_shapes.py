@@ -14,7 +14,7 @@ from quadrl.engines.rng import Rng
 from quadrl.evaluation.rollout import fly
 
 DECLARED = re.compile(r"^ +(\w+): [^#\n]*# \(((?:\w+, ?)*\w*)\)", re.MULTILINE)
-NAMED = {"N", "n", "R", "T", "k"}
+NAMED = {"N", "n", "R", "S", "T", "k"}
 
 
 def declared(kind):
@@ -71,7 +71,7 @@ def test_rollouts_and_trajectories_have_the_shapes_that_stand_behind_them():
 
     flown = fly(still, tasks.make("hover", time_limit=0.5), episodes=2)
     longest = int(flown.length.max())
-    assert check(flown, T=longest, N=2, R=4, k=4) == 18
+    assert check(flown, S=longest + 1, T=longest, N=2, R=4, k=4) == 18
     steps = int(flown.length[1])
     drawn = flown.trajectory(VEHICLES["paper"], 1)
     assert check(drawn, T=steps, R=4) == 7
