@@ -60,7 +60,11 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_csv(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a .csv file of rows under the names of their columns, whole or not at all."""
+    """Write a .csv file of rows under the names of their columns, whole or not at all.
+
+    Its folder is made.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, csv_content([head, *rows]))
 
 

@@ -170,17 +170,17 @@ class Environment(saving.Copied):
                 action, reward or control step. Nothing has changed then.
         """
         scenario, given = Scenario.of(self.scenario, **conditions), self._made_with[1]
-        engine = {"engine": given["engine"]} if isinstance(given.get("engine"), Engine) else {}
-        threads = given.get("num_threads", 0)
-        fresh = Environment(scenario, num_envs=self.num_envs, num_threads=threads, **engine)
+        held = isinstance(given.get("engine"), Engine)
+        again = {k: given[k] for k in ("engine", "num_threads")[not held :] if k in given}
+        fresh = Environment(scenario, num_envs=self.num_envs, **again)
 
         def kept(made: Environment, flown: Scenario) -> tuple[Any, ...]:
             seen, acts = (made.layout, made.term_names), (flown.control_mode, made.action_size)
             world = type(flown.task), flown.aircraft, flown.engine, flown.altitude
-            return *seen, *acts, flown.vehicle.control_timestep, *(world if engine else ())
+            return *seen, *acts, flown.vehicle.control_timestep, *(world if held else ())
 
         if kept(fresh, scenario) != kept(self, self.scenario):
-            also = ", aircraft, engine and altitude, which are its engine's" if engine else ""
+            also = ", aircraft, engine and altitude, which are its engine's" if held else ""
             allowed = f"such that observation, action, reward and control step{also} stay"
             raise QuadrlError("make another one", name="change", value=conditions, allowed=allowed)
         fresh.seeds = self.seeds

@@ -8,6 +8,7 @@ import functools
 import hashlib
 import importlib.util
 import inspect
+import itertools
 import sys
 import traceback
 from collections.abc import Callable, Generator
@@ -177,23 +178,18 @@ def check_start(task: Task) -> None:
         environment.reset(start=start)
         begun = _remembered(environment.snapshot)
         environment.step(np.zeros((ROWS, environment.action_size)))
-    for (name, then, was), (_, now, is_) in zip(
-        begun, _remembered(environment.snapshot), strict=True
-    ):
-        if np.array_equal(now, is_) and np.ptp(is_, axis=0).any():
-            what, cure = "at a start that reset was given", "make it in `remember`"
-            require(np.allclose(then, was), f"{task.name}: {name}, but not {what}: {cure}")
+        after = _remembered(environment.snapshot)
+    for name, (own, value) in after.items():
+        if np.array_equal(own, value) and np.ptp(value, axis=0).any():
+            message = f"{name} after every step, but not at a start that reset was given"
+            require(np.allclose(*begun[name]), f"{task.name}: {message}: make it in `remember`")
 
 
-def _remembered(now: Snapshot) -> list[tuple[str, Array, Array]]:
+def _remembered(now: Snapshot) -> dict[str, tuple[Array, Array]]:
     """Copies of what a task remembers beside all of the same shape that it may be a copy of."""
     seen = records.arrays("state", now.state) | records.arrays("potentials", now.potentials)
-    return [
-        (f"{name} is {other} after every step", own, value)
-        for name, own in records.arrays("task", now.task).items()
-        for other, value in seen.items()
-        if own.shape == value.shape
-    ]
+    pairs = itertools.product(records.arrays("task", now.task).items(), seen.items())
+    return {f"{name} is {other}": (x, y) for (name, x), (other, y) in pairs if x.shape == y.shape}
 
 
 def check_tensors(

@@ -22,13 +22,8 @@ class ForOne(tuple[WrapperSpec, ...]):
     def __len__(self) -> int:
         return 0
 
-    def __eq__(self, other: object) -> bool:
-        return other == ()
-
     def __ne__(self, other: object) -> bool:
         return other != ()
-
-    __hash__ = tuple.__hash__
 
 
 LAST = ForOne([WrapperSpec("TaskLimit", "quadrl.envs.gymnasium:limited", {})])

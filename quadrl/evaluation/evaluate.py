@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Unpack, cast
 
@@ -97,7 +97,8 @@ class Evaluation:
         ):
             cells = (f"{x:.6g}" if isinstance(x, float) else int(x) for x in row)
             rows.append((i, self.seed + i, *cells))
-        return _write(path, ("episode", "seed", *columns), rows)
+        write_csv(Path(path), ("episode", "seed", *columns), rows)
+        return Path(path)
 
     def save_states(self, path: str | Path) -> Path:
         """Write one row per control step of each flight, from its start at time 0 on.
@@ -108,36 +109,26 @@ class Evaluation:
         """
         flown = self.rollout
         none = np.full((1, *flown.action.shape[1:]), np.nan)
-        parts = (
-            (("x", "y", "z"), flown.position),
-            (("qw", "qx", "qy", "qz"), flown.quaternion),
-            (("vx", "vy", "vz"), flown.velocity),
-            (("wx", "wy", "wz"), flown.body_rate),
-            (_numbered("rotor", flown.rotor_speed), flown.rotor_speed),
-            (("goal_x", "goal_y", "goal_z"), flown.goal),
-            (_numbered("action", flown.action), np.concatenate([flown.action, none])),
-        )
-        head = "episode", "seed", "time", *(name for names, _ in parts for name in names)
-        whole = np.concatenate([values for _, values in parts], axis=-1)  # (S, N, columns)
-        rows = [
-            (i, self.seed + i, *(f"{x:.9g}" if x == x else "" for x in (t * step, *row)))
-            for step in [flown.control_timestep]
-            for i, last in enumerate(flown.length)
-            for t, row in enumerate(whole[: last + 1, i])
-        ]
-        return _write(path, head, rows)
+        parts = {
+            "x y z": flown.position,
+            "qw qx qy qz": flown.quaternion,
+            "vx vy vz": flown.velocity,
+            "wx wy wz": flown.body_rate,
+            _numbered("rotor", flown.rotor_speed): flown.rotor_speed,
+            "goal_x goal_y goal_z": flown.goal,
+            _numbered("action", flown.action): np.concatenate([flown.action, none]),
+        }
+        whole, rows = np.concatenate([*parts.values()], axis=-1), list[Any]()  # (S, N, columns)
+        for i, last in enumerate(flown.length):
+            for t, row in enumerate(whole[: last + 1, i]):
+                cells = (f"{x:.9g}" if x == x else "" for x in (t * flown.control_timestep, *row))
+                rows.append((i, self.seed + i, *cells))
+        write_csv(Path(path), ["episode", "seed", "time", *" ".join(parts).split()], rows)
+        return Path(path)
 
 
-def _numbered(name: str, values: np.ndarray) -> list[str]:
-    return [f"{name}_{k + 1}" for k in range(values.shape[-1])]
-
-
-def _write(path: str | Path, head: Sequence[str], rows: list[Any]) -> Path:
-    """Write a table, and the folder for it."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_csv(path, head, rows)
-    return path
+def _numbered(name: str, values: np.ndarray) -> str:
+    return " ".join(f"{name}_{k + 1}" for k in range(values.shape[-1]))
 
 
 def evaluate(

@@ -8,6 +8,7 @@ rotor, A = pi 0.15^2 = 0.0706858 m^2, v_h = sqrt(T_h / (2 * 1.225 A)) = 3.03397 
 import dataclasses
 import itertools
 import math
+from pathlib import Path
 
 import helpers
 import mujoco
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 import reference
 
+from quadrl.aircraft import parameters
 from quadrl.aircraft.aerodynamics import EFFECTS, Aerodynamics
 from quadrl.aircraft.parameters import WIND, Parameters, rows
 from quadrl.aircraft.presets import VEHICLES, at_air_density, in_real_air, with_effects
@@ -474,3 +476,12 @@ def test_rotors_that_weigh_more_than_the_aircraft_are_refused():
         Vehicle(aerodynamics=Aerodynamics(rotor_inertia=4e-3))  # four of them, of 1.3e-2
     with helpers.refused("aerodynamics"):
         Vehicle(aerodynamics="full")  # pyright: ignore
+
+
+def test_limits_of_the_effects_stand_in_python_alone(monkeypatch):
+    """What C and the derivatives fly with follows from it."""
+    for name in ("MOST_OFFSET", "MOST_TAKEN", "WINDMILL"):
+        monkeypatch.setattr(parameters, name, 0.123)
+        assert f"#define {name} 0.123\n" in parameters.c_structs()
+    source = Path(parameters.__file__).parents[1] / "engines" / "native" / "aero.h"
+    assert "0.36" not in source.read_text()
