@@ -6,27 +6,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import WrapperSpec
 
+from quadrl.envs.common import LAST
 from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
     from quadrl.envs import dm_control, gymnasium, rsl_rl, sb3, torchrl
 
 __all__ = ["dm_control", "gymnasium", "register_ids", "rsl_rl", "sb3", "torchrl"]
-
-
-class ForOne(tuple[WrapperSpec, ...]):
-    """Wrappers that `gym.make` applies last; to `make_vec`, which refuses any, it is empty."""
-
-    def __len__(self) -> int:
-        return 0
-
-    def __ne__(self, other: object) -> bool:
-        return other != ()
-
-
-LAST = ForOne([WrapperSpec("TaskLimit", "quadrl.envs.gymnasium:limited", {})])
 
 
 def register_ids() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Unpack
 
 import numpy as np
+from gymnasium.envs.registration import WrapperSpec
 
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Conditions, Scenario
@@ -42,6 +43,19 @@ def make(
     """
     scenario = Scenario.of(task, [*OWN, *also], **conditions)
     return Environment(scenario, num_envs=num_envs, seed=seed, num_threads=num_threads)
+
+
+class ForOne(tuple[WrapperSpec, ...]):
+    """Wrappers that `gym.make` applies last; to `make_vec`, which refuses any, it is empty."""
+
+    def __len__(self) -> int:
+        return 0
+
+    def __ne__(self, other: object) -> bool:
+        return other != ()
+
+
+LAST = ForOne([WrapperSpec("TaskLimit", "quadrl.envs.gymnasium:limited", {})])
 
 
 class Changing:

@@ -26,8 +26,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import Seed
 from quadrl.core.environment import Environment, Transition
 from quadrl.core.task import Task
-from quadrl.envs import LAST
-from quadrl.envs.common import PICTURE, Changing, Named, episode_info, make
+from quadrl.envs.common import LAST, PICTURE, Changing, Named, episode_info, make
 from quadrl.rendering.pictures import Pictures
 
 Array = np.ndarray
