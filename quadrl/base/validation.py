@@ -113,8 +113,16 @@ def seeds(value: Any, largest: int) -> list[int]:
     return whole
 
 
-def choice(name: str, value: Any, choices: Iterable[str], others: str = "") -> Any:
+def choice(
+    name: str,
+    value: Any,
+    choices: Iterable[str],
+    others: str = "",
+    known_as: Mapping[str, str] | None = None,
+) -> Any:
     """A value that is one of the choices; `others` says what else there can be.
+
+    `known_as` has the choice, or a sentence, for what other programs call it.
 
     Raises:
         QuadrlError: It is none of them; the message lists them and names the nearest.
@@ -122,9 +130,12 @@ def choice(name: str, value: Any, choices: Iterable[str], others: str = "") -> A
     allowed = list(choices)
     if isinstance(value, str) and value in allowed:
         return value
-    near = difflib.get_close_matches(str(value), allowed, n=1)
-    hint = f" (did you mean {near[0]}?)" if near else ""
-    raise QuadrlError(name=name, value=value, allowed=f"one of {', '.join(allowed)}{hint}{others}")
+    like = {_letters(one): one for one in allowed}
+    near = difflib.get_close_matches(_letters(str(value)), like, n=1)
+    meant = (known_as or {}).get(str(value).lower(), like[near[0]] if near else "")
+    hint = f" (did you mean {meant}?)" if meant in allowed else ""
+    reason, allowed = "" if hint else meant, f"one of {', '.join(allowed)}{hint}{others}"
+    raise QuadrlError(reason, name=name, value=value, allowed=allowed)
 
 
 def keys(what: str, given: Iterable[str], choices: Iterable[str], *, tried: bool = False) -> None:
@@ -278,6 +289,12 @@ def action(given: Any, shape: tuple[int, ...]) -> np.ndarray:
         where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
         raise QuadrlError(name=f"action{list(where)}", value=float(array[where]), allowed="finite")
     return array
+
+
+def _letters(name: str) -> str:
+    """What is left of a name, or of an environment's id, without the way it is written."""
+    bare = name.rpartition("/")[2].partition("-v")[0]
+    return "".join(filter(str.isalnum, bare)).lower()
 
 
 def _kind(value: Any) -> str:

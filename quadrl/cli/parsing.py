@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import re
 from collections.abc import Iterable, Sequence
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
+from quadrl.cli import choices
+from quadrl.core.rules import import_own
+from quadrl.learning import foreign
+from quadrl.learning.config import TrainConfig, algorithm_of
+from quadrl.tasks import TASKS
 
 Parsed = TypeVar("Parsed")
 NUMBERS = ConstructorRegistry()
@@ -42,7 +49,7 @@ def parse(kind: type[Parsed], words: Sequence[str], commands: Iterable[str]) -> 
     """
     command = _command(words)
     if command and not command.startswith("-"):
-        choice("command", command, commands)
+        choice("command", command, commands, known_as=foreign.COMMANDS)
     _refuse_repetition(words)
     complaints = io.StringIO()
     try:
@@ -117,7 +124,7 @@ def _in_a_line(box: str, words: Sequence[str]) -> str:
         name, kind, given = found.groups()
         return f"{name} = {given}: must be {KINDS.get(kind, kind)}"
     if found := re.search(r"Unrecognized (?:or misplaced )?options: ([^\s,]+)", text):
-        return f"{_unknown(found[1], box, command, here)}; see {where}"
+        return f"{_unknown(found[1].partition('=')[0], box, command, words)}; see {where}"
     if found := re.search(r"Missing value for argument '(\S+)'", text):
         return f"{found[1]} needs a value; see {where}"
     if found := re.search(r"Missing from .*?: (.*?) \(required\)", text):
@@ -125,7 +132,7 @@ def _in_a_line(box: str, words: Sequence[str]) -> str:
     return f"{text.partition('For full helptext')[0].strip()}; see {where}"
 
 
-def _unknown(word: str, box: str, command: str, here: str) -> str:
+def _unknown(word: str, box: str, command: str, words: Sequence[str]) -> str:
     """What is wrong with a word that the command does not take."""
     if not word.startswith("-"):
         return f"{word} is one word too many"
@@ -139,7 +146,34 @@ def _unknown(word: str, box: str, command: str, here: str) -> str:
         having.setdefault(option, []).extend([other] * bool(other))
     if others := having.get(word):
         more = ", ..." * ("[...]" in similar)
-        return f"{word} is not an option of {here}; commands with it: {', '.join(others)}{more}"
-    meant = next((name for name, others in having.items() if command in others), "")
+        where = f"quadrl {command}; commands with it: {', '.join(others)}{more}"
+        return f"{word} is not an option of {where}"
+    own = (name for name, others in having.items() if command in others and "." not in name)
+    meant = next(own, "")
+    with contextlib.suppress(QuadrlError):  # the algorithm may be unknown, too
+        if command == "train":
+            task, given = trained(words)
+            known = foreign.setting(word.strip("-"), algorithm_of(task, given["algo"]))
+            if " " in known:
+                return f"{word} is an unknown option; {known}"
+            known = choices.FLAGS.get(known, known).replace("_", "-")
+            meant = f"--{known}" if known else meant
     hint = f" (did you mean {meant}?)" if meant else ""
     return f"{word} is an unknown option{hint}"
+
+
+def trained(words: Iterable[str]) -> tuple[str, dict[str, Any]]:
+    """The task that words behind `quadrl train` name, and its algorithm, aircraft and variant.
+
+    The files that `--import` names are imported, since they may register them.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("algo", "vehicle", "variant"):
+        parser.add_argument(f"--{name}", nargs="?")
+    parser.add_argument("--import", action="append", nargs="?", default=[])
+    known, others = parser.parse_known_args([*words])
+    given = vars(known)
+    with contextlib.suppress(QuadrlError):  # who imports them next says what is wrong
+        for path in given.pop("import"):
+            import_own(Path(path))
+    return next((word for word in others if word in TASKS), TrainConfig.task), given

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import time
@@ -20,12 +19,12 @@ from quadrl.base.validation import number, seeds
 from quadrl.cli import choices
 from quadrl.cli.console import again, console, make_table, reason, say
 from quadrl.cli.flown import parsed
+from quadrl.cli.parsing import trained
 from quadrl.cli.study import carry_out
 from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import flat
-from quadrl.tasks import TASKS
 
 if TYPE_CHECKING:
     from quadrl.learning.run import Run
@@ -40,13 +39,9 @@ shown: dict[str, Any] = dict(flat(dataclasses.asdict(TrainConfig())))
 
 def show_defaults(words: Sequence[str]) -> None:
     """Let help show the defaults of the task, algorithm, aircraft and variant that words name."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("algo", "vehicle", "variant"):
-        parser.add_argument(f"--{name}")
-    known, others = parser.parse_known_args(words)
+    task, given = trained(words)
     with contextlib.suppress(QuadrlError):  # the parser says what is wrong
-        task = next((word for word in others if word in TASKS), TrainConfig.task)
-        config = TrainConfig(task, **vars(known))
+        config = TrainConfig(task, **given)
         shown.clear()
         shown.update(flat(dataclasses.asdict(config)))
 

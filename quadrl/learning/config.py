@@ -17,7 +17,7 @@ from quadrl.aircraft.aerodynamics import FULL
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import free_name
-from quadrl.base.validation import choice, keys, number, resolved, tuples
+from quadrl.base.validation import choice, number, resolved, tuples
 from quadrl.base.version import __version__
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.observing import resolve as resolve_observing
@@ -30,6 +30,7 @@ from quadrl.core.scenario import KEYWORDS, Scenario
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_SEED
+from quadrl.learning import foreign
 from quadrl.learning.defaults import PAIRS, flat, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, read_config
 from quadrl.learning.origin import Origin, with_networks
@@ -69,18 +70,23 @@ class TrainConfig(TrainSettings):
         """
         object.__setattr__(self, "recorded", recorded)
         settings = _given(settings)
-        keys("setting", settings, [field.name for field in dataclasses.fields(self)])
+        algo = algorithm_of(task, settings.get("algo"))
+        known = [field.name for field in dataclasses.fields(self)]
+        foreign.refuse_unknown("setting", settings, known, algo)
         settings = with_networks(settings)
         kind = TASKS.get(task, Task)  # an unknown task is refused with the defaults
-        algo = settings.get("algo", kind.trained_by)
-        algo = choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS)
         vehicle = settings.setdefault("vehicle", kind.trained_on)
         variant = settings.get("variant", TrainConfig.variant)
-        known = self._known(vehicle), variant, settings.get("memory")
-        values, _ = training_defaults(task, algo, *known)
+        varied = self._known(vehicle), variant, settings.get("memory")
+        values, _ = training_defaults(task, algo, *varied)
         for name, own in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
+            if name != algo:
+                with_it, _ = training_defaults(task, name, *varied)
+                given = _idle(name, given, (values[name], with_it[name]), algo)
             if isinstance(given, dict):
+                known = [field.name for field in dataclasses.fields(own)]
+                foreign.refuse_unknown(f"setting of {name}", given, known, algo)
                 given = values[name] | _given(given)
             settings[name] = resolved(name, given, own, word="setting")
         if isinstance(given := settings.get("randomization"), Randomization):
@@ -209,7 +215,10 @@ class TrainConfig(TrainSettings):
         if self.recorded:
             scenario["changed"] = self.recorded.get("changed", {})
         whole = {"scenario": scenario, "versions": _versions()}
-        return json.loads(json.dumps(dataclasses.asdict(self) | whole))
+        whole = dataclasses.asdict(self) | whole
+        for name in {*ALGORITHMS} - {self.algo}:  # they do nothing
+            del whole[name]
+        return json.loads(json.dumps(whole))
 
     @classmethod
     def of_folder(cls, folder: Path) -> TrainConfig:
@@ -266,6 +275,28 @@ def prepare(
         config = TrainConfig(task or "hover", **settings)
     named = Path("runs") / f"{config.task}-{config.algo}-{config.seed}"
     return config, free_name(named, CONFIG) if out is None else Path(out)
+
+
+def algorithm_of(task: str, algo: str | None) -> str:
+    """Name the algorithm that trains a task: the given one or, if that is None, the task's own."""
+    algo = TASKS.get(task, Task).trained_by if algo is None else algo
+    return choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS, known_as=foreign.ALGORITHMS)
+
+
+def _idle(name: str, given: Any, usual: tuple[dict[str, Any], ...], algo: str) -> dict[str, Any]:
+    """Refuse settings of an algorithm that does not train, since they would do nothing.
+
+    What is usual may be there: `dataclasses.replace` passes all fields on.
+    """
+    if not isinstance(given, dict):
+        given = dataclasses.asdict(resolved(name, given, ALGORITHM_CONFIGS[name], word="setting"))
+    for key, value in given.items():
+        if value not in [layers.get(key) for layers in usual]:
+            meant = foreign.setting(key, algo, guess=False)
+            hint = f"did you mean {meant}?" if meant else ""
+            allowed = f"left out with algo {algo}"
+            raise QuadrlError(hint, name=f"{name}.{key}", value=value, allowed=allowed)
+    return {}
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:

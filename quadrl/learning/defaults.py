@@ -152,6 +152,8 @@ def training_defaults(
             name: label if layer.get(name) == read.get(name) else f"{label}, at its control rate"
             for name, _ in flat(read)
         }
+    # What other algorithms are tuned to does nothing.
+    values |= {name: fields[name] for name in ALGORITHM_CONFIGS if name != algo}
     return values, sources
 
 

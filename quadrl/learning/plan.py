@@ -14,7 +14,8 @@ from quadrl.base.files import read_table
 from quadrl.base.validation import choice, keys, names, number
 from quadrl.base.validation import seeds as seeds_of
 from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
-from quadrl.learning.config import TrainConfig
+from quadrl.learning import foreign
+from quadrl.learning.config import ALIASES, TrainConfig, algorithm_of
 from quadrl.learning.defaults import merged
 from quadrl.learning.executor import PlannedRun
 
@@ -71,16 +72,21 @@ def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
     algorithms = names("algorithms", content.get("algorithms", ["ppo"]))
     seeds = seeds_of(content.get("seeds", [0]), MAX_SEED)
     episodes = number("episodes", content.get("episodes", EPISODES), 1, MAX_EPISODES, whole=True)
-    common = _settings("settings", content.get("settings", {}))
-    only = _only(content.get("only", []), {"tasks": tasks, "algorithms": algorithms})
-    variants = _variants(content.get("variants", []))
+    whole = {"tasks": tasks, "algorithms": algorithms}
+    common = _settings("settings", content.get("settings", {}), algorithms)
+    only = _only(content.get("only", []), whole)
+    variants = _variants(content.get("variants", []), algorithms)
     number("trainings", len(tasks) * len(algorithms) * len(seeds) * len(variants), 1, MAX_RUNS)
     runs: list[PlannedRun] = []
     known: dict[str, str] = {}
     for seed, task, algo, variant in itertools.product(seeds, tasks, algorithms, variants):
         name = "-".join([task, algo, *filter(None, [variant]), str(seed)])
-        own = (some for of, some in only if task in of["tasks"] and algo in of["algorithms"])
-        settings = merged(common, *own, variants[variant])
+        settings, as_called = dict[str, Any](), ALIASES.get(algo, algo)
+        for of, some in ((whole, common), *only, (whole, variants[variant])):
+            if task in of["tasks"] and algo in of["algorithms"]:
+                others = {ALIASES.get(one, one) for one in of["algorithms"]} - {as_called}
+                mine = {name: value for name, value in some.items() if name not in others}
+                settings = merged(settings, mine)
         try:
             config = TrainConfig(task, algo=algo, seed=seed, num_threads=1, **settings)
         except QuadrlError as error:
@@ -92,14 +98,15 @@ def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
     return Plan(folder, tuple(runs), episodes)
 
 
-def _settings(key: str, given: Any) -> dict[str, Any]:
+def _settings(key: str, given: Any, algorithms: list[str]) -> dict[str, Any]:
     """Check the names in a table of settings; `TrainConfig` checks their values."""
     if not isinstance(given, dict):
         raise QuadrlError(name=key, value=given, allowed="a table of settings of a training")
     for name in OWN.keys() & given.keys():
         raise QuadrlError(name=f"{key}.{name}", value=given[name], allowed=OWN[name])
     known = [field.name for field in dataclasses.fields(TrainConfig) if field.name not in OWN]
-    keys(f"setting in {key}", given, known)
+    algo = algorithm_of(TrainConfig.task, algorithms[0])
+    foreign.refuse_unknown(f"setting in {key}", given, known, algo)
     return given
 
 
@@ -112,7 +119,7 @@ def _only(given: Any, of: dict[str, list[str]]) -> list[tuple[dict[str, list[str
             for name in wanted:
                 choice(f"only.{key}", name, of[key])
         rest = {key: value for key, value in table.items() if key not in SOME}
-        found.append((whom, _settings("only", rest)))
+        found.append((whom, _settings("only", rest, whom["algorithms"])))
     return found
 
 
@@ -123,7 +130,7 @@ def _tables(key: str, given: Any) -> list[dict[str, Any]]:
     return [dict(one) for one in given]
 
 
-def _variants(given: Any) -> dict[str, dict[str, Any]]:
+def _variants(given: Any, algorithms: list[str]) -> dict[str, dict[str, Any]]:
     """Read the settings by the name of the variant; without variants, one without a name."""
     variants: dict[str, dict[str, Any]] = {}
     for one in _tables("variants", given):
@@ -133,5 +140,5 @@ def _variants(given: Any) -> dict[str, dict[str, Any]]:
             allowed = "a name of its own, of letters, digits, _ and ."
             raise QuadrlError(name="variants.name", value=name, allowed=allowed)
         rest = {key: value for key, value in one.items() if key != "name"}
-        variants[name] = _settings(f"variants.{name}", rest)
+        variants[name] = _settings(f"variants.{name}", rest, algorithms)
     return variants or {"": {}}

@@ -502,6 +502,29 @@ MISTYPED = {
     "trian hover": "did you mean train?",
     "train hover --bogus": "--bogus is an unknown option; see quadrl train --help",
     "train hover --stepz 5": "did you mean --steps?",
+    "train hover --learning-rate 1e-3": "(did you mean --ppo.learning-rate?); see",
+    "train hover --learning_rate=1e-3": "(did you mean --ppo.learning-rate?); see",
+    "train hover --lr 1e-3 --algo gae": "(did you mean --vpg.learning-rate?); see",
+    "train race --lr 1e-3": "(did you mean --apg.learning-rate?); see",  # as it is trained
+    "train hover --ppo.lr 1e-3": "(did you mean --ppo.learning-rate?); see",
+    "train hover --epochs 3": "(did you mean --ppo.epochs?); see",
+    "train hover --minibatch 64": "(did you mean --ppo.minibatch?); see",
+    "train hover --batch-size 64": "(did you mean --ppo.minibatch?); see",
+    "train hover --total-timesteps 9": "(did you mean --steps?); see",
+    "train hover --eval-every 9": "(did you mean --evaluations?); see",
+    "train hover --gpu": "(did you mean --device?); see",
+    "train hover --name x": "(did you mean --out?); see",
+    "train hover --load x": "(did you mean --from?); see",
+    "train --env hover": "--env is an unknown option; the task comes first",
+    "train hover --config x": "a file of quadrl study holds settings",
+    "train hover --wandb": "--wandb is an unknown option; a run folder holds TensorBoard's files",
+    "train hover --apg.learning-rate 0.1": "with algo ppo; did you mean ppo.learning_rate?",
+    "train hover --seeds 0:2 --apg.step 0.1": "apg.step = 0.1: must be left out with algo ppo",
+    "train hover --algo PPO": "(did you mean ppo?)",
+    "train hover --algo sac": "Stable-Baselines3 has it",
+    "train quadrl/Hover-v0": "(did you mean hover?)",
+    "list": "(did you mean tasks?)",
+    "new-task": "a Python file of your own that --import names",
     "train hover --camera track": "not an option of quadrl train; commands with it: render; see",
     "benchmark --vehicle x": "not an option of quadrl benchmark; commands with it: check, evaluate",
     "completion tcsh": "shell = 'tcsh': must be one of bash, zsh, fish",
@@ -529,6 +552,17 @@ def test_a_mistyped_command_is_answered_in_a_line(capsys, tmp_path, words):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("quadrl: ") and MISTYPED[words] in line
     assert not list(tmp_path.iterdir())
+
+
+def test_an_option_is_that_of_the_algorithm_that_an_own_task_is_trained_by(capsys, monkeypatch):
+    for registry, name in OWN_NAMES:  # what it registers is taken out again
+        monkeypatch.setitem(registry, name, None)
+        monkeypatch.delitem(registry, name)
+    Path("own.py").write_text(
+        OWN.replace("    training =", "    trained_by = 'vpg'\n    training =")
+    )
+    assert command("train", "near_hover", "--import", "own.py", "--lr", "1e-3") == 2
+    assert "(did you mean --vpg.learning-rate?)" in capsys.readouterr().err
 
 
 def test_a_dry_run_says_what_was_given_and_steps_may_be_written_as_1e6(capsys):

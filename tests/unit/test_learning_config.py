@@ -14,13 +14,15 @@ from runs import TINY
 
 import quadrl
 from quadrl import tasks
+from quadrl.cli import COMMANDS
 from quadrl.core.scenario import as_json
 from quadrl.evaluation import evaluate as evaluation
+from quadrl.learning import foreign
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import OF_VEHICLE, VARIANTS
 from quadrl.learning.environments import make_env
 from quadrl.learning.folder import read_config, write_config
-from quadrl.learning.settings import PPOConfig, VPGConfig
+from quadrl.learning.settings import ALGORITHM_CONFIGS, APGConfig, PPOConfig, VPGConfig
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
 
@@ -42,10 +44,11 @@ def test_a_default_comes_from_the_last_layer_that_has_one(tuned):
     config = TrainConfig("tuned")
     assert (config.gamma, config.num_envs, config.hidden) == (0.5, 32, (8, 8))
     assert (config.rollout, config.steps) == (TrainConfig.rollout, TrainConfig.steps)
-    assert config.vpg == VPGConfig(critic_rate=0.25) and config.ppo == PPOConfig()
-    given = TrainConfig("tuned", gamma=0.7, vpg={"critic_epochs": 3}, hidden=None)
+    assert config.vpg == VPGConfig() and config.ppo == PPOConfig()  # PPO trains
+    given = TrainConfig("tuned", algo="vpg", gamma=0.7, vpg={"critic_epochs": 3}, hidden=None)
     assert (given.gamma, given.hidden) == (0.7, (8, 8))
-    assert given.vpg == VPGConfig(critic_rate=0.25, critic_epochs=3)
+    own = Tuned.training_with["vpg"]["vpg"]  # which come after those that all algorithms share
+    assert given.vpg == VPGConfig(**own, critic_epochs=3)
     # An algorithm changes fields: one step of the policy per batch wants smaller ones.
     usual, plain = (TrainConfig("static_waypoint", algo=algo) for algo in ("ppo", "vpg"))
     assert (plain.num_envs, plain.rollout) == (128, 8)
@@ -121,6 +124,68 @@ def test_settings_that_cannot_be_trained_are_refused(change, name, value):
         TrainConfig(**change)
 
 
+IDLE = [  # a setting of an algorithm that does not train: what names it, and what is meant
+    ("hover", {"apg": {"learning_rate": 0.1}}, "apg.learning_rate", "ppo.learning_rate"),
+    ("hover", {"apg": APGConfig(learning_rate=0.1)}, "apg.learning_rate", "ppo.learning_rate"),
+    ("hover", {"algo": "trpo", "ppo": {"epochs": 3}}, "ppo.epochs", "trpo.critic_epochs"),
+    ("hover", {"algo": "gae", "ppo": {"lr": 3}}, "ppo.lr", "vpg.learning_rate"),
+    ("hover", {"apg": {"step": 0.1}}, "apg.step", None),
+    ("race", {"ppo": {"minibatch": 64}}, "ppo.minibatch", "apg.minibatch"),  # its own is apg
+]
+
+
+@pytest.mark.parametrize(("task", "given", "name", "meant"), IDLE)
+def test_a_setting_of_another_algorithm_is_refused(tmp_path, task, given, name, meant):
+    with refused(name) as caught:
+        quadrl.train(task, out=tmp_path / "run", **given)
+    said = str(caught.value)
+    assert said.endswith(f"; did you mean {meant}?" if meant else "left out with algo ppo")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("algo", ["ppo", "trpo", "vpg"])
+def test_a_changed_copy_keeps_what_was_usual(algo):
+    for task in ("hover", "race"):  # both have settings of their own for PPO
+        config = TrainConfig(task, algo=algo)
+        for other in ("ppo", "trpo", "vpg"):
+            changed = dataclasses.replace(config, algo=other, seed=3)
+            assert changed.algo == other and changed.seed == 3
+        assert dataclasses.replace(config, ppo=PPOConfig(), memory="gru", holds_goal=False)
+    assert dataclasses.replace(TrainConfig(algo="vpg"), task="race").task == "race"
+
+
+FOREIGN = [  # what other programs call a setting, and what the answer says
+    ({"learning_rate": 1e-3}, 'ppo.learning_rate, given as ppo={"learning_rate": ...}'),
+    ({"ppo": {"lr": 1e-3}}, 'ppo.learning_rate, given as ppo={"learning_rate": ...}'),
+    ({"lr": 1e-3, "algo": "vpg"}, "did you mean vpg.learning_rate"),
+    ({"task": "race", "lr": 1e-3}, "did you mean apg.learning_rate"),
+    ({"lr": 1e-3, "algo": "trpo"}, "did you mean trpo.max_kl"),
+    ({"batch_size": 64}, "did you mean ppo.minibatch"),
+    ({"total_timesteps": 1}, r"did you mean steps\?"),
+    ({"n_steps": 1}, r"did you mean rollout\?"),
+    ({"wandb": True}, "TensorBoard's files"),
+    ({"algo": "PPO"}, r"did you mean ppo\?"),
+    ({"algo": "sac"}, "Stable-Baselines3 has it"),
+    ({"task": "quadrl/RandomWaypoint-v0"}, r"did you mean random_waypoint\?"),
+]
+
+
+@pytest.mark.parametrize(("given", "said"), FOREIGN)
+def test_foreign_names_lead_to_ours(given, said):
+    with refused(match=said):
+        TrainConfig(**given)
+
+
+def test_what_foreign_names_lead_to_is_there():
+    own = {field.name for one in ALGORITHM_CONFIGS.values() for field in dataclasses.fields(one)}
+    ours = own | {field.name for field in dataclasses.fields(TrainConfig)} | {"out"}
+    assert {name for names in foreign.SETTINGS for name in names.split()} <= ours
+    theirs = [*foreign.SETTINGS.values(), *foreign.OTHERWISE.values()]
+    assert len(names := " ".join(theirs).split()) == len(set(names))
+    for word, answer in (foreign.COMMANDS | foreign.ALGORITHMS).items():
+        assert " " in answer or answer in (*COMMANDS, *ALGORITHM_CONFIGS), word
+
+
 def test_an_unknown_training_default_of_a_task_is_refused(tuned, monkeypatch):
     monkeypatch.setattr(Tuned, "training", {"gama": 0.9})
     with refused(value="gama"):
@@ -149,7 +214,7 @@ def test_a_run_in_wind_says_what_the_air_does(tmp_path):
 
 def test_a_setting_that_an_older_run_lacks_has_its_default(tmp_path):
     older = TINY.resolved()
-    del older["evaluations"], older["apg"]
+    del older["evaluations"], older["ppo"]["critic"]
     write_config(tmp_path, older)
     assert TrainConfig.of_folder(tmp_path) == TINY
 

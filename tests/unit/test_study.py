@@ -57,6 +57,16 @@ def test_every_combination_is_planned(write, tmp_path):
     assert wide.config == alone and wide.folder == tmp_path / "out" / "landing-ppo-wide-4"
 
 
+def test_a_table_serves_the_algorithms_that_it_is_for(write):
+    both = {"ppo": {"epochs": 2}, "vpg": {"critic_epochs": 3}}
+    content = {"tasks": ["hover"], "algorithms": ["ppo", "gae"], "settings": both}
+    first, second = (run.config for run in read_plan(content, None).runs)
+    assert first.ppo.epochs == 2 and second.vpg.critic_epochs == 3
+    content["only"] = [{"algorithms": ["gae"], "ppo": {"epochs": 4}}]  # it would do nothing
+    with refused(match="the study: hover-gae-0: ppo.epochs = 4: must be left out with algo vpg"):
+        read_plan(content, None)
+
+
 def test_json_and_a_dict_are_the_same(write):
     content = {"tasks": ["hover"], "settings": {"hidden": [8]}}
     (file,), (given,) = (
@@ -73,10 +83,12 @@ def test_json_and_a_dict_are_the_same(write):
         (('"hover", "landing"', '"hower"'), "did you mean hover"),
         (('"hover", "landing"', ""), "tasks = .*a list of different names"),
         (('"hover", "landing"', '"hover", "hover"'), "different names"),
-        (('"ppo", "gae"', '"gae", "vpg"'), "hover-gae-narrow-3 and hover-vpg-narrow-3"),
+        (('"ppo", "gae"', '"ppo", "gae", "vpg"'), "hover-gae-narrow-3 and hover-vpg-narrow-3"),
         (("3:5", "5:5"), "seeds = '5:5'"),
         (("episodes = 7", "episodes = 0"), "episodes = 0"),
         (("steps = 4096", "step = 4096"), "setting in settings = 'step'"),
+        (("steps = 4096", "lr = 1e-3"), "did you mean ppo.learning_rate"),
+        (("steps = 4096", "apg = {epochs = 3}"), "hover-ppo-narrow-3: apg.epochs = 3: .*left out"),
         (("steps = 4096", "seed = 4"), r"settings.seed = 4: must be the key seeds"),
         (("steps = 4096", "num_threads = 4"), "settings.num_threads"),
         (("hidden = [256]", "hiden = [256]"), "setting in variants.wide = 'hiden'"),
