@@ -11,6 +11,7 @@ from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, cross, dot, namespace, norm, stack, to_body
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import State
+from quadrl.tasks.boxes import gap
 from quadrl.tasks.gates import Course
 from quadrl.tasks.tracks import OTHER, Track, attitude
 
@@ -18,9 +19,10 @@ NEAR = 0.7  # [m], within which it is seen where a gate or a pole truly stands
 ASIDE = 0.15, 0.15, 0.1  # [m], by how much gates may be elsewhere along x, y and z
 ASIDE_POLE = 0.15, 0.15, 0.05  # [m], the same of poles, whose tops are higher or lower
 LEANING = 0.05, 0.1, 0.2  # [rad], by how much gates roll, pitch and turn at most
-POLE = 0.015  # [m], radius of a pole
+POLE, HIGH = 0.015, 0.8  # [m], radius of a pole and half its length, without its round ends
 WOOD = (0.55, 0.45, 0.35, 1.0)
-STAND, DEPTH = 0.05, 0.01  # [m], of stands and frames, half their width
+STAND, DEPTH = (0.05, 0.05, 0.5), 0.01  # [m], half of the edges of a stand, of a frame's depth
+BOX = 0.07, 0.07, 0.02  # [m], half of the edges of the box that collides (drone-models: cf21B_500)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Arena(Course):
 
     gates: Array  # (N, 9 G) centre [m], unit vectors through each gate and to its left
     poles: Array  # (N, 3 P) x, y and height of the top [m] of each pole
-    ball: Array  # (N,) [m], radius of the ball that stands for the aircraft in collisions
+    size: Array  # (N,) of the box that stands for the aircraft in collisions, over that of BOX
     seen: Array  # (N, G + P) 1 for gates and poles that have been near, 0 for others
 
     @property
@@ -66,7 +68,7 @@ class Arena(Course):
 
     def guessed(self, track: Track) -> Arena:
         """The arena as the aircraft knows it: what has not been near stands where it should."""
-        xp, (gates, poles) = namespace(self.ball), nominal(track)
+        xp, (gates, poles) = namespace(self.size), nominal(track)
         near = [self.seen[..., k] > 0 for k in range(self.seen.shape[-1])]
         places = [xp.where(near[k // 9], self.gates[..., k], gates[k]) for k in range(len(gates))]
         rest = near[len(track.gates) :]
@@ -90,31 +92,34 @@ class Arena(Course):
         for middle, turned in zip(centre, axes, strict=True):
             high = middle[2] - track.frame / 2
             place = middle - (track.frame / 2 + high / 2) * turned[2]
-            size = STAND, STAND, high / 2
+            size = *STAND[:2], high / 2
             shown.append(Primitive("box", size, place, attitude(turned), WOOD, glow=0.2))
         return shown
 
-    def room(self, place: Array, track: Track) -> Array:
-        """Distance of the nearest pole, frame or stand from a place (N, 3), (N,) [m]."""
-        xp = namespace(place)
-        inner, outer = track.opening / 2, track.frame / 2
+    def clearance(self, state: State, track: Track) -> Array:
+        """Lower bound of the distance from the aircraft's box to what stands here, (N,) [m].
 
-        def past(away: Array, limit: float) -> Array:
-            return xp.clip(away - limit, 0.0, None)
-
-        rooms: list[Array] = []
-        for x, y, top in self.tops:
-            beside = _length(place[..., 0] - x, place[..., 1] - y)
-            rooms.append(_length(past(beside, POLE), past(place[..., 2], top)))
-        for centre, through, left in self.frames:
-            off = place - centre
-            along, aside = abs(dot(off, through)), abs(dot(off, left))
-            up = dot(off, cross(through, left))
-            within = past(-xp.maximum(aside, abs(up)), -inner)
-            out = past(aside, outer), past(abs(up), outer)
-            rooms.append(_length(past(along, DEPTH), within, *out))
-            rooms.append(_length(past(along, STAND), past(aside, STAND), past(up, -outer)))
-        return functools.reduce(xp.minimum, rooms)
+        It is negative where the box touches a pole, a frame or a stand, and nowhere else.
+        """
+        xp, place, own = namespace(self.size), state.position[..., None, :], state.rotation
+        half = [self.size[..., None] * edge for edge in BOX]  # (N, 1), and all else (N, G or P)
+        tops = place - self.poles.reshape(*self.size.shape, -1, 3)
+        off = [tops[..., 0], tops[..., 1], tops[..., 2] + HIGH]
+        turn = [[own[..., k, i, None] for i in range(3)] for k in range(3)]
+        gaps = [gap(off, turn, half, (0.0, 0.0, HIGH), POLE)]
+        frames = self.gates.reshape(*self.size.shape, -1, 3, 3)
+        centre, through, left = (frames[..., k, :] for k in range(3))
+        axes = through, left, cross(through, left)
+        off = [dot(place - centre, axis) for axis in axes]
+        turn = [[dot(axis, own[..., None, :, i]) for i in range(3)] for axis in axes]
+        wide, outer = (track.frame - track.opening) / 4, track.frame / 2
+        gaps.append(gap([*off[:2], off[2] + outer + STAND[2]], turn, half, STAND))
+        for k in (1, 2):  # of a frame's four sides the box can reach the two nearer ones
+            beside, size = [*off], [DEPTH, outer, outer]
+            size[k], middle = wide, outer - wide + 0.0 * off[k]
+            beside[k] = off[k] - xp.where(off[k] < 0, -middle, middle)
+            gaps.append(gap(beside, turn, half, size))
+        return xp.min(xp.concat(gaps, axis=-1), axis=-1)
 
 
 @functools.cache
@@ -124,29 +129,29 @@ def nominal(track: Track) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(gates.ravel().tolist()), tuple(sum(track.poles, ()))
 
 
-def furnished(rng: Rng, track: Track, size: float, balls: tuple[float, float]) -> Arena:
+def furnished(rng: Rng, track: Track, off: float, boxes: tuple[float, float]) -> Arena:
     """An arena before the start of an episode.
 
     Args:
         rng: Draws where everything stands.
         track: Where it should.
-        size: 1 where it stands elsewhere, 0 where it does not.
-        balls: Radius of the smallest and of the largest ball [m].
+        off: 1 where it stands elsewhere, 0 where it does not.
+        boxes: Smallest and largest box, over that of BOX.
     """
     count, (gates, poles) = len(track.gates), nominal(track)
-    shift = rng.uniform(-size, size, 6 * count + len(poles))
-    ball = rng.uniform(*balls)
+    shift = rng.uniform(-off, off, 6 * count + len(poles))
+    size = rng.uniform(*boxes)
     rows: list[Array] = []
     for k in range(count):
         x, y, z, east, north = gates[9 * k : 9 * k + 5]
-        off = [most * shift[..., 6 * k + i] for i, most in enumerate((*ASIDE, *LEANING))]
-        rows += [x + off[0], y + off[1], z + off[2], *_leaning(east, north, *off[3:])]
+        by = [most * shift[..., 6 * k + i] for i, most in enumerate((*ASIDE, *LEANING))]
+        rows += [x + by[0], y + by[1], z + by[2], *_leaning(east, north, *by[3:])]
     aside = ASIDE_POLE * (len(poles) // 3)
     stand = [poles[k] + aside[k] * shift[..., 6 * count + k] for k in range(len(poles))]
     one = 0.0 * shift[..., 0]
     three, seen = stack(one, one, one), 0.0 * shift[..., : count + len(poles) // 3]
     course = Course(three, one, three, three, one, one, three, one)
-    return Arena(**vars(course), gates=stack(*rows), poles=stack(*stand), ball=ball, seen=seen)
+    return Arena(**vars(course), gates=stack(*rows), poles=stack(*stand), size=size, seen=seen)
 
 
 def _leaning(east: float, north: float, roll: Array, pitch: Array, turn: Array) -> list[Array]:

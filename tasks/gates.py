@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -44,6 +44,8 @@ class GateRace(Task):
     """Fly through gates in order and in their direction; a task says where they are."""
 
     keeps_place = False
+    on_ground: ClassVar[float] = -1.0
+    """For how long after the start the ground ends no race [s]; below 0 it always does."""
     observation = {
         **ROTATION,
         **MOTION,
@@ -89,7 +91,8 @@ class GateRace(Task):
     def __post_init__(self) -> None:
         """Validate the race."""
         super().__post_init__()
-        number(f"{self.name} margin", self.margin, 0, self.course.opening / 2)
+        least, most = (self.course.opening - self.course.frame) / 2, self.course.opening / 2
+        number(f"{self.name} margin", self.margin, least, most)
         number(f"{self.name} flying", self.flying, 0, 1)
         number(f"{self.name} laps", self.laps, 1, whole=True)
 
@@ -209,7 +212,8 @@ class GateRace(Task):
     def _failed(self, now: Snapshot) -> Array:
         """Through a frame, on the ground, or astray, (N,) bool."""
         astray = now.potentials.distance > now.task.leg + ASTRAY
-        return self._crossed(now)[1] | astray | touches_ground(now)
+        begun = (now.time > self.on_ground) | (now.task.passed > 0)
+        return self._crossed(now)[1] | astray | (touches_ground(now) & begun)
 
     def _finished(self, now: Snapshot) -> Array:
         """Whether this control step passes the last gate of the last lap, (N,) bool."""

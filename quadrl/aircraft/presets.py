@@ -59,6 +59,28 @@ CRAZYFLIE_BRUSHLESS = Vehicle(
     control_timestep=0.02,  # chosen
     dead_time=0.005,  # in addition to the lag (IMRCLab flights)
 )
+CF21B_500 = Vehicle(
+    name="cf21B_500",  # Crazyflie 2.1 Brushless with propeller guards, as drone-models 0.1.0 has it
+    mass=0.04338,
+    inertia=(25e-6, 28e-6, 49e-6),
+    rotors=ring(
+        (315, 225, 135, 45),
+        (1, -1, 1, -1),
+        0.05,
+        # Thrust at hover, at 15,896 rpm; it is a parabola with a linear part, 1.3 % more at most.
+        thrust_coefficient=3.839e-8,
+        torque_coefficient=3.839e-8 * 6.113e-3,  # ratio of torque to thrust at hover
+        lag_up=1 / 0.0571,  # at hover: it falls with the speed
+        lag_down=1 / 0.0621,  # at hover: it falls with the speed
+        max_speed=math.sqrt(0.2 / 3.839e-8),  # 0.2 N per rotor
+        radius=0.0275,
+    ),
+    drag_coefficient=5e-3,  # chosen: 9.2 m/s of terminal speed; with `full` it is linear
+    moment_coefficient=1e-7,  # chosen: as the brushed one's
+    action_scale=400.0,  # chosen: as the other brushless one's
+    physics_timestep=0.005,  # chosen
+    control_timestep=0.02,  # chosen
+)
 RACER = Vehicle(
     name="racer",  # Foehn et al. 2022, "Agilicious", Science Robotics 7: the Kingfisher
     mass=0.752,
@@ -112,7 +134,8 @@ HEXA = Vehicle(
 OPTIONS = "mass inertia drag_coefficient moment_coefficient action_scale dead_time".split()
 """Fields that may differ from an aircraft's without making another one of it."""
 VEHICLES = {
-    vehicle.name: vehicle for vehicle in (Vehicle(), CRAZYFLIE, CRAZYFLIE_BRUSHLESS, RACER, HEXA)
+    vehicle.name: vehicle
+    for vehicle in (Vehicle(), CRAZYFLIE, CRAZYFLIE_BRUSHLESS, CF21B_500, RACER, HEXA)
 }
 """The aircraft that are known by name."""
 _ALL = Aerodynamics.full()
@@ -141,6 +164,13 @@ REAL_AIR = {
             translational_lift=0.0,  # unknown
         ),
         0.2,  # estimated, as the brushed one's
+    ),
+    "cf21B_500": (  # drone-models has linear drag and the inertia of rotors, and nothing else
+        Aerodynamics(
+            rotor_drag=3.228e-6,  # 0.0215 N s/m at hover; theirs along the axes is 0.0236 N s/m
+            rotor_inertia=3.893e-8,
+        ),
+        0.0,
     ),
     "racer": (
         dataclasses.replace(

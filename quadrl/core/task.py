@@ -45,6 +45,8 @@ class Task(abc.ABC):
 
     name: ClassVar[str]
     """The name in the catalogue."""
+    version: ClassVar[int] = 0
+    """The -vN of its Gymnasium id, which grows when its numbers change."""
     asks: ClassVar[str]
     """What it asks of the aircraft, in a line."""
     starts: ClassVar[str]
@@ -115,6 +117,12 @@ class Task(abc.ABC):
     control step to the next, for each 0.05 s."""
     survival_weight: float = 10.0
     """Reward for each 0.05 s in the air."""
+
+    @classmethod
+    def gymnasium_id(cls) -> str:
+        """Its id in Gymnasium: quadrl/<CamelCase>-vN."""
+        camel = "".join(word.capitalize() for word in cls.name.split("_"))
+        return f"quadrl/{camel}-v{cls.version}"
 
     def __post_init__(self) -> None:
         """Validate options."""

@@ -17,10 +17,9 @@ __all__ = ["dm_control", "gymnasium", "register_ids", "rsl_rl", "sb3", "torchrl"
 
 
 def register_ids() -> None:
-    """Register every task of the catalogue as quadrl/<CamelCase>-v0 (idempotent)."""
-    for name in TASKS:
-        camel = "".join(word.capitalize() for word in name.split("_"))
-        if (id := f"quadrl/{camel}-v0") not in gym.registry:
+    """Register every task of the catalogue as quadrl/<CamelCase>-vN (idempotent)."""
+    for name, task in TASKS.items():
+        if (id := task.gymnasium_id()) not in gym.registry:
             gym.register(
                 id=id,
                 entry_point="quadrl.envs.gymnasium:make_one",

@@ -130,7 +130,7 @@ def _measure(works: list[Work], seconds: float, repeats: int) -> list[list[float
 
 def _layers(task: Task, num_envs: int, stack: contextlib.ExitStack) -> list[Layer]:
     """Make all layers; what has to be closed goes to the stack."""
-    gymnasium_id = f"quadrl/{task.name.title().replace('_', '')}-v0"
+    gymnasium_id = task.gymnasium_id()
     vehicle, size, free = Vehicle(), f"{num_envs:,}", f"{FREE_FLIGHT_ENVS:,}"
     air = in_real_air(vehicle)
     model = Scenario.of(task, vehicle=vehicle).compile_model(drawn=False)

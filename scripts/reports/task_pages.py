@@ -23,7 +23,7 @@ PAGE = """{asks}
 import gymnasium
 import quadrl
 
-{make}env = gymnasium.make("quadrl/{camel}-v0"{given})
+{make}env = gymnasium.make("{id}"{given})
 observation, info = env.reset(seed=0)
 for _ in range(10):
     observation, reward, terminated, truncated, info = env.step({fly})
@@ -86,7 +86,6 @@ def page(name: str) -> str:
     """Everything about a task, in the order of Gymnasium's pages."""
     task, vehicle = tasks.make(name), Vehicle()
     known = describe(task)
-    camel = "".join(word.capitalize() for word in name.split("_"))
     limit, step = known["time_limit"], vehicle.control_timestep
     size = known["observation"][-1]["last"] + 1
     facts = [
@@ -117,7 +116,7 @@ def page(name: str) -> str:
     drawn = (report.IMAGES / "tasks" / f"{name}.webp").exists()
     return moving * drawn + PAGE.format(
         name=name,
-        camel=camel,
+        id=task.gymnasium_id(),
         make=f'policy = quadrl.Policy.pretrained("{name}")\n' if flies else "",
         given=", **policy.keywords" if flies and (other or task.trained_on != "paper") else "",
         fly="policy(observation)" if flies else "env.action_space.sample()",

@@ -17,7 +17,7 @@ from quadrl import envs
 from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
 
-IDS = {name: f"quadrl/{name.title().replace('_', '')}-v0" for name in TASKS}
+IDS = {name: task.gymnasium_id() for name, task in TASKS.items()}
 HOVER = "quadrl/Hover-v0"
 HEAVY = dataclasses.replace(quadrl.Vehicle(), mass=1.3, control_timestep=0.02)
 every_mode = pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)

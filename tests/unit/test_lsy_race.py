@@ -1,9 +1,10 @@
 """LSY race: where things stand, what is seen of it, and what ends a race."""
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import matrices, random_quaternions, refused
 
 from quadrl import tasks
 from quadrl.core.environment import Environment
@@ -13,18 +14,21 @@ from quadrl.tasks.lsy_race import LsyRace
 AT_REST = {"velocity": (0.0, 0.0, 0.0), "quaternion": (1, 0, 0, 0)}
 
 
-def begun(count=1, position=None, **options):
+def begun(count=1, position=None, quaternion=None, **options):
     """An environment at its first snapshot, the aircraft at rest somewhere."""
-    settings = {"vehicle": "crazyflie_brushless", "engine": "free_flight"}
+    settings = {"vehicle": "cf21B_500", "engine": "free_flight"}
     environment = Environment(LsyRace(**options), num_envs=count, seed=3, **settings)
-    environment.reset(start=None if position is None else AT_REST | {"position": position})
+    given = {} if quaternion is None else {"quaternion": quaternion}
+    environment.reset(
+        start=AT_REST | {"position": position} | given if position is not None else {}
+    )
     return environment
 
 
-def world(task, row):
-    """MuJoCo's model of the solids of a row, and a point that moves about as a tiny ball."""
+def frames(task, row):
+    """MuJoCo's model of the frames and stands of a row as the competition has them, and a box."""
     spec = mujoco.MjSpec()
-    box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+    box = mujoco.mjtGeom.mjGEOM_BOX
     for centre, through, left in task.gates[row].reshape(-1, 3, 3):
         quat = np.zeros(4)
         axes = np.array([through, left, np.cross(through, left)])
@@ -33,28 +37,58 @@ def world(task, row):
         for side in (-1, 1):
             body.add_geom(type=box, pos=[0, 0, 0.28 * side], size=[0.01, 0.36, 0.08])
             body.add_geom(type=box, pos=[0, 0.28 * side, 0], size=[0.01, 0.08, 0.36])
-        body.add_geom(type=box, pos=[0, 0, -0.36 - 1.0], size=[0.05, 0.05, 1.0])
-    for x, y, top in task.poles[row].reshape(-1, 3):
-        spec.worldbody.add_geom(type=cylinder, pos=[x, y, top - 2.0], size=[0.015, 2.0, 0])
-    body = spec.worldbody.add_body(mocap=True)
-    body.add_geom(name="point", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-4, 0, 0])
+        body.add_geom(type=box, pos=[0, 0, -0.86], size=[0.05, 0.05, 0.5])
+    spec.worldbody.add_body(mocap=True).add_geom(name="own", type=box, size=[0.07, 0.07, 0.02])
     model = spec.compile()
     return model, mujoco.MjData(model)
 
 
-def test_what_is_free_is_the_distance_that_mujoco_measures():
-    draw = np.random.default_rng(0)
-    places = draw.uniform((-1.6, -1.0, 0.3), (1.4, 1.0, 1.6), (60, 3))
-    now = begun(60, places).snapshot
-    found = now.task.room(now.state.position, LsyRace().course)
-    for row in range(60):
-        model, data = world(now.task, row)
-        data.mocap_pos[0] = now.state.position[row]
+def to_poles(task, row, position, rotation):
+    """Distance of the box from the nearest pole, by places along the axes of the poles."""
+    least = np.inf
+    for x, y, top in task.poles[row].reshape(-1, 3):
+        along = np.linspace(max(top - 1.6, position[2] - 0.2), min(top, position[2] + 0.2), 801)
+        places = np.stack([0 * along + x, 0 * along + y, along], axis=1) - position
+        outside = abs(places @ rotation) - (0.07, 0.07, 0.02)
+        least = min(least, np.linalg.norm(np.maximum(outside, 0), axis=1).min() - 0.015)
+    return least
+
+
+def test_the_box_touches_where_it_truly_does_and_no_distance_is_overstated():
+    draw, count = np.random.default_rng(0), 150
+    task = begun(count).snapshot.task
+    kind, which = draw.integers(0, 4, count), draw.integers(0, 4, count)
+    places = np.zeros((count, 3))
+    for row, (what, k) in enumerate(zip(kind, which, strict=True)):
+        centre, through, left = task.gates[row].reshape(4, 3, 3)[k]
+        up = np.cross(through, left)
+        if what == 0:  # near a pole
+            off = draw.uniform(-0.14, 0.14, 2)
+            places[row] = *(task.poles[row, 3 * k : 3 * k + 2] + off), draw.uniform(0.1, 1.7)
+        elif what == 1:  # near a stand
+            off = draw.uniform(-0.16, 0.16, 2)
+            places[row] = centre + off[0] * through + off[1] * left - draw.uniform(0.3, 1) * up
+        else:  # near a frame
+            off = draw.normal(0, 0.06), *draw.uniform(-0.5, 0.5, 2)
+            places[row] = centre + off[0] * through + off[1] * left + off[2] * up
+    places[:, 2] = np.maximum(places[:, 2], 0.12)
+    quaternion = random_quaternions(draw, count)
+    quaternion[::3, 1:3] *= 0.1  # nearly level
+    quaternion[::9, 1:3] = 0.0
+    quaternion /= np.linalg.norm(quaternion, axis=1)[:, None]
+    now = begun(count, places, quaternion=quaternion).snapshot
+    found, turned = now.task.clearance(now.state, LsyRace().course), matrices(quaternion)
+    assert 0.3 < (found < 0).mean() < 0.7
+    for row in range(count):
+        model, data = frames(now.task, row)
+        data.mocap_pos[0], data.mocap_quat[0] = places[row], quaternion[row]
         mujoco.mj_kinematics(model, data)
-        point = model.geom("point").id
-        others = [k for k in range(model.ngeom) if k != point]
-        least = min(mujoco.mj_geomDistance(model, data, k, point, 9.0, None) for k in others)
-        assert found[row] == pytest.approx(max(least, 0.0), abs=3e-4)
+        own = model.geom("own").id
+        others = (k for k in range(model.ngeom) if k != own)
+        least = min(mujoco.mj_geomDistance(model, data, k, own, 9.0, None) for k in others)
+        poles = to_poles(now.task, row, places[row], turned[row])
+        assert found[row] < max(min(least, poles), 0.0) + 2e-6
+        assert (found[row] < 0) == (least < 0 or poles < 0) or 0 < poles < 1e-3
 
 
 def test_gates_and_poles_stand_elsewhere_in_each_episode_of_level_two_alone():
@@ -110,13 +144,18 @@ def test_where_they_truly_stand_is_seen_from_near_and_known_from_then_on():
     ("position", "ends"),
     [
         ((-1.5, 0.75, 0.5), False),
-        ((-2.51, 0.75, 0.5), True),
-        ((0.0, 1.51, 0.5), True),
-        ((0.0, 0.0, 2.05), True),
-        ((0.0, 0.75 + 0.015 + LsyRace.ball + 0.01, 1.0), False),  # beside a pole
-        ((0.0, 0.75 + 0.015 + LsyRace.ball - 0.01, 1.0), True),
+        ((-2.99, 0.75, 0.5), False),
+        ((-3.01, 0.75, 0.5), True),
+        ((0.0, 3.01, 0.5), True),
+        ((0.0, 0.0, 2.49), False),
+        ((0.0, 0.0, 2.51), True),
+        ((0.0, 0.75 + 0.015 + 0.07 + 0.01, 1.0), False),  # beside a pole
+        ((0.0, 0.75 + 0.015 + 0.07 - 0.01, 1.0), True),
         ((0.0, -0.75, 1.2), False),  # in the middle of the last gate
-        ((0.0, -0.75 + 0.14, 1.2), True),  # too near to its frame
+        ((0.0, -0.75 + 0.2 - 0.07 - 0.01, 1.2), False),  # beside its frame, above, below
+        ((0.0, -0.75 + 0.2 - 0.07 + 0.01, 1.2), True),
+        ((0.0, -0.75, 1.2 + 0.2 - 0.02 - 0.01), False),
+        ((0.0, -0.75, 1.2 + 0.2 - 0.02 + 0.01), True),
         ((0.0, -0.75, 0.5), True),  # on its stand
     ],
 )
@@ -128,6 +167,26 @@ def test_a_race_ends_where_the_aircraft_may_not_be(position, ends):
     assert done.terminated[0] == ends and not done.is_success[0]
 
 
+def test_it_begins_on_the_floor_with_its_rotors_at_rest_and_has_half_a_second_to_leave_it():
+    environment = begun(20)
+    state = environment.snapshot.state
+    assert (0.01 <= state.position[:, 2]).all() and (state.position[:, 2] < 0.03).all()
+    assert (state.rotor_speed == 0).all() and (environment.snapshot.rotor_command == 0).all()
+    climbing = np.arange(20) < 10
+    for step in range(1, 40):
+        done = environment.step(np.where(climbing[:, None], 1.0, -1.0) * np.ones((20, 4)))
+        stays = environment.snapshot.state.height[~climbing]
+        assert (stays > 0.5 * environment.vehicle.ground_clearance).all()  # the floor carries it
+        assert (done.terminated[~climbing] == (step > 25)).all()
+        assert not done.terminated[climbing].any()
+        if step == 25:
+            assert (environment.snapshot.state.position[climbing, 2] > 0.1).all()
+    # What has passed a gate has flown, however long ago it began.
+    environment = begun(1, (-1.5, 0.75, 0.5), flying=1.0)
+    environment.engine.qpos[0, 2] = 0.01
+    assert environment.step(np.zeros((1, 4))).terminated[0]
+
+
 def test_practice_begins_in_the_middle_of_gates():
     task = LsyRace(flying=1.0)
     environment = begun(300, flying=1.0)
@@ -137,7 +196,13 @@ def test_practice_begins_in_the_middle_of_gates():
     np.testing.assert_allclose(now.state.position, centre, atol=1e-12)
     speed = np.linalg.norm(now.state.velocity, axis=1)
     assert speed.max() > 0.95 and (speed < 1.0).all()
+    assert (now.state.rotor_speed == environment.vehicle.hover_speed).all()
     np.testing.assert_allclose(now.state.velocity, speed[:, None] * through, atol=1e-12)
+
+
+def test_its_id_says_that_its_numbers_have_changed():
+    assert LsyRace.gymnasium_id() == "quadrl/LsyRace-v1" in gymnasium.registry
+    assert tasks.TASKS["hover"].gymnasium_id() == "quadrl/Hover-v0" in gymnasium.registry
 
 
 def test_no_other_levels():
@@ -145,14 +210,30 @@ def test_no_other_levels():
         tasks.make("lsy_race", level=3)
 
 
-def test_in_practice_the_ball_may_be_smaller():
-    size = begun(300, least_ball=0.02).snapshot.task.ball
-    assert 0.02 <= size.min() < 0.025 and 0.065 < size.max() < 0.07
-    environment = begun(1, (-1.5, 0.75, 0.5), level=0, ball=0.01, least_ball=0.01)
-    environment.engine.qpos[0, :3] = np.add((0.0, -0.75 + 0.18, 1.2), environment.origin)
-    assert not environment.step(np.zeros((1, 4))).terminated[0]  # 2 cm from the last frame
-    with refused(name="lsy_race least_ball", value=0.1):
-        tasks.make("lsy_race", least_ball=0.1)
+def test_in_practice_the_box_may_be_smaller():
+    size = begun(300, least_box=0.3).snapshot.task.size
+    assert 0.3 <= size.min() < 0.32 and 0.98 < size.max() < 1.0
+    environment = begun(1, (-1.5, 0.75, 0.5), level=0, box=0.5, least_box=0.5)
+    for aside, ends in ((0.2 - 0.045, False), (0.2 - 0.025, True)):  # half its edge: 3.5 cm
+        environment.engine.qpos[0, :3] = np.add((0.0, -0.75 + aside, 1.2), environment.origin)
+        environment.engine.qvel[:] = 0.0
+        assert environment.step(np.zeros((1, 4))).terminated[0] == ends
+    for name, value in (("least_box", 1.1), ("box", 2.0)):
+        with refused(name=f"lsy_race {name}", value=value):
+            tasks.make("lsy_race", **{name: value})
+
+
+def test_a_passage_counts_within_a_square_of_45_cm_as_in_the_competition():
+    for aside, passes in ((0.22, True), (0.23, False)):
+        environment = begun(1, (-1.5, 0.75, 0.5), level=0)
+        task = environment.snapshot.task
+        place = task.goal + aside * task.left
+        environment.engine.qpos[0, :3] = (place - 0.001 * task.through)[0] + environment.origin
+        environment.engine.qvel[:] = 0.0
+        environment.step(np.zeros((1, 4)))  # now it is before the gate
+        environment.engine.qvel[0, :3] = 1.0 * task.through[0]
+        environment.step(np.zeros((1, 4)))
+        assert (environment.snapshot.task.passed[0] == 1) == passes
 
 
 def test_progress_is_paid_up_to_a_speed_and_leads_around_the_second_gate():

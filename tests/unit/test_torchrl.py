@@ -60,8 +60,9 @@ def test_torchrls_gymnasium_wrapper_sees_the_same_episodes(name, mode):
     ours = rollout(QuadrotorEnv(name, COUNT, seed=5, time_limit=limit))
     assert 3 <= ours["next", "done"].sum()
     assert not ours["next", "done"].all(0).any()
-    id = f"quadrl/{name.title().replace('_', '')}-v0"
-    vector = gym.make_vec(id, num_envs=COUNT, time_limit=limit, autoreset_mode=mode)
+    vector = gym.make_vec(
+        TASKS[name].gymnasium_id(), num_envs=COUNT, time_limit=limit, autoreset_mode=mode
+    )
     environment = GymWrapper(vector)
     check_env_specs(environment)
     vector.environment.seed(5)  # environment.set_seed would use up the first episodes
