@@ -22,8 +22,8 @@ from quadrl.tasks.references import AXES, PIECE
 LONGEST_GAP, FASTEST, FASTEST_TURN, SHORTEST, LONGEST = 0.5, 20.0, 10.0, 0.1, 3600.0
 SURE = 1e-6  # relative tolerance of a limit
 DEGREE = 5  # of the splines
-# [m], tolerance of a curve where the digits of its file are finer, and of any curve.
-FINE, FINEST = 1e-4, 1e-6
+# [m]: tolerance where the digits of a file are finer; the least; from when a distance is told.
+FINE, FINEST, TOLD = 1e-4, 1e-6, 1e-3
 # The deviation that noise may leave in the acceleration [m/s^2]; the widest band at first [rad/s].
 QUIET, WIDEST = 0.005, 40.0
 LOOSE, BETTER = 1.25, 0.7  # of the tolerance: near enough; of the distance before: worth a band
@@ -130,7 +130,7 @@ def read(name: str, path: str, tolerance: float) -> Recorded:
         raise QuadrlError(reason, name=name, value=path, allowed=allowed) from error
     asked = max(tolerance, FINEST) if tolerance else _rounding(rows[:, :AXES])
     spacing, coefficients, passed = smoothed(times, rows, asked)
-    if (off := _distance(passed - rows)) > LOOSE * asked:
+    if (off := _distance(passed - rows)) > max(LOOSE * asked, TOLD):
         text = f"{name}: the curve passes the rows of {path} at {1e3 * off:.2g} mm (root mean "
         text += f"square): they are noisy or have corners; figure_tolerance={off:.2g} says so"
         warnings.warn(text, QuadrlWarning, stacklevel=2)
