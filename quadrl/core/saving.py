@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from quadrl.aircraft.parameters import LAYOUT, refitted
+from quadrl.aircraft.parameters import AIRCRAFT, LAYOUT, refitted
 from quadrl.base import records
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import MAX_SEED, Seed, seeds_of_rows
@@ -21,6 +21,10 @@ from quadrl.engines.engine import Engine
 
 MOMENT = ("action", "rotor_command", "time")
 """Arrays of a snapshot that are its own."""
+TABLES = "engine.parameters", "engine.begun"
+"""Rows of the aircraft: those that fly, and those with which their episodes began. In between an
+event may have changed any number but these:"""
+MADE_OF = "mark", "size", "rotor_count", "effects"
 MOST_STEPS = 2.0**53
 """Whole numbers up to here are exact in double precision."""
 
@@ -107,10 +111,11 @@ class Memory:
         Raises:
             QuadrlError: The row has a number that is not known here.
         """
-        table, layout, own = "engine.parameters", saved.get("engine.layout"), self.engine.parameters
-        if layout is None or table not in saved or np.array_equal(layout, LAYOUT):
+        layout, own = saved.get("engine.layout"), self.engine.begun
+        if layout is None or not saved.keys() >= {*TABLES} or np.array_equal(layout, LAYOUT):
             return saved
-        return {**saved, table: refitted(saved[table], layout, own), "engine.layout": LAYOUT}
+        tables = {name: refitted(saved[name], layout, own) for name in TABLES}
+        return {**saved, **tables, "engine.layout": LAYOUT}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
         """Refuse the state of another environment, or one that no environment can be in.
@@ -120,10 +125,10 @@ class Memory:
         """
         own = self.save()
         records.check_alike(saved, own)
-        table, sampler = "engine.parameters", self.randomizer.sampler
+        (present, table), sampler = TABLES, self.randomizer.sampler
         for name in own:
             begins = name.startswith(("randomizer.", "observer.", "episode."))
-            checked = begins or name in ("engine.rows", "engine.solids", *MOMENT)
+            checked = begins or name in ("engine.rows", "engine.solids", present, *MOMENT)
             if checked and not np.isfinite(saved[name]).all():
                 raise QuadrlError(name=name, value=saved[name], allowed="finite")
         self._check_counters(saved)
@@ -133,6 +138,11 @@ class Memory:
         if not (drawn or np.array_equal(saved[table], own[table])):
             reason = "the state was saved with another aircraft"
             raise QuadrlError(reason, name=table, value=saved[table], allowed="this aircraft's")
+        now, then = (np.ascontiguousarray(saved[name]).view(AIRCRAFT) for name in TABLES)
+        for name in MADE_OF:
+            if not np.array_equal(now[name], then[name]):
+                allowed = "as when the episode began: it does not change in flight"
+                raise QuadrlError(name=f"{present} {name}", value=now[name], allowed=allowed)
         if self.weather:
             self.weather.check(saved)
         elif "weather.table" in saved:

@@ -38,6 +38,7 @@ class Engine(abc.ABC):
     air: np.ndarray  # (N, AIR) rows of air; saved and restored with the rest
     wind: np.ndarray  # (N, 3) [m/s], world frame: the first numbers of `air`
     parameters: np.ndarray  # (N,) rows, or (1,) where all are the same
+    begun: np.ndarray  # the same when the episodes began, before anything changed in flight
     forked = False  # whether it was made before this process was forked, which lacks its threads
 
     def __init__(
@@ -75,6 +76,7 @@ class Engine(abc.ABC):
         (N, 0) in a world without solids."""
         rows = self._model_field("body_user")[:, 1]
         self.parameters = rows.view(parameters.AIRCRAFT)[:, 0]
+        self.begun = self.parameters.copy()
         flown = self.model, fields, self.parameters, self._threads, self.solids
         self._free_flight = FreeFlight(*flown) if name == "free_flight" else None
         # Two frames in turn: the last state stays whole while the next one is computed.
@@ -100,7 +102,7 @@ class Engine(abc.ABC):
         """A field of the model with a leading axis (N or 1), live."""
 
     def write_parameters(self, rows: np.ndarray, table: np.ndarray) -> None:
-        """Give some aircraft (n,) parameters (n,) of their own; MuJoCo's own fields follow."""
+        """Give some aircraft (n,) parameters (n,), also in flight; MuJoCo's own fields follow."""
         rotor = table["rotor"][:, : self.vehicle.rotor_count]
         mass, inertia = table["mass"][:, None], table["inertia"]
         # As MuJoCo computes them from mass and inertia when it compiles a model.
@@ -227,6 +229,7 @@ class Engine(abc.ABC):
         self._check_start(rows, start, table)
         if table is not None:
             self.write_parameters(rows, table)
+            self.begun[rows] = table
         if solids is not None:
             self.solids.place(rows, solids)
         self.clear(rows)
@@ -265,13 +268,15 @@ class Engine(abc.ABC):
         table = np.ascontiguousarray(saved["parameters"]).view(parameters.AIRCRAFT)[:, 0]
         if not np.array_equal(table, self.parameters):
             self.write_parameters(np.arange(len(table)), table)
+        self.begun[:] = np.ascontiguousarray(saved["begun"]).view(parameters.AIRCRAFT)[:, 0]
         if "solids" in saved:
             self.solids.restore(saved["solids"])
         self._fill(None)
 
     def _saved(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """The result of `save`, from the rows of the simulation."""
-        saved = {"rows": rows, "parameters": parameters.numbers(self.parameters).copy()}
+        both = {"parameters": self.parameters, "begun": self.begun}
+        saved = {"rows": rows} | {k: parameters.numbers(v).copy() for k, v in both.items()}
         saved["layout"] = parameters.LAYOUT
         return saved | ({"solids": self.solids.save()} if len(self.solids.geoms) else {})
 

@@ -17,6 +17,7 @@ from quadrl.core import record
 from quadrl.core.catalogue import TASKS
 from quadrl.core.environment import Environment
 from quadrl.core.rules import IMPORTED, import_own
+from quadrl.core.saving import TABLES
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE, RUN, RUN_FORMAT
 from quadrl.learning import checkpoint
@@ -46,16 +47,17 @@ def older_rows(saved):
     rotor = [(name, kind, *map(tuple, shape)) for name, kind, *shape in fields[-1][1]]
     plain = [(name, kind, *map(tuple, shape)) for name, kind, *shape in fields[:-1]]
     kind = np.dtype([*plain, ("rotor", rotor, AIRCRAFT["rotor"].shape)])
-    now = np.ascontiguousarray(saved["engine.parameters"]).view(AIRCRAFT)[:, 0]
-    table = np.zeros(len(now), kind)
-    for name in kind.names[:-1]:
-        table[name] = now[name]
-    for name in kind["rotor"].base.names:
-        table["rotor"][name] = now["rotor"][name]
-    layout = np.frombuffer(json.dumps(fields).encode(), np.uint8)
-    rows = table.view(float).reshape(len(table), -1)
-    assert rows.shape[1] < saved["engine.parameters"].shape[1]
-    return saved | {"engine.parameters": rows, "engine.layout": layout}
+    layout, tables = np.frombuffer(json.dumps(fields).encode(), np.uint8), {}
+    for place in TABLES:
+        now = np.ascontiguousarray(saved[place]).view(AIRCRAFT)[:, 0]
+        table = np.zeros(len(now), kind)
+        for name in kind.names[:-1]:
+            table[name] = now[name]
+        for name in kind["rotor"].base.names:
+            table["rotor"][name] = now["rotor"][name]
+        tables[place] = table.view(float).reshape(len(table), -1)
+        assert tables[place].shape[1] < saved[place].shape[1]
+    return saved | tables | {"engine.layout": layout}
 
 
 def test_a_run_of_before_a_number_existed_goes_on_to_the_same_policy(tmp_path):

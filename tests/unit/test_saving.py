@@ -1,16 +1,21 @@
 """Resets of some rows, saving and restoring, and what a task remembers."""
 
+import copy
 import dataclasses
+import pickle
 
 import helpers
 import numpy as np
 import pytest
+import safetensors.numpy
 from helpers import EVERYTHING, drawn, flying
 from test_sensors import WILD as EVERY_SENSOR
 
 from quadrl import tasks
+from quadrl.aircraft.parameters import AIRCRAFT
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.conditions.weather import Weather
+from quadrl.core.environment import Environment
 from quadrl.core.task import TaskState
 from quadrl.tasks.hover import Hover
 
@@ -112,10 +117,47 @@ def test_the_state_of_another_aircraft_is_not_restored(randomization, changed):
     vehicle = dataclasses.replace(PAPER, **changed)
     wrong = flying(randomization=randomization, vehicle=vehicle).save()
     broken["engine.rows"][0, 0] = np.nan
-    for saved, name in ((wrong, "engine.parameters"), (broken, "engine.rows")):
+    for saved, name in ((wrong, "engine.begun"), (broken, "engine.rows")):
         with helpers.refused(name):
             other.restore(saved)
         np.testing.assert_array_equal(drawn(other), before)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("randomization", [None, {"mass": (0.9, 1.1)}])
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_aircraft_that_changed_in_flight_is_saved_copied_and_resumed(
+    count, randomization, engine
+):
+    """The first rotor loses 15 % of its thrust and torque in the third step, as in the guide."""
+    settings = {"num_envs": count, "engine": engine, "randomization": randomization}
+    environment, fresh = (Environment("hover", seed=s, **settings) for s in (3, 4))
+    environment.reset(), fresh.reset()
+    flown = environment.engine
+    actions = helpers.random_actions(6, count)
+    for k, action in enumerate(actions[:3]):
+        if k == 2:
+            weak = flown.parameters[:1].copy()
+            for name in ("thrust_coefficient", "torque_coefficient"):
+                weak["rotor"][name][:, 0] *= 0.85
+            flown.write_parameters(np.array([0]), weak)
+        environment.step(action)
+    copies = [copy.deepcopy(environment), pickle.loads(pickle.dumps(environment)), fresh]
+    fresh.restore(safetensors.numpy.load(safetensors.numpy.save(environment.save())))
+    for action in actions[3:]:
+        record, *others = (helpers.recorded(e, e.step(action)) for e in (environment, *copies))
+        helpers.assert_records(others, [record] * len(others))
+    for one in copies:
+        np.testing.assert_array_equal(one.engine.parameters, flown.parameters)
+    assert (flown.begun != flown.parameters).any()
+    # What cannot change in flight, and what is no number, is refused, and changes nothing.
+    before = fresh.engine.parameters.copy()
+    for name, value in (("rotor_count", 6.0), ("mass", np.nan)):
+        broken = environment.save()
+        broken["engine.parameters"].view(AIRCRAFT)[name][0] = value
+        with helpers.refused():
+            fresh.restore(broken)
+        np.testing.assert_array_equal(fresh.engine.parameters, before)
 
 
 @dataclasses.dataclass(frozen=True)
