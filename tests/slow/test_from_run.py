@@ -57,8 +57,8 @@ def test_it_is_reproducible_and_resumes_without_the_other_run(first, tmp_path):
     assert sources["from_run"] == "given"
 
 
-def test_a_run_without_another_one_is_saved_as_before(first):
-    assert "from_run" not in TINY.resolved()
+def test_a_run_says_whose_networks_it_began_with(first):
+    assert TINY.resolved()["from_run"] == ""
     assert after(first).resolved()["from_run"].startswith(f"{first}@")
     names = {name: where for name, _, where in after(first).sources()}
     assert names["hidden"] == names["critic_hidden"] == f"run {first}"

@@ -72,7 +72,7 @@ def test_every_algorithm_continues_where_it_was_stopped(tmp_path, algo):
     assert_same_run(alone, train(config, tmp_path / "run", resume=True))
     policy = quadrl.Policy.load(alone)
     assert policy.metadata["algo"] == algo and policy.action_size == (6 if algo == "apg" else 4)
-    assert (policy.metadata["vehicle"], policy.metadata["rotors"]) == ("hexa", 6)
+    assert (policy.metadata["vehicle"]["name"], policy.metadata["rotors"]) == ("hexa", 6)
     assert policy.control_mode == config.control_mode
 
 
@@ -87,7 +87,8 @@ def test_an_uncertain_training_continues_and_its_policy_knows_what_it_met(tmp_pa
     stopped(config, tmp_path / "run", 3)
     assert_same_run(alone, train(config, tmp_path / "run", resume=True))
     policy = quadrl.Policy.load(alone)
-    assert policy.conditions["observe"] == {"action_history": 1, "rotor_speed": "estimated"}
+    seen = quadrl.Observing(action_history=1, rotor_speed="estimated")
+    assert policy.scenario.observe == seen
     assert policy.metadata["aerodynamics"] == "rotor_drag"
     drawn = quadrl.Randomization(**policy.conditions["randomization"])
     assert drawn == quadrl.RANDOMIZATIONS["full"]

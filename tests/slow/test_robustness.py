@@ -105,9 +105,12 @@ def test_a_controller_knows_the_rotor_speeds_as_the_policies_beside_it_do(polici
     own = Scenario.of(flown.pop("geometric controller")).observe
     assert own.given() == ({} if seen == "true" else {"rotor_speed": seen})
     for name, scenario in flown.items():  # as in their trainings
-        assert Scenario.of(scenario).observe.given() == quadrl.Policy.pretrained(
-            "hover", variant="robust" if "robust" in name else "ideal"
-        ).conditions.get("observe", {})
+        assert (
+            Scenario.of(scenario).observe.given()
+            == quadrl.Policy.pretrained(
+                "hover", variant="robust" if "robust" in name else "ideal"
+            ).scenario.observe.given()
+        )
     if seen == "estimated":  # as the command's comparison does
         beside = quadrl.evaluate("hover_robust", episodes=1).yardstick().scenario.observe
         assert beside.given() == {"rotor_speed": seen}

@@ -1,5 +1,6 @@
 """The policy as numbers: what it computes, what it refuses to read, what it needs to fly."""
 
+import dataclasses
 import json
 
 import gymnasium as gym
@@ -237,6 +238,19 @@ def test_its_keywords_make_what_it_fits_in_dm_control():
     policy = Policy.pretrained("hover", variant="robust")
     classic = quadrl.load("hover", task_kwargs={"random": 0, **policy.keywords})
     policy.check_fits(classic.task.environment)
+
+
+def test_an_environment_with_other_numbers_than_in_the_training_is_told(monkeypatch):
+    policy, paper = Policy.pretrained("hover"), VEHICLES["paper"]
+    monkeypatch.setitem(VEHICLES, "paper", dataclasses.replace(paper, mass=0.7))
+    with pytest.warns(QuadrlWarning, match="paper of this policy has mass = 0.65; .* 0.7; here"):
+        policy.check_fits(Environment("hover"))
+    with pytest.warns(QuadrlWarning, match="mass = 0.65; paper is now 0.7; flown: as recorded"):
+        found = quadrl.evaluate("hover", episodes=1)
+    assert found.vehicle == paper
+    with pytest.warns(QuadrlWarning, match="flown: as recorded"):
+        assert policy.keywords["vehicle"] == paper
+    assert quadrl.evaluate("hover", episodes=1, vehicle_options={"mass": 0.6}).vehicle.mass == 0.6
 
 
 def test_another_time_between_two_actions_than_in_training_is_warned_of():

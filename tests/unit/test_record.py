@@ -166,8 +166,10 @@ def test_a_run_of_somebody_else_chooses_no_file_to_run(ringed, monkeypatch, tmp_
             act(run)
     with refused("task", "ringed", match="give --import ringed.py"):
         quadrl.evaluate(run)
-    key.chmod(0o644)  # others can read it, so it seals nothing
-    assert record.sealed_imports() == [] and not (tmp_path / "ran").exists()
+    assert not (tmp_path / "ran").exists()
     import_own(file)
+    assert [one["path"] for one in record.sealed_imports()] == [str(file)]
+    key.chmod(0o644)  # others can read it, so it seals nothing
+    assert record.sealed_imports() == []
     with pytest.warns(QuadrlWarning, match="ringed.py is not what it was"):
         assert quadrl.evaluate(run, episodes=1).task.name == "ringed"

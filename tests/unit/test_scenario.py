@@ -121,6 +121,12 @@ def test_what_a_record_lacks_has_its_default_and_what_is_unknown_is_refused(name
         Scenario.of(record)
 
 
+def test_what_the_record_of_an_aircraft_lacks_is_not_taken_from_that_of_its_name_today():
+    record = Scenario.of("hover", vehicle="crazyflie").to_json()
+    assert record["vehicle"].pop("dead_time") == 0.01
+    assert Scenario.of(record).vehicle.dead_time == 0.0
+
+
 def test_it_is_the_same_environment_however_it_is_asked_for():
     by_keywords = Environment("random_waypoint", **EVERYTHING)
     given = Environment(Scenario.of(whole().to_json()))
