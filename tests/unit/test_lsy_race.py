@@ -151,6 +151,9 @@ def test_where_they_truly_stand_is_seen_from_near_and_known_from_then_on():
         ((0.0, 0.0, 2.51), True),
         ((0.0, 0.75 + 0.015 + 0.07 + 0.01, 1.0), False),  # beside a pole
         ((0.0, 0.75 + 0.015 + 0.07 - 0.01, 1.0), True),
+        # A corner points at it: 0.07 sqrt(2) = 0.0990 and 0.015 are 0.1140 = 0.0806 sqrt(2).
+        ((0.0816, 0.75 + 0.0816, 1.0), False),
+        ((0.0796, 0.75 + 0.0796, 1.0), True),
         ((0.0, -0.75, 1.2), False),  # in the middle of the last gate
         ((0.0, -0.75 + 0.2 - 0.07 - 0.01, 1.2), False),  # beside its frame, above, below
         ((0.0, -0.75 + 0.2 - 0.07 + 0.01, 1.2), True),
