@@ -197,9 +197,9 @@ class TrainConfig(TrainSettings):
         """What is flown in the training."""
         return Scenario.of(self.base, task_options=self.training_options)
 
-    @property
+    @functools.cached_property
     def base(self) -> Scenario:
-        """What its settings name, or the run that it was read from has recorded."""
+        """What its settings name, or the run that it was read from has recorded; made once."""
         given = {name: getattr(self, name, None) for name in KEYWORDS}
         named = {name: value for name, value in given.items() if value not in (None, "", {})}
         return Scenario.of(self.recorded or named)

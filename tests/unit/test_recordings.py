@@ -13,6 +13,7 @@ from quadrl import tasks
 from quadrl.base.errors import QuadrlWarning
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
+from quadrl.learning.config import TrainConfig
 from quadrl.tasks import recordings
 
 RATE = 2 * np.pi / 8
@@ -276,6 +277,18 @@ def test_what_flew_is_kept_without_its_file(tmp_path, monkeypatch, recwarn):
     with pytest.warns(QuadrlWarning, match="own.csv is not the file whose curve is flown"):
         assert Scenario.of(saved).task == task
     assert Scenario.of(saved, task_options={"figure": "own.csv"}).task != task
+
+
+def test_a_training_flies_and_keeps_one_curve_though_its_file_changes(tmp_path):
+    figure = write(tmp_path / "own.csv", "t,x,y,z", (TIME, *PLACE))
+    config = TrainConfig("trajectory", task_options={"figure": figure})
+    begun = config.scenario.task.figure
+    write(tmp_path / "own.csv", "t,x,y,z", (TIME, Y, X, Z))
+    kept = config.resolved()["scenario"]["task_options"]["figure"]
+    assert config.training_scenario.task.figure == begun and kept["digest"] == begun.digest
+    os.remove(figure)
+    resumed = TrainConfig.of_saved(config.resolved(), steps=10_000_000)
+    assert resumed.scenario.task.figure == begun
 
 
 @pytest.mark.parametrize(
