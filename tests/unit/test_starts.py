@@ -40,6 +40,17 @@ def test_an_aircraft_at_rest_passes_no_gate_and_is_not_out(track, compiled, monk
     assert not done.reward_terms["pass"].any() and not done.reward_terms["miss"].any()
 
 
+def test_among_poles_only_who_begins_against_something_is_out():
+    place = np.random.default_rng(1).uniform([-2.4, -2.4, 0.4], [2.4, 2.4, 2.0], (COUNT, 3))
+    environment = helpers.begun("lsy_race", COUNT)
+    turning = environment.vehicle.hover_speed
+    environment.reset(start=STILL | {"position": place, "rotor_speed": turning})
+    clearance = environment.snapshot.potentials.clearance.copy()
+    done = environment.step(np.zeros((COUNT, 4)))
+    assert not environment.snapshot.task.passed.any()
+    assert not done.terminated[clearance > 0.01].any() and done.terminated[clearance < 0].all()
+
+
 def test_some_rows_remember_their_start_and_the_others_their_flight():
     environment = helpers.begun("race", 3)
     before = environment.snapshot.task.position.copy()
