@@ -19,6 +19,7 @@ from quadrl import envs, tasks
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.extras import needed
 from quadrl.base.shield import shield_triton
 from quadrl.base.validation import registered
 from quadrl.base.version import __version__ as __version__
@@ -95,7 +96,8 @@ def __dir__() -> list[str]:
 def __getattr__(name: str) -> Any:
     """Import on first use what brings more libraries."""
     if name in LAZY:
-        return getattr(importlib.import_module(LAZY[name]), name)
+        with needed(f"quadrl.{name}"):
+            return getattr(importlib.import_module(LAZY[name]), name)
     if name in ("suite", "rendering", "testing"):
         return importlib.import_module(f"quadrl.{name}")
     raise AttributeError(f"module 'quadrl' has no attribute {name!r}")

@@ -17,6 +17,7 @@ from rich.console import Console
 from tyro.conf import CascadeSubcommandArgs, Positional, UseAppendAction, arg
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.extras import needed
 from quadrl.base.signals import IN_ORDER, Stopped, handling
 from quadrl.base.validation import choice
 from quadrl.base.version import __version__
@@ -91,7 +92,8 @@ def main(arguments: list[str] | None = None) -> None:
             console.console.quiet = chosen.quiet
             for path in chosen.own:
                 import_own(path)
-            chosen.command.run()
+            with needed(f"quadrl {type(chosen.command).__name__.lower()}"):
+                chosen.command.run()
     except (QuadrlError, OSError, MemoryError, RuntimeError) as error:
         said = console.reason(error)
         if os.environ.get("QUADRL_TRACEBACK") or said is None:

@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 from quadrl.base.errors import QuadrlError
+from quadrl.base.extras import needed
 from quadrl.base.validation import choice
 from quadrl.cli import choices
 from quadrl.cli.console import console, going_on, make_table, print_json, say
@@ -54,7 +55,7 @@ class Robustness(Conditioned):
             )
         flown = [policy_named(name) for name in self.policies]
         flown += [choice("controller", name, CONTROLLERS) for name in self.controller]
-        with going_on():
+        with going_on(), needed("quadrl robustness", "matplotlib"):
             card = robustness(
                 flown,
                 self.task or None,

@@ -15,6 +15,7 @@ from quadrl.aircraft.rotors import Rotor
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError
+from quadrl.base.extras import needed
 from quadrl.base.files import free_name, write_whole
 from quadrl.base.validation import choice
 from quadrl.base.version import __version__
@@ -28,11 +29,11 @@ from quadrl.rendering.video import checked
 from quadrl.tasks import TASKS
 
 TARGETS = {
-    "mjcf": ("xml", "quadrl.deploy.mjcf", ""),
-    "onnx": ("onnx", "quadrl.deploy.onnx", "export"),
-    "torch": ("pt2", "quadrl.evaluation.module", "train"),
+    "mjcf": ("xml", "quadrl.deploy.mjcf"),
+    "onnx": ("onnx", "quadrl.deploy.onnx"),
+    "torch": ("pt2", "quadrl.evaluation.module"),
 }
-"""By name: the ending of its file, the module that makes it, and the extra which that needs."""
+"""By name: the ending of its file, and the module that makes it."""
 
 
 def export(what: Any, to: str, out: str | Path | None = None) -> Path:
@@ -53,7 +54,7 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
         QuadrlError: A name is unknown, there is no policy, or a library is missing.
         OSError: The file cannot be written.
     """
-    ending, name, extra = TARGETS[choice("to", to, TARGETS)]
+    ending, name = TARGETS[choice("to", to, TARGETS)]
     found = _found(what)
     if to == "mjcf":
         vehicle = found if isinstance(found, Vehicle) else found.scenario.vehicle
@@ -65,11 +66,8 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
     else:
         reason = f"an aircraft has no network: give a policy for {to}"
         raise QuadrlError(reason, name="to", value=to, allowed=f"mjcf for {found.name}")
-    try:
+    with needed("quadrl.export"):
         module = importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        reason = f"python -m pip install 'quadrl[{extra}]' installs it"
-        raise QuadrlError(f"{error.name} is not installed: {reason}") from error
     path, _ = checked(out or free_name(Path(f"{stem}.{ending}")), (ending,))
     path.parent.mkdir(parents=True, exist_ok=True)  # refused before the work, not after
     write_whole(path, module.content(*given))

@@ -8,14 +8,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
-from tensordict import TensorDict
 
-try:
-    from rsl_rl.env import VecEnv
-except ImportError as error:
-    reason = "quadrl.envs.rsl_rl needs rsl_rl: pip install 'quadrl[rsl_rl]'"
-    raise ImportError(reason) from error
+from quadrl.base.extras import needed
+
+with needed("quadrl.envs.rsl_rl"):
+    from rsl_rl.env import VecEnv  # isort: skip
+    import torch
+    from tensordict import TensorDict
 
 from quadrl.base.errors import QuadrlError
 from quadrl.core.scenario import Scenario

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-try:
+from quadrl.base.extras import needed
+
+with needed("quadrl.envs.sb3"):
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
-except ImportError as error:
-    reason = "quadrl.envs.sb3 needs Stable-Baselines3: pip install stable-baselines3"
-    raise ImportError(reason) from error
 
 from quadrl.base.errors import QuadrlError
 from quadrl.core.task import Task

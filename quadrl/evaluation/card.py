@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl.base.errors import QuadrlError
+from quadrl.base.extras import needed
 from quadrl.base.files import check_texts, csv_content, write_whole
 from quadrl.base.media import Media
 from quadrl.base.units import quantity
@@ -174,7 +175,8 @@ class Card:
 
     def _drawn(self, name: str, *kinds: str) -> list[bytes]:
         """One of its pictures, as files of some kinds."""
-        from quadrl.evaluation import card_figures, plotting  # they take a second
+        with needed("a card"):
+            from quadrl.evaluation import card_figures, plotting  # they take a second
 
         draw = card_figures.maps if name == RECOVERY else card_figures.card
         figure = draw(self.found)

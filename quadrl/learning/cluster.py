@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from quadrl.base.errors import QuadrlError
+from quadrl.base.extras import needed
 from quadrl.base.machine import cores
 from quadrl.learning.executor import End, Local, PlannedRun, Process, order
 
@@ -92,12 +93,8 @@ def on_ray(address: str, local: Local) -> Generator[Nodes]:
         QuadrlError: Ray is not installed, or there is no cluster at the address.
     """
     os.environ.update(QUIET | os.environ)
-    try:
+    with needed("quadrl.study"):
         import ray
-    except ImportError as error:
-        raise QuadrlError(
-            "Ray is not installed: python -m pip install 'quadrl[ray]' installs it"
-        ) from error
     mine = not ray.is_initialized()
     if mine:
         _connect(ray, address, local.jobs)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from quadrl.base.errors import QuadrlError
+from quadrl.base.extras import needed
 from quadrl.base.media import Media
 from quadrl.base.progress import ProgressBar
 from quadrl.base.validation import choice
@@ -104,7 +105,8 @@ def plot(*what: Any, kind: str = "png") -> Media:
         QuadrlError: There is nothing to draw, the runs are of several tasks, or the kind is
             unknown.
     """
-    from quadrl.evaluation import plotting
+    with needed("quadrl.plot"):
+        from quadrl.evaluation import plotting
 
     if not what:
         raise QuadrlError("give runs, run folders, or an evaluation")

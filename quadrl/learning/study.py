@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.base.errors import QuadrlError
+from quadrl.base.extras import needed
 from quadrl.base.files import write_csv, write_json
 from quadrl.base.units import quantity
 from quadrl.base.validation import number
@@ -153,7 +154,8 @@ def study(
         QuadrlError: The study cannot be read, a folder holds a run with other settings, or Ray
             cannot be used, before anything was begun; or all trainings failed.
     """
-    plan = read_plan(what, None if out is None else Path(out))
+    with needed("quadrl.study", "torch", "torchrl", "matplotlib"):
+        plan = read_plan(what, None if out is None else Path(out))
     if jobs is not None:
         number("jobs", jobs, 1, MAX_JOBS, whole=True)
     here = Local(plan.episodes, jobs, own)

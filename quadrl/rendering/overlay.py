@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import RenderingUnavailable
+from quadrl.base.extras import needed
 from quadrl.base.rotation import Array, roll_pitch_yaw
 from quadrl.base.units import LENGTHS, length
 from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER
@@ -41,7 +42,7 @@ class Panel:
             windy: Whether it has a line for the wind.
         """
         self._image, self._draw, font = (
-            require(f"PIL.{name}", "Pillow") for name in ("Image", "ImageDraw", "ImageFont")
+            require(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont")
         )
         self._scale = max(height / 720, 0.72)  # smaller print cannot be read
         self._colours = [tuple(round(255 * part) for part in colour) for colour in colours]
@@ -184,12 +185,10 @@ def grid(pictures: Sequence[Array], columns: int = 0) -> Array:
     return np.vstack([np.hstack(filled[k : k + columns]) for k in range(0, len(filled), columns)])
 
 
-def require(module: str, package: str) -> Any:
-    """A module that only videos need; RenderingUnavailable if its package is not installed."""
+def require(module: str) -> Any:
+    """A module that only pictures need; RenderingUnavailable if its package is not installed."""
     try:
-        return importlib.import_module(module)
+        with needed("drawing"):
+            return importlib.import_module(module)
     except ImportError as error:
-        raise RenderingUnavailable(
-            f"videos need {package}: install the extra `video` of quadrl; simulation and training "
-            "work without it"
-        ) from error
+        raise RenderingUnavailable(str(error)) from error

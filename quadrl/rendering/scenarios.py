@@ -63,7 +63,7 @@ def read_scenarios(path: str | os.PathLike[str]) -> list[Scenario]:
 def ffmpeg() -> str:
     """Path of an ffmpeg: the system's, else the one that imageio-ffmpeg brings."""
     own = shutil.which("ffmpeg")
-    return own or require("imageio_ffmpeg", "imageio-ffmpeg").get_ffmpeg_exe()
+    return own or require("imageio_ffmpeg").get_ffmpeg_exe()
 
 
 def put_into_gif(path: Path, text: str) -> None:
@@ -88,5 +88,5 @@ def _of_video(path: Path) -> str:
 
 
 def _of_picture(path: Path) -> str:
-    with require("PIL.Image", "Pillow").open(path) as picture:
+    with require("PIL.Image").open(path) as picture:
         return picture.info.get(COMMENT, "")

@@ -69,10 +69,10 @@ def write_contact_sheet(
             tiles.append(np.pad(tile, ((1, 1), (1, 1), (0, 0)), constant_values=255))
             on_frame(len(tiles), total)
     sheet = io.BytesIO()
-    image = require("PIL.Image", "Pillow").fromarray(grid(tiles, COLUMNS))
+    image = require("PIL.Image").fromarray(grid(tiles, COLUMNS))
     carried = comment(flight.scenario for flight in flights)
     if kind == "png":
-        text = require("PIL.PngImagePlugin", "Pillow").PngInfo()
+        text = require("PIL.PngImagePlugin").PngInfo()
         text.add_text(COMMENT, carried)
         image.save(sheet, format="png", pnginfo=text)
     else:

@@ -261,6 +261,6 @@ def checked(path: str | os.PathLike[str], kinds: Sequence[str]) -> tuple[Path, s
 
 def _mediapy() -> Any:
     """Import mediapy and tell it where ffmpeg is."""
-    mediapy = require("mediapy", "mediapy")
+    mediapy = require("mediapy")
     mediapy.set_ffmpeg(ffmpeg())
     return mediapy

@@ -425,9 +425,8 @@ def test_a_missing_library_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     with helpers.refused() as caught:
         export("hover", "onnx")
-    assert str(caught.value) == (
-        "onnx is not installed: python -m pip install 'quadrl[export]' installs it"
-    )
+    said = "quadrl.export needs onnx: python -m pip install 'quadrl[export]'"
+    assert str(caught.value) == said and isinstance(caught.value, ImportError)
 
 
 def test_an_aircraft_needs_neither_torch_nor_onnx():

@@ -282,7 +282,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(capsys, monkeypatch):
         assert "screen" in said("--native")
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.delitem(sys.modules, "quadrl.rendering.live.browser", raising=False)
-    assert "extra `view`" in said()
+    assert "quadrl view needs viser: python -m pip install 'quadrl[view]'" in said()
 
 
 def test_the_command_serves_until_it_is_interrupted(capsys, monkeypatch):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Unpack
 
-from quadrl.base.errors import RenderingUnavailable
+from quadrl.base.extras import needed
 from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
@@ -48,7 +48,8 @@ def view(
 
     Raises:
         QuadrlError: Something is unknown, out of range, or does not fit together.
-        RenderingUnavailable: There is no screen, or the page's library is not installed.
+        RenderingUnavailable: There is no screen.
+        MissingLibrary: A library of the page is not installed.
     """
     conditions["weather"] = conditions.get("weather") or "calm"
     if native:
@@ -58,12 +59,8 @@ def view(
         _, flown, scenario = setting(controller, task, **conditions)
         window.run(Flight(flown, scenario, num_envs=num_envs, seed=seed))
         return
-    try:
+    with needed("quadrl view"):
         from quadrl.rendering.live.browser import Page
-    except ImportError as error:
-        raise RenderingUnavailable(
-            f"quadrl view needs {error.name}: install the extra `view` of quadrl"
-        ) from error
     name, flown, scenario = setting(controller, task, **conditions)
     flight, name = Flight(flown, scenario, num_envs=num_envs, seed=seed), label or name
     page = Page(flight, {name: lambda: flown} | others(scenario), host=host, port=port)
