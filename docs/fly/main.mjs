@@ -218,8 +218,7 @@ class Page {
       const { flight: { error, qpos, qvel }, history } = episode, side = SIDES[k];
       const speed = Math.hypot(...qvel.subarray(0, 3));
       const tilt = Math.acos(Math.min(1 - 2 * (qpos[4] ** 2 + qpos[5] ** 2), 1));
-      const short = error < 1;
-      at(`${side}-error`).textContent = short ? `${(100 * error).toFixed(1)} cm` : `${error.toFixed(2)} m`;
+      at(`${side}-error`).textContent = length(error);
       at(`${side}-error`).dataset.metres = error;
       at(`${side}-speed`).textContent = `${speed.toFixed(2)} m/s`;
       at(`${side}-tilt`).textContent = `${((180 / Math.PI) * tilt).toFixed(0)}°`;
@@ -462,6 +461,13 @@ function choices(id, values, choose, unit = "") {
 
 function pressed(id, value) {
   for (const button of at(id).children) button.setAttribute("aria-pressed", button.value === `${value}`);
+}
+
+// A length [m] in the unit in which it has digits.
+function length(metres) {
+  if (metres >= 1) return `${metres.toFixed(2)} m`;
+  if (metres >= 0.01) return `${(100 * metres).toFixed(1)} cm`;
+  return metres >= 0.001 ? `${(1000 * metres).toFixed(1)} mm` : `${(1e6 * metres).toFixed(0)} µm`;
 }
 
 // How an episode stands, in words; nothing before its end.

@@ -4,13 +4,18 @@ import { besideAim } from "./flight.mjs";
 
 const LAYERS = ["weight", "bias"];
 const DAMAGED = "The file is damaged or not a safetensors file.";
+const WRITTEN = { "\b": "an ONNX model", PK: "an archive, such as a program of torch" };
 const CHECKPOINT = "This is a checkpoint, from which a training goes on. The policy is policy.safetensors in the same folder.";
 
 // What a safetensors file says of itself: its text table, its arrays' places, and the bytes that hold them.
 function readTable(buffer) {
   const bytes = new Uint8Array(buffer);
   const size = bytes.length < 8 ? NaN : Number(new DataView(bytes.buffer).getBigUint64(0, true));
-  if (!(size <= bytes.length - 8)) throw new Error(DAMAGED);
+  if (!(size <= bytes.length - 8)) {
+    const start = new TextDecoder().decode(bytes.subarray(0, 2));
+    const [, other] = Object.entries(WRITTEN).find(([first]) => start.startsWith(first)) ?? [];
+    throw new Error(other ? `This is ${other}, for other programs. Drop the policy.safetensors that it was made of.` : DAMAGED);
+  }
   try {
     const table = JSON.parse(new TextDecoder().decode(bytes.subarray(8, 8 + size)));
     const { __metadata__: texts = {}, ...entries } = table;

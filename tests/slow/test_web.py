@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
+import quadrl
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.files import HEADER, write_safetensors
@@ -208,7 +209,11 @@ def test_files_that_cannot_fly_are_refused(node, tmp_path):
                     for name in (TRAINED, "target_following_ppo"))  # fmt: skip
     checkpoint = tmp_path / "checkpoint.safetensors"
     write_safetensors(checkpoint, {"steps": np.arange(3)}, {"format": CHECKPOINT}, save)
+    for to in ("onnx", "torch"):
+        (tmp_path / to).write_bytes(quadrl.export("hover", to).read_bytes())
     cases = [
+        ((tmp_path / "onnx").read_bytes(), "hover", "paper", "an ONNX model.*policy.safetensors"),
+        ((tmp_path / "torch").read_bytes(), "hover", "paper", "torch.*policy.safetensors"),
         (hover, "hover", "paper", "^$"),
         (hover, "random_waypoint", "paper", "^$"),
         (hover, "hover", "hexa", "4 rotors"),
@@ -315,6 +320,46 @@ def test_every_task_and_aircraft_is_shown(browse):
             # The gates of a race are farther apart than other goals.
             assert shown.value(metres("left")) < (20 if task == "race" else 3)
         assert shown.value(STAYS) and not shown.complaints
+
+
+# What stands outside of its panel or of the window, and panels that scroll sideways; JavaScript.
+OUTSIDE = """(() => {
+  const inside = (own, { left, right }) => own.left > left - 0.5 && own.right < right + 0.5;
+  const controls = [...document.querySelectorAll("button, select, input, .drop, output, dd, kbd")];
+  const lost = controls.filter((one) => {
+    const own = one.getBoundingClientRect(), panel = one.closest("header, aside, .view, #stage");
+    const window = { left: 0, right: document.documentElement.clientWidth };
+    return own.width && !(inside(own, panel.getBoundingClientRect()) && inside(own, window));
+  });
+  const wide = [...document.querySelectorAll("html, header, aside, .choice, .row, .view, figure")];
+  const scroll = wide.filter((one) => one.scrollWidth > one.clientWidth);
+  return [...lost, ...scroll].map((one) => one.id || one.value || one.className || one.tagName);
+})()"""
+
+
+def test_every_control_lies_inside_its_panel(browse):
+    with browse("#task=hover&aircraft=crazyflie_brushless&seed=3") as shown:
+        shown.wait(f"{TIME} > 0")
+        for width in (360, 390, 480, 560, 561, 640, 768, 900, 901, 1024, 1366, 1600, 1920):
+            size = dict(width=width, height=900, deviceScaleFactor=1, mobile=False)
+            shown.ask("Emulation.setDeviceMetricsOverride", **size)
+            shown.wait(f"innerWidth === {width}")
+            assert shown.value(OUTSIDE) == [], width
+        buttons = "[...document.querySelectorAll('#aircraft button')].map((one) => one.value)"
+        assert shown.value(buttons) == [*VEHICLES]
+
+
+def test_an_error_is_shown_with_its_digits(browse):
+    units = {"m": 1, "cm": 0.01, "mm": 1e-3, "µm": 1e-6}
+    with browse("#task=hover&aircraft=paper&seed=3") as shown:
+        for moment in (0, 3, 8):
+            shown.wait(f"{TIME} > {moment}")
+            for side in ("left", "right"):
+                text = f"document.getElementById('{side}-error').textContent"
+                number, unit, metres_ = shown.value(f"`${{{text}}} ${{{metres(side)}}}`").split()
+                metres_ = float(metres_)
+                error = abs(float(number) * units[unit] - metres_)
+                assert error <= max(0.06 * metres_, 1e-6), (number, unit)
 
 
 def test_a_dropped_policy_flies(browse, tmp_path):
