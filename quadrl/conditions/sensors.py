@@ -65,10 +65,8 @@ class RotorSpeed(Sensor):
 
     def begin(self, now: Moment) -> Memory:
         """A model starts from hover: no aircraft knows its true speeds."""
-        if self.source == "true":
-            return {}
-        hover = now.parameters.rotor.hover_speed
-        return {"speed": np.broadcast_to(hover, np.shape(now.true.rotor_speed))}
+        hover, shape = now.parameters.rotor.hover_speed, np.shape(now.true.rotor_speed)
+        return {} if self.source == "true" else {"speed": np.broadcast_to(hover, shape)}
 
     def follow(
         self, memory: Memory, specified: Parameters, command: Array, seconds: float

@@ -43,9 +43,8 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
         what: A `Policy`, what `quadrl.train` returned, a run folder, a .safetensors file, or the
             name of a policy that comes with quadrl; for "mjcf" also a Vehicle, or its name.
         to: "mjcf" for the aircraft as a model of MuJoCo, "onnx" or "torch" for the policy.
-        out: The file; one that exists is overwritten. By default NAME.xml, .onnx or .pt2 in this
-            folder, by the name of the aircraft, or of the policy, its run or else its task; where
-            that exists, NAME-2.xml and so on.
+        out: The file; one that exists is overwritten. By default, in this folder, NAME.xml of an
+            aircraft, NAME.onnx or .pt2 of a policy; where that exists, NAME-2.xml and so on.
 
     Returns:
         The path of the file.

@@ -197,7 +197,7 @@ def write(environment: Environment) -> tuple[str, int]:
     emit("begin", memory, **places, kept=_row(task.remember(start, task_state)))
 
     memory = _Memory(environment)
-    parameters, state = memory.parameters(), memory.state()
+    parameters, state = memory.parameters(), memory.estimate()
     remembered, _ = memory.kept(task_state)
     now, episode = begin(task, state, remembered, parameters, environment.action_size)
     emit("first", memory, **given(now, episode))

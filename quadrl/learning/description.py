@@ -19,10 +19,9 @@ def describe(task: Task) -> dict[str, Any]:
 
     Returns:
         name, asks, starts, ends, solved (texts); time_limit [s]; training: settings that have other
-        defaults with this task; observation: name, first, last, unit, meaning and
-        formula of each term of the flat vector; action (text); reward: name, weight (None if there
-        is no option for it) and meaning of each term; options: name, value and meaning of the
-        others.
+        defaults with this task; observation: name, place, unit, meaning and formula of
+        each term of the flat vector; action (text); reward: name, weight (None if there is no
+        option for it) and meaning of each term; options: name, value and meaning of the others.
     """
     environment, texts = Environment(task, seed=0), docstrings(type(task))
     values = dataclasses.asdict(task)

@@ -168,6 +168,18 @@ def test_a_flight_of_a_policy_is_pythons(node, name, events):
         assert differences["error"] < 1e-6 and differences["reward"] < 1e-3
 
 
+def test_an_estimate_begins_with_what_an_aircraft_can_know(node):
+    observe = Policy.load(SHIPPED / "hover_robust.safetensors").scenario.observe
+    environment, _ = begun("hover", "paper", 3, observe=observe)
+    start, paper = coordinates(environment), VEHICLES["paper"]
+    start[13:] *= 0.9
+    settings = {"task": "hover", "aircraft": "paper", "seed": 3}
+    job = dict(job="fly", settings=settings, controller="hover_robust", steps=1, events=[])
+    (found,) = node(job | {"start": start.tolist()})
+    seen = np.array(found["flown"][0]["observation"])[environment.layout["rotor_speed"]]
+    np.testing.assert_allclose(seen, paper.hover_speed / paper.max_speed, rtol=1e-6)
+
+
 @pytest.mark.parametrize("task, vehicle", PAIRS)
 def test_a_flight_of_the_geometric_controller_is_pythons(node, task, vehicle):
     controller = GeometricController(VEHICLES[vehicle], tasks.make(task))
