@@ -119,10 +119,12 @@ class Vehicle:
                 reason = f"they turn the aircraft about its {axis} axis in one direction only"
                 self._refuse("position", "on different sides of every axis", reason)
         rows = self.mixer / np.abs(self.mixer).max(axis=1, keepdims=True)
-        values = np.linalg.svd(rows, compute_uv=False)
+        values, level = (np.linalg.svd(part, compute_uv=False) for part in (rows, rows[:3]))
         if values[-1] < SINGULAR * values[0]:
             reason = "they cannot set thrust, roll, pitch and yaw independently (singular mixer)"
-            self._refuse("position", "a layout with an allocation that can be inverted", reason)
+            if level[-1] < SINGULAR * level[0]:
+                self._refuse("position", "a layout with an allocation that can be inverted", reason)
+            self._refuse("spin", "others, such as 1, -1, 1, -1 around the aircraft", reason)
         squares = hover_squares(self.mixer, self.mass * GRAVITY)
         if not (squares > 0).all():
             reason = "hovering without turning would need a negative thrust of one of them"

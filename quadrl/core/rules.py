@@ -224,13 +224,19 @@ def check_tensors(
         leaves = {k: torch.tensor(array, requires_grad=True) for k, array in arrays.items()}
         state = State.of_coordinates(**leaves, origin_height=height)
         outputs = _outputs(task, tensors[0], dataclasses.replace(tensors[1], state=state))
-        real = [value.sum() for value in outputs.values() if value.requires_grad]
+        real = {name: value for name, value in outputs.items() if value.requires_grad}
         require(real, f"{task.name}: with tensors, no output has a gradient")
-        with blame(task, "backward"):
-            sum(real).backward()  # type: ignore[union-attr]
-        for name, leaf in leaves.items():
-            finite = leaf.grad is None or bool(leaf.grad.isfinite().all())
-            require(finite, f"{task.name}: the gradient by {name} {where} is {leaf.grad}")
+        for name, value in real.items():
+            with blame(task, f"backward of {name!r}"):
+                found = torch.autograd.grad(
+                    value.sum(), [*leaves.values()], retain_graph=True, allow_unused=True
+                )
+            for by, one in zip(leaves, found, strict=True):
+                cure = (
+                    f"by {by}; take lengths by quadrl.base.rotation.norm, whose gradient is 0 there"
+                )
+                finite = one is None or bool(one.isfinite().all())
+                require(finite, f"{task.name}: {name!r} has no gradient {where} {cure}")
 
 
 def varied_actions(steps: int, count: int, size: int = 4) -> np.ndarray:

@@ -37,6 +37,8 @@ SLOWEST = math.sqrt(GRAVITY * TILT / DRIFT)
 """Bandwidth w of the attitude [rad/s] below which it goes farther: about g tilt / w^2."""
 
 PHASE_MARGIN = math.pi / 4  # [rad]
+FASTEST_TIP = 250.0  # [m/s]
+"""Tips of blades are slower in hover: near the speed of sound, 340 m/s, they lose thrust."""
 TURNING = 0.2308
 """How deep one weight of thrust pushes an aircraft that turns over, over g T^2: twice the integral
 of (1 / 2 - x) cos(2 pi x^2) from 0 to 1 / 2."""
@@ -107,6 +109,9 @@ def _thrust(vehicle: Vehicle, sampler: AircraftSampler, flown: Scenario) -> Iter
     needed, room = drawn.scale(), reach.room
     hover = vehicle.hover_speed / vehicle.max_speed
     yield Row("hover speed", float(vehicle.hover_speed.max()), "rad/s")
+    tip = max(w * rotor.disc for w, rotor in zip(vehicle.hover_speed, vehicle.rotors, strict=True))
+    unit = f"over {FASTEST_TIP:g}: coefficients are per square of rad/s, not of rpm; radii in m"
+    yield Row("tip speed in hover", float(tip), "m/s", OK if tip <= FASTEST_TIP else unit)
     yield Row("hover over largest speed", 100 * float(hover.max()), "%")
     commanded = 100 * float((hover + scale / vehicle.max_speed).max())
     beyond = f"actions over {room / scale:.2g} are cut to the largest speed"

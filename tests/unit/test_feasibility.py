@@ -16,7 +16,7 @@ import quadrl
 from quadrl import cli
 from quadrl.aircraft.parameters import rows
 from quadrl.aircraft.presets import VEHICLES, in_real_air, resolve
-from quadrl.aircraft.rotors import GRAVITY, mixer
+from quadrl.aircraft.rotors import GRAVITY, mixer, ring
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import units
 from quadrl.base.errors import QuadrlWarning
@@ -303,6 +303,7 @@ def test_the_rows_of_the_paper_by_worked_numbers():
     for name, value in {
         "hover speed": 225.68,
         "hover over largest speed": 100 / math.sqrt(2),
+        "tip speed in hover": 225.68 * PAPER.rotors[0].disc,
         "thrust over weight, action 1": MOST,
         "thrust over weight, limits": 2.0,
         # 9e-3 v^2 = 0.65 g sqrt(MOST^2 - 1)
@@ -347,6 +348,21 @@ def test_rotor_drag_takes_from_the_wind_that_is_held():
 def test_what_is_wrong_is_said_with_what_to_do(given, quantity, words):
     row = found(**given)[quantity]
     assert (row.verdict == OK) == (words == OK) and words in row.verdict
+
+
+def test_coefficients_in_another_unit_show_in_the_speed_of_the_tips():
+    # As a file of others gives them, per rpm^2: hover at 14,476 "rad/s" x 0.0231 m = 334 m/s.
+    one = ring((45, 135, 225, 315), (-1, 1, -1, 1), 0.04, thrust_coefficient=3.16e-10,
+               torque_coefficient=7.94e-12, lag_up=20.0, lag_down=20.0, max_speed=21_700.0,
+               radius=0.0231)  # fmt: skip
+    small = resolve("crazyflie", {"mass": 0.027, "action_scale": 3600.0})
+    row = found(vehicle=dataclasses.replace(small, rotors=one))["tip speed in hover"]
+    assert row.value == pytest.approx(334.4, rel=1e-3) and "not of rpm" in row.verdict
+
+
+@pytest.mark.parametrize("name", quadrl.VEHICLES)
+def test_tips_of_the_aircraft_that_come_with_quadrl_are_slow(name):
+    assert found(vehicle=name)["tip speed in hover"].verdict == OK
 
 
 def test_loops_answer_at_the_physics_step():

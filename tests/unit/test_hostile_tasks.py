@@ -10,6 +10,8 @@ import pytest
 
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.base.rotation import namespace
+from quadrl.core.rules import check_functions
 from quadrl.core.task import TaskState
 from quadrl.engines import mjcf
 from quadrl.engines.mujoco import DataEngine
@@ -142,3 +144,16 @@ def test_a_model_that_is_no_aircraft_is_refused(name, engine):
     model = MODELS[name]()
     with helpers.refused(match="a model to fly needs"):
         DataEngine(Vehicle(), model, mujoco.MjData(model), altitude=3.0, engine=engine)
+
+
+def test_a_term_without_a_gradient_is_named_with_the_cure():
+    torch = pytest.importorskip("torch")
+
+    def reward(self, before, now, end):
+        x, y = (now.state.position[..., k] for k in range(2))
+        aside = namespace(x).sqrt(x * x + y * y)  # a length as one writes it by hand
+        return Hover.reward(self, before, now, end) | {"miss": -aside}
+
+    lost = r"'miss' has no gradient at rest in the goal by position; .*quadrl.base.rotation.norm"
+    with pytest.raises(AssertionError, match=lost):
+        check_functions(helpers.variant(reward=reward), torch)

@@ -173,8 +173,9 @@ BAD = [  # parameters, name, value (... for any)
     # All on the x axis: no roll. All behind the centre: no hover.
     (dict(rotors=placed((0.2, 0), (0.1, 0), (-0.1, 0), (-0.2, 0))), "rotor positions", ...),
     (dict(rotors=placed((-0.1, 0.2), (-0.3, 0.2), (-0.1, -0.2), (-0.3, -0.2))), ..., ...),
-    # Spins 1, 1, -1, -1 around an X: yaw is a multiple of pitch, so one of them is not free.
-    (dict(rotors=ringed((45, 315, 135, 225), (1, 1, -1, -1))), "rotor positions", ...),
+    # Spins 1, 1, -1, -1 around an X: yaw is a multiple of pitch, so one of them is not free; with
+    # other spins at the same places it is.
+    (dict(rotors=ringed((45, 315, 135, 225), (1, 1, -1, -1))), "rotor spins", [1.0, 1, -1, -1]),
     # A plus moved ahead by more than its arm would need a negative thrust to hover.
     (dict(rotors=placed((0.5, 0), (0.3, 0.2), (-0.01, 0), (0.3, -0.2))), "rotor positions", ...),
     # All lean ahead by 5 degrees: whoever hovers level flies off.
