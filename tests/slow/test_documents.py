@@ -34,6 +34,7 @@ PAGES = [*pages.all_pages(), REPOSITORY / "CONTRIBUTING.md"]
 TEXTS = {str(page.relative_to(REPOSITORY)): page.read_text() for page in PAGES}
 LANGUAGES = {"python", "bash", "bibtex", "diff", "toml", ""}  # the first two are run
 SCRIPTS = ("scripts/quickstart", "scripts/test")
+ACTIVATES = "source .venv/bin/activate"
 SHORT_TRAINING = ("--steps", "8192", "--episodes", "4", "--no-video")
 SHORTER = {
     "train": SHORT_TRAINING,
@@ -106,7 +107,8 @@ def trained(tmp_path_factory):
     program = programs / "quadrl"
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m quadrl "$@"\n')
     program.chmod(0o755)
-    run(scripts / "quickstart", *SHORT_TRAINING, cwd=folder)
+    said = run(scripts / "quickstart", *SHORT_TRAINING, cwd=folder).stdout
+    assert said.endswith(f"for the command quadrl: {ACTIVATES}\n")
     return folder
 
 
@@ -198,7 +200,7 @@ def test_every_command_is_checked():
         for block in blocks("").get(page, ()):  # which nothing runs
             assert not re.search(r"^ *(quadrl|python -m) ", block, re.MULTILINE), page
     tested = {command for some in QUADRL for command in some}
-    assert {*COMMANDS} <= tested | {*VIEWS, *STUDIED, *SCRIPTS, *PIP, *STARTS_RAY}
+    assert {*COMMANDS} <= tested | {*VIEWS, *STUDIED, *SCRIPTS, *PIP, *STARTS_RAY, ACTIVATES}
     for script in SCRIPTS:
         assert os.access(REPOSITORY / script, os.X_OK)
         run("bash", "-n", REPOSITORY / script)
@@ -265,6 +267,12 @@ def test_quickstart_makes_the_run_folder_that_the_page_lists(trained):
     )
     listed = {name.rstrip("/") for name in re.findall(r"`([\w.]+/?)`", table)}
     assert listed - {"flight.mp4"} == {path.name for path in (trained / RUN).iterdir()}
+
+
+def test_the_commands_of_the_first_page_can_follow_one_another():
+    made = re.findall(r"--out (\S+)", "".join(blocks("bash")["README.md"]))
+    assert made and RUN not in made  # quickstart makes that one
+    assert len(made) == len({*made})
 
 
 def test_generated_parts_are_up_to_date():
