@@ -83,6 +83,7 @@ IN_AIR = {
         )
     )
     for name, vehicle in LAYOUTS.items()
+    if name != "cf21B_500"  # whose own set has two of them alone
 }
 """The same with every effect of the air."""
 

@@ -78,7 +78,7 @@ CF21B_500 = Vehicle(
     drag_coefficient=5e-3,  # chosen: 9.2 m/s of terminal speed; with `full` it is linear
     moment_coefficient=1e-7,  # chosen: as the brushed one's
     action_scale=400.0,  # chosen: as the other brushless one's
-    physics_timestep=0.005,  # chosen
+    physics_timestep=0.004,  # chosen
     control_timestep=0.02,  # chosen
 )
 RACER = Vehicle(

@@ -21,7 +21,7 @@ import reference  # noqa: E402
 
 FLIGHTS = {name: (vehicle, 50, 3.0) for name, vehicle in helpers.LAYOUTS.items()}
 """Vehicle, number of flights, and largest wind in each direction [m/s]."""
-NEW = {"crazyflie_brushless": 8}
+NEW = {"crazyflie_brushless": 8, "cf21B_500": 9}
 SEEDS = {name: seed for seed, name in enumerate(sorted(FLIGHTS.keys() - NEW))} | NEW
 """Those of new names are given, so that the others keep theirs."""
 AIRCRAFT = 12

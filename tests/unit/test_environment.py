@@ -148,6 +148,8 @@ def test_a_saved_environment_of_another_shape_is_refused():
     kept = environment.save()
     before = helpers.coordinates(environment.engine)
     for name, value in kept.items():
+        if name == "engine.layout":  # another one is of another version: test_record
+            continue
         for wrong in (value[..., :1], np.zeros(7), value.astype(np.complex128), None):
             if wrong is None or (wrong.shape, wrong.dtype) != (value.shape, value.dtype):
                 changed = {k: v for k, v in (kept | {name: wrong}).items() if v is not None}

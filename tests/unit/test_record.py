@@ -133,6 +133,7 @@ def ringed(tmp_path, monkeypatch):
     """A run of a task of one's own, and the file of that task."""
     monkeypatch.setenv("QUADRL_CACHE", str(tmp_path / "cache"))
     (file := tmp_path / "ringed.py").write_text(OWN)
+    forget()  # what other tests have imported is no file of this run
     import_own(file)
     run = train(TrainConfig("ringed", steps=64, num_envs=4, rollout=8), tmp_path / "run")
     forget()
