@@ -120,7 +120,10 @@ def test_a_shipped_policy_still_reaches_its_metrics(file):
         kind = SHIPPED_AS.get(algo, algo) if variant == "ideal" else variant
         made_for = "" if variant == "ideal" or config["vehicle"] == "paper" else config["vehicle"]
         assert file.stem == "_".join(filter(None, (task, kind, made_for)))
-    assert (config["seed"], config["vehicle"]) == (metadata["seed"], metadata["vehicle"]["name"])
+    # The networks of lsy_race are of its earlier rules, and fly the aircraft of the present ones.
+    lent = {"lsy_race_ppo": "crazyflie_brushless"}
+    trained = lent.get(file.stem, metadata["vehicle"]["name"])
+    assert (config["seed"], config["vehicle"]) == (metadata["seed"], trained)
     assert beside["command"].split()[:2] == ["quadrl", "train"]
     task = quadrl.tasks.make(policy.task, **metadata.get("task_options", {}))
     vehicle = setting(policy)[2].aircraft
