@@ -1,6 +1,7 @@
 """Clients that take their time: they learn, they film, they fly in other processes."""
 
 import functools
+import re
 from pathlib import Path
 
 import gymnasium as gym
@@ -56,6 +57,16 @@ def test_an_example_trains(example):
     options = ["--algo", "sac"] if example == "learning_curve" else []
     done = python(EXAMPLES / f"{example}.py", "--total-steps", "4096", *options)
     assert '"successful"' in done.stdout or '"success' in done.stdout
+
+
+def test_the_yardsticks_fly_corners_nearer_and_recover_as_often_as_the_policies():
+    done = python(EXAMPLES / "yardsticks.py", "--episodes", "20")
+    found = [re.search(r", (\w+): (\d+) % (?:.*, (.*) cm)?", x) for x in done.stdout.splitlines()]
+    rows = [(who, int(share), cm and float(cm)) for who, share, cm in (x.groups() for x in found)]
+    for (_, _, policy), (_, share, controller) in (rows[0:2], rows[2:4]):  # pentagram, zigzag
+        assert share == 100 and controller < policy / 2
+    for (_, policy, _), (_, controller, _) in (rows[6:8], rows[8:10]):
+        assert controller >= policy - 15 and controller >= 70  # twice the standard error of 20
 
 
 @pytest.mark.filterwarnings("default")  # of Ray, about itself
