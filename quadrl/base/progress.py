@@ -48,10 +48,9 @@ class ProgressBar:
     NOTEBOOK_SECONDS = 0.2  # between two updates in a notebook
     WIDTH = 24  # characters of the bar
 
-    def __init__(self, console: Console | None = None, *, lines: bool = True) -> None:
-        """Make the bar; with `lines`, a log or a pipe, where it cannot be drawn, gets lines."""
+    def __init__(self, console: Console | None = None) -> None:
+        """Make the bar."""
         self._console = console or Console()
-        self._lines = lines
         self._notebook: Any = None  # the handle of what is displayed
         self._progress = progress.Progress(
             progress.BarColumn(bar_width=self.WIDTH),
@@ -90,7 +89,7 @@ class ProgressBar:
         left = self._clock.left(done, total)
         seconds = self.NOTEBOOK_SECONDS if self._console.is_jupyter else self.LINE_SECONDS
         now = time.monotonic()
-        # What takes no time needs no line; a training always has its last one.
+        # A drawing that takes no time needs no line; a training always has its last one.
         wanted = self._begun is not None or self._console.is_jupyter
         if now - self._last_line < seconds and not (last and wanted):
             return
@@ -98,7 +97,7 @@ class ProgressBar:
         if self._console.is_jupyter:
             filled = round(self.WIDTH * done / total)
             self._display(f"{'━' * filled}{'╌' * (self.WIDTH - filled)}  {text}{left}")
-        elif self._lines:
+        else:
             line = f"{100 * done / total:3.0f} %  {text}{left}"
             self._console.print(line, soft_wrap=True, highlight=False)
 
