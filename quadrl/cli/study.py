@@ -54,8 +54,14 @@ def carry_out(
     if json:
         print_json(found.content | {"compared": [dataclasses.asdict(one) for one in compared]})
     else:
-        console.print("", make_table(found.table, numbers=4))
-        say("\nmeans over the seeds, with their 95 % intervals in brackets")
+        columns, said = [*zip(*found.table, strict=True)], "with their 95 % intervals in brackets"
+        if sum(max(map(len, column)) + 2 for column in columns) > console.width:
+            kept = (column for column in columns if column[0] not in ("turning", "circling"))
+            columns = [[cell.partition(" (")[0] for cell in column] for column in kept]
+            said = "whose 95 % intervals, turning and circling are in table.csv"
+        numbers = len(columns) - [column[0] for column in columns].index("seeds")
+        console.print("", make_table([*zip(*columns, strict=True)], numbers=numbers))
+        say(f"\nmeans over the seeds, {said}")
         if compared:
             head = ("the one", "the other", f"smaller {compare}", "verdict", "power")
             console.print("", make_table([head, *map(_row, compared)], numbers=3))

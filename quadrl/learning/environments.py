@@ -141,8 +141,8 @@ def make_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device).cpu()
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).strip().partition("\n")[0]
-        allowed = "a device that this torch can use, such as cpu"
+        reason = str(error).strip().partition("\n")[0].partition("Expected one of")[0]
+        allowed = "a device that this torch can use, such as cpu, or cuda for a GPU of NVIDIA"
         raise QuadrlError(reason, name="device", value=name, allowed=allowed) from error
     return device
 

@@ -64,7 +64,7 @@ class StudyResult:
     @property
     def table(self) -> list[tuple[str, ...]]:
         """The rows as text, the head first."""
-        known = (*GROUP, "seeds")
+        known = [name for name in (*GROUP, "seeds") if any(row[name] for row in self.rows)]
         head = (*known, "successful", "error over the last 2 s", "turning", "circling", "training")
         figures = ([_text(row, name) for name in FIGURES] for row in self.rows)
         named = ([str(row[name]) for name in known] for row in self.rows)

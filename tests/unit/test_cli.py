@@ -520,6 +520,7 @@ MISTYPED = {
     "train hover --wandb": "--wandb is an unknown option; a run folder holds TensorBoard's files",
     "train hover --apg.learning-rate 0.1": "with algo ppo; did you mean ppo.learning_rate?",
     "train hover --seeds 0:2 --apg.step 0.1": "apg.step = 0.1: must be left out with algo ppo",
+    "train hover --device gpu": "such as cpu, or cuda for a GPU of NVIDIA",
     "train hover --algo PPO": "(did you mean ppo?)",
     "train hover --algo sac": "Stable-Baselines3 has it",
     "train quadrl/Hover-v0": "(did you mean hover?)",

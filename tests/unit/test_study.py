@@ -9,12 +9,13 @@ from helpers import refused
 import quadrl
 from quadrl.base.files import write_json
 from quadrl.base.validation import seeds
+from quadrl.cli.study import carry_out
 from quadrl.learning import executor
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import End, PlannedRun, train_all
 from quadrl.learning.folder import EVALUATION, write_config
 from quadrl.learning.plan import read_plan
-from quadrl.learning.study import interval
+from quadrl.learning.study import FIGURES, StudyResult, interval
 
 STUDY = """
 tasks = ["hover", "landing"]
@@ -237,3 +238,18 @@ def test_settings_of_some_tasks_and_algorithms_alone():
 def test_wrong_settings_of_some(only, said):
     with refused(match=said):
         read_plan({"tasks": ["hover"], "algorithms": ["ppo"], "only": only}, None)
+
+
+@pytest.mark.parametrize("columns", [80, 200])
+def test_the_table_fits_the_terminal(monkeypatch, capsys, columns):
+    figures = {name: 0.0123 for name in FIGURES}
+    spread = {f"{name}_{end}": 0.0123 for name in FIGURES for end in ("low", "high")}
+    row = {"task": "straight_and_level", "algo": "trpo", "variant": "", "seeds": 3}
+    found = StudyResult(Path("runs/x"), (), (row | figures | spread,) * 2, {})
+    monkeypatch.setattr("quadrl.learning.study.study", lambda *what, **how: found)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    carry_out({})
+    _, head, *rows = capsys.readouterr().out.splitlines()
+    assert len(head) <= columns and head.split()[-1] == "training" and "variant" not in head
+    assert rows[0] == rows[1] and rows[0].startswith("straight_and_level  trpo      3")
+    assert ("1 % (1 % to 1 %)" in rows[0]) == (columns == 200)  # a row is a line
