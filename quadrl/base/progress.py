@@ -48,9 +48,10 @@ class ProgressBar:
     NOTEBOOK_SECONDS = 0.2  # between two updates in a notebook
     WIDTH = 24  # characters of the bar
 
-    def __init__(self, console: Console | None = None) -> None:
-        """Make the bar."""
+    def __init__(self, console: Console | None = None, *, lines: bool = True) -> None:
+        """Make the bar; with `lines`, a log or a pipe, where it cannot be drawn, gets lines."""
         self._console = console or Console()
+        self._lines = lines
         self._notebook: Any = None  # the handle of what is displayed
         self._progress = progress.Progress(
             progress.BarColumn(bar_width=self.WIDTH),
@@ -89,7 +90,7 @@ class ProgressBar:
         left = self._clock.left(done, total)
         seconds = self.NOTEBOOK_SECONDS if self._console.is_jupyter else self.LINE_SECONDS
         now = time.monotonic()
-        # A drawing that takes no time needs no line; a training always has its last one.
+        # What takes no time needs no line; a training always has its last one.
         wanted = self._begun is not None or self._console.is_jupyter
         if now - self._last_line < seconds and not (last and wanted):
             return
@@ -97,7 +98,7 @@ class ProgressBar:
         if self._console.is_jupyter:
             filled = round(self.WIDTH * done / total)
             self._display(f"{'━' * filled}{'╌' * (self.WIDTH - filled)}  {text}{left}")
-        else:
+        elif self._lines:
             line = f"{100 * done / total:3.0f} %  {text}{left}"
             self._console.print(line, soft_wrap=True, highlight=False)
 

@@ -157,7 +157,7 @@ class Train:
 
 def _draw(run: Run, *, video: bool) -> None:
     """Draw the pictures of a run; Ctrl-C skips the rest of them."""
-    with ProgressBar(console) as bar:
+    with ProgressBar(console, lines=False) as bar:
 
         def on_frame(done: int, total: int) -> None:
             hint = " (Ctrl-C skips it)" if console.is_terminal else ""

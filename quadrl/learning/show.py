@@ -84,7 +84,7 @@ def render(
     flights = [one.trajectory() for one in flown]
     models = [one.scenario.compile_model() for one in flown]
     write = write_contact_sheet if sheet else write_video
-    with ProgressBar() as bar, tempfile.TemporaryDirectory() as folder:
+    with ProgressBar(lines=False) as bar, tempfile.TemporaryDirectory() as folder:
         if progress:
             picture["on_frame"] = lambda done, total: bar.update(done, total, "drawing")
         path = Path(folder, f"flight.{kind}")

@@ -1,5 +1,6 @@
 """What a newcomer gets wrong is answered in a line that says what to do."""
 
+import logging
 import os
 import subprocess
 import sys
@@ -8,9 +9,11 @@ from pathlib import Path
 import gymnasium
 import pytest
 from helpers import refused
+from rich.console import Console
 
 import quadrl
 from quadrl.base.errors import QuadrlWarning
+from quadrl.base.progress import ProgressBar
 from quadrl.learning.config import TrainConfig
 
 
@@ -121,3 +124,24 @@ tasks testing train"""
 def test_tab_completion_shows_the_public_names_alone():
     assert sorted(dir(quadrl)) == PUBLIC.split()
     assert all(hasattr(quadrl, name) for name in PUBLIC.split())
+
+
+@pytest.mark.parametrize("lines", [True, False])
+def test_a_pipe_gets_lines_of_trainings_but_none_of_drawings(capsys, monkeypatch, lines):
+    monkeypatch.setattr(ProgressBar, "LINE_SECONDS", 0.0)
+    with ProgressBar(Console(force_terminal=False), lines=lines) as bar:
+        bar.update(1, 4, "working")
+    assert capsys.readouterr().out == (" 25 %  working\n" if lines else "")
+
+
+def test_a_check_that_passes_logs_nothing():
+    pytest.importorskip("torchrl")
+    said = []
+    log = logging.getLogger("torchrl")
+    log.addHandler(handler := logging.NullHandler())
+    handler.handle = said.append
+    try:
+        quadrl.testing.check_torchrl(quadrl.tasks.make("hover"))
+    finally:
+        log.removeHandler(handler)
+    assert not said
