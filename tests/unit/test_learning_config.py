@@ -167,6 +167,7 @@ FOREIGN = [  # what other programs call a setting, and what the answer says
     ({"algo": "PPO"}, r"did you mean ppo\?"),
     ({"algo": "sac"}, "Stable-Baselines3 has it"),
     ({"task": "quadrl/RandomWaypoint-v0"}, r"did you mean random_waypoint\?"),
+    ({"task": "quadrl/Race-v0"}, r"did you mean race\?"),
 ]
 
 
