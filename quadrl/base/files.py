@@ -60,12 +60,8 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_csv(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a .csv file of rows under the names of their columns, whole or not at all.
-
-    Its folder is made.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, csv_content([head, *rows]))
+    """Write a .csv file of rows under the names of their columns, whole or not at all."""
+    write_whole(in_a_folder(path), csv_content([head, *rows]))
 
 
 def csv_content(rows: Iterable[Sequence[Any]]) -> bytes:
@@ -98,6 +94,19 @@ def free_name(path: Path, holding: str = "") -> Path:
     """
     names = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(2))
     return next(x for x in itertools.chain([path], names) if not (x / holding).exists())
+
+
+def in_a_folder(path: str | os.PathLike[str]) -> Path:
+    """The path of a file to be written, whose folder exists: asked before the work for its content.
+
+    Raises:
+        QuadrlError: There is no such folder; a mistyped one is not made.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        reason = f"there is no folder {path.parent}; make it first"
+        raise QuadrlError(f"{path} cannot be written: {reason}")
+    return path
 
 
 def lock(folder: Path) -> int:

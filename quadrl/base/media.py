@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import write_whole
+from quadrl.base.files import in_a_folder, write_whole
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -38,15 +38,15 @@ class Media:
         """Write the file, whole or not at all.
 
         Raises:
-            QuadrlError: The name has an ending that is not the kind's, nor one of a figure.
+            QuadrlError: There is no such folder, or the name has an ending that is not the kind's,
+                nor one of a figure.
         """
-        path = Path(path)
+        path = in_a_folder(path)
         content, kind = self.content, path.suffix.lower().lstrip(".")
         if kind != self.kind:
             if self.make is None or not kind:
                 allowed = f"a name that ends in .{self.kind}"
                 raise QuadrlError(name="path", value=str(path), allowed=allowed)
             content = self.make(kind)
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, content)
         return path

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from quadrl.base.files import in_a_folder
 from quadrl.base.units import quantity
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, print_json, say
@@ -29,6 +30,8 @@ class Evaluate(Flown):
 
     def run(self) -> None:
         """Print the metrics, beside those of the geometric controller."""
+        for path in filter(None, (self.csv, self.states)):
+            in_a_folder(path)
         flown = evaluate(
             flies(self.policy, self.controller, self.algo),
             self.task or None,

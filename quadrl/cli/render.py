@@ -54,7 +54,6 @@ class Render(Flown):
             again = f" ({len(controllers) + 1})" if name in controllers else ""
             controllers[name + again] = flies(policy, controller, algo)
         out, kind = checked(self.out or free_name(Path("flight.mp4")), (*VIDEOS, *SHEETS))
-        out.parent.mkdir(parents=True, exist_ok=True)  # refused before the flight, not after
         media = render(
             controllers if len(controllers) > 1 else next(iter(controllers.values())),
             self.task or None,

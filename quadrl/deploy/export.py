@@ -68,7 +68,6 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
     with needed("quadrl.export"):
         module = importlib.import_module(name)
     path, _ = checked(out or free_name(Path(f"{stem}.{ending}")), (ending,))
-    path.parent.mkdir(parents=True, exist_ok=True)  # refused before the work, not after
     write_whole(path, module.content(*given))
     return path
 

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.files import write_whole
+from quadrl.base.files import in_a_folder, write_whole
 from quadrl.base.rotation import roll_pitch_yaw
 from quadrl.base.validation import choice
 from quadrl.core.snapshot import Rollout
@@ -82,12 +82,11 @@ def save(figure: Figure, path: Path, comment: str = "") -> Path:
     """Write a figure, whole or not at all; its kind is what the name ends in.
 
     Raises:
-        QuadrlError: The name ends in no kind of picture.
+        QuadrlError: The name ends in no kind of picture, or there is no such folder.
     """
     kind = path.suffix.removeprefix(".").lower()
     written = content(figure, kind, f"ending of {path}", comment)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, written)
+    write_whole(in_a_folder(path), written)
     return path
 
 

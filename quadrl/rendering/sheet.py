@@ -77,6 +77,5 @@ def write_contact_sheet(
         image.save(sheet, format="png", pnginfo=text)
     else:
         image.save(sheet, format="jpeg", quality=90, comment=carried)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, sheet.getvalue())
     return path

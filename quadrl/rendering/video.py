@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
+from quadrl.base.files import in_a_folder
 from quadrl.base.validation import number
 from quadrl.core.trajectory import Trajectory
 from quadrl.rendering import drawing
@@ -200,7 +201,6 @@ def write_video(
     with contextlib.closing(drawn) as frames:
         first = next(frames)  # what cannot be drawn fails here, before ffmpeg begins
         writer = _mediapy().VideoWriter(temporary, first.shape[:2], fps=fps, **encoding)
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             writer.__enter__()
             with contextlib.suppress(BrokenPipeError):  # ffmpeg says itself why it stopped
@@ -250,13 +250,13 @@ def listed(one_or_more: Any, count: int = 1) -> list[Any]:
 
 
 def checked(path: str | os.PathLike[str], kinds: Sequence[str]) -> tuple[Path, str]:
-    """A path that ends in one of some kinds, and the kind."""
+    """A path in a folder that exists, which ends in one of some kinds, and the kind."""
     path = Path(path)
     kind = path.suffix.removeprefix(".").lower()
     if kind not in kinds or path.is_dir():
         allowed = f"the name of a file ending in .{' or .'.join(kinds)}"
         raise QuadrlError(name="path", value=str(path), allowed=allowed)
-    return path, kind
+    return in_a_folder(path), kind
 
 
 def _mediapy() -> Any:

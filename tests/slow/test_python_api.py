@@ -81,7 +81,7 @@ def test_an_evaluation_has_the_task_and_the_vehicle_of_the_training(run):
 def test_render(run, tmp_path, kind, begins):
     video = quadrl.render(run, kind=kind, **SMALL)
     assert begins in video.content[:12]
-    path = video.save(tmp_path / "new" / f"flight.{kind}")
+    path = video.save(tmp_path / f"flight.{kind}")
     assert path.read_bytes() == video.content
     with refused("path"):
         video.save(tmp_path / "flight.txt")

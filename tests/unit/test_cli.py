@@ -261,7 +261,7 @@ def test_evaluate_prints_one_json_object_and_nothing_else(run, capsys):
 
 
 def test_render_writes_a_video_that_plays(run, tmp_path, capsys):
-    path = tmp_path / "new" / "a.mp4"
+    path = tmp_path / "a.mp4"
     size = ["--width", "160", "--height", "120", "--fps", "20", "--camera", "chase"]
     assert command("render", run, "--out", path, *size) == 0
     assert capsys.readouterr().out.endswith(f"wrote {path}\n")  # after a bar, if it takes long
@@ -310,6 +310,7 @@ def test_plot_of_several_runs(run, tmp_path, capsys, refusal):
     for task, labels in (("hover", ("PPO, 1 seed", "VPG, 1 seed")), ("landing", ("PPO, 1 seed",))):
         picture = Path(f"curves_{task}.svg").read_text()
         assert all(label in picture for label in labels)
+    Path("new").mkdir()
     assert command("plot", *folders[:2], "--out", "new/x.pdf") == 0
     assert command("plot", *folders, "--out", "new/x.png") == 0
     assert set(os.listdir("new")) == {"x.pdf", "x_hover.png", "x_landing.png"}
@@ -380,7 +381,7 @@ def test_completion_knows_the_names(capsys):
 
 
 def test_a_table_of_the_flights(tmp_path, capsys):
-    path = tmp_path / "new" / "flights.csv"
+    path = tmp_path / "flights.csv"
     assert command("evaluate", "hover", "--episodes", "3", "--seed", "4", "--csv", path) == 0
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
@@ -587,6 +588,28 @@ def test_folders_that_cannot_be_used(refusal, copy, tmp_path):
     ):
         assert str(file) in refusal(*words)[1]
     assert file.read_text() == "something"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "evaluate {run} --csv new/a.csv",
+        "evaluate {run} --states new/a.csv",
+        "render {run} --out new/a.mp4",
+        "render {run} --out new/a.png",
+        "plot {run} --out new/a.pdf",
+        "export hover --to onnx --out new/a.onnx",
+        "export crazyflie --to mjcf --out new/a.xml",
+    ],
+)
+def test_a_file_in_a_folder_that_is_none_is_refused_before_the_work(
+    refusal, run, tmp_path, monkeypatch, words
+):
+    for work in ("evaluate.evaluate", "render.render"):
+        monkeypatch.delattr(f"quadrl.cli.{work}")
+    _, line = refusal(*(word.format(run=run) for word in words.split()))
+    assert f"{Path(words.split()[-1])} cannot be written: there is no folder new" in line
+    assert not list(tmp_path.iterdir())
 
 
 BEGIN = """    def begin(self, rng, parameters):

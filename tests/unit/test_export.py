@@ -62,6 +62,7 @@ def hovering(vehicle) -> tuple[mujoco.MjData, mujoco.MjData]:
 
 def test_it_hovers_where_quadrl_is_not(tmp_path):
     (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "there").mkdir()
     path = export("crazyflie", "mjcf", tmp_path / "there" / "small.xml")
     assert path.stat().st_size < 20_000 and [*path.parent.iterdir()] == [path]
     assert float(python("-c", ALONE, path, cwd=tmp_path / "elsewhere").stdout) < 1e-3
@@ -384,9 +385,9 @@ def test_files_have_names_of_their_own_unless_they_are_given():
 
 
 def test_the_command_says_what_it_wrote(capsys, tmp_path):
-    cli.main(["export", "hover", "--to", "onnx", "--out", "new/flown.onnx"])
-    assert capsys.readouterr().out == "wrote new/flown.onnx\n"
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["flown.onnx"]
+    cli.main(["export", "hover", "--to", "onnx", "--out", "flown.onnx"])
+    assert capsys.readouterr().out == "wrote flown.onnx\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["flown.onnx"]
 
 
 def test_a_run_is_exported_by_its_folder(tmp_path):

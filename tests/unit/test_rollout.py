@@ -297,7 +297,7 @@ def test_a_torch_module_flies_as_the_arrays_that_it_was_made_of():
 
 def test_states_are_a_row_per_control_step_from_the_start_on(tmp_path):
     found = quadrl.evaluate("geometric", "hover", episodes=2, seed=3, vehicle="hexa", time_limit=1)
-    with open(found.save_states(tmp_path / "new" / "states.csv"), newline="") as file:
+    with open(found.save_states(tmp_path / "states.csv"), newline="") as file:
         rows = list(csv.DictReader(file))
     flown, length = found.rollout, found.rollout.length
     assert len(rows) == length.sum() + 2
