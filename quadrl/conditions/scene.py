@@ -5,12 +5,14 @@ for itself. Aircraft collide with them in both engines; free flight hands an air
 near one to MuJoCo. The `Surroundings` of a snapshot have clearances and hits.
 """
 
+# pyright: reportUnnecessaryIsInstance=false
+# What users give is checked, whatever its annotation promises.
 from __future__ import annotations
 
 import dataclasses
 import reprlib
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,12 +21,15 @@ from quadrl.aircraft.parameters import HELD, MARK
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, cross
-from quadrl.conditions.solids import Pose, Solid, heading
+from quadrl.base.validation import MAX_OPTION
+from quadrl.conditions.solids import MIN_LENGTH, Pose, Solid, heading
 from quadrl.engines.engine import Engine
 from quadrl.engines.solids import KINDS, MOTION
 from quadrl.engines.state import Start
 
 FAR = 1000.0  # [m]
+FASTEST, WIDEST = 100.0, 0.5
+"""The fastest that a solid may move [m/s], and how far it may turn in a physics step [rad]."""
 HIDDEN = 3
 """Geom group that pictures do not show: they draw the solids where they are in the episode."""
 ELSEWHERE = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
@@ -55,11 +60,11 @@ class Scene:
         Raises:
             QuadrlError: Two solids have the same name, or something is not a solid.
         """
+        given: list[Any] = [*solids] if isinstance(solids, Sequence) else [None]
+        if not all(isinstance(solid, Solid) for solid in given):
+            allowed = "a list of Sphere, Cylinder, Box and Gate of quadrl.conditions.solids"
+            raise QuadrlError(name="solids", value=solids, allowed=allowed)
         self.solids = tuple(solids)
-        for solid in self.solids:
-            if not isinstance(cast(Any, solid), Solid):
-                allowed = "Sphere, Cylinder, Box and Gate of quadrl.conditions.solids"
-                raise QuadrlError(name="solids", value=solid, allowed=allowed)
         self.names = tuple(solid.name for solid in self.solids)
         """Names of the solids, in order."""
         if len(set(self.names)) < len(self.names):
@@ -111,8 +116,13 @@ class Scene:
             last: Poses of the other solids; by default the declared ones.
 
         Raises:
-            QuadrlError: There is no such solid, or an array has the wrong shape.
+            QuadrlError: These are no poses, there is no such solid, or an array has the wrong shape
+                or numbers that no pose has.
         """
+        given: list[Any] = [*placed.values()] if isinstance(placed, Mapping) else [None]
+        if not all(isinstance(pose, Pose) for pose in given):
+            name = "move" if last is not None else "place (or move, at the start)"
+            raise QuadrlError(name=name, value=placed, allowed="a dict of a Pose for each name")
         if unknown := set(placed) - set(self.names):
             raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(self.names))
         if last is None:
@@ -127,14 +137,10 @@ class Scene:
         for solid, first in zip(self.solids, self._first, strict=True):
             if (pose := placed.get(solid.name)) is None:
                 continue
-            turn = pose.quaternion
-            turn = heading(np.zeros(count)) if turn is None else np.asarray(turn, dtype=float)
-            position = np.asarray(pose.position, dtype=float)
-            for array, size in ((position, 3), (turn, 4)):
-                if array.shape != (count, size) or not np.isfinite(array).all():
-                    allowed = f"finite arrays, position ({count}, 3) and quaternion ({count}, 4)"
-                    raise QuadrlError(name=f"pose of {solid.name}", value=array, allowed=allowed)
-            turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
+            position = _checked(f"position of {solid.name}", pose.position, (count, 3))
+            turn = heading(np.zeros(count))
+            if pose.quaternion is not None:
+                turn = _unit(f"quaternion of {solid.name}", pose.quaternion, count)
             own = solid
             if pose.size is not None:
                 own = solid.sized(_checked_size(solid, pose.size, made))
@@ -147,6 +153,25 @@ class Scene:
                 made[:, k, :3] = position + origin + _rotated(turn, offset)
                 made[:, k, 3:7] = turn
         return made
+
+    def check_move(self, last: np.ndarray, poses: np.ndarray, timestep: float) -> None:
+        """Refuse solids that jump between poses (n, K, 7 or 13), a physics step [s] apart.
+
+        Raises:
+            QuadrlError: The message has the solid, its speed and its turn.
+        """
+        speed = np.linalg.norm(poses[..., :3] - last[..., :3], axis=-1) / timestep
+        cosine = abs((poses[..., 3:7] * last[..., 3:7]).sum(axis=-1))
+        turn = 2 * np.arccos(np.minimum(cosine, 1.0))
+        if len(wrong := np.argwhere((speed > FASTEST) | (turn > WIDEST))):
+            row, geom = map(int, wrong[0])
+            solid = self.names[int(np.searchsorted(self._first, geom, side="right")) - 1]
+            raise QuadrlError(
+                "else it would throw what it touches",
+                name=f"speed [m/s] of {solid} in `move`, and turn [rad] in a physics step",
+                value=[round(float(each[row, geom]), 3) for each in (speed, turn)],
+                allowed=f"at most {FASTEST:g} and {WIDEST:g}",
+            )
 
     def check_start(
         self,
@@ -211,14 +236,36 @@ class Scene:
         return Surroundings(self.names, *measured)
 
 
-def _checked_size(solid: Solid, size: Array, poses: np.ndarray) -> np.ndarray:
-    found, shape = np.asarray(size, dtype=float), (len(poses), len(solid.lengths))
-    has_sizes = poses.shape[-1] > 7
-    if not has_sizes or found.shape != shape or not ((found > 0) & (found < np.inf)).all():
-        lengths = f"finite, positive, {shape}: {', '.join(solid.lengths)}"
-        allowed = lengths if has_sizes else "None in `move` where `place` gives none"
-        raise QuadrlError(name=f"size of {solid.name}", value=size, allowed=allowed)
+def _checked(
+    name: str, given: Any, shape: tuple[int, ...], least: float = -MAX_OPTION
+) -> np.ndarray:
+    """Numbers of a shape, each between `least` and `MAX_OPTION`."""
+    try:
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if found.shape != shape or not ((found >= least) & (found <= MAX_OPTION)).all():
+        allowed = f"an array {shape} of numbers between {least:g} and {MAX_OPTION:g}"
+        raise QuadrlError(name=name, value=given, allowed=allowed)
     return found
+
+
+def _unit(name: str, given: Any, count: int) -> np.ndarray:
+    """Unit quaternions (n, 4), from such whose length may be off by 1 %."""
+    turn = _checked(name, given, (count, 4))
+    length = np.linalg.norm(turn, axis=-1, keepdims=True)
+    if len(wrong := np.flatnonzero(abs(length - 1) > 0.01)):
+        raise QuadrlError(name=name, value=turn[wrong[0]], allowed="(w, x, y, z) of length 1")
+    return turn / length
+
+
+def _checked_size(solid: Solid, size: Any, poses: np.ndarray) -> np.ndarray:
+    """Lengths (n, k) of a solid, where each row has its own."""
+    name = f"size of {solid.name} ({', '.join(solid.lengths)})"
+    if poses.shape[-1] == 7:
+        allowed = "None in `move` where `place` gives none"
+        raise QuadrlError(name=name, value=size, allowed=allowed)
+    return _checked(name, size, (len(poses), len(solid.lengths)), MIN_LENGTH)
 
 
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:

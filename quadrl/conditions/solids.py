@@ -12,9 +12,10 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
-from quadrl.base.validation import number
+from quadrl.base.validation import MAX_OPTION, number, numbers
 
 Vector = tuple[float, float, float]
+MIN_LENGTH = 1 / MAX_OPTION  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,12 +45,15 @@ class Solid(abc.ABC):
     rotors of who is held stop for the rest of the episode."""
 
     def __post_init__(self) -> None:
-        """Validate the name and the lengths."""
+        """Validate the name, the numbers and the lengths."""
         if not isinstance(name := cast(Any, self.name), str) or not name.isidentifier():
             raise QuadrlError(name="solid", value=self.name, allowed="a name such as 'post'")
-        number(f"{self.name} grip", self.grip, 0)
+        for name, size, *ends in (("position", 3, -MAX_OPTION, MAX_OPTION), ("rgba", 4, 0, 1)):
+            given = numbers(f"{self.name} {name}", getattr(self, name), size, *ends)
+            object.__setattr__(self, name, given)
+        number(f"{self.name} grip", self.grip, 0, MAX_OPTION)
         for name in self.lengths:
-            number(f"{self.name} {name}", getattr(self, name), positive=True)
+            number(f"{self.name} {name}", getattr(self, name), MIN_LENGTH, MAX_OPTION)
 
     @property
     def lengths(self) -> tuple[str, ...]:

@@ -141,6 +141,7 @@ class Environment(saving.Copied):
         self.autopilot = Autopilot(*given) if loops else None
         """What flies the loops of the control mode; None where it has none."""
         self._flown = 0  # physics steps of this control step that `control` has commanded
+        self._moves: list[np.ndarray] = []  # where solids are after each of its physics steps
         self.seed(seed)
         self._made = frozenset(vars(self)).difference(LIVE)  # attributes that stay
 
@@ -355,6 +356,7 @@ class Environment(saving.Copied):
             self.make_anew()
         inputs = self._begun.inputs
         taken, command = inputs.action, inputs.command
+        self._moves = self._solids_ahead() if self._solids_move else []
         taken[:] = validation.action(action, (self.num_envs, self.action_size))
         if self.blowing:
             self.blowing.advance()
@@ -387,19 +389,21 @@ class Environment(saving.Copied):
                 self.observer.follow(command, self.vehicle.physics_timestep)
         if self._solids_move:
             steps = 1
-            self._move_solids()
+            self.engine.solids.move(self._moves[self._flown], self.vehicle.physics_timestep)
         self._flown += steps
         self.engine.ctrl[:] = self.randomizer.delayed(command, steps)
         return steps
 
-    def _move_solids(self) -> None:
-        """Move solids to where the next physics step ends."""
-        vehicle, engine = self.vehicle, self.engine
-        flown = (self._flown + 1) * vehicle.physics_timestep
-        time = self.episode.steps * vehicle.control_timestep + flown
-        poses = self.task.move(self.snapshot.task, time), self.num_envs, self.origin
-        made = self.scene.poses(*poses, engine.solids.poses)
-        engine.solids.move(made, vehicle.physics_timestep)
+    def _solids_ahead(self) -> list[np.ndarray]:
+        """Where solids are after each physics step of this control step, checked before it."""
+        vehicle, last, poses = self.vehicle, self.engine.solids.poses, list[np.ndarray]()
+        begun = self.episode.steps * vehicle.control_timestep
+        for k in range(vehicle.substeps):
+            placed = self.task.move(self.snapshot.task, begun + (k + 1) * vehicle.physics_timestep)
+            made = self.scene.poses(placed, self.num_envs, self.origin, last)
+            self.scene.check_move(last, made, vehicle.physics_timestep)
+            poses.append(last := made)
+        return poses
 
     def finish(self) -> Transition:
         """Do the second half of a step, after the engine has advanced."""

@@ -125,7 +125,10 @@ class Solids:
         During the step they stand half-way; contacts take into account the mean velocity and the
         acceleration since the step before, which MuJoCo does not know.
         """
-        last, self.moves = self.poses.copy(), True
+        last, self.moves, poses = self.poses.copy(), True, poses.copy()
+        # Of the two quaternions of an attitude the one nearer to the last.
+        turns = (poses[..., 3:7] * last[..., 3:7]).sum(axis=-1, keepdims=True)
+        poses[..., 3:7] *= np.where(turns < 0, -1.0, 1.0)
         half = (last + poses) / 2
         half[..., 3:7] /= np.linalg.norm(half[..., 3:7], axis=-1, keepdims=True)
         self._stand(np.arange(len(poses)), half)
@@ -208,5 +211,4 @@ def _turn_rate(last: np.ndarray, poses: np.ndarray, timestep: float) -> np.ndarr
     was, now = last[..., 3:7], poses[..., 3:7]
     half = was[..., :1] * now[..., 1:] - now[..., :1] * was[..., 1:]
     half = half + cross(was[..., 1:], now[..., 1:])
-    near = (was * now).sum(axis=-1, keepdims=True)  # the cosine of half the angle
-    return 2 * np.where(near < 0, -half, half) / timestep
+    return 2 * half / timestep

@@ -216,29 +216,67 @@ def of_size(*lengths, count=1):
     return Pose(np.zeros((count, 3)), size=np.tile(lengths, (count, 1)))
 
 
+def placing(last=None, **poses):
+    return lambda: EVERY.poses(poses, 1, np.zeros(3), last)
+
+
+def turned_by(quaternion):
+    return placing(ball=Pose(np.zeros((1, 3)), quaternion))
+
+
 @pytest.mark.parametrize(
     ("make_it", "name"),
     [
         (lambda: Sphere("ball", radius=0.0), "ball radius"),
+        (lambda: Sphere("ball", radius=1e10), "ball radius"),
         (lambda: Box("wall", grip=-1.0), "wall grip"),
+        (lambda: Box("wall", grip=np.inf), "wall grip"),
         (lambda: Box("wall", length=-1.0), "wall length"),
+        (lambda: Cylinder("post", height="2 m"), "post height"),  # pyright: ignore
         (lambda: Sphere("no name"), "solid"),
+        (lambda: Sphere("ball", position=(0.0, np.nan, 0.0)), r"ball position\[1\]"),
+        (lambda: Sphere("ball", position=(0.0, 0.0, 1e10)), r"ball position\[2\]"),
+        (lambda: Sphere("ball", position=(0.0, 0.0)), "ball position"),  # pyright: ignore
+        (lambda: Sphere("ball", position="near"), "ball position"),  # pyright: ignore
+        (lambda: Box("wall", rgba=(1.0, 0.0, 0.0)), "wall rgba"),  # pyright: ignore
+        (lambda: Box("wall", rgba=(255.0, 0.0, 0.0, 1.0)), r"wall rgba\[0\]"),
         (lambda: Scene([Sphere("ball"), Box("ball")]), "solids"),
         (lambda: Scene(["post"]), "solids"),  # pyright: ignore
-        (lambda: EVERY.poses({"bal": Pose(np.zeros((1, 3)))}, 1, np.zeros(3)), "place"),
-        (lambda: EVERY.poses({"ball": Pose(np.zeros(3))}, 1, np.zeros(3)), "pose of ball"),
-        (lambda: EVERY.poses({"ball": Pose(np.full((1, 3), np.nan))}, 1, np.zeros(3)), "pose"),
-        (lambda: EVERY.poses({"ball": of_size(0.0)}, 1, np.zeros(3)), "size of ball"),
-        (lambda: EVERY.poses({"post": of_size(0.1)}, 1, np.zeros(3)), "size of post"),
-        (
-            lambda: EVERY.poses({"ball": of_size(0.1)}, 1, np.zeros(3), last=np.ones((1, 7, 7))),
-            "size of ball = .* None in `move`",
-        ),
+        (lambda: Scene(None), "solids"),  # pyright: ignore
+        (lambda: Scene(Sphere("ball")), "solids"),  # pyright: ignore
+        (placing(bal=Pose(np.zeros((1, 3)))), "place"),
+        (lambda: EVERY.poses(None, 1, np.zeros(3)), "place"),  # pyright: ignore
+        (lambda: EVERY.poses(None, 1, np.zeros(3), np.ones((1, 7, 7))), "move"),  # pyright: ignore
+        (placing(ball=np.zeros((1, 3))), "place"),
+        (placing(ball=Pose(np.zeros(3))), "position of ball"),
+        (placing(ball=Pose(None)), "position of ball"),
+        (placing(ball=Pose([["here", "there", "up"]])), "position of ball"),
+        (placing(ball=Pose(np.full((1, 3), np.nan))), "position of ball"),
+        (placing(ball=Pose(np.full((1, 3), -1.01e9))), "position of ball"),
+        (turned_by(np.zeros((1, 4))), "quaternion of ball"),
+        (turned_by(np.full((1, 4), 1e-320)), "quaternion of ball"),
+        (turned_by(np.full((1, 4), 0.52)), "quaternion of ball"),
+        (turned_by(np.array([[1.0, 0.0, np.nan, 0.0]])), "quaternion of ball"),
+        (turned_by(np.ones((1, 3))), "quaternion of ball"),
+        (placing(ball=of_size(0.0)), "size of ball"),
+        (placing(ball=of_size(1.01e9)), "size of ball"),
+        (placing(ball=of_size(np.nan)), "size of ball"),
+        (placing(post=of_size(0.1)), r"size of post \(radius, height\)"),
+        (placing(np.ones((1, 7, 7)), ball=of_size(0.1)), "size of ball .* None in `move`"),
     ],
 )
 def test_what_no_world_can_hold_is_refused(make_it, name):
     with refused(match=f"^{name}"):
         make_it()
+
+
+def test_a_quaternion_of_nearly_unit_length_means_its_direction():
+    unit = np.array([[0.6, 0.0, 0.8, 0.0]])
+    made = [
+        EVERY.poses({"wall": Pose(np.zeros((1, 3)), length * unit)}, 1, np.zeros(3))
+        for length in (1.0, 0.995, 1.005)
+    ]
+    np.testing.assert_allclose(made[1:], [made[0]] * 2, rtol=0, atol=1e-15)
 
 
 # ---------------------------------------------------------------------------------- in a task
@@ -331,6 +369,11 @@ def test_a_reset_of_some_rows_moves_their_solids_alone():
     np.testing.assert_array_equal(moved > 0.01, [False, True, False, True])
 
 
+def unchanged(environment, saved):
+    for name, array in environment.save().items():
+        np.testing.assert_array_equal(array, saved[name])
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 def test_a_start_in_a_solid_is_refused_and_changes_nothing(engine):
     """The ball of 0.2 m stands 9 m to the north, and a rotor's hub 0.23 m from the centre."""
@@ -344,8 +387,7 @@ def test_a_start_in_a_solid_is_refused_and_changes_nothing(engine):
             environment.reset(start=level | {"position": places})
     with refused("position at the start", match=r"\[2\]"):
         environment.reset(np.array([2]), start=level | {"position": [0.0, 9.0, 0.0]})
-    for name, array in environment.save().items():
-        np.testing.assert_array_equal(array, before[name])
+    unchanged(environment, before)
     # The edge of a rotor may be in it: whoever touches a solid is no fault of the scene.
     environment.reset(start=level | {"position": [0.0, 9.45, 0.0]})
     declared = {"solids": lambda self: [Sphere("ball", radius=2.0)]}
@@ -368,6 +410,55 @@ def test_aircraft_may_begin_on_their_feet(vehicle):
     environment.step(np.full((1, environment.action_size), -0.1))
     assert environment.snapshot.landed.all()
     np.testing.assert_allclose(environment.snapshot.state.position, [[0, 0, height]], atol=0.01)
+
+
+def gate_at(time, ahead=0.0, turn=0.0, **others):
+    """A gate that drifts and turns, or is elsewhere."""
+    level = np.stack([4.0 + 0.5 * time + ahead, 0 * time, 0 * time], axis=-1)
+    return {"gate": dataclasses.replace(Pose(level, heading(0.2 * time + turn)), **others)}
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize(
+    ("then", "said"),
+    [
+        (lambda time: None, "^move"),
+        (lambda time: gate_at(time, position=None), "^position of gate"),
+        (lambda time: gate_at(time, quaternion=np.zeros((2, 4))), "^quaternion of gate"),
+        # By 5 m in 10 ms, and by a radian.
+        (lambda time: gate_at(time, 5.0), r"^speed \[m/s\] of gate .* \[500.5, .* 100 and 0.5"),
+        (lambda time: gate_at(time, turn=1.0), r"of gate in `move`, and turn \[rad\] .* 1.002"),
+    ],
+    ids=["None", "no place", "zeros", "jumps", "turns"],
+)
+def test_a_move_that_no_solid_makes_is_refused_and_changes_nothing(then, said, engine):
+    """It goes wrong at 0.12 s, in the second physics step of the third control step."""
+    own = {
+        "solids": lambda self: [Sphere("ball", position=(0.0, 5.0, 0.0)), Gate("gate")],
+        "move": lambda self, state, time: gate_at(time) if time[0] < 0.115 else then(time),
+    }
+    environment = begun(type("Lost", (Hover,), own)(), num_envs=2, engine=engine)
+    for _ in range(2):
+        environment.step(np.zeros((2, 4)))
+    saved = environment.save()
+    with refused(match=said):
+        environment.step(np.ones((2, 4)))
+    unchanged(environment, saved)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        ({"solids": lambda self: None}, "^solids"),
+        ({"place": lambda self, rng, start, state: None}, "^place"),
+        ({"place": lambda self, *_: {"gate": Pose(None)}}, "^position of gate"),
+    ],
+)
+def test_a_task_that_forgets_to_return_is_refused_by_name(own, said, engine):
+    gate = {"solids": lambda self: [Gate("gate", position=(4.0, 0.0, 0.0))]}
+    with refused(match=said):
+        begun(type("Forgets", (Hover,), gate | own)(), engine=engine)
 
 
 def test_sizes_come_from_the_seed_of_the_row_and_stay_with_a_saved_state():
