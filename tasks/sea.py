@@ -12,14 +12,19 @@ import numpy as np
 
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, namespace, norm, stack
+from quadrl.base.rotation import Array, namespace, norm, quaternion_from_heading_and_tilt, stack
 from quadrl.conditions.solids import Box
 from quadrl.core.task import TaskState
 from quadrl.engines.rng import FULL_TURN, Rng
 
 WAVES = 12  # that the sea is made of
 RAREST = 1e-6  # of the share of the energy in longer waves: those are endless
-TILES, FARTHEST = 20, math.asinh(50.0)  # of the water that is drawn, along and across
+STRIPS = 60  # of the water that is drawn
+NEAREST, FARTHEST = (
+    12.0,
+    150.0,
+)  # [m]: within the first they are about as wide, the second is the end
+DEPTH = 0.15  # [m], of the middle of a strip below its surface
 WATER = np.array([0.10, 0.34, 0.48, 1.0])
 DECK = Box("deck", length=4.0, width=4.0, height=0.2, rgba=(0.38, 0.42, 0.46, 1.0))
 FREEBOARD = 1.5  # [m], of the deck over the water
@@ -118,22 +123,29 @@ def hull(deck: Motion, size: tuple[float, float]) -> Primitive:
     return Primitive("box", half, below, upright(deck.normal)[0], HULL, glow=0.0)
 
 
-def water(waves: Waves, time: np.ndarray) -> list[Primitive]:
-    """Tiles of the water about the boat of one episode (N = 1)."""
-    edges = 3 * np.sinh(np.linspace(-FARTHEST, FARTHEST, TILES + 1))  # the nearer, the smaller
-    grids = (edges[1:] + edges[:-1]) / 2, 0.52 * np.diff(edges)
-    place, half = (np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) for grid in grids)
-    lag = (place @ waves.course[0])[:, None] * waves.frequency[0] ** 2 / GRAVITY
-    there = deck(dataclasses.replace(waves, phase=waves.phase - lag), time)
-    height = there.position[:, 2:]
-    colour = WATER + np.clip(0.08 * height, -0.08, 0.2) * (1.0, 1.0, 1.0, 0.0)
-    tiles = (
-        np.concatenate([half, 0 * height + 0.15], axis=-1),
-        np.concatenate([place, height - FREEBOARD], axis=-1),
-        upright(there.normal),
-        colour,
-    )
-    return [Primitive("box", *tile, glow=0.2) for tile in zip(*tiles, strict=True)]
+def water(waves: Waves, time: Array) -> list[Primitive]:
+    """The water about the boat of one episode (N = 1): strips, as long as the crests of its waves.
+
+    Each begins where the last one ends, so that there are no gaps between them.
+    """
+    edges = NEAREST * np.sinh(np.linspace(-1, 1, STRIPS + 1) * math.asinh(FARTHEST / NEAREST))
+    wave_number = waves.frequency[0] ** 2 / GRAVITY
+    # Far away the strips are wider than short waves, and have what is left of them in the mean.
+    kept = _mean(wave_number * (np.gradient(edges) / 2)[:, None])
+    phase = waves.phase - wave_number * edges[:, None]
+    there = dataclasses.replace(waves, amplitude=waves.amplitude * kept, phase=phase)
+    height = deck(there, time).position[:, 2]
+    tilt, (east, north) = np.arctan2(np.diff(height), np.diff(edges)), waves.course[0]
+    along = (edges[1:] + edges[:-1]) / 2 + DEPTH * np.sin(tilt)
+    up = (height[1:] + height[:-1]) / 2 - DEPTH * np.cos(tilt) - FREEBOARD
+    none, heading = 0 * tilt, math.atan2(north, east)
+    halves = stack(np.diff(edges) / np.cos(tilt) / 2, none + FARTHEST, none + DEPTH)
+    places = stack(along * east, along * north, up)
+    attitudes = quaternion_from_heading_and_tilt(none + heading, -tilt, none + math.pi / 2)
+    paler = np.clip(0.08 * (up + FREEBOARD), -0.08, 0.2)[:, None]
+    colours = WATER + paler * (1.0, 1.0, 1.0, 0.0)
+    strips = zip(halves, places, attitudes, colours, strict=True)
+    return [Primitive("box", *strip, glow=0.2) for strip in strips]
 
 
 def _sums(*parts: Array) -> list[Array]:

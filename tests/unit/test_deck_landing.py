@@ -1,10 +1,12 @@
 """Landing on a moving deck: the sea is the one that is asked for, and the deck follows it."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 from helpers import refused
+from scipy.spatial.transform import Rotation
 
 from quadrl import tasks
 from quadrl.aircraft import parameters
@@ -14,8 +16,8 @@ from quadrl.conditions.solids import heading
 from quadrl.core.environment import Environment
 from quadrl.engines.rng import Rng
 from quadrl.tasks.deck_landing import DECK, DeckLanding
+from quadrl.tasks.sea import FREEBOARD, upright, water
 from quadrl.tasks.sea import deck as deck_of
-from quadrl.tasks.sea import upright
 
 PAPER = VEHICLES["paper"]
 OWN = parameters.Parameters.of(parameters.rows(PAPER), PAPER.control_timestep)
@@ -62,6 +64,23 @@ def test_velocity_turn_and_normal_of_the_deck_are_those_of_its_way():
     slope = (there.position - now.position)[:, 2] / ahead
     lean = -(now.normal[:, :2] * made.course).sum(axis=1) / now.normal[:, 2]
     np.testing.assert_allclose(slope, lean, atol=2e-3)
+
+
+def test_the_water_that_is_drawn_is_whole_and_moves_as_the_deck_does():
+    """Its strips begin where the last one ends; near the boat it is what the boat would ride on."""
+    made, time = sea(1, 4.0, **TINY), np.array([3.0])
+    ends = []
+    for strip in water(made, time):
+        turn, (half, _, thick) = Rotation.from_quat(strip.quaternion, scalar_first=True), strip.size
+        ends.append([strip.position + turn.apply([x, 0, thick]) for x in (-half, half)])
+    ends = np.array(ends)
+    np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1], atol=1e-9)
+    ahead = ends[1:, 0] @ [*made.course[0], 0.0]
+    assert ahead[0] < -100.0 and ahead[-1] > 100.0 and (np.diff(ahead) > 0).all()
+    near = abs(ahead) < 15.0
+    phase = made.phase - made.frequency**2 / GRAVITY * ahead[near, None]
+    there = deck_of(dataclasses.replace(made, phase=phase), time).position[:, 2]
+    np.testing.assert_allclose(ends[1:, 0, 2][near], there - FREEBOARD, atol=0.05)
 
 
 def on_the_deck(count, engine="mujoco", falls=0.0, aside=0.0, slips=0.0, **waves):
