@@ -17,11 +17,12 @@ from quadrl.base.units import LENGTHS, length
 from quadrl.core.trajectory import FAILURE, SUCCESS, TIME_OVER
 from quadrl.rendering.horizon import horizon
 
-MARGIN, HEIGHT = 18, 138  # [pixels] at a height of 720, as are those below
-LINE = 21  # from one to the next
-DIAL, DIAL_LEFT = 90, 186  # diameter of the horizon, and where it begins
-BARS, BAR = 298, 21  # where the bars begin, and from one to the next
-TOP, BOTTOM = 17, 103  # of the bars
+MARGIN, HEIGHT = 18, 146  # [pixels] at a height of 720, as are those below
+SMALL, USUAL, LARGE = 15, 17, 20  # print
+FIRST, LINE = 43, 23  # where the lines begin, and from one to the next
+DIAL, DIAL_LEFT = 90, 194  # diameter of the horizon, and where it begins
+BARS, BAR = 302, 21  # where the bars begin, and from one to the next
+TOP, BOTTOM, BELOW = 17, 108, 113  # of the bars, and of what is written below them
 ROOM = 0.8  # share of a picture's width that the panel may take
 GREY, WHITE, DARK = (150, 163, 180), (236, 240, 246), (44, 52, 64)
 OUTCOMES = {SUCCESS: (38, 148, 84), FAILURE: (196, 58, 54), TIME_OVER: (176, 124, 30)}
@@ -44,11 +45,11 @@ class Panel:
         self._image, self._draw, font = (
             require(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont")
         )
-        self._scale = max(height / 720, 0.72)  # smaller print cannot be read
+        self._scale = max(height / 720, 0.8)  # 12 pixels: smaller print cannot be read
         self._colours = [tuple(round(255 * part) for part in colour) for colour in colours]
-        self._fonts = {k: font.load_default(size=k * self._scale) for k in (13, 15, 18)}
+        self._fonts = {k: font.load_default(size=k * self._scale) for k in (SMALL, USUAL, LARGE)}
         room = (DIAL_LEFT - 22) * self._scale
-        while self._fonts[18].getlength(title) > room and len(title) > 2:
+        while self._fonts[LARGE].getlength(title) > room and len(title) > 2:
             title = title.rstrip("…")[:-1] + "…"
         # What stays is drawn once.
         labels = flight_lines(wind=0.0 if windy else None)
@@ -56,11 +57,11 @@ class Panel:
         width = BARS + BAR * len(colours) + 12
         self._background = self._rounded(width, self._height, 14, (13, 18, 26))
         draw = self._draw.Draw(self._background)
-        self._write(draw, 16, 11, title, 18, (255, 255, 255))
+        self._write(draw, 16, 11, title, LARGE, (255, 255, 255))
         for row, label in enumerate(labels):
-            self._write(draw, 16, 41 + LINE * row, label, 15, GREY)
+            self._write(draw, 16, FIRST + LINE * row, label, USUAL, GREY)
         for rotor in range(len(colours)):
-            self._write(draw, BARS + BAR * rotor + 6, 109, str(rotor + 1), 13, GREY, "ma")
+            self._write(draw, BARS + BAR * rotor + 6, BELOW, str(rotor + 1), SMALL, GREY, "ma")
 
     def fits(self, width: int, height: int) -> bool:
         """Whether it is small enough for a picture."""
@@ -95,9 +96,9 @@ class Panel:
         draw = self._draw.Draw(image)
 
         for row, value in enumerate(values):
-            self._write(draw, 166, 41 + LINE * row, value, 15, WHITE, "ra")
+            self._write(draw, DIAL_LEFT - 16, FIRST + LINE * row, value, USUAL, WHITE, "ra")
         middle, heading = DIAL_LEFT + DIAL / 2, f"{bearing(attitude):03.0f}°"
-        self._write(draw, middle, 109, heading, 13, GREY, "ma")
+        self._write(draw, middle, BELOW, heading, SMALL, GREY, "ma")
         for rotor, share in enumerate(np.clip(shares, 0, 1)):
             left, level = BARS + BAR * rotor, BOTTOM - float(share) * (BOTTOM - TOP)
             for upper, fill in ((TOP, DARK), (level, self._colours[rotor])):
@@ -118,7 +119,7 @@ class Panel:
     ) -> None:
         """Write a line of text, on a rounded background, into a picture in place."""
         x, y = self._at(left, top)
-        font = self._fonts[18]
+        font = self._fonts[LARGE]
         ground = self._rounded(font.getlength(text) / self._scale + 32, 34, 17, fill, opacity)
         place = picture[y : y + ground.height, x : x + ground.width]
         image = self._image.fromarray(place)

@@ -321,20 +321,20 @@ def test_a_flight_is_drawn_as_it_was_flown(model, monkeypatch):
 @pytest.mark.parametrize("rotors", [4, 8])
 def test_the_panel_shows_rotor_speeds_in_its_corner_and_the_outcome_below(rotors):
     panel = Panel(240, "x" * 200, [(1.0, 0.42, 0.1)] * rotors)  # a title that is cut
-    assert not panel.fits(160, 120) and (rotors == 8 or panel.fits(360, 280))
+    assert not panel.fits(160, 120) and (rotors == 8 or panel.fits(400, 300))
     blank = np.full((240, 400, 3), 128, np.uint8)
     slow, fast, good, bad = pictures = [blank.copy() for _ in range(4)]
     shown = (0, ""), (1, ""), (0, SUCCESS), (0, FAILURE)
     for picture, (share, end) in zip(pictures, shown, strict=True):
         panel.draw(picture, ["0.10 s", "0.12 m"], np.full(rotors, share), outcome=end)
     rows, columns = np.nonzero(changed(blank, slow, by=3))
-    # 18 pixels of margin, 138 of height and 310 + 21 a rotor of width, times 0.72.
-    assert 12 <= min(rows.min(), columns.min()) and rows.max() <= 13 + 99
-    assert columns.max() == pytest.approx(0.72 * (18 + 310 + 21 * rotors), abs=2)
+    # 18 pixels of margin, 146 of height and 314 + 21 a rotor of width, times 0.8.
+    assert 13 <= min(rows.min(), columns.min()) and rows.max() <= 14 + 117
+    assert columns.max() == pytest.approx(0.8 * (18 + 314 + 21 * rotors), abs=2)
     bars = changed(slow, fast) & (fast[..., 0] > 200)
-    assert bars.sum() == pytest.approx(rotors * 12 * 86 * 0.72**2, rel=0.15)
+    assert bars.sum() == pytest.approx(rotors * 12 * 91 * 0.8**2, rel=0.15)
     rows, _ = np.nonzero(changed(slow, good))
-    assert rows.min() > 0.72 * (18 + 138) and len(rows) > 500
+    assert rows.min() > 0.8 * (18 + 146) and len(rows) > 500
     green, red = (p[rows.min() :].reshape(-1, 3).astype(int).sum(0) for p in (good, bad))
     assert green[1] > red[1] and red[0] > green[0]
 
@@ -492,6 +492,16 @@ def test_a_failure_of_the_encoder_leaves_the_old_video(model, monkeypatch, tmp_p
     assert not list(Path().glob(".*"))
 
 
+@pytest.mark.parametrize("height", [240, 480, 1080])
+def test_the_print_of_the_panel_can_be_read(height):
+    """Its capitals are 10 pixels high, and higher in large pictures."""
+    picture = np.zeros((height, 2 * height, 3), np.uint8)
+    Panel(height, "", []).draw(picture, ["HHHHHH"], [])
+    rows, columns = np.nonzero(picture[..., 0] > 180)  # but for the horizon, behind the value
+    rows = rows[columns < 0.8 * max(1.0, height / 576) * 196]
+    assert np.ptp(rows) + 1 >= max(10, 0.016 * height)
+
+
 def test_gymnasium_shows_the_panel_and_the_outcome():
     options = dict(render_mode="rgb_array", width=400, height=300, time_limit=0.15)
     with contextlib.closing(gym.make("quadrl/Hover-v0", **options)) as env:
@@ -504,15 +514,15 @@ def test_gymnasium_shows_the_panel_and_the_outcome():
         assert changed(one, other).sum() < 5  # a new episode remembers nothing
     begin, same, *_, late, end = pictures[0]
     assert changed(begin, same).sum() < 5
-    assert changed(late[119:144, 13:100], end[119:144, 13:100]).mean() > 0.5  # the outcome
+    assert changed(late[140:165, 15:100], end[140:165, 15:100]).mean() > 0.5  # the outcome
     environment = helpers.begun("hover")
     with contextlib.closing(Pictures(environment, "follow", 160, 96)) as drawing:
         small = drawing.frame()
     with Renderer(environment.scenario.compile_model(), 400, 300) as opened:
         plain = LiveFlight("follow").picture(opened, environment, 0)
     assert small[:12].mean() > 150 and plain[:12].mean() > 150  # sky in the corner
-    assert begin[13:112, 13:270].mean() < 0.8 * plain[13:112, 13:270].mean()
-    assert changed(begin[150:], plain[150:]).sum() < 5
+    assert begin[15:130, 15:300].mean() < 0.8 * plain[15:130, 15:300].mean()
+    assert changed(begin[170:], plain[170:]).sum() < 5
 
 
 def test_a_picture_of_a_flight_in_progress_shows_where_it_came_from(renderer):
