@@ -45,7 +45,7 @@ class Sea(Waves):
 class DeckLanding(Landing):
     """Land on the deck of a boat; the origin of the frame is where its pad lies in calm water."""
 
-    name = "deck_landing"
+    name, version = "deck_landing", 1
     compiled = True
     asks = "touch down on the pad of a boat in waves of sea states 2 to 5, and stay on it"
     starts = "5 m up, within 1.5 m sideways, at rest, any heading"

@@ -38,7 +38,7 @@ class Touchdown(TaskState):
 class Landing(Task):
     """Land on the pad; the origin of the frame is where the aircraft's centre comes to rest."""
 
-    name = "landing"
+    name, version = "landing", 1
     compiled = True
     asks = "touch down smoothly on a pad, without a crash and without sinking into its own wash"
     starts = "3 m up, within 1.5 m sideways, at rest, any heading"

@@ -50,7 +50,7 @@ class Distances(Potentials):
 class LsyRace(GateRace):
     """Fly the course of LSY's drone racing of summer 2026."""
 
-    name, version = "lsy_race", 1
+    name, version = "lsy_race", 2
     compiled = True
     asks = "fly through four small gates among poles; their places change in each episode"
     starts = (

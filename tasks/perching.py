@@ -45,7 +45,7 @@ class Perch(TaskState):
 class Perching(Task):
     """Perch on a surface; its middle is the origin of the task's frame."""
 
-    name = "perching"
+    name, version = "perching", 1
     compiled = True
     asks = "land with the feet on a surface, level to vertical, and stay on it"
     starts = (

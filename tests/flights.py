@@ -81,7 +81,7 @@ def by_mj_step(task, seed, mode):
     solids = Solids(model, 1, origin, lambda name: getattr(model, name)[None], Threads(1, 1))
     hits, feet = np.split(data.userdata[None, parameters.AIR :], [parameters.HIT], axis=1)
     world = types.SimpleNamespace(solids=solids, hits=hits, feet=feet)
-    world.clearance = lambda rows: solids.clearance(data.qpos[None], row, vehicle.rotor_count)
+    world.clearance = lambda rows: solids.clearance(data.qpos[None])
     control = modes.kind(mode)(vehicle)
     own = parameters.Parameters.of(row, vehicle.control_timestep)
     settle = round(min(task.settle_time, task.time_limit) / vehicle.control_timestep)

@@ -178,7 +178,6 @@ class Scene:
         engine: Engine,
         rows: np.ndarray,
         start: Start,
-        table: np.ndarray | None,
         poses: np.ndarray | None,
     ) -> None:
         """Refuse aircraft that `Engine.place`, given the same, would put into a solid.
@@ -188,12 +187,8 @@ class Scene:
         Raises:
             QuadrlError: The message has the rows and where the first of them would be.
         """
-        own = engine.parameters if table is None else table
-        own = own[rows] if table is None and len(own) > 1 else own.copy()
-        own["hull"], own["rotor"]["radius"] = own["hull"].min(axis=-1, keepdims=True) / 2, 0.0
         qpos = np.concatenate([start.position + engine.origin, start.quaternion], axis=-1)
-        placed = rows, poses, np.ascontiguousarray(qpos), own, engine.vehicle.rotor_count
-        if len(inside := np.flatnonzero(engine.solids.clearance_before(*placed) < 0)):
+        if len(inside := np.flatnonzero(engine.solids.is_inside(rows, poses, qpos))):
             reason = f"rows that begin in one: {reprlib.repr(rows[inside].tolist())}"
             value, allowed = start.position[inside[0]], f"outside of {', '.join(self.names)}"
             raise QuadrlError(reason, name="position at the start", value=value, allowed=allowed)

@@ -255,7 +255,7 @@ class Environment(saving.Copied):
             poses = self.scene.poses(placed, len(rows), self.origin)
         # Practice of a task in which they touch may begin in one, and is over at once.
         if self.scene.solids and ("position" in (start or ()) or not self.task.contact):
-            self.scene.check_start(self.engine, rows, begun, table, poses)
+            self.scene.check_start(self.engine, rows, begun, poses)
         state = self.engine.place(rows, begun, table, poses)
         self.seeds = seeds
         self.randomizer.begin(rows, *place, drawn)

@@ -17,7 +17,6 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.engines import mjcf
 
 HEIGHT = 1.0  # [m], of the hover
-ARM = 0.008  # [m], radius of an arm of an aircraft with `scale` 1
 DRAG_RADIUS = 0.05  # over the size of the aircraft: of a sphere that carries next to no air along
 THINNEST = 1e-6  # [kg/m^3]
 HEAD = """<!--
@@ -112,7 +111,7 @@ def _draw_without_meshes(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
         elif geom.type == shape.mjGEOM_MESH or geom.name.startswith("ground_"):
             whole.delete(geom)
     for k, rotor in enumerate(vehicle.rotors, 1):
-        arm = dict(fromto=(0, 0, 0, *rotor.position), size=(ARM * vehicle.scale, 0, 0))
+        arm = dict(fromto=(0, 0, 0, *rotor.position), size=(mjcf.ARM_RADIUS * vehicle.scale, 0, 0))
         tube = whole.find_default("leg")
         body.add_geom(tube, name=f"arm_{k}", material="carbon", **arm)
     used = {geom.material for geom in (*whole.worldbody.geoms, *body.geoms)}

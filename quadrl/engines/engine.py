@@ -284,7 +284,7 @@ class Engine(abc.ABC):
         """Lower bound of each aircraft's distance to a solid, (n,) [m]; infinite without solids."""
         if rows is None and self.forked:
             rows = np.arange(self.num_envs)  # this way takes no threads
-        return self.solids.clearance(self.qpos, self.parameters, self.vehicle.rotor_count, rows)
+        return self.solids.clearance(self.qpos, rows)
 
     def _write(self, rows: np.ndarray, start: Start | State) -> None:
         self.qpos[rows] = np.concatenate([start.position + self.origin, start.quaternion], axis=-1)

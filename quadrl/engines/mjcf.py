@@ -16,7 +16,7 @@ from quadrl.engines import native
 
 ASSETS = Path(__file__).parents[1] / "assets"
 DRAWN_RADIUS = 0.06  # [m], of the rotor in assets/rotor.xml
-FOOT_RADIUS = 0.008  # [m], of an aircraft with `scale` 1
+FOOT_RADIUS = ARM_RADIUS = 0.008  # [m], of an aircraft with `scale` 1
 STRIKE_HEIGHT = 0.005  # [m], half the height of what collides of the rotor in assets/rotor.xml
 # Colours of the rotors ahead, aside and behind; a rotor is ahead if the cosine of its bearing is
 # above AHEAD.
@@ -122,7 +122,7 @@ def _add_physics(whole: mujoco.MjSpec, vehicle: Vehicle) -> None:
 
 
 def _add_collision(body: mujoco.MjsBody, vehicle: Vehicle) -> None:
-    """Add hull, discs of the rotors and feet, which collide with the world, not with each other."""
+    """Add hull, arms, discs and feet, which collide with the world, not with each other."""
     shape = mujoco.mjtGeom
     common = dict(contype=0, conaffinity=1, mass=0.0, group=3, rgba=(0.9, 0.2, 0.5, 0.4))
     body.add_geom(name="strike_hull", type=shape.mjGEOM_ELLIPSOID, size=vehicle.hull, **common)
@@ -135,6 +135,11 @@ def _add_collision(body: mujoco.MjsBody, vehicle: Vehicle) -> None:
             quat=_upright(rotor.axis),
             **common,
         )
+        if math.hypot(*rotor.position) > (radius := ARM_RADIUS * vehicle.scale):
+            body.add_geom(
+                name=f"strike_arm_{k + 1}", type=shape.mjGEOM_CAPSULE, size=(radius, 0, 0),
+                fromto=(0, 0, 0, *rotor.position), **common,
+            )  # fmt: skip
     x, y, z = vehicle.foot
     radius = FOOT_RADIUS * vehicle.scale
     for k, (ahead, left) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):

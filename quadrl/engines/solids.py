@@ -63,6 +63,7 @@ class Solids:
         """
         self.geoms, self._origin, self._field = geoms_of_solids(model), origin, field
         self._threads, self._kernel = threads, native.library().quadrl_clearance
+        self._outline, self._middles = _outline(model), _middles(model)
         _, which, *offset = model.geom_user[self.geoms].T[:5] if len(self.geoms) else [[]] * 5
         self._first = np.unique(which, return_index=True)[1]  # geom of each solid
         self._declared = np.hstack([model.geom_size[self.geoms], np.transpose(offset)])  # (K, 6)
@@ -157,22 +158,21 @@ class Solids:
         self.motion[:] = motion
 
     def clearance(
-        self, qpos: np.ndarray, parameters: np.ndarray, rotors: int, rows: np.ndarray | None = None
+        self, qpos: np.ndarray, rows: np.ndarray | None = None, balls: np.ndarray | None = None
     ) -> np.ndarray:
         """Lower bound of each aircraft's distance to the nearest solid, (n,) [m].
 
         Args:
             qpos: (N, 7), live.
-            parameters: Rows (N,), or (1,) for all.
-            rotors: Number of rotors of each.
             rows: Which aircraft (n,); None for all.
+            balls: From which balls, as `_outline` gives them; None for those.
         """
         out = np.full(len(qpos) if rows is None else len(rows), np.inf)
-        if len(self.geoms):
-            row = parameters.strides[0] // 8 if len(parameters) > 1 else 0
-            arrays = (qpos, parameters, self.table, self.nearby)
+        balls = self._outline if balls is None else balls
+        if len(self.geoms) and len(balls):
+            arrays = (qpos, balls, self.table, self.nearby)
             # As `Rows` in native/solids.c.
-            where = native.struct(*arrays, qpos.strides[0] // 8, row, len(self.geoms), rotors)
+            where = native.struct(*arrays, qpos.strides[0] // 8, len(self.geoms), len(balls))
             measure, about, into = self._kernel, where.ctypes.data, out.ctypes.data
             if rows is None:
                 self._threads.call(lambda first, end: measure(about, first, end, None, into))
@@ -180,30 +180,61 @@ class Solids:
                 measure(about, 0, len(rows), rows.ctypes.data, into)
         return out
 
-    def clearance_before(
-        self,
-        rows: np.ndarray,
-        poses: np.ndarray | None,
-        qpos: np.ndarray,
-        parameters: np.ndarray,
-        rotors: int,
-    ) -> np.ndarray:
-        """`clearance` of aircraft (n,) and solids that are not placed yet, with the row of each.
+    def is_inside(self, rows: np.ndarray, poses: np.ndarray | None, qpos: np.ndarray) -> np.ndarray:
+        """Whether the middle of the hull or of a rotor would be in a solid, (n,) bool.
 
-        Poses are as `place` takes them; None for where the solids are.
+        Args:
+            rows: Which aircraft, (n,).
+            poses: Where solids would be, as `place` takes them; None for where they are.
+            qpos: Where aircraft would be, (n, 7).
         """
-        if poses is None and len(parameters) == 1:  # the lists of the nearest serve the start, too
+        if poses is None:  # the lists of the nearest serve the start, too
             places = np.empty((len(self.table), 7))
             places[rows] = qpos
-            return self.clearance(places, parameters, rotors, rows)
-        then, count = copy.copy(self), len(rows)
+            return self.clearance(places, rows, self._middles) < 0
+        then, count, poses = copy.copy(self), len(rows), self._with_sizes(poses)
         then.table, then.nearby = self.table[rows], np.zeros(count, NEARBY)
         then.nearby["place"] = np.nan
-        if poses is not None:
-            poses = self._with_sizes(poses)
-            then.table["position"], then.table["size"] = poses[..., :3], poses[..., 7:10]
-            then.table["turn"] = rotation_matrix(poses[..., 3:7]).reshape(count, -1, 9)
-        return then.clearance(qpos, parameters, rotors, np.arange(count))
+        then.table["position"], then.table["size"] = poses[..., :3], poses[..., 7:10]
+        then.table["turn"] = rotation_matrix(poses[..., 3:7]).reshape(count, -1, 9)
+        places = np.ascontiguousarray(qpos)
+        return then.clearance(places, np.arange(count), self._middles) < 0
+
+
+def _touching(model: mujoco.MjModel) -> np.ndarray:
+    """Numbers of the geoms of an aircraft that can touch."""
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    return np.flatnonzero(collides & (model.geom_bodyid == 1))
+
+
+def _balls(balls: list[tuple[np.ndarray, float]]) -> np.ndarray:
+    """Centres (3), radii and reaches (S, 5) [m] of balls, as `Ball` in native/solids.c."""
+    made = np.array([(*c, radius, np.linalg.norm(c) + radius) for c, radius in balls])
+    return made[np.argsort(-made[:, 4], kind="stable")] if balls else np.zeros((0, 5))
+
+
+def _outline(model: mujoco.MjModel) -> np.ndarray:
+    """Balls (S, 5) [m] that enclose what can touch of an aircraft, body frame; three for an arm."""
+    balls: list[tuple[np.ndarray, float]] = []
+    for k in _touching(model):
+        centre, radius = model.geom_pos[k], float(model.geom_rbound[k])
+        if model.geom_type[k] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            off = model.geom_size[k, 1] / 1.5  # of the outer thirds' middles
+            third = off * rotation_matrix(model.geom_quat[k])[:, 2]
+            radius -= off
+            balls += [(centre - third, radius), (centre + third, radius)]
+        balls.append((centre, radius))
+    return _balls(balls)
+
+
+def _middles(model: mujoco.MjModel) -> np.ndarray:
+    """The inner half of the hull and the hubs of the rotors, as balls (S, 5) [m]."""
+    within = {mujoco.mjtGeom.mjGEOM_ELLIPSOID: 0.5, mujoco.mjtGeom.mjGEOM_CYLINDER: 0.0}
+    shares = [(k, within.get(mujoco.mjtGeom(model.geom_type[k]))) for k in _touching(model)]
+    middles = [
+        (model.geom_pos[k], s * model.geom_size[k].min()) for k, s in shares if s is not None
+    ]
+    return _balls(middles)
 
 
 def _turn_rate(last: np.ndarray, poses: np.ndarray, timestep: float) -> np.ndarray:

@@ -204,7 +204,7 @@ def test_practice_begins_in_the_middle_of_gates():
 
 
 def test_its_id_says_that_its_numbers_have_changed():
-    assert LsyRace.gymnasium_id() == "quadrl/LsyRace-v1" in gymnasium.registry
+    assert LsyRace.gymnasium_id() == "quadrl/LsyRace-v2" in gymnasium.registry
     assert tasks.TASKS["hover"].gymnasium_id() == "quadrl/Hover-v0" in gymnasium.registry
 
 

@@ -54,6 +54,48 @@ def flown(scene, poses, velocity, steps=12, engine="mujoco", vehicle=PAPER):
     return made, np.array(track), hits
 
 
+def enclosing(vehicle):
+    """Centres (3,) and radii [m] of balls about hull, discs, arms (three each) and feet."""
+    scale = vehicle.size / 0.23
+    yield np.zeros(3), max(vehicle.hull)
+    for rotor in vehicle.rotors:
+        tip, up = np.array(rotor.position), np.array(rotor.axis)
+        yield tip + vehicle.rotor_height * up, np.hypot(1.0, 0.005 / 0.06) * rotor.radius
+        for middle in (1 / 6, 3 / 6, 5 / 6):
+            yield middle * tip, np.linalg.norm(tip) / 6 + 0.008 * scale
+    x, y, z = vehicle.foot
+    for ahead, left in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        yield np.array([ahead * x, left * y, z + 0.008 * scale]), 0.008 * scale
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_clearance_is_a_lower_bound_of_the_distance_to_what_can_touch(name):
+    """Small balls about each part of an aircraft, as far as the farthest part or less."""
+    vehicle, rng, count = VEHICLES[name], np.random.default_rng(1), 96
+    scene = Scene([Sphere("ball", radius=0.02 * vehicle.scale)])
+    level = flown(scene, {}, np.zeros((count, 3)), 0, vehicle=vehicle)[0]
+    model, data = level.model, mujoco.MjData(level.model)
+    ball, parts = level.solids.geoms[0], np.flatnonzero(level.model.geom_bodyid == 1)
+    near = model.geom_pos[rng.choice(parts, count)]
+    way = rng.normal(size=(count, 3))
+    away = rng.uniform(0, 0.3, (count, 1)) * vehicle.size
+    places = near + away * way / np.linalg.norm(way, axis=1, keepdims=True)
+    made = flown(scene, {"ball": Pose(places)}, np.zeros((count, 3)), 0, vehicle=vehicle)[0]
+    measured, touches = np.zeros(count), np.zeros(count, dtype=bool)
+    for row in range(count):
+        model.geom_pos[ball] = made.solids.poses[row, 0, :3]
+        data.qpos[:] = made.qpos[row]
+        mujoco.mj_forward(model, data)
+        measured[row] = min(mujoco.mj_geomDistance(model, data, ball, k, 9.0, None) for k in parts)
+        touches[row] = data.ncon > 0
+    free = measured > 1e-6
+    assert (made.clearance() <= np.where(free, measured, 0.0) + 1e-6).all()
+    assert touches.sum() > 10 and free.sum() > 10 and (made.clearance()[touches] < 0).all()
+    # By the size of the hull at most; it is a ball there, and each disc another one.
+    coarse = max(*vehicle.hull, *(rotor.radius for rotor in vehicle.rotors))
+    assert (made.clearance()[free] > measured[free] - coarse).all()
+
+
 @pytest.mark.parametrize("solid", EVERY.solids, ids=EVERY.names)
 def test_clearance_is_the_distance_that_mujoco_measures(solid):
     scene = Scene([solid])
@@ -65,10 +107,7 @@ def test_clearance_is_the_distance_that_mujoco_measures(solid):
     found = engine.clearance()
     spec = mujoco.MjSpec()
     scene.add_to(spec)
-    centres = [np.zeros(3)] + [
-        np.array(r.position) + PAPER.rotor_height * np.array(r.axis) for r in PAPER.rotors
-    ]
-    radii = [max(PAPER.hull)] + [rotor.radius for rotor in PAPER.rotors]
+    centres, radii = zip(*enclosing(PAPER), strict=True)
     body = spec.worldbody.add_body(mocap=True)
     for k, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
         kind = mujoco.mjtGeom.mjGEOM_SPHERE
@@ -113,6 +152,37 @@ def test_both_engines_stop_at_a_post_and_say_how_fast_it_was_hit(count):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("name", VEHICLES)
+def test_a_post_between_hull_and_rotor_is_touched(name, engine):
+    """A post half as thick as an arm, in the middle of what hull and discs leave of one."""
+    vehicle = VEHICLES[name]
+    tip = np.array(vehicle.rotors[0].position)
+    arm = np.linalg.norm(tip)
+    middle = (max(vehicle.hull) + arm - vehicle.rotors[0].radius) / 2 / arm * tip
+    across = np.array([[-tip[1], tip[0], 0.0]]) / arm
+    scene = Scene([Cylinder("post", radius=0.002 * vehicle.scale, height=4.0)])
+    pose = {"post": Pose(middle + 2.0 * vehicle.size * across)}
+    velocity = 10.0 * vehicle.size * across
+    hits = flown(scene, pose, velocity, steps=6, engine=engine, vehicle=vehicle)[2]
+    assert hits[0, 0] == 1 and hits[0, 1] > 2 * vehicle.size
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_a_post_in_the_way_of_an_arm_swings_the_aircraft_around_it(engine):
+    """A post of 6 cm half-way along the arm of the paper's aircraft, at 2 m/s.
+
+    The impulse J at 0.12 m takes J / m of its speed and turns it by 0.12 J / J_z, so that the arm
+    stops: 2 = J (1 / 0.65 + 0.12^2 / 0.013), of which 1.16 m/s are the speed's, in still air.
+    """
+    scene = Scene([Cylinder("post", radius=0.03, height=4.0)])
+    pose = {"post": Pose(np.array([[0.122, 1.0, 0.0]]))}
+    _, track, hits = flown(scene, pose, [[0.0, 2.0, 0.0]], steps=10, engine=engine)
+    assert hits[0].tolist() == [1.0, pytest.approx(1.98, abs=0.02)]
+    speed = (track[-1, 0, 1] - track[-5, 0, 1]) / 0.4
+    assert 0.3 < speed < 2.0 - 1.16
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 @pytest.mark.parametrize("solid", EVERY.solids, ids=EVERY.names)
 def test_a_size_of_a_row_acts_as_the_declared_one(solid, engine):
     count, name = 4, solid.name
@@ -150,8 +220,7 @@ def test_among_many_posts_the_nearest_is_known_all_the_way(engine):
     velocity = np.array([[5.0, 0, 0], [5.0, 0.02, 0], [4.5, -0.02, 0]])
     flight, track, hits = flown(scene, poses, velocity, steps=30, engine=engine)
     assert (hits[:, 0] > 0).all() and (track[:, :, 0].max(axis=0) < 7.75).all()
-    parts = [(np.zeros(3), max(PAPER.hull))]
-    parts += [(np.array(r.position), r.radius) for r in PAPER.rotors]
+    parts = list(enclosing(PAPER))
     # Level, since nothing has been touched.
     before = np.maximum.accumulate(track[:, :, 0]) < 7.0
     free = [

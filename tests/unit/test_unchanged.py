@@ -6,6 +6,7 @@ share of the largest number of the same kind in the record. Flags must be the sa
 
 import functools
 import json
+import math
 from pathlib import Path
 
 import helpers
@@ -18,6 +19,7 @@ from quadrl.aircraft.rotors import GRAVITY, plus
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.control import modes
 from quadrl.core.environment import Environment
+from quadrl.engines import mjcf
 from quadrl.engines.state import Start
 
 EVERY = 6  # control steps between two recorded observations
@@ -50,6 +52,7 @@ class AsRecorded(modes.ThrustBodyRate):
 @pytest.fixture(autouse=True)
 def as_recorded(monkeypatch):
     monkeypatch.setitem(modes.CONTROL_MODES, AsRecorded.name, AsRecorded)
+    monkeypatch.setattr(mjcf, "ARM_RADIUS", math.inf)  # arms touched nothing
 
 
 def vehicle_of(old):

@@ -3,54 +3,34 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define LANES 1
-#include "aero.h"
 #include "export.h"
 #include "solids.h"
 
-// Addresses of the rows of a simulation: qpos (7) of aircraft i is at i * stride doubles, its
-// parameters are at i * row doubles (0: the same for all), its solids, `count` of them, at i *
-// count, and its list of the nearest ones at i.
+// A ball about some of what can touch of an aircraft: its centre, body frame, its radius, and how
+// far from the centre of mass it reaches [m].
 typedef struct {
-  const double *qpos, *parameters;
+  double centre[3], radius, reach;
+} Ball;
+
+// Addresses of the rows of a simulation: qpos (7) of aircraft i is at i * stride doubles, its
+// solids, `count` of them, are at i * count, and its list of the nearest ones at i. balls: those of
+// all aircraft, at least one, the one that reaches farthest first.
+typedef struct {
+  const double* qpos;
+  const Ball* balls;
   const Solid* solids;
   Nearby* nearby;
-  int64_t stride, row, count, rotors;
+  int64_t stride, count, parts;
 } Rows;
 
 enum { AHEAD = 4, CACHE_LINE = 64 };  // aircraft, bytes
 
-// Spheres around the hull and around each rotor's disc, body frame, and the radius of a sphere
-// about the centre of mass that encloses them.
-typedef struct {
-  double centre[MAX_ROTORS + 1][3], radius[MAX_ROTORS + 1], reach;
-} Outline;
-
-static Outline outline_of(const Aircraft* a, int64_t rotors) {
-  Outline o = {0};
-  for (int j = 0; j < 3; ++j) {
-    if (a->hull[j][0] > o.radius[0]) o.radius[0] = a->hull[j][0];
-  }
-  o.reach = o.radius[0];
-  for (int64_t k = 1; k <= rotors; ++k) {
-    const Rotor* rotor = a->rotor + k - 1;
-    double squares = 0;
-    for (int j = 0; j < 3; ++j) {
-      const double at = rotor->position[j][0] + a->rotor_height[0] * rotor->axis[j][0];
-      o.centre[k][j] = at;
-      squares += at * at;
-    }
-    o.radius[k] = rotor->radius[0];
-    if (sqrt(squares) + o.radius[k] > o.reach) o.reach = sqrt(squares) + o.radius[k];
-  }
-  return o;
-}
-
-// Distance [m] of the nearest solid from the spheres of the outline, a lower bound of the
-// clearance, for the aircraft first..last-1, or for those of ids.
+// Distance [m] of the nearest solid from the balls, a lower bound of the clearance, for the aircraft
+// first..last-1, or for those of ids.
 QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t last,
                                        const int64_t* ids, double* out) {
-  Outline own = outline_of((const Aircraft*)rows->parameters, rows->rotors);
+  const Ball* balls = rows->balls;
+  const double reach = balls->reach;
   for (int64_t row = first; row < last; ++row) {
     const int64_t i = ids ? ids[row] : row;
     const double* p = rows->qpos + i * rows->stride;
@@ -58,16 +38,7 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
     const double r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
                          2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                          2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
-    if (rows->row) {
-      own = outline_of((const Aircraft*)(rows->parameters + i * rows->row), rows->rotors);
-    }
-    double points[MAX_ROTORS + 1][3], least = HUGE_VAL;
-    for (int64_t k = 0; k <= rows->rotors; ++k) {
-      const double* c = own.centre[k];
-      for (int j = 0; j < 3; ++j) {
-        points[k][j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
-      }
-    }
+    double least = HUGE_VAL;
     const Solid* solids = rows->solids + i * rows->count;
     Nearby* list = rows->nearby + i;
     // The list of an aircraft ahead is not in the cache: fetch it as far as its two nearest solids.
@@ -81,20 +52,34 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
     // List anew if some part of the aircraft may be nearer to a solid that is not listed.
     const double *then = list->distance, *next = then + LISTED;
     double way = way_since(list, p);
-    if (!(then[0] + 2 * way + own.reach < *next)) {
+    if (!(then[0] + 2 * way + reach < *next)) {
       list_nearest(solids, rows->count, p, list);
       way = way_since(list, p);
     }
-    const int all = !(then[0] + 2 * way + own.reach < *next);
+    const int all = !(then[0] + 2 * way + reach < *next);
     const int64_t count = all || rows->count < LISTED ? rows->count : LISTED;
     for (int64_t s = 0; s < count; ++s) {
       // Most solids need no closer look: no part of the aircraft is nearer to this one than that,
       // nor to any of those after it, which were farther when they were listed.
-      if (!all && then[s] - way - own.reach > least) break;
+      if (!all && then[s] - way - reach > least) break;
       const Solid* solid = (all ? solids : list->solid) + s;
-      if (solid_distance(solid, p) - own.reach > least) continue;
-      for (int64_t k = 0; k <= rows->rotors; ++k) {
-        const double free = solid_distance(solid, points[k]) - own.radius[k];
+      const double away = solid_distance(solid, p);
+      if (away - reach > least + ROUNDING) continue;
+      double normal[3] = {0}, along[3];
+      if (away > 0) solid_normal(solid, p, away, normal);
+      for (int j = 0; j < 3; ++j) {
+        along[j] = r[j] * normal[0] + r[3 + j] * normal[1] + r[6 + j] * normal[2];
+      }
+      for (const Ball* ball = balls; ball < balls + rows->parts; ++ball) {
+        if (away - ball->reach > least + ROUNDING) break;  // nor does what reaches less far
+        const double *c = ball->centre, off = along[0] * c[0] + along[1] * c[1] + along[2] * c[2];
+        // The distance from something convex grows at least as its slope says.
+        if (away > 0 && away + off - ball->radius > least + ROUNDING) continue;
+        double place[3];
+        for (int j = 0; j < 3; ++j) {
+          place[j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
+        }
+        const double free = solid_distance(solid, place) - ball->radius;
         least = free < least ? free : least;
       }
     }

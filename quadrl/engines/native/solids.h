@@ -11,13 +11,38 @@ typedef struct {
   double kind, size[3], position[3], turn[9];
 } Solid;
 
-// Signed distance of a point from the surface of a solid [m]; negative inside.
-static double solid_distance(const Solid* s, const double point[3]) {
-  double away[3], local[3], out = 0, in;
+// A point in a solid's own frame.
+static inline void to_solid(const Solid* s, const double point[3], double local[3]) {
+  double away[3];
   for (int k = 0; k < 3; ++k) away[k] = point[k] - s->position[k];
   for (int k = 0; k < 3; ++k) {
     local[k] = s->turn[k] * away[0] + s->turn[3 + k] * away[1] + s->turn[6 + k] * away[2];
   }
+}
+
+// Unit vector to a point outside of a solid from the nearest one of it, at a distance.
+static inline void solid_normal(const Solid* s, const double point[3], double distance,
+                                double normal[3]) {
+  double local[3], off[3], squares;
+  to_solid(s, point, local);
+  squares = local[0] * local[0] + local[1] * local[1];
+  const double round = sqrt(s->kind == SPHERE ? squares + local[2] * local[2] : squares);
+  for (int k = 0; k < 3; ++k) {
+    const int is_round = s->kind == SPHERE || (s->kind == CYLINDER && k < 2);
+    const double from = is_round ? round : fabs(local[k]);
+    const double past = from - s->size[is_round ? 0 : s->kind == CYLINDER ? 1 : k];
+    off[k] = past > 0 ? past * local[k] / from : 0;
+  }
+  for (int k = 0; k < 3; ++k) {
+    normal[k] = s->turn[3 * k] * off[0] + s->turn[3 * k + 1] * off[1] + s->turn[3 * k + 2] * off[2];
+    normal[k] /= distance;
+  }
+}
+
+// Signed distance of a point from the surface of a solid [m]; negative inside.
+static double solid_distance(const Solid* s, const double point[3]) {
+  double local[3], out = 0, in;
+  to_solid(s, point, local);
   if (s->kind == SPHERE) {
     return sqrt(local[0] * local[0] + local[1] * local[1] + local[2] * local[2]) - s->size[0];
   }
