@@ -15,13 +15,13 @@ from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.progress import ProgressBar
 from quadrl.base.signals import heeded
 from quadrl.base.units import percent
-from quadrl.base.validation import number, seeds
+from quadrl.base.validation import seeds
 from quadrl.cli import choices
 from quadrl.cli.console import again, console, make_table, reason, say
 from quadrl.cli.flown import parsed
 from quadrl.cli.parsing import trained
 from quadrl.cli.study import carry_out
-from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
+from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import flat
@@ -76,8 +76,6 @@ class Train:
     seeds: str = ""
     """Train several seeds as a study and summarize: 0:5 for 0 to 4, or 3,5,8. The same command
     resumes a stopped study."""
-    episodes: int = 100
-    """Episodes of the evaluation at the end."""
     video: bool = True
     """Draw a flight at the end (not with --seeds)."""
     dry_run: bool = False
@@ -111,14 +109,13 @@ class Train:
             if other is not None:
                 raise QuadrlError(name=name, value=str(other), allowed="left out beside --seeds")
         given, config = seeds(self.seeds, MAX_SEED), TrainConfig(task or "hover", **settings)
-        settings.pop("algo", None)
+        settings = {k: v for k, v in settings.items() if k not in ("algo", "episodes")}
         what = {"tasks": [config.task], "algorithms": [config.algo], "seeds": given,
-                "episodes": self.episodes, "settings": settings}  # fmt: skip
+                "episodes": config.episodes, "settings": settings}  # fmt: skip
         carry_out(what, out=self.out or Path("runs", f"{config.task}-{config.algo}-seeds"))
 
     def _train(self, config: TrainConfig, folder: Path) -> Run:
         """Train and evaluate, and print the result."""
-        number("episodes", self.episodes, 1, MAX_EPISODES, whole=True)
         began = time.perf_counter()
         with console.status("importing torch and TorchRL"):
             from quadrl.learning.run import train_in
@@ -135,7 +132,6 @@ class Train:
                     folder,
                     config,
                     resume=self.resume is not None,
-                    episodes=self.episodes,
                     show=bar.show,
                     heed=heeded,
                 )

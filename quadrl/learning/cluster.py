@@ -76,7 +76,7 @@ class Nodes(Local):
             folder.mkdir(parents=True, exist_ok=True)
         needs = {"num_cpus": 1, "num_gpus": int(run.config.device.startswith("cuda"))}
         remote = self.ray.remote(max_retries=-1, **needs)(carry_out_here)
-        what, log = order(run, self.episodes, self.own), run.log.absolute()
+        what, log = order(run, self.own), run.log.absolute()
         return Task(self.ray, remote.remote(what, log))
 
 
@@ -99,7 +99,7 @@ def on_ray(address: str, local: Local) -> Generator[Nodes]:
     if mine:
         _connect(ray, address, local.jobs)
     try:
-        yield Nodes(local.episodes, local.jobs, local.own, ray)
+        yield Nodes(local.jobs, local.own, ray)
     finally:
         if mine:
             ray.shutdown()

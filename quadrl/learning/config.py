@@ -29,7 +29,7 @@ from quadrl.core.record import import_again, warn_of_changes
 from quadrl.core.scenario import KEYWORDS, Scenario
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
-from quadrl.evaluation.rollout import MAX_SEED
+from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning import foreign
 from quadrl.learning.defaults import PAIRS, flat, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, read_config
@@ -158,6 +158,7 @@ class TrainConfig(TrainSettings):
             ("num_threads", 0, MAX_THREADS, {"whole": True}),
             ("memory_width", 1, MAX_WIDTH, {"whole": True}),
             ("evaluations", 0, math.inf, {"whole": True}),
+            ("episodes", 1, MAX_EPISODES, {"whole": True}),
             ("gamma", 0, 1, {}),
             ("gae_lambda", 0, 1, {}),
             ("initial_deviation", 0.01, math.e, {}),

@@ -87,13 +87,12 @@ class End:
     """Whether its process or its machine died, and another attempt may succeed."""
 
 
-def order(run: PlannedRun, episodes: int, own: Iterable[Path] = ()) -> dict[str, Any]:
+def order(run: PlannedRun, own: Iterable[Path] = ()) -> dict[str, Any]:
     """Make the order for a process: train and evaluate, after importing files of one's own."""
     return {
         "config": dataclasses.asdict(run.config),
         "versions": run.config.resolved()["versions"],
         "folder": str(run.folder.absolute()),
-        "episodes": episodes,
         "own": [str(path.absolute()) for path in own],
     }
 
@@ -156,7 +155,6 @@ class Process:
 class Local:
     """Processes on this machine."""
 
-    episodes: int
     jobs: int | None = None
     """Trainings at a time; None for one per core."""
     own: tuple[Path, ...] = ()
@@ -167,7 +165,7 @@ class Local:
 
     def begin(self, run: PlannedRun) -> Any:
         """Begin a training, or continue it; returns what can `poll` and `stop` it."""
-        return Process(order(run, self.episodes, self.own), run.log)
+        return Process(order(run, self.own), run.log)
 
 
 def train_all(

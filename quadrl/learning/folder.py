@@ -37,8 +37,8 @@ WARNINGS = "warnings.txt"
 """MuJoCo's warnings during the training, if there were any."""
 LOCK = "training.lock"
 """Host and process of the training that works here, if the file system has no locks."""
-FREE = ("num_threads", "checkpoint_seconds", "evaluations")
-"""Settings that do not change the result."""
+FREE = ("num_threads", "checkpoint_seconds", "evaluations", "episodes")
+"""Settings that do not change what is trained."""
 CHANGEABLE = (*FREE, "steps", "device")
 """Settings that may have other values when a run is continued."""
 DRAWN = {"steps", "seconds", "return", "success", "error", "survival"}

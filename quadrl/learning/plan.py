@@ -13,7 +13,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import read_table
 from quadrl.base.validation import choice, keys, names, number
 from quadrl.base.validation import seeds as seeds_of
-from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
+from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning import foreign
 from quadrl.learning.config import ALIASES, TrainConfig, algorithm_of
 from quadrl.learning.defaults import merged
@@ -26,11 +26,11 @@ OWN = {
     "task": "the key tasks",
     "algo": "the key algorithms",
     "seed": "the key seeds",
+    "episodes": "the key episodes",
     "num_threads": "left out: a training of a study has one thread",
 }
 """Settings that no table of a study may hold, and what to write instead."""
 MAX_RUNS = 10_000
-EPISODES = 100
 
 
 class Plan(NamedTuple):
@@ -38,8 +38,6 @@ class Plan(NamedTuple):
 
     folder: Path
     runs: tuple[PlannedRun, ...]
-    episodes: int
-    """Episodes of the evaluation at the end of each."""
 
 
 def read_plan(what: str | Path | Mapping[str, Any], out: Path | None) -> Plan:
@@ -71,7 +69,7 @@ def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
     tasks = names("tasks", content["tasks"])
     algorithms = names("algorithms", content.get("algorithms", ["ppo"]))
     seeds = seeds_of(content.get("seeds", [0]), MAX_SEED)
-    episodes = number("episodes", content.get("episodes", EPISODES), 1, MAX_EPISODES, whole=True)
+    own = {"episodes": content.get("episodes", TrainConfig.episodes), "num_threads": 1}
     whole = {"tasks": tasks, "algorithms": algorithms}
     common = _settings("settings", content.get("settings", {}), algorithms)
     only = _only(content.get("only", []), whole)
@@ -88,14 +86,14 @@ def _plan(content: Mapping[str, Any], folder: Path) -> Plan:
                 mine = {name: value for name, value in some.items() if name not in others}
                 settings = merged(settings, mine)
         try:
-            config = TrainConfig(task, algo=algo, seed=seed, num_threads=1, **settings)
+            config = TrainConfig(task, algo=algo, seed=seed, **own, **settings)
         except QuadrlError as error:
             raise QuadrlError(f"{name}: {error}") from error
         other = known.setdefault(json.dumps(dataclasses.asdict(config), sort_keys=True), name)
         if other != name:
             raise QuadrlError(f"{other} and {name} have the same settings: remove one of them")
         runs.append(PlannedRun(config, folder / name, variant))
-    return Plan(folder, tuple(runs), episodes)
+    return Plan(folder, tuple(runs))
 
 
 def _settings(key: str, given: Any, algorithms: list[str]) -> dict[str, Any]:

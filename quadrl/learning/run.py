@@ -12,12 +12,10 @@ from typing import Any
 
 from quadrl.base.files import write_csv, write_json
 from quadrl.base.progress import Progress, ProgressBar
-from quadrl.base.validation import number
 from quadrl.control.feasibility import warn_of_unreached
 from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import MAX_EPISODES
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import written
 from quadrl.learning.folder import (
@@ -130,7 +128,6 @@ def train(
     *,
     out: str | Path | None = None,
     resume: str | Path | None = None,
-    episodes: int = 100,
     on_progress: Callable[[Progress], None] | None = None,
     **settings: Any,
 ) -> Run:
@@ -141,8 +138,8 @@ def train(
         out: Folder of the run; by default runs/TASK-ALGO-SEED, with a number behind it if that
             holds a run already.
         resume: Continue the run in this folder, with its own settings. Of the settings only
-            `steps`, `device`, `num_threads` and `checkpoint_seconds` may be given.
-        episodes: Episodes of the evaluation at the end.
+            `steps`, `device`, `num_threads`, `checkpoint_seconds`, `evaluations` and `episodes` may
+            be given.
         on_progress: Called after each iteration; by default a progress bar is shown.
         **settings: Fields of `TrainConfig`: `seed`, `algo`, `vehicle`, `steps`, ...
 
@@ -156,7 +153,7 @@ def train(
     config, folder = prepare(task, out, resume, settings)
     with ProgressBar() as bar:
         show = on_progress or bar.show
-        return train_in(folder, config, resume=resume is not None, episodes=episodes, show=show)
+        return train_in(folder, config, resume=resume is not None, show=show)
 
 
 def train_in(
@@ -164,24 +161,22 @@ def train_in(
     config: TrainConfig,
     *,
     resume: bool,
-    episodes: int,
     show: Callable[[Progress], None],
     heed: Callable[[Callable[..., None]], AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> Run:
     """Train as `train` does, with prepared settings and folder, within `heed(training.ask)`."""
-    number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = config.scenario
     asked = scenario.randomization, scenario.control_mode, scenario.mean_wind, scenario.lands
     warn_of_unreached(scenario.aircraft, *asked)
     training = Training(config, folder, resume=resume)
     with heed(training.ask):
         policy = training.run(_evaluating(training, show) if config.evaluations else show)
-    found = evaluate(policy, scenario, episodes=episodes)
+    found = evaluate(policy, scenario, episodes=config.episodes)
     seconds = round(training.seconds, 2)
     record = {"training_s": seconds, "scenario": scenario.to_json()}
     late: dict[float, float] = {}
     for dead_time in DEAD_TIMES if scenario.vehicle.dead_time else ():
-        other = evaluate(policy, scenario, episodes=episodes, engine="free_flight",
+        other = evaluate(policy, scenario, episodes=config.episodes, engine="free_flight",
                          vehicle_options={"dead_time": dead_time})  # fmt: skip
         late[dead_time] = float(other.metrics["success_rate"])
     if late:

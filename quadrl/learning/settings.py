@@ -248,3 +248,5 @@ class TrainSettings:
     """Number of evaluations, evenly over the training: the policy of the moment flies 50 episodes
     with its mean action, in free flight, for a row of evaluations.csv. They count in the seconds of
     the training."""
+    episodes: int = 100
+    """Episodes of the evaluation at the end."""

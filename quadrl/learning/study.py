@@ -158,7 +158,7 @@ def study(
         plan = read_plan(what, None if out is None else Path(out))
     if jobs is not None:
         number("jobs", jobs, 1, MAX_JOBS, whole=True)
-    here = Local(plan.episodes, jobs, own)
+    here = Local(jobs, own)
     with on_ray(ray, here) if ray else contextlib.nullcontext(here) as executor:
         failed = train_all(plan.runs, executor, on_line)
     found = sum_up(plan, failed)

@@ -56,8 +56,8 @@ def carry_out(what: dict[str, Any]) -> None:
         time.sleep(POLL_SECONDS)
     if PlannedRun(config, folder).done:  # by the lost one
         return
-    given: Any = {"resume": (folder / CONFIG).exists(), "episodes": what["episodes"]}
-    finished = train_in(folder, config, **given, show=lambda progress: None, heed=heeded)
+    resume = (folder / CONFIG).exists()
+    finished = train_in(folder, config, resume=resume, show=lambda progress: None, heed=heeded)
     for _ in finished.draw(video=False):
         pass
 

@@ -190,7 +190,7 @@ def test_a_training_waits_until_a_lost_one_has_left_its_folder(tmp_path):
     (run,) = read_plan(STUDY | {"seeds": [0], "settings": SHORT}, tmp_path).runs
     run.folder.mkdir()
     unlock = lock_folder(run.folder)
-    process = Process(executor.order(run, 2), tmp_path / "log.txt")
+    process = Process(executor.order(run), tmp_path / "log.txt")
     try:
         time.sleep(15)  # in which it would have ended, well or with an error
         assert process.poll() is None
@@ -249,7 +249,7 @@ def test_a_folder_that_the_machines_do_not_share_is_named(tmp_path):
     (run, _) = read_plan(STUDY, tmp_path / "elsewhere").runs
     own = Path("own.py").absolute()
     for missing in (run.folder, own):
-        end = carry_out_here(executor.order(run, 2, [own]), tmp_path / "log.txt")
+        end = carry_out_here(executor.order(run, [own]), tmp_path / "log.txt")
         assert str(missing) in end.message and "--out" in end.message and not end.lost
         run.folder.mkdir(parents=True, exist_ok=True)
 

@@ -348,8 +348,11 @@ def test_the_name_of_a_task_flies_the_policy_that_ships(capsys, refusal):
 def test_resume_takes_the_settings_of_the_run(run, copy, undrawn):
     for name in ("policy.safetensors", "checkpoint.safetensors", "metrics.csv"):
         (copy / name).unlink()
-    assert command("train", "--resume", copy, "--no-video", "--episodes", "2") == 0
+    assert command("train", "--resume", copy, "--no-video") == 0
     assert (copy / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
+    for words, episodes in (((), 2), (("--episodes", "3"), 3), ((), 3)):  # as many as it was given
+        assert command("train", "--resume", copy, "--no-video", *words) == 0
+        assert json.loads((copy / "evaluation.json").read_text())["episodes"] == episodes
 
 
 @pytest.mark.parametrize("name", sorted(tasks.TASKS))

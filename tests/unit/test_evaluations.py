@@ -16,8 +16,8 @@ def trained(folder, *, last=None, resume=False, **settings):
         if progress.iteration == last:
             raise Stop
 
-    given = {"resume": resume, "episodes": 2, "show": show}
-    return train_in(folder, changed(**settings), **given)
+    given = {"resume": resume, "show": show}
+    return train_in(folder, changed(episodes=2, **settings), **given)
 
 
 def test_policies_are_evaluated_along_the_way_and_end_as_without(tmp_path):

@@ -12,7 +12,7 @@ from quadrl.base.signals import Stopped, heeded
 from quadrl.learning import checkpoint
 from quadrl.learning.run import train_in
 
-RARE = changed(checkpoint_seconds=1e9)
+RARE = changed(checkpoint_seconds=1e9, episodes=1)
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +41,7 @@ def sent(*signals, after=2):
 
 
 def run(folder, show, **given):
-    return train_in(folder, RARE, resume=False, episodes=1, show=show, **given)
+    return train_in(folder, RARE, resume=False, show=show, **given)
 
 
 def saved(folder):

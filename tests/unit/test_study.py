@@ -49,12 +49,14 @@ def write(tmp_path):
 
 def test_every_combination_is_planned(write, tmp_path):
     plan = read_plan(write(STUDY), tmp_path / "out")
-    assert len(plan.runs) == 2 * 2 * 2 * 2 and plan.episodes == 7
+    assert len(plan.runs) == 2 * 2 * 2 * 2 and {run.config.episodes for run in plan.runs} == {7}
     names = [run.name for run in plan.runs]
     assert names[:2] == ["hover-ppo-narrow-3", "hover-ppo-wide-3"] and len(set(names)) == 16
     wide = next(run for run in plan.runs if run.name == "landing-ppo-wide-4")
     ppo = {"epochs": 2, "minibatch": 64}
-    alone = TrainConfig("landing", seed=4, steps=4096, hidden=(256,), ppo=ppo, num_threads=1)
+    alone = TrainConfig(
+        "landing", seed=4, steps=4096, hidden=(256,), ppo=ppo, num_threads=1, episodes=7
+    )
     assert wide.config == alone and wide.folder == tmp_path / "out" / "landing-ppo-wide-4"
 
 
@@ -92,6 +94,7 @@ def test_json_and_a_dict_are_the_same(write):
         (("steps = 4096", "apg = {epochs = 3}"), "hover-ppo-narrow-3: apg.epochs = 3: .*left out"),
         (("steps = 4096", "seed = 4"), r"settings.seed = 4: must be the key seeds"),
         (("steps = 4096", "num_threads = 4"), "settings.num_threads"),
+        (("steps = 4096", "episodes = 4"), "settings.episodes = 4: must be the key episodes"),
         (("hidden = [256]", "hiden = [256]"), "setting in variants.wide = 'hiden'"),
         (("hidden = [256]", "hidden = [0]"), "hover-ppo-wide-3: width of a hidden layer = 0"),
         (("epochs = 2", "epoch = 2"), "hover-ppo-narrow-3: .*epoch"),
