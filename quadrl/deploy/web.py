@@ -92,6 +92,7 @@ def make_book() -> tuple[dict[str, Any], str]:
         for vehicle in VEHICLES.values():
             environment = Environment(task, vehicle=vehicle, seed=0)
             source, drawn = flights.write(environment)
+            about = world(environment.engine.model, vehicle.physics_timestep)
             sources.append(source)
             pairs[f"{task.name}_{vehicle.name}"] = {
                 "drawn": drawn,
@@ -99,7 +100,7 @@ def make_book() -> tuple[dict[str, Any], str]:
                 "besideAim": [beside_aim(environment, Aim(beside_goal=x)) for x in (False, True)],
                 "origin": environment.origin.tolist(),
                 # JSON knows no infinity, which is where the floor of these tasks is.
-                "world": np.nan_to_num(world(environment.engine.model)).tolist(),
+                "world": np.nan_to_num(about).tolist(),
             }
     book = {
         "drawn": {

@@ -6,6 +6,7 @@ An engine takes rotor commands, advances some physics steps, and reports which a
 from __future__ import annotations
 
 import abc
+from collections.abc import Iterator
 from typing import Literal
 
 import mujoco
@@ -78,7 +79,10 @@ class Engine(abc.ABC):
         self.parameters = rows.view(parameters.AIRCRAFT)[:, 0]
         self.begun = self.parameters.copy()
         flown = self.model, fields, self.parameters, self._threads, self.solids
-        self._free_flight = FreeFlight(*flown) if name == "free_flight" else None
+        step = vehicle.physics_timestep
+        self._free_flight = FreeFlight(*flown, step) if name == "free_flight" else None
+        self.finer = round(step / self.model.opt.timestep)
+        """Steps of the model in a physics step."""
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
         self._middle: Frame | None = None
@@ -131,6 +135,24 @@ class Engine(abc.ABC):
     @abc.abstractmethod
     def advance(self, steps: int) -> None:
         """Fly some physics steps with the commands in `ctrl`."""
+
+    def contact_steps(self, steps: int, rows: np.ndarray | None = None) -> Iterator[int]:
+        """Put solids that move where they are in each step of the model.
+
+        Args:
+            steps: Physics steps; one, if solids move.
+            rows: Which aircraft MuJoCo flies, (n,); None for all.
+
+        Yields:
+            Steps of the model, which MuJoCo is to fly then.
+        """
+        if not self.solids.moves:
+            yield steps * self.finer
+            return
+        rows = np.arange(self.num_envs) if rows is None else rows
+        for k in range(steps * self.finer):
+            self.solids.stand(rows, (k + 0.5) / self.finer)
+            yield 1
 
     def leg(self, steps: int) -> Leg:
         """Copy the state, commands, air and parameters of the next steps, for their derivatives.

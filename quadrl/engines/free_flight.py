@@ -35,6 +35,7 @@ class FreeFlight:
         table: np.ndarray,
         threads: Threads,
         solids: Solids,
+        step: float,
     ) -> None:
         """Check the model and take the addresses.
 
@@ -44,13 +45,14 @@ class FreeFlight:
             table: Rows of parameters (N,), or one (1,) for all, which is live.
             threads: Threads to fly on.
             solids: The solids about the aircraft.
+            step: Physics step [s].
 
         Raises:
             QuadrlError: The model holds something that free flight does not know.
         """
         _check(model)
         self._kernel, self._threads = native.library().quadrl_free_flight, threads
-        self.world = world(model)
+        self.world = world(model, step)
         self._near = np.zeros(len(fields["qpos"]), dtype=np.int8)
         # As the kernels read them: the row, or blocks of LANES rows side by side.
         self.parameters, block, rotors = table, 0, fields["act"].shape[1]
@@ -84,8 +86,8 @@ class FreeFlight:
         return np.flatnonzero(self._near) if marked else None
 
 
-def world(model: mujoco.MjModel) -> np.ndarray:
-    """Physics step [s], gravity along z [m/s^2], floor and reach [m]: `World` of the kernel.
+def world(model: mujoco.MjModel, step: float) -> np.ndarray:
+    """The kernel's World: physics step, as given [s], gravity along z [m/s^2], floor and reach [m].
 
     An aircraft may touch the ground if its centre of mass is below the floor, and a solid if it is
     within the reach of it.
@@ -98,7 +100,7 @@ def world(model: mujoco.MjModel) -> np.ndarray:
         ground = ~own
         ground[geoms_of_solids(model)] = False
         floor = model.geom_pos[ground, 2].max(initial=0.0) + reach + MARGIN
-    return np.array([model.opt.timestep, model.opt.gravity[2], floor, reach + MARGIN])
+    return np.array([step, model.opt.gravity[2], floor, reach + MARGIN])
 
 
 def _check(model: mujoco.MjModel) -> None:

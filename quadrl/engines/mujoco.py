@@ -18,6 +18,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.engines import mjcf, native
 from quadrl.engines.engine import ENGINES, Engine, EngineName
 from quadrl.engines.free_flight import FIELDS
+from quadrl.engines.mjcf import CONTACT_STEPS
 
 MAX_ENVS = 1 << 20
 MAX_THREADS = 1024
@@ -90,7 +91,8 @@ class BatchEngine(Engine):
         if self._free_flight and (near := self._free_flight.advance(steps)) is None:
             return
         native.check_installed()
-        self.batch.step(near, nstep=steps)
+        for count in self.contact_steps(steps, near):
+            self.batch.step(near, nstep=count)
 
     def clear(self, rows: np.ndarray) -> None:
         """Reset MuJoCo's warm starts and warnings of some aircraft."""
@@ -145,7 +147,8 @@ class DataEngine(Engine):
         """
         if not self.fly(steps):
             native.check_installed()
-            mujoco.mj_step(self.model, self.data, steps)
+            for count in self.contact_steps(steps):
+                mujoco.mj_step(self.model, self.data, count)
 
     def fly(self, steps: int) -> bool:
         """Advance in free flight if possible, and return whether it was.
@@ -154,7 +157,7 @@ class DataEngine(Engine):
         """
         if self._free_flight is None or self._free_flight.advance(steps) is not None:
             return False
-        self.data.time += steps * self.model.opt.timestep
+        self.data.time += steps * self.vehicle.physics_timestep
         return True
 
     def clear(self, rows: np.ndarray) -> None:
@@ -216,12 +219,12 @@ def _check_model(model: mujoco.MjModel, vehicle: Vehicle) -> None:
     marked = model.nuser_body == parameters.ROW_SIZE and row[0] == parameters.MARK
     marked = marked and row.view(parameters.AIRCRAFT)["rotor_count"][0] == count
     rotors = sizes and (model.actuator_dynprm[:, native.MARK_SLOT] == parameters.MARK).all()
-    step, air = model.opt.timestep, parameters.AIR
+    finer, air = vehicle.physics_timestep / model.opt.timestep, parameters.AIR
     for right, what in (
         (sizes, f"7 positions, 6 velocities, {count} rotors, and nothing else that moves"),
         (marked and rotors, "the parameters of an aircraft: begin with quadrl.engines.mjcf.spec"),
         (model.nuserdata >= air, f"nuserdata of at least {air}, for the air"),
-        (step == vehicle.physics_timestep, f"the vehicle's step, {vehicle.physics_timestep} s"),
+        (finer in (1, CONTACT_STEPS), f"the vehicle's step, {vehicle.physics_timestep} s"),
     ):
         if not right:
             raise QuadrlError(f"a model to fly needs {what}")

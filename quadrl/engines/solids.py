@@ -80,6 +80,7 @@ class Solids:
         """Present poses (N, K, 7 or 13), as `place` takes them."""
         self.motion = np.zeros((count, len(self.geoms), 6))
         """Velocity [m/s] and angular velocity [rad/s] of the last move (N, K, 6), world frame."""
+        self._last = self.poses.copy()  # those at the beginning of the physics step
         self.moves = False
         """Whether any has moved since it was placed."""
 
@@ -94,8 +95,9 @@ class Solids:
         """
         if poses.shape[-1] != self.poses.shape[-1]:
             self.poses, poses = self._with_sizes(self.poses), self._with_sizes(poses)
+            self._last = self.poses.copy()
         if self.moves or not np.array_equal(self.poses[rows], poses):  # most stand where they stood
-            self.poses[rows], self.motion[rows] = poses, 0.0
+            self.poses[rows], self._last[rows], self.motion[rows] = poses, poses, 0.0
             self._stand(rows, poses)
 
     def _with_sizes(self, poses: np.ndarray) -> np.ndarray:
@@ -123,17 +125,16 @@ class Solids:
     def move(self, poses: np.ndarray, timestep: float) -> None:
         """Move the solids of all rows to poses, as `place` takes them, within a physics step [s].
 
-        During the step they stand half-way; contacts take into account the mean velocity and the
-        acceleration since the step before, which MuJoCo does not know.
+        Contacts take into account the mean velocity and the acceleration since the step before,
+        which MuJoCo does not know.
         """
-        last, self.moves, poses = self.poses.copy(), True, poses.copy()
+        last, self.moves, poses = self._last, True, poses.copy()
+        last[:] = self.poses
         # Of the two quaternions of an attitude the one nearer to the last.
         turns = (poses[..., 3:7] * last[..., 3:7]).sum(axis=-1, keepdims=True)
         poses[..., 3:7] *= np.where(turns < 0, -1.0, 1.0)
-        half = (last + poses) / 2
-        half[..., 3:7] /= np.linalg.norm(half[..., 3:7], axis=-1, keepdims=True)
-        self._stand(np.arange(len(poses)), half)
         self.poses[:] = poses
+        self.stand(np.arange(len(poses)), 0.5)
         velocity = (poses[..., :3] - last[..., :3]) / timestep
         motion = np.concatenate([velocity, _turn_rate(last, poses, timestep)], axis=-1)
         # Before the first step after a start no velocity is known.
@@ -141,6 +142,12 @@ class Solids:
         faster = np.where(known, (motion - self.motion) / timestep, 0.0)
         self._field("geom_user")[:, self.geoms, MOTION:] = np.concatenate([motion, faster], axis=-1)
         self.motion[:] = motion
+
+    def stand(self, rows: np.ndarray, share: float) -> None:
+        """Put the solids of some rows (n,) where they are after a share of the physics step."""
+        between = (1 - share) * self._last[rows] + share * self.poses[rows]
+        between[..., 3:7] /= np.linalg.norm(between[..., 3:7], axis=-1, keepdims=True)
+        self._stand(rows, between)
 
     def arrive(self) -> None:
         """Write the poses at the end of the last step, if they moved."""

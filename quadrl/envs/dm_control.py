@@ -79,15 +79,22 @@ class Physics(mujoco.Physics):
         return picture
 
     def step(self, nstep: int = 1) -> None:
-        """Advance by physics steps; a NativeError if callbacks are not those of the rotors."""
+        """Advance by steps of the model; a NativeError without the rotors' callbacks."""
         native.check_installed()
-        while nstep:
-            steps = self.inner_loop(nstep) if self.inner_loop else nstep
+        finer = self.engine.finer if self.engine is not None else 1
+        left, rest = divmod(nstep, finer)  # physics steps, and a part of one
+        while left:
+            steps = self.inner_loop(left) if self.inner_loop else left
             if self.engine is not None and self.engine.fly(steps):
                 self.forward()  # what is drawn and measured belongs to the new state
+            elif self.engine is not None:
+                for count in self.engine.contact_steps(steps):
+                    super().step(count)
             else:
                 super().step(steps)
-            nstep -= steps
+            left -= steps
+        if rest:
+            super().step(rest)
 
     @contextlib.contextmanager
     def check_invalid_state(self) -> Generator[None]:
@@ -213,4 +220,5 @@ def make(
     physics.engine = DataEngine(vehicle, model, data, altitude=scenario.altitude, engine=engine)
     environment = Environment(scenario, engine=physics.engine)
     quadrotor = QuadrotorTask(environment, random)
-    return control.Environment(physics, quadrotor, n_sub_steps=vehicle.substeps, **settings)
+    steps = vehicle.substeps * physics.engine.finer
+    return control.Environment(physics, quadrotor, n_sub_steps=steps, **settings)

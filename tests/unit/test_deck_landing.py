@@ -127,7 +127,9 @@ def test_a_touchdown_is_remembered_and_a_hard_one_fails():
     done = made.step(np.full((2, 4), -1.0))
     seen = made.snapshot.task
     assert (seen.down == 1).all() and done.terminated.tolist() == [False, True]
-    np.testing.assert_allclose(seen.speed, [0.2, 0.8], atol=0.05)
+    # On its last 3 mm it falls no faster than freely.
+    fell = np.sqrt(np.square([0.2, 0.8]) + 2 * 9.81 * 0.003)
+    assert (seen.speed > [0.19, 0.79]).all() and (seen.speed < fell + 0.01).all()
     np.testing.assert_allclose(seen.miss, 0.1, atol=0.02)
     np.testing.assert_allclose(seen.upright, 1.0, atol=1e-3)
 

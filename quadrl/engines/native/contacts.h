@@ -137,6 +137,11 @@ static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) 
     }
     // The feet are the aircraft's only spheres.
     const int foot = m->geom_type[own ? second : first] == mjGEOM_SPHERE;
+    if (contact->dist > 0) {  // they do not touch
+      const int held = grips && d->userdata[AIR + HIT + HELD] > 0;
+      if (held && foot && solid[GRIP] > 0) hold(m, d, a, body, solid[GRIP], way, arm);
+      continue;
+    }
     if (notes && foot) note_touch(m, d, body, way, moves);
     if (grips && foot && solid[GRIP] > 0) hold(m, d, a, body, solid[GRIP], way, arm);
     if (hit[0] > 0 && !(speed > hit[1])) continue;
