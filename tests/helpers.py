@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from quadrl import tasks
 from quadrl.aircraft import parameters
 from quadrl.aircraft.aerodynamics import Aerodynamics
-from quadrl.aircraft.presets import VEHICLES, in_real_air
+from quadrl.aircraft.presets import VEHICLES, in_real_air, with_effects
 from quadrl.aircraft.rotors import ring
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
@@ -45,7 +45,7 @@ ALIKE = ("mark", "size", "rotor_count", "effects", *parameters.DERIVED)
 """Numbers of a row that are the same in all: what kind of row it is, and what no force reads."""
 UP = np.array([0.0, 0.0, 100.0])  # [m]; where nothing is near
 _ROTOR = dict(thrust_coefficient=1.1e-5, torque_coefficient=2e-7, lag_up=20.0, lag_down=12.0)
-LAYOUTS = VEHICLES | {
+LAYOUTS = {name: with_effects(vehicle, "none") for name, vehicle in VEHICLES.items()} | {
     "eight": Vehicle(
         name="eight",
         mass=1.2,
@@ -68,7 +68,9 @@ LAYOUTS = VEHICLES | {
     ),
 }
 """Every preset, and layouts that no preset has."""
-_AIR = dataclasses.replace(Aerodynamics.full(), flapping_moment=2e-6, rotor_inertia=2e-5)
+_AIR = dataclasses.replace(
+    Aerodynamics.full(), flapping_moment=2e-6, flapping_pitch=0.6, rotor_inertia=2e-5
+)
 IN_AIR = {
     f"{name} in air": in_real_air(
         vehicle

@@ -73,8 +73,9 @@ def lift(rotor, air, speed, climb, across, noise=0.0):
     kappa /= 4 * rotor.thrust_coefficient
     momentum = 2 * air.air_density * area * w0 * w0
     w = flow_through(w0, kappa, min(max(climb, -2 * w0), 3 * w0), across)
-    w -= 1.85 * max(-2 * w0 - climb, 0.0)  # towards the windmill state
     total = rest + (momentum * kappa * (1 - w / w0) if w0 else 0.0)
+    # Towards the windmill state.
+    total += 2 * air.air_density * area * w0 * 0.9 * max(-2 * w0 - climb, 0.0)
     total += air.translational_lift * air.air_density * area * across * across
     deep = 1 - ((climb / (w0 + 1e-6) + 1.4) / 1.2) ** 2
     slow = 1 - (across / (0.95 * (w0 + 1e-6))) ** 2
@@ -128,8 +129,10 @@ def rotor_effects(x, vehicle, lag, air_velocity):
         momentum = rotor.spin * air.rotor_inertia * omega_k * axis
         force += push
         flapping = air.flapping_moment * omega_k * np.cross(across, axis)
+        sideways = np.linalg.norm(across, axis=-1, keepdims=True)
         most = 0.2 * rotor.disc * rotor.thrust_coefficient * omega_k**2
-        size = np.hypot(most, np.linalg.norm(flapping, axis=-1, keepdims=True))
+        size = np.hypot(most, air.flapping_moment * omega_k * sideways)
+        flapping[..., 1] *= air.flapping_pitch
         moment += np.cross(r, push) + flapping * most / np.maximum(size, 1e-300)
         moment -= rotor.spin * air.rotor_inertia * lag[..., k, None] * axis
         moment -= np.cross(omega, momentum)

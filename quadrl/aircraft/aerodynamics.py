@@ -20,14 +20,14 @@ from quadrl.base.validation import number
 
 DENSITIES = (1e-3, 100.0)  # [kg/m^3]
 MAX_BODY_LIFT = 2.0
+MAX_PITCH = 10.0
 MOST_OFFSET = 0.2
 """Largest distance of the centre of lift from the hub by `flapping_moment`, in radii (chosen)."""
 MOST_TAKEN = 0.36
 """Largest share of the flow through a disc that the ground takes: lift over 0.64."""
-WINDMILL = 1.85
-"""By how much the flow through a disc falls for each m/s of descent beyond 2 w0, on the way to the
-windmill state: chosen for 1.58 times the thrust of hover at 2.4 w0, a Crazyflie's by Johnson's
-model (NASA/TP-2005-213477)."""
+WINDMILL = 0.9
+"""By how much thrust grows for each m/s of descent beyond 2 w0, on the way to the windmill state,
+over 2 rho A w0: near what Johnson's model gives for each preset (NASA/TP-2005-213477)."""
 STILL_AIR, ROTOR_EFFECTS, GROUND_EFFECT = range(3)
 """Values of `Aerodynamics.effects`: none, effects on the rotors, and also that of the ground."""
 
@@ -50,6 +50,8 @@ class Aerodynamics:
     flapping_moment: float = 0.0
     """k_flap [N s^2/rad]: moment on the hub over rotor speed and airspeed; nose up in forward
     flight, and never above MOST_OFFSET radii times the thrust."""
+    flapping_pitch: float = 1.0
+    """Share of `flapping_moment` that acts in pitch, by the airspeed along x; all of it in roll."""
     vortex_ring: float = 0.0
     """D, 0 to 1: loss of thrust in fast descent, as a share of the answer to inflow."""
     vortex_ring_noise: float = 0.0
@@ -79,6 +81,7 @@ class Aerodynamics:
             ("rotor_drag", "flapping_moment", "rotor_inertia", "translational_lift"), (0.0, MAX)
         ) | dict.fromkeys(("vortex_ring", "vortex_ring_noise"), (0.0, 1.0))
         ranges |= {"blade_lift": (0.0, MAX), "body_lift": (0.0, MAX_BODY_LIFT)}
+        ranges |= {"flapping_pitch": (0.0, MAX_PITCH)}
         for name, (low, high) in (ranges | {"air_density": DENSITIES}).items():
             object.__setattr__(self, name, number(name, getattr(self, name), low, high))
         if self.inflow and self.blade_lift < MIN:
@@ -198,7 +201,7 @@ def _rates(
     disc = np.array([rotor.disc for rotor in rotors])
     slope = air.inflow * air.blade_lift * air.air_density * math.pi * disc**3 * fastest / 4
     drag, spin = air.rotor_drag * fastest, air.rotor_inertia * fastest.sum()
-    flap = air.flapping_moment * fastest.sum() / inertia.min()
+    flap = air.flapping_moment * max(1.0, air.flapping_pitch) * fastest.sum() / inertia.min()
     steep = thrust * fastest / (disc / 2)  # no rotor gains more over half a radius
     rates = {
         "inflow": max(slope.sum() / mass, (slope * arms**2).sum() / inertia.min()),

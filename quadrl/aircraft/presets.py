@@ -15,6 +15,17 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import IN_A_FILE, choice, keys, record
 
+_ALL = Aerodynamics.full()
+BRUSHLESS_AIR = dataclasses.replace(
+    _ALL,
+    rotor_drag=2.5e-6,  # fitted to IMRCLab flights
+    flapping_moment=1.02e-7,  # IMRCLab flights: 6.4e-4 N m per m/s sideways
+    flapping_pitch=0.46,  # the same flights: 2.9e-4 N m per m/s ahead
+    rotor_inertia=6e-8,  # IMRCLab flights
+    blade_lift=0.343,  # gives the heave damping of the IMRCLab flights, 0.47 1/s
+    vortex_ring=0.59,  # as the brushed one's
+    translational_lift=0.0,  # unknown
+)
 CRAZYFLIE = Vehicle(
     name="crazyflie",  # Crazyflie 2.1, brushed; motors 1 to 4, clockwise from ahead on the right
     mass=0.0293,  # Foerster 2015, "System Identification of the Crazyflie 2.0 Nano Quadrocopter"
@@ -52,8 +63,9 @@ CRAZYFLIE_BRUSHLESS = Vehicle(
         max_speed=math.sqrt(0.18 / 3.7e-8),  # 0.18 N per rotor: drone-models
         radius=0.0275,  # drone-models
     ),
-    drag_coefficient=5e-3,  # chosen: 8.5 m/s of terminal speed
+    drag_coefficient=1e-3,  # estimated: what is not drag of the rotors
     moment_coefficient=1e-7,  # chosen: as the brushed one's
+    aerodynamics=BRUSHLESS_AIR,  # IMRCLab flights are 4.7 times nearer with it
     action_scale=400.0,  # chosen: the weakest aircraft of the randomization `full` hovers
     physics_timestep=0.0025,  # chosen: it turns faster than the brushed one
     control_timestep=0.02,  # chosen
@@ -78,7 +90,7 @@ CF21B_500 = Vehicle(
     drag_coefficient=5e-3,  # chosen: 9.2 m/s of terminal speed; with `full` it is linear
     moment_coefficient=1e-7,  # chosen: as the brushed one's
     action_scale=400.0,  # chosen: as the other brushless one's
-    physics_timestep=0.004,  # chosen
+    physics_timestep=0.0025,  # chosen: as the other brushless one's
     control_timestep=0.02,  # chosen
 )
 RACER = Vehicle(
@@ -120,7 +132,7 @@ HEXA = Vehicle(
         0.215,
         thrust_coefficient=8.54858e-6,
         torque_coefficient=8.54858e-6 * 0.016,
-        lag_up=1 / 0.025,
+        lag_up=1 / 0.0125,
         lag_down=1 / 0.025,
         max_speed=838.0,
         radius=0.1,
@@ -128,17 +140,11 @@ HEXA = Vehicle(
     drag_coefficient=3e-2,  # chosen: 22 m/s of terminal speed
     moment_coefficient=2e-3,  # chosen
     action_scale=110.0,  # chosen: a fifth of the hover speed, since its yaw is weak
-    physics_timestep=0.005,  # chosen
+    physics_timestep=0.0025,  # chosen: a fifth of the lag
     control_timestep=0.02,  # chosen
 )
 OPTIONS = "mass inertia drag_coefficient moment_coefficient action_scale dead_time".split()
 """Fields that may differ from an aircraft's without making another one of it."""
-VEHICLES = {
-    vehicle.name: vehicle
-    for vehicle in (Vehicle(), CRAZYFLIE, CRAZYFLIE_BRUSHLESS, CF21B_500, RACER, HEXA)
-}
-"""The aircraft that are known by name."""
-_ALL = Aerodynamics.full()
 REAL_AIR = {
     "paper": (_ALL, 1.0),  # equation 8 is its drag beside the rotors' already
     "crazyflie": (
@@ -150,21 +156,12 @@ REAL_AIR = {
             flapping_moment=5.6e-8,
             rotor_inertia=6.4e-8,  # 2.2e-3 of the inertia about z (flights of a brushed one: ARPL)
             blade_lift=0.384,  # gives the heave damping of drone-models, 0.0128 N s/m
+            vortex_ring=0.59,  # leaves 0.92 of the thrust at 1.45 w0: 0.91 by Johnson's model
             translational_lift=0.0,  # unknown; k_h is that share of rho A
         ),
         0.2,  # estimated from its frontal area
     ),
-    "crazyflie_brushless": (
-        dataclasses.replace(
-            _ALL,
-            rotor_drag=2.5e-6,  # fitted to IMRCLab flights
-            flapping_moment=1.02e-7,  # IMRCLab flights: 6.4e-4 N m per m/s sideways
-            rotor_inertia=6e-8,  # IMRCLab flights
-            blade_lift=0.343,  # gives the heave damping of the IMRCLab flights, 0.47 1/s
-            translational_lift=0.0,  # unknown
-        ),
-        0.2,  # estimated, as the brushed one's
-    ),
+    "crazyflie_brushless": (BRUSHLESS_AIR, 0.2),  # share estimated, as the brushed one's
     "cf21B_500": (  # drone-models has linear drag and the inertia of rotors, and nothing else
         Aerodynamics(
             rotor_drag=3.228e-6,  # 0.0215 N s/m at hover; theirs along the axes is 0.0236 N s/m
@@ -176,8 +173,9 @@ REAL_AIR = {
         dataclasses.replace(
             _ALL,
             rotor_drag=6.2e-5,  # estimated
-            rotor_inertia=0.0,  # unknown
+            rotor_inertia=5.64e-6,  # UZH's simulator of an aircraft with these motors
             blade_lift=0.9,  # estimated, for three blades
+            vortex_ring=0.48,  # leaves 0.88 of the thrust at 1.45 w0: 0.86 by Johnson's model
             translational_lift=0.0,  # unknown
         ),
         0.3,  # estimated from its frontal area
@@ -185,15 +183,23 @@ REAL_AIR = {
     "hexa": (
         dataclasses.replace(
             _ALL,
-            rotor_drag=8.06e-5,  # RotorS, for the same rotor on the hummingbird
-            rotor_inertia=0.0,  # unknown
+            rotor_drag=8.06e-5,  # RotorS
+            rotor_inertia=4.3e-6,  # RotorS: a box of 5 g, 0.1 m by 0.015 m
             blade_lift=0.8,  # estimated, for two blades
+            vortex_ring=0.49,  # leaves 0.88 of the thrust at 1.45 w0: 0.87 by Johnson's model
             translational_lift=0.0,  # unknown
         ),
         0.3,  # estimated, as the racer's
     ),
 }
 """By aircraft: its full set, and the share of its quadratic drag that is not the rotors' own."""
+
+
+VEHICLES = {
+    vehicle.name: vehicle
+    for vehicle in (Vehicle(), CRAZYFLIE, CRAZYFLIE_BRUSHLESS, CF21B_500, RACER, HEXA)
+}
+"""The aircraft that are known by name."""
 
 
 def resolve(
@@ -267,11 +273,14 @@ def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> V
     if not isinstance(aerodynamics, str):
         allowed = f"an Aerodynamics, {NONE}, {FULL}, or names of {', '.join(EFFECTS)}"
         raise QuadrlError(name="aerodynamics", value=aerodynamics, allowed=allowed)
-    density = vehicle.aerodynamics.air_density
+    own, share, drag = _full_set(vehicle)
     if aerodynamics == NONE:
-        return dataclasses.replace(vehicle, aerodynamics=Aerodynamics(air_density=density))
-    own, share = _full_set(vehicle)
-    own = own.at(density)
+        none = Aerodynamics(air_density=vehicle.aerodynamics.air_density)
+        return dataclasses.replace(vehicle, aerodynamics=none, drag_coefficient=drag)
+    if own is None:
+        reason = f"quadrl knows the full set of {', '.join(REAL_AIR)}; give this one its own"
+        allowed = "an aircraft with aerodynamics=Aerodynamics(...)"
+        raise QuadrlError(reason, name="vehicle", value=vehicle.name, allowed=allowed)
     kept = set(SWITCHES)
     if aerodynamics != FULL:
         names = [name.strip() for name in aerodynamics.split(",")]
@@ -279,7 +288,7 @@ def with_effects(vehicle: Vehicle, aerodynamics: str | Aerodynamics | None) -> V
         kept = {f for name in names for f in EFFECTS[choice("aerodynamics", name, choices)]}
     off = {name: Aerodynamics.__dataclass_fields__[name].default for name in SWITCHES}
     chosen = dataclasses.replace(own, **{n: off[n] for n in SWITCHES if n not in kept})
-    drag = vehicle.drag_coefficient * (share if chosen.rotor_drag else 1.0)
+    drag *= share if chosen.rotor_drag else 1.0
     return dataclasses.replace(vehicle, aerodynamics=chosen, drag_coefficient=drag)
 
 
@@ -321,13 +330,14 @@ def check_known(vehicle: Vehicle) -> None:
         raise QuadrlError(reason, name="vehicle", value=vehicle.name, allowed="another name")
 
 
-def _full_set(vehicle: Vehicle) -> tuple[Aerodynamics, float]:
-    """Every effect of a vehicle, and the share of its quadratic drag beside its rotor drag."""
-    own = vehicle.aerodynamics
-    if own.effects:
-        return own, 1.0  # its drag is what it says
-    if vehicle.name not in REAL_AIR:
-        reason = f"quadrl knows the full set of {', '.join(REAL_AIR)}; give this one its own"
-        allowed = "an aircraft with aerodynamics=Aerodynamics(...)"
-        raise QuadrlError(reason, name="vehicle", value=vehicle.name, allowed=allowed)
-    return REAL_AIR[vehicle.name]
+def _full_set(vehicle: Vehicle) -> tuple[Aerodynamics | None, float, float]:
+    """Every effect of a vehicle, the share of its drag that is not its rotors', and all of it.
+
+    The drag [N s^2/m^2] is the quadratic one that stands for both where rotor drag does not act.
+    """
+    own, drag = vehicle.aerodynamics, vehicle.drag_coefficient
+    known, share = REAL_AIR.get(vehicle.name, (None, 1.0))
+    known = known and known.at(own.air_density)
+    if own == known:
+        return own, share, drag / share if own.rotor_drag and share else drag
+    return (own, 1.0, drag) if own.effects else (known, share, drag)  # its drag is what it says

@@ -110,21 +110,20 @@ def optional(kind: Any, default: Callable[[str], str], within: str = "") -> Any:
 
 @dataclass_transform(frozen_default=True)
 def command(kind: type[Kind]) -> type[Kind]:
-    """Make a class of options a frozen dataclass; help shows a default where there is one.
-
-    Help breaks its lines by the terminal, not where the source does.
-    """
+    """Make a class of options a frozen dataclass; help shows a default where there is one."""
     made = dataclasses.dataclass(frozen=True)(kind)
-    hints, said = typing.get_type_hints(made, include_extras=True), docstrings(kind)
+    hints = typing.get_type_hints(made, include_extras=True)
     for name in vars(made).get("__annotations__", {}):
         hint: Any = hints[name]
-        shown = arg(help=f"{said[name]}." if name in said else None, help_behavior_hint=_default)
         if hasattr(hint, "__metadata__"):  # a hint of its own comes last, and counts
-            made.__annotations__[name] = Annotated[(hint.__origin__, shown, *hint.__metadata__)]
+            made.__annotations__[name] = Annotated[(hint.__origin__, SHOWN, *hint.__metadata__)]
         else:
-            made.__annotations__[name] = Annotated[hint, shown]
+            made.__annotations__[name] = Annotated[hint, SHOWN]
     return made
 
 
 def _default(label: str) -> str:
     return "" if label in ("", "''", "None") else f"(default: {label})"
+
+
+SHOWN = arg(help_behavior_hint=_default)

@@ -107,13 +107,13 @@ def lift_change(
         through = xp.sqrt(w * w + p_square)
         lacking = (w0 + k) * w0 - k * w - (w - v) * through
         w = w + through * lacking / ((k + through) * through + (w - v) * w + 1e-12)
-    w = w - WINDMILL * clip(-2 * w0 - climb, low=0.0)
     over = 1 / (w0 + 1e-6)
     off = (climb * over + 1.4) / 1.2
     steep = clip(1 - off * off, low=0.0)
     ring = steep * steep * steep * clip(1 - p_square * over * over / 0.95**2, low=0.0)
     change = (
         flow * k * (w0 - w - p.vortex_ring[..., None] * w0 * ring)
+        + flow * inflow * WINDMILL * w0 * clip(-2 * w0 - climb, low=0.0)
         + inflow * p.translational_lift[..., None] * flow / 2 * p_square
         + p.vortex_ring_noise[..., None] * rest * noise * ring
     )
@@ -192,6 +192,7 @@ def rotor_wrench(
     slope = p.flapping_moment[..., None]
     share = most / namespace(speed).sqrt(most * most + slope * slope * p_square + 1e-40)
     flap = (slope * speed * share)[..., None] * cross(across, rotor.axis)
+    flap = stack(flap[..., 0], p.flapping_pitch[..., None] * flap[..., 1], flap[..., 2])
     inertia = rotor.spin * p.rotor_inertia[..., None]
     momentum = (inertia * speed)[..., None] * rotor.axis
     faster = (inertia * rotor_acceleration(p, speed, command))[..., None] * rotor.axis

@@ -165,16 +165,6 @@ def test_help_says_what_each_setting_means(capsys):
     assert "None}" not in text
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_help_fills_its_lines(capsys, monkeypatch, name):
-    monkeypatch.setenv("COLUMNS", "100")
-    assert command(name, "--help") == 0
-    rows = [row.strip("│").rstrip() for row in capsys.readouterr().out.splitlines()]
-    texts = [len(row) - len(row.lstrip()) for row in rows]  # where they begin
-    for k in (k for k, begins in enumerate(texts[:-1]) if begins > 4 and begins == texts[k + 1]):
-        assert len(rows[k]) + len(rows[k + 1].split()[0]) > 95, rows[k : k + 2]
-
-
 @pytest.mark.parametrize(
     "words", [(), ("landing",), ("landing", "--algo=vpg", "--variant", "robust")]
 )

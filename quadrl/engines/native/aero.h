@@ -127,14 +127,15 @@ AERO double aero_lift_change(const Aircraft* a, const Rotor* rotor, const Disc* 
   double w = 0.5 * (v - k + sqrt((v - k) * (v - k) + 4 * w0 * (w0 + k)));  // exact for p = 0
   w = aero_flow_step(w, w0, k, v, p_square);
   w = aero_flow_step(w, w0, k, v, p_square);
-  w -= WINDMILL * aero_positive(-2 * w0 - climb);
   // Vortex ring state: strongest at a descent of 1.4 w0, gone at p = 0.95 w0.
   const double over = 1 / (w0 + 1e-6);
   const double off = (climb * over + 1.4) * (1 / 1.2);
   const double steep = aero_positive(1 - off * off);
   const double slow = aero_positive(1 - p_square * over * over * (1 / (0.95 * 0.95)));
   const double ring = steep * steep * steep * slow;
+  const double windmill = a->inflow[i] * WINDMILL * w0 * aero_positive(-2 * w0 - climb);
   const double change = disc->flow[i] * k * (w0 - w - a->vortex_ring[i] * w0 * ring) +
+                        disc->flow[i] * windmill +
                         a->inflow[i] * a->translational_lift[i] * disc->flow[i] * 0.5 * p_square +
                         a->vortex_ring_noise[i] * rest * noise * ring;
   return aero_clip(change, -rest, 0.6 * rest);  // above, the blades stall
@@ -234,6 +235,7 @@ AERO void aero_rotors(const Aircraft* a, const Disc* disc, int effects, int roto
                           aero_flapping_share(a, rotor, omega, p_square, i);
       const double inertia = rotor->spin[i] * a->rotor_inertia[i];
       const double faster = inertia * aero_rotor_acceleration(rotor, omega, command[k][i], i);
+      const double tilt[3] = {flap, flap * a->flapping_pitch[i], flap};
       for (int m = 0; m < 3; ++m) {
         push[m] = change * n[m] - drag * u[m];
         spin[m] = inertia * omega * n[m];  // angular momentum
@@ -242,7 +244,7 @@ AERO void aero_rotors(const Aircraft* a, const Disc* disc, int effects, int roto
         const int next = (m + 1) % 3, last = (m + 2) % 3;
         force[m][i] += push[m];
         moment[m][i] += r[next] * push[last] - r[last] * push[next] +
-                        flap * (u[next] * n[last] - u[last] * n[next]) -
+                        tilt[m] * (u[next] * n[last] - u[last] * n[next]) -
                         (turn[next] * spin[last] - turn[last] * spin[next]) - faster * n[m];
       }
     }
