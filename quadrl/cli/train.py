@@ -14,7 +14,6 @@ from tyro.conf import arg
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.progress import ProgressBar
 from quadrl.base.signals import heeded
-from quadrl.base.units import percent
 from quadrl.base.validation import seeds
 from quadrl.cli import choices
 from quadrl.cli.console import again, console, make_table, reason, say
@@ -143,9 +142,8 @@ class Train:
             advice = f"the run is kept, {go_on}" if kept else "choose another --out"
             raise QuadrlError(f"{reason(error)}; {advice}") from error
         say(f"\n{run.summary} (imports: {imports:.1f} s; engine: {config.engine})\n")
-        if run.late:
-            shares = ", ".join(f"{1000 * s:g} ms {percent(x)}" for s, x in run.late.items())
-            say(f"successful by the aircraft's dead time: {shares}\n")
+        if run.lateness:
+            say(f"{run.lateness}\n")
         if config.num_envs < FEW:
             say("Many aircraft train faster than few, with shorter rollouts: see --num-envs.\n")
         return run

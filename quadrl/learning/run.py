@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -12,7 +13,9 @@ from typing import Any
 
 from quadrl.base.files import write_csv, write_json
 from quadrl.base.progress import Progress, ProgressBar
+from quadrl.base.units import percent
 from quadrl.control.feasibility import warn_of_unreached
+from quadrl.core.scenario import Scenario
 from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
@@ -40,9 +43,10 @@ COLUMNS = {
     "return": "return_mean",
 }
 """Columns of evaluations.csv after steps and seconds, and the metric of each."""
-DEAD_TIMES = (0.01, 0.02)
-"""Dead times [s] with which the policy of an aircraft that has one also flies: those of Crazyflies,
-and what a radio adds."""
+LATER = (0.01, 0.02)
+"""How much later [s] commands also act, as by a radio, where the largest is a control step."""
+STANDS = 0.98
+"""Share of the flights that succeed with late commands of a policy for which they do not matter."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -60,8 +64,8 @@ class Run:
     seconds: float
     """Wall clock of the training [s], without imports and evaluation."""
     late: dict[float, float] = dataclasses.field(default_factory=dict)
-    """Share of the flights that succeed, by the dead time of the aircraft [s]; empty if it has
-    none."""
+    """Share of the flights that succeed, by how much later [s] commands act than in training; empty
+    where that is no whole control step."""
 
     def __repr__(self) -> str:
         return f"{self.summary}\n{self.misses}".rstrip()
@@ -77,6 +81,16 @@ class Run:
         """What it misses of what the task asks, and what to do next, in a line; "" if nothing."""
         what = missed(self.evaluation.task.targets, self.evaluation.metrics)
         return f"misses: {what}. {self._next()}" if what else ""
+
+    @property
+    def lateness(self) -> str:
+        """What late commands do to it, and what mends that, in a line; "" if it was not flown."""
+        shares = [f"{1000 * s:g} ms later {percent(x)}" for s, x in self.late.items()]
+        said = f"successful with commands that act {', '.join(shares)}" if shares else ""
+        if said and min(self.late.values()) < STANDS:
+            drawn = json.dumps({"command_delay": [0.0, max(self.late)]})
+            said += f"; to stand that, train with --randomization {shlex.quote(drawn)}"
+        return said
 
     def _next(self) -> str:
         """The command that goes on where targets are missed."""
@@ -174,15 +188,23 @@ def train_in(
     found = evaluate(policy, scenario, episodes=config.episodes)
     seconds = round(training.seconds, 2)
     record = {"training_s": seconds, "scenario": scenario.to_json()}
-    late: dict[float, float] = {}
-    for dead_time in DEAD_TIMES if scenario.vehicle.dead_time else ():
-        other = evaluate(policy, scenario, episodes=config.episodes, engine="free_flight",
-                         vehicle_options={"dead_time": dead_time})  # fmt: skip
-        late[dead_time] = float(other.metrics["success_rate"])
+    late = _later(policy, scenario, config.episodes)
     if late:
-        record["success_rate_by_dead_time"] = {f"{s:g}": share for s, share in late.items()}
+        record["success_rate_later"] = {f"{s:g}": share for s, share in late.items()}
     write_json(folder / EVALUATION, found.metrics | record)
     return Run(folder, config, policy, found, seconds, late)
+
+
+def _later(policy: Policy, scenario: Scenario, episodes: int) -> dict[float, float]:
+    """Share of the flights that succeed where commands act LATER, if that is a control step."""
+    vehicle, shares = scenario.vehicle, dict[float, float]()
+    for later in LATER if LATER[-1] >= vehicle.control_timestep else ():
+        steps = round((vehicle.dead_time + later) / vehicle.physics_timestep)
+        late = {"dead_time": steps * vehicle.physics_timestep}
+        flown = {"engine": "free_flight", "vehicle_options": late}
+        found = evaluate(policy, scenario, episodes=episodes, **flown)
+        shares[later] = float(found.metrics["success_rate"])
+    return shares
 
 
 def _evaluating(training: Training, show: Callable[[Progress], None]) -> Callable[[Progress], None]:

@@ -229,15 +229,16 @@ def test_the_result_comes_before_the_pictures_and_where_to_go_on_without_them(
         assert words in said  # on one line, however long
 
 
-def test_train_says_what_dead_time_does(tmp_path, capsys):
+def test_train_says_what_late_commands_do(tmp_path, capsys):
     # Nobody has learned anything in 192 steps; within two steps nobody falls, either.
     long = ("--task-options", "time_limit=0.04", "tolerance=9", "heading_tolerance=9")
     words = (*SIZE, *long, "--episodes", "2", "--no-video", "--out", tmp_path / "run")
     assert command("train", "hover", "--vehicle", "crazyflie", *words) == 0
-    assert "dead time: 10 ms 100 %, 20 ms 100 %" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "successful with commands that act 10 ms later 100 %, 20 ms later 100 %\n" in said
     assert {p.name for p in (tmp_path / "run").iterdir()} == FILES
     recorded = json.loads((tmp_path / "run" / "evaluation.json").read_text())
-    assert recorded["success_rate_by_dead_time"] == {"0.01": 1.0, "0.02": 1.0}
+    assert recorded["success_rate_later"] == {"0.01": 1.0, "0.02": 1.0}
 
 
 def test_evaluate_prints_one_json_object_and_nothing_else(run, capsys):

@@ -1,5 +1,7 @@
 """What a training says that misses what its task asks, and what to type next."""
 
+import dataclasses
+import json
 import re
 import shlex
 from pathlib import Path
@@ -93,3 +95,17 @@ def test_python_and_notebooks_say_it():
         training = run("hover", reached("hover", share))
         assert len(repr(training).splitlines()) == lines
         assert ("misses: " in training._repr_html_()) == (lines == 2)
+
+
+def test_late_commands_lead_to_the_training_that_stands_them():
+    own = run("hover", {"success_rate": 1.0}, vehicle="crazyflie")
+    assert own.lateness == ""
+    stands = dataclasses.replace(own, late={0.01: 1.0, 0.02: 0.98})
+    assert (
+        stands.lateness == "successful with commands that act 10 ms later 100 %, 20 ms later 98 %"
+    )
+    falls = dataclasses.replace(own, late={0.01: 0.98, 0.02: 0.0}).lateness
+    said, given = falls.split("; to stand that, train with ")
+    assert said.endswith("10 ms later 98 %, 20 ms later 0 %")
+    cli.parse(["train", "hover", *shlex.split(given)])
+    assert json.loads(shlex.split(given)[1]) == {"command_delay": [0.0, 0.02]}
