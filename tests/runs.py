@@ -31,6 +31,8 @@ TINY = TrainConfig(
 
 def changed(**settings) -> TrainConfig:
     other = {"training_options": {}} if "task" in settings else {}  # hover's is no other task's
+    if settings.get("algo", "ppo") != "ppo":
+        other["ppo"] = {}  # settings of PPO are refused there
     if settings.get("memory", "none") != "none":
         other["ppo"] = dataclasses.replace(TINY.ppo, fused=False)
     return dataclasses.replace(TINY, **other | settings)

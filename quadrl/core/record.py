@@ -63,11 +63,11 @@ def warn_of_changes(
 
 def sealed_imports() -> list[dict[str, str]]:
     """The files of `--import` in this process: path, sha256, and the seal of both."""
-    key = _key()
+    if not IMPORTED or not (key := _key()):
+        return []
     return [
         {"path": str(path), "sha256": digest, "seal": _seal(key, str(path), digest)}
         for path, digest in IMPORTED.items()
-        if key
     ]
 
 
@@ -79,8 +79,9 @@ def import_again(run: Mapping[str, Any], folder: Path) -> None:
     Raises:
         QuadrlError: A file fails, as `import_own` says.
     """
-    key = _key()
-    for path, was, seal in _imports(run, folder):
+    imports = _imports(run, folder)
+    key = _key() if imports else None
+    for path, was, seal in imports:
         # It may have moved, and be given by its new path.
         now = IMPORTED.get(path) or {own.name: x for own, x in IMPORTED.items()}.get(path.name)
         if now is None:

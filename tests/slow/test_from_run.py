@@ -1,5 +1,6 @@
 """Trainings that begin with the networks of another run."""
 
+import dataclasses
 import shutil
 
 import numpy as np
@@ -69,7 +70,7 @@ def test_a_run_that_learned_on_is_another_one(first, tmp_path):
     config = after(other)
     train(TrainConfig.of_folder(other), other, resume=True)  # over already: as it was
     longer = TrainConfig.of_folder(other)
-    train(changed(**vars(longer) | {"steps": 224}), other, resume=True)
+    train(dataclasses.replace(longer, steps=224), other, resume=True)
     with refused("from", allowed=config.from_run):
         Training(config, tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -107,7 +107,10 @@ def test_everything_says_what_it_is_in_short(run):
         quadrl.VEHICLES["racer"], quadrl.plot(run),
     )  # fmt: skip
     for one in shown:
-        assert len(repr(one)) < 300 and "\n" not in repr(one)
+        # A run that misses its task's targets says so in a line of its own, with what to do next.
+        said, *missed = repr(one).split("\n")
+        assert len(said) < 300 and missed == ([run.misses] if one is run else [])
+    assert run.misses.startswith("misses: ")
     assert repr(TINY.seed) in repr(TINY) and "num_envs=8" in repr(TINY)
 
 
