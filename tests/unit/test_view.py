@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import math
 import socket
 import sys
 import urllib.request
@@ -221,11 +222,32 @@ def test_the_camera_stays_with_its_aircraft(page, camera):
     world, place = page.scene._world, page.scene._airframe.batched_positions[1]
     turn = Rotation.from_quat(world.wxyz, scalar_first=True)
     home = page.flight.environment.origin
+    if camera == "follow":  # it looks between the aircraft and its goal
+        place = place + (page.flight.environment.goals()[1] - page.flight.pose[1, :3]) / 2
     np.testing.assert_allclose(world.position + turn.apply(place), home, atol=1e-5)
     ahead = Rotation.from_quat(page.flight.drawn()[1, 3:7], scalar_first=True).apply((1, 0, 0))
     seen = turn.apply(ahead)
     if camera == "chase":  # the nose points away from the camera
         assert seen[1] == pytest.approx(0.0, abs=1e-6) and seen[0] > 0
+
+
+@pytest.mark.parametrize("away", [0.0, 0.5, 3.0, 30.0])
+def test_the_camera_that_follows_keeps_the_goal_off_the_panel(page, monkeypatch, away):
+    """The panel takes the right 320 of 1366 pixels; a goal far away may lie behind it."""
+    stand = np.array((-1.2, -1.7, 0.9))  # of the camera, so that this is to its right:
+    right = np.cross(-stand, (0.0, 0.0, 1.0)) / np.hypot(*stand[:2])
+    way = away * right
+    monkeypatch.setattr(page.flight.environment, "goals", lambda: page.flight.pose[:, :3] + way)
+    page.camera.value = "follow"
+    page.frame(0.0)
+    world, camera = page.scene._world, page.scene._server.initial_camera
+    place = page.scene._airframe.batched_positions[page.row]
+    ahead = np.subtract(camera.look_at, camera.position)
+    edge = math.tan(camera.fov / 2) * 1366 / 768 * (1 - 2 * 320 / 1366)
+    for seen in (place, place + way) if away < 30 else (place,):
+        seen = seen + world.position - camera.position
+        depth = seen @ ahead / np.linalg.norm(ahead)
+        assert depth > 0 and abs(seen @ right) / depth < edge
 
 
 def test_every_marker_and_primitive_is_drawn(page, monkeypatch):

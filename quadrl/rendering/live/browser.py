@@ -124,7 +124,7 @@ class Page:
         camera, apart = self.camera.value, self.apart.value
         if self._viewed != (camera, apart):
             self._viewed = camera, apart
-            self.scene.view(camera, apart)
+            self.scene.view(self.row, camera, apart)
         with self.server.atomic():
             self.scene.draw(seconds, self.row, camera, apart)
             self.scene.draw_paths(apart, self.show_markers.value, self.show_trails.value)

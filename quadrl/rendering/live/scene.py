@@ -22,6 +22,8 @@ from quadrl.rendering.live.flight import Flight
 CAMERAS = ("free", "follow", "chase")
 # Where the camera stands, seen from where it looks, in sizes of what it shows.
 VIEWS = {"free": (-0.7, -1.0, 0.5), "follow": (-1.2, -1.7, 0.9), "chase": (-2.2, 0.0, 0.7)}
+FARTHEST = 2.0  # [m], of those sizes, for a goal far away
+ROOM = 0.8  # in sizes, to either side of where "follow" looks, before the panel begins
 LAG = 0.15  # [s], of the camera behind the aircraft
 SEGMENTS = 3000  # of all trails together
 PIECE = 0.1  # [s], of a trail
@@ -50,6 +52,8 @@ class Scene:
         self._home = flight.environment.origin  # where cameras look
         self._centre, self._heading = self._home.copy(), np.array([1.0, 0.0])
         self._shown: Any = None
+        self._room = 0.0  # [m], see ROOM
+        self._room = 0.0  # [m]
         self._labels, self._labelled = [], []
         model = flight.scenario.compile_model()
         seen = meshes.of_model(model)
@@ -68,11 +72,15 @@ class Scene:
             for k, (blades, hub) in enumerate(zip(seen.blades, seen.hubs, strict=True))
         ]
 
-    def view(self, camera: str, apart: float) -> None:
+    def view(self, row: int, camera: str, apart: float) -> None:
         """Place the cameras of all browsers, also of those that connect later."""
-        field = 2.5 + 0.95 * apart * (self._columns - 1)
-        size = field if camera == "free" else max(0.7 * self._flight.vehicle.scale, 0.05)
-        stand = self._home + size * np.array(VIEWS[camera])
+        size = max(0.7 * self._flight.vehicle.scale, 0.05)
+        if camera == "free":
+            size = 2.5 + 0.95 * apart * (self._columns - 1)
+        elif camera == "follow":
+            away = float(np.linalg.norm(self._to_goal(row)))
+            size = max(size, min(away / 2 / ROOM, FARTHEST))
+        stand, self._room = self._home + size * np.array(VIEWS[camera]), ROOM * size
         cameras = [client.camera for client in self._server.get_clients().values()]
         for one in (self._server.initial_camera, *cameras):
             # A browser may have sent an impossible one.
@@ -92,7 +100,11 @@ class Scene:
             node.batched_wxyzs = turned.as_quat(scalar_first=True)
         if self._obstacles is not None:
             self._obstacles.batched_positions = offsets
-        self._move_world(seconds, camera, places[row], attitude[row].apply((1, 0, 0))[:2])
+        place = places[row]
+        if camera == "follow":  # between the aircraft and its goal
+            way = self._to_goal(row)
+            place = place + way * min(0.5, self._room / max(float(np.linalg.norm(way)), 1e-9))
+        self._move_world(seconds, camera, place, attitude[row].apply((1, 0, 0))[:2])
 
     def draw_paths(self, apart: float, markers: bool, trails: bool) -> None:
         """Send goals, markers and trails."""
@@ -120,6 +132,10 @@ class Scene:
         across, along = numbers % self._columns, numbers // self._columns
         grid = np.stack([across, -along, 0 * numbers], axis=1).astype(float)
         return apart * (grid - (grid.min(0) + grid.max(0)) / 2)
+
+    def _to_goal(self, row: int) -> Array:
+        """The way (3,) [m] from an aircraft to its goal."""
+        return self._flight.environment.goals()[row] - self._flight.pose[row, :3]
 
     def _move_world(self, seconds: float, camera: str, place: Array, ahead: Array) -> None:
         """Follow an aircraft by moving the world: the camera is left to the browser's user."""
