@@ -36,10 +36,11 @@ rotor the noise of its thrust in the vortex ring state, of unit variance."""
 HIT = 2
 """How many numbers follow the air in a world with solids: the number of the solid that was hit
 fastest in this control step, from 1 on (0 for none), and the speed of that hit [m/s]."""
-FEET, HELD = 6, 5
+FEET, HELD, SINCE = 7, 5, 6
 """How many follow those: 1 once a foot has touched a solid; at the moment of that touch the speed
 into the solid and along it [m/s], the cosine of the angle between the body's z axis and the solid's
-normal, and the body rate [rad/s]; and, at index `HELD`, 1 once a solid grips a foot."""
+normal, and the body rate [rad/s]; at index `HELD`, 1 once a solid grips a foot; and, at index
+`SINCE`, when it last touched a solid, by MuJoCo's clock [s]."""
 MARK = 1903518052.0
 """Marks the actuators and bodies of quadrl: "quad" in ASCII."""
 SETTINGS = (
@@ -219,7 +220,7 @@ def c_structs() -> str:
 
     effects = f"{STILL_AIR=}, {ROTOR_EFFECTS=}, {GROUND_EFFECT=}"
     sizes = f"MAX_ROTORS = {MAX_ROTORS}, WIND = {WIND}, AIR = {AIR}, HIT = {HIT}, FEET = {FEET}"
-    sizes += f", HELD = {HELD}, ROW_SIZE = {ROW_SIZE}"
+    sizes += f", HELD = {HELD}, SINCE = {SINCE}, ROW_SIZE = {ROW_SIZE}"
     return (
         "// Written by quadrl/aircraft/parameters.py from Rotor, Vehicle and Aerodynamics.\n"
         f"#define QUADRL_MARK {MARK!r}\n#define MOST_OFFSET {MOST_OFFSET!r}\n"

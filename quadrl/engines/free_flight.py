@@ -16,13 +16,11 @@ import numpy as np
 from quadrl.aircraft.parameters import MAX_ROTORS, ROTOR, ROW_SIZE, numbers
 from quadrl.base.errors import QuadrlError
 from quadrl.engines import native
-from quadrl.engines.solids import Solids, geoms_of_solids
+from quadrl.engines.solids import MARGIN, Solids, geoms_of_solids
 from quadrl.engines.threads import LANES, Threads
 
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "userdata")
 """Arrays of mjData that free flight reads or writes."""
-MARGIN = 0.05
-"""Clearance at which MuJoCo takes over [m]; larger than the margin of a contact."""
 
 
 class FreeFlight:

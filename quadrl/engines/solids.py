@@ -30,8 +30,11 @@ MOTION = 6
 """Index in a geom's user data of its velocity and angular velocity, and of their derivatives."""
 SOLID = np.dtype([("kind", "f8"), ("size", "f8", 3), ("position", "f8", 3), ("turn", "f8", 9)])
 """`Solid` in native/solids.h."""
-NEARBY = np.dtype([("place", "f8", 3), ("distance", "f8", 9), ("solid", SOLID, 8)])
+NEARBY = np.dtype([("place", "f8", 3), ("leap", "f8"), ("distance", "f8", 9), ("solid", SOLID, 8)])
 """`Nearby` there."""
+MARGIN = 0.05
+"""Clearance at which MuJoCo takes over from free flight [m]; larger than the margin of a
+contact."""
 
 
 def geoms_of_solids(model: mujoco.MjModel) -> np.ndarray:
@@ -98,6 +101,7 @@ class Solids:
             self._last = self.poses.copy()
         if self.moves or not np.array_equal(self.poses[rows], poses):  # most stand where they stood
             self.poses[rows], self._last[rows], self.motion[rows] = poses, poses, 0.0
+            self.nearby["leap"][rows] = 0.0
             self._stand(rows, poses)
 
     def _with_sizes(self, poses: np.ndarray) -> np.ndarray:
@@ -142,6 +146,12 @@ class Solids:
         faster = np.where(known, (motion - self.motion) / timestep, 0.0)
         self._field("geom_user")[:, self.geoms, MOTION:] = np.concatenate([motion, faster], axis=-1)
         self.motion[:] = motion
+        if len(self.nearby):
+            # No part of the aircraft is farther from a solid that it may touch than this.
+            reach = self._outline[:1, 4] + np.linalg.norm(self.table["size"], axis=-1)
+            speed, turn = (np.linalg.norm(motion[..., part], axis=-1) for part in np.s_[:3, 3:])
+            leap = timestep * (speed + turn * reach).max(axis=1)
+            self.nearby["leap"] = np.maximum(leap - MARGIN, 0.0)
 
     def stand(self, rows: np.ndarray, share: float) -> None:
         """Put the solids of some rows (n,) where they are after a share of the physics step."""

@@ -7,6 +7,8 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "solids.h"
+
 enum { GRIP = 5, MOTION = 6, LEGS = 4 };
 
 // Whether two numbers are equal bit for bit, which is quicker than `==`.
@@ -106,12 +108,101 @@ static void carry(const mjModel* m, mjData* d, const mjContact* contact, const m
   }
 }
 
-// Records the fastest hit of an aircraft on a solid and the first touch of its feet, from the
-// present contacts, and holds feet that a solid grips.
-static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) {
+// The velocity of a point that is fixed to the body, world frame.
+static void body_motion(const mjModel* m, const mjData* d, int body, const mjtNum place[3],
+                        mjtNum velocity[3]) {
   const mjtNum *rate = d->qvel + m->body_dofadr[body] + 3, *turn = d->xmat + 9 * body;
-  const int notes = m->nuserdata >= AIR + HIT + FEET, grips = notes && m->nuser_geom > GRIP;
+  mjtNum arm[3], spin[3];
+  for (int k = 0; k < 3; ++k) {
+    arm[k] = place[k] - d->xpos[3 * body + k];
+    spin[k] = turn[3 * k] * rate[0] + turn[3 * k + 1] * rate[1] + turn[3 * k + 2] * rate[2];
+    velocity[k] = d->qvel[m->body_dofadr[body] + k];
+  }
+  add_cross(spin, arm, velocity);
+}
+
+// Notes a hit if it is the fastest of this control step.
+static void note_hit(mjData* d, mjtNum solid, mjtNum speed) {
   mjtNum* hit = d->userdata + AIR;
+  if (hit[0] > 0 && !(speed > hit[1])) return;
+  hit[0] = 1 + solid;
+  hit[1] = speed > 0 ? speed : 0;
+}
+
+static mjtNum length_of(const mjtNum v[3]) {
+  return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
+}
+
+// The smallest length of a geom: of a ball about its centre, within it, it is the radius.
+static mjtNum inner_radius(const mjModel* m, int geom) {
+  const mjtNum* size = m->geom_size + 3 * geom;
+  mjtNum least = size[0];
+  for (int k = 1; k < 3; ++k) least = size[k] > 0 && size[k] < least ? size[k] : least;
+  return least;
+}
+
+// Notes where a geom has passed through a solid, or a part of one, in the last `span` seconds, in
+// which no contact was seen: a ball within it, on its straight way as seen from the solid.
+static void note_pass(const mjModel* m, mjData* d, int body, int own, int other, const Solid* solid,
+                      mjtNum span) {
+  const mjtNum *place = d->geom_xpos + 3 * own, radius = inner_radius(m, own);
+  mjtNum velocity[3], moves[3], faster[3], way[3], at[3], normal[3], speed = 0;
+  body_motion(m, d, body, place, velocity);
+  solid_motion(m, d, other, place, moves, faster);
+  for (int k = 0; k < 3; ++k) way[k] = (velocity[k] - moves[k]) * span;
+  const mjtNum length = length_of(way);
+  if (!(length > 2 * radius)) return;  // it would still touch
+  mjtNum gone = 0, gap = 1;
+  for (int n = 0; gone < length && gap > ROUNDING; ++n) {
+    for (int k = 0; k < 3; ++k) at[k] = place[k] + (gone / length - 1) * way[k];
+    gap = solid_distance(solid, at) - radius;
+    if ((n == 0 && gap <= ROUNDING) || n == 99) return;
+    gone += gap;
+  }
+  if (gap > ROUNDING) return;
+  solid_normal(solid, at, gap + radius, normal);
+  for (int k = 0; k < 3; ++k) speed -= normal[k] * way[k] / span;
+  note_hit(d, m->geom_user[(size_t)m->nuser_geom * other + 1], speed);
+}
+
+// Upper bound of the length of a vector.
+static mjtNum at_most(const mjtNum v[3]) { return fabs(v[0]) + fabs(v[1]) + fabs(v[2]); }
+
+// Notes passes of all parts of an aircraft through all solids.
+static void note_passes(const mjModel* m, mjData* d, int body, mjtNum span) {
+  const mjtNum *place = d->xpos + 3 * body, *velocity = d->qvel + m->body_dofadr[body];
+  const int first = m->body_geomadr[body], end = first + m->body_geomnum[body];
+  mjtNum reach = 0, thin = HUGE_VAL;
+  for (int own = first; own < end; ++own) {
+    if (!m->geom_conaffinity[own]) continue;
+    reach = fmax(reach, at_most(m->geom_pos + 3 * own) + m->geom_rbound[own]);
+    thin = fmin(thin, inner_radius(m, own));
+  }
+  const mjtNum own_way = (at_most(velocity) + at_most(velocity + 3) * reach) * span;
+  for (int other = 0; other < m->ngeom; ++other) {
+    const mjtNum* user = m->geom_user + (size_t)m->nuser_geom * other;
+    if (!is_same(user[0], QUADRL_MARK)) continue;
+    const mjtNum room = reach + m->geom_rbound[other];
+    const mjtNum its_way = (at_most(user + MOTION) + at_most(user + MOTION + 3) * room) * span;
+    // Contacts are seen twice in a step; between the two a solid does not move.
+    if (own_way / 2 + its_way <= 2 * (thin + inner_radius(m, other))) continue;
+    Solid solid = {.kind = m->geom_type[other]};
+    memcpy(solid.size, m->geom_size + 3 * other, sizeof solid.size);
+    memcpy(solid.position, d->geom_xpos + 3 * other, sizeof solid.position);
+    memcpy(solid.turn, d->geom_xmat + 9 * other, sizeof solid.turn);
+    if (solid_distance(&solid, place) > reach + own_way + its_way) continue;
+    for (int own = first; own < end; ++own) {
+      if (m->geom_conaffinity[own]) note_pass(m, d, body, own, other, &solid, span);
+    }
+  }
+}
+
+// Records the fastest hit of an aircraft on a solid and the first touch of its feet, from the
+// present contacts, and holds feet that a solid grips; where those show none, a pass through a solid
+// since the last one.
+static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) {
+  const int notes = m->nuserdata >= AIR + HIT + FEET, grips = notes && m->nuser_geom > GRIP;
+  int touches = 0;
   for (int c = 0; c < d->ncon; ++c) {
     const mjContact* contact = d->contact + c;
     const int first = contact->geom[0], second = contact->geom[1];
@@ -120,19 +211,14 @@ static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) 
     const int other = own ? first : second;
     const mjtNum* solid = m->geom_user + (size_t)m->nuser_geom * other;
     if ((!own && m->geom_bodyid[first] != body) || !is_same(solid[0], QUADRL_MARK)) continue;
-    mjtNum arm[3], spin[3], velocity[3], way[3], moves[3], faster[3], speed = 0;
+    mjtNum arm[3], velocity[3], way[3], moves[3], faster[3], speed = 0;
     solid_motion(m, d, other, contact->pos, moves, faster);
     carry(m, d, contact, moves, faster, own);
+    body_motion(m, d, body, contact->pos, velocity);
     for (int k = 0; k < 3; ++k) {
       // The frame's axis points from the first geom to the second.
       way[k] = own ? -contact->frame[k] : contact->frame[k];
       arm[k] = contact->pos[k] - d->xpos[3 * body + k];
-      spin[k] = turn[3 * k] * rate[0] + turn[3 * k + 1] * rate[1] + turn[3 * k + 2] * rate[2];
-    }
-    for (int k = 0; k < 3; ++k) {
-      const int next = (k + 1) % 3, last = (k + 2) % 3;
-      velocity[k] = d->qvel[m->body_dofadr[body] + k] + spin[next] * arm[last] -
-                    spin[last] * arm[next];
       speed += (velocity[k] - moves[k]) * way[k];
     }
     // The feet are the aircraft's only spheres.
@@ -144,8 +230,17 @@ static void note_hits(const mjModel* m, mjData* d, const Aircraft* a, int body) 
     }
     if (notes && foot) note_touch(m, d, body, way, moves);
     if (grips && foot && solid[GRIP] > 0) hold(m, d, a, body, solid[GRIP], way, arm);
-    if (hit[0] > 0 && !(speed > hit[1])) continue;
-    hit[0] = 1 + solid[1];
-    hit[1] = speed > 0 ? speed : 0;
+    note_hit(d, solid[1], speed);
+    touches = 1;
   }
+  if (!notes) return;
+  mjtNum* since = d->userdata + AIR + HIT + SINCE;
+  const mjtNum free = d->time - *since, span = free < m->opt.timestep ? free : m->opt.timestep;
+  // What comes out on the other side touches at no speed.
+  const int known = m->nuser_geom >= MOTION + 12;
+  if (known && span > 0 && !(d->userdata[AIR + 1] > 0)) {
+    note_passes(m, d, body, span);
+    if (d->userdata[AIR + 1] > 0) *since = d->time;
+  }
+  if (touches) *since = d->time;
 }

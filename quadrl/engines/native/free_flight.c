@@ -67,7 +67,7 @@ static int may_touch(const Solid* solids, int64_t count, Nearby* list, double re
   if (count == 0) return 0;
   const double p[3] = {m[POSITION][i], m[POSITION + 1][i], m[POSITION + 2][i]};
   const double v[3] = {m[VELOCITY][i], m[VELOCITY + 1][i], m[VELOCITY + 2][i]};
-  const double way = (aero_length(v) + pull * time) * time + reach;
+  const double way = (aero_length(v) + pull * time) * time + reach + list->leap;
   if (way_since(list, p) + way < list->distance[0]) return 0;
   if (!(way_since(list, p) + way < list->distance[LISTED])) list_nearest(solids, count, p, list);
   for (int64_t k = 0; k < count && k < LISTED; ++k) {

@@ -66,11 +66,12 @@ static double solid_distance(const Solid* s, const double point[3]) {
 // distance is that of the next one, which is not listed. When the aircraft moves, no distance
 // changes by more than the length of its way, so that most steps need not read all the others,
 // which are far away in memory. With a place of NaN the list is unknown, which
-// quadrl/engines/solids.py sets whenever a solid gets another pose.
+// quadrl/engines/solids.py sets whenever a solid gets another pose. leap: how much farther than free
+// flight's margin a solid has come in the last physics step [m].
 enum { LISTED = 8 };
 #define ROUNDING 1e-9  // [m], more than the error of any distance
 typedef struct {
-  double place[3], distance[LISTED + 1];
+  double place[3], leap, distance[LISTED + 1];
   Solid solid[LISTED];
 } Nearby;
 
