@@ -110,6 +110,21 @@ def test_the_deck_is_where_the_task_says_and_carries_who_stands_on_it(engine):
     assert over.all() and (made.snapshot.potentials.distance < 0.02).all()
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_who_stands_on_the_deck_goes_on_alike_from_a_saved_state(engine):
+    made, off = on_the_deck(4, engine, lowest_waves=2.0), np.full((4, 4), -1.0)
+    for _ in range(8):
+        made.step(off)
+    assert made.snapshot.landed.all()
+    saved, other = made.save(), Environment(made.task, num_envs=4, engine=engine)
+    other.restore(saved)
+    for _ in range(3):
+        made.step(off)
+        other.step(off)
+        np.testing.assert_array_equal(other.engine.qpos, made.engine.qpos)
+        np.testing.assert_array_equal(other.engine.qvel, made.engine.qvel)
+
+
 def test_who_rests_on_the_pad_off_its_heading_has_not_succeeded():
     made = on_the_deck(2, lowest_waves=0.1, highest_waves=0.1)
     deck = deck_of(made.snapshot.task, made.snapshot.time)

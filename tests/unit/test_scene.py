@@ -774,3 +774,87 @@ def test_a_bar_that_turns_by_half_a_radian_a_step_sweeps_up_who_hovers(name, eng
     hits, _ = struck(engine, vehicle, bar, path, start, np.pi / rate)
     # The bar is 1.5 m from its axis there; what it has thrown may meet it again.
     assert (hits.max(axis=0) > 0.7 * 1.5 * rate).all()
+
+
+# ------------------------------------------------------------------------- what nobody sees at once
+
+
+def test_a_list_of_the_nearest_holds_only_as_far_as_none_else_can_be_nearer():
+    """Eight balls stand 1 m to the west and a ninth 2.5 m to the east, to which it flies by 1 m.
+
+    The nearest listed one is then 2 m away, and the one that is not listed 1.5 m.
+    """
+    scene = Scene([Sphere(f"ball_{k}", radius=0.01) for k in range(9)])
+    height = 0.05 * np.arange(8)
+    west = -np.sqrt(1.01**2 - height**2)
+    places = [(x, 0.0, z) for x, z in zip(west, height, strict=True)] + [(2.51, 0.0, 0.0)]
+    poses = {f"ball_{k}": Pose(np.array([place])) for k, place in enumerate(places)}
+    made, *_ = flown(scene, poses, np.zeros((1, 3)), steps=0)
+    made.qpos[0, 0] += 1.0
+    # The rotor ahead: its hub 0.23 m away and 3 cm higher, in a ball about its disc.
+    free = np.hypot(1.51 - 0.23, 0.03) - np.hypot(0.06, 0.005) - 0.01
+    assert made.clearance()[0] == pytest.approx(free, abs=1e-9)
+
+
+def test_only_the_inner_half_of_the_hull_must_be_free_at_a_start():
+    """Over a ball of 20 cm; the hull of the paper's aircraft is 4.5 cm deep below its middle."""
+    declared = {"solids": lambda self: [Sphere("ball", position=(0.0, 9.0, 0.0))]}
+    environment = begun(type("OverBall", (Hover,), declared)())
+    level = {"quaternion": [1.0, 0.0, 0.0, 0.0]}
+    environment.reset(start=level | {"position": [0.0, 9.0, 0.2226]})
+    with refused("position at the start"):
+        environment.reset(start=level | {"position": [0.0, 9.0, 0.2224]})
+
+
+def test_what_a_snapshot_has_of_moving_solids_stays_as_it_was():
+    moves = {
+        "solids": lambda self: [Gate("gate")],
+        "move": lambda self, state, time: gate_at(time),
+    }
+    environment = begun(type("Leaving", (Hover,), moves)(), num_envs=2)
+    environment.step(np.zeros((2, 4)))
+    around = environment.snapshot.around
+    place = around.position.copy()
+    environment.step(np.zeros((2, 4)))
+    np.testing.assert_array_equal(around.position, place)
+    assert (environment.snapshot.around.position != place).any()
+
+
+@pytest.mark.parametrize("other_sign", [1.0, -1.0])
+def test_a_solid_turns_rigidly_the_short_way_around(other_sign):
+    """By 0.48 rad in a step of 10 ms; a quaternion and its negative are the same attitude."""
+    scene, step = Scene([Box("wall", length=2.0, width=1.0, height=1.0)]), 0.01
+    made, *_ = flown(scene, {}, np.zeros((1, 3)), steps=0)
+    for k in (1, 2):
+        turn = other_sign**k * heading(np.array([0.48 * k]))
+        pose = {"wall": Pose(np.zeros((1, 3)), turn)}
+        made.solids.move(scene.poses(pose, 1, made.origin, made.solids.poses), step)
+        half = rotation_matrix(heading(np.array([0.48 * (k - 0.5)])))[0]
+        np.testing.assert_allclose(made.solids.table["turn"][0, 0].reshape(3, 3), half, atol=1e-12)
+    # The rate is that of the sine of half the angle.
+    np.testing.assert_allclose(made.solids.motion[0, 0, 3:], [0, 0, 2 * np.sin(0.24) / step])
+
+
+def test_a_deck_that_turns_fast_holds_an_aircraft_at_its_distance():
+    """At 2 rad/s, 0.5 m from the axis: 2 m/s^2 towards it, a fifth of what friction can give."""
+    track, _ = carried(lambda t: ((0.0, 0.0, 0.0), 2.0 * t), place=(0.5, 0.0), time=2.0)
+    radius = np.linalg.norm(track[:, 0, :2], axis=-1)
+    np.testing.assert_allclose(radius[100:], radius[100], atol=1e-3)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@pytest.mark.parametrize("grip", [0.9, 1.2])
+def test_a_grip_is_a_multiple_of_the_weight_of_the_whole_aircraft(grip, engine):
+    """Under a ceiling, feet up: what grips with less than its weight lets it fall."""
+    scene = Scene([Box("ceiling", length=4.0, width=4.0, height=0.2, grip=grip)])
+    made = make(engine, PAPER, compile_model(PAPER, drawn=False, scene=scene.add_to), 1, altitude=9)
+    none, over = np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0, 0.0]])
+    start = Start(none, over, none, none, np.zeros((1, PAPER.rotor_count)))
+    up = {"ceiling": Pose(np.array([[0.0, 0.0, 0.1 - PAPER.foot[2] - 1e-4]]))}
+    made.place(np.array([0]), start, solids=scene.poses(up, 1, made.origin))
+    made.ctrl[:] = 0.0
+    made.advance(50)
+    made.read()
+    assert made.feet[0, 0] == 1
+    fall = -made.state.position[0, 2]
+    assert fall < 0.005 if grip > 1 else fall > 0.1

@@ -25,6 +25,12 @@ typedef struct {
 
 enum { AHEAD = 4, CACHE_LINE = 64 };  // aircraft, bytes
 
+// Whether no solid that is not listed may be the nearest of any part of an aircraft that has come a
+// way: the first listed one is that much farther at most, and an unlisted one that much nearer.
+static int is_known(const Nearby* list, double way, double reach) {
+  return list->distance[0] + 2 * way + reach < list->distance[LISTED];
+}
+
 // Distance [m] of the nearest solid from the balls, a lower bound of the clearance, for the aircraft
 // first..last-1, or for those of ids.
 QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t last,
@@ -49,14 +55,13 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
       }
       __builtin_prefetch(rows->qpos + next * rows->stride);
     }
-    // List anew if some part of the aircraft may be nearer to a solid that is not listed.
-    const double *then = list->distance, *next = then + LISTED;
+    const double* then = list->distance;
     double way = way_since(list, p);
-    if (!(then[0] + 2 * way + reach < *next)) {
+    if (!is_known(list, way, reach)) {
       list_nearest(solids, rows->count, p, list);
       way = way_since(list, p);
     }
-    const int all = !(then[0] + 2 * way + reach < *next);
+    const int all = !is_known(list, way, reach);
     const int64_t count = all || rows->count < LISTED ? rows->count : LISTED;
     for (int64_t s = 0; s < count; ++s) {
       // Most solids need no closer look: no part of the aircraft is nearer to this one than that,
