@@ -77,7 +77,9 @@ class Hover(Task):
             "gae_lambda": 0.95,
             "critic_hidden": (64,),
             "holds_goal": False,
-            "apg": {"step": 0.4},
+            # Without, a flight in 2,000 that begins heading west does not turn.
+            "training_options": FARTHER,
+            "apg": {"step": 0.5},
         },
     }
     variants = {"robust": {"training_options": AS_ASKED, **IN_GUSTS}}

@@ -486,6 +486,7 @@ def test_a_disc_that_makes_power_from_nothing_is_refused():
         ({"rotor_drag": 0.1}, "rotor_drag"),
         ({"inflow": True, "blade_lift": 4.0}, "inflow"),
         ({"flapping_moment": 1.0}, "flapping_moment"),
+        ({"flapping_moment": 0.2, "flapping_pitch": 10.0}, "flapping_moment"),
         ({"rotor_inertia": 1e-3}, "rotor_inertia"),
     ],
 )

@@ -174,3 +174,11 @@ def test_a_run_of_somebody_else_chooses_no_file_to_run(ringed, monkeypatch, tmp_
     assert record.sealed_imports() == []
     with pytest.warns(QuadrlWarning, match="ringed.py is not what it was"):
         assert quadrl.evaluate(run, episodes=1).task.name == "ringed"
+
+
+def test_no_key_is_made_where_nothing_was_imported(tmp_path, monkeypatch):
+    monkeypatch.setenv("QUADRL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(record, "IMPORTED", {})
+    assert record.sealed_imports() == []
+    record.import_again({"imports": []}, tmp_path)
+    assert not [*tmp_path.rglob(record.KEY)]
