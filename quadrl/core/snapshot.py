@@ -167,23 +167,23 @@ class Rollout:
         """How long each successful flight took, (n,) [s]."""
         return self.length[self.is_success] * self.control_timestep
 
-    def trajectory(self, vehicle: Vehicle, episode: int = 0) -> Trajectory:
-        """The flight of one aircraft, to be drawn; the markers are those of the first."""
-        steps = slice(0, int(self.length[episode]))
+    def trajectory(self, vehicle: Vehicle) -> Trajectory:
+        """The first flight, to be drawn: the markers are its own."""
+        steps = slice(0, int(self.length[0]))
         after = slice(1, steps.stop + 1)
-        position, wind = self.position[after, episode] + self.origin, self.wind[steps, episode]
+        position, wind = self.position[after, 0] + self.origin, self.wind[steps, 0]
         return Trajectory(
             time=np.arange(1, len(position) + 1) * self.control_timestep,
-            qpos=np.concatenate([position, self.quaternion[after, episode]], axis=1),
-            rotor_speed=self.rotor_speed[after, episode],
-            error=self.error[steps, episode],
-            reward=self.reward[steps, episode],
-            goal=self.goal[after, episode] + self.origin,
+            qpos=np.concatenate([position, self.quaternion[after, 0]], axis=1),
+            rotor_speed=self.rotor_speed[after, 0],
+            error=self.error[steps, 0],
+            reward=self.reward[steps, 0],
+            goal=self.goal[after, 0] + self.origin,
             control_timestep=self.control_timestep,
             max_rotor_speed=vehicle.max_speed,
             task=self.task.name,
             markers=self.markers[steps],
-            outcome=outcome(self.terminated[episode], True, self.is_success[episode]),
+            outcome=outcome(self.terminated[0], True, self.is_success[0]),
             wind=wind if wind.any() else None,
         )
 

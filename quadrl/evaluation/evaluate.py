@@ -77,9 +77,12 @@ class Evaluation:
         rows = [("", self.name), *((name, quantity(name, x)) for name, x in self.metrics.items())]
         return html_table(rows)
 
-    def trajectory(self, episode: int = 0) -> Trajectory:
-        """One of the flights, to be drawn; what it is drawn in carries the scenario."""
-        flight = self.rollout.trajectory(self.vehicle, episode)
+    def trajectory(self) -> Trajectory:
+        """The first flight, to be drawn; what it is drawn in carries the scenario.
+
+        Another one is the first of an evaluation with the seed of that flight.
+        """
+        flight = self.rollout.trajectory(self.vehicle)
         return dataclasses.replace(flight, scenario=self.scenario.to_json())
 
     def yardstick(self) -> Evaluation:

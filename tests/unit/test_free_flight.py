@@ -187,3 +187,18 @@ def test_a_task_that_builds_a_wall_is_refused():
     with helpers.refused("engine", match="wall"):
         Environment(Walled(), engine="free_flight")
     Environment(Walled())
+
+
+def test_the_clock_of_a_world_with_contacts_is_that_of_the_flight():
+    # Its model has shorter steps.
+    one = Environment("landing", engine="free_flight", seed=0)
+    one.reset()
+    one.step(np.zeros((1, 4)))
+    assert one.engine.data.time == pytest.approx(one.vehicle.control_timestep)
+
+
+def test_what_an_aircraft_was_when_its_episode_began_is_kept():
+    many = Environment("hover", num_envs=3, seed=0, engine="free_flight", randomization="full")
+    many.reset()
+    assert len(set(many.engine.parameters["mass"])) == 3
+    np.testing.assert_array_equal(many.engine.begun, many.engine.parameters)

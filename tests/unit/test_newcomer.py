@@ -13,6 +13,7 @@ from rich.console import Console
 
 import quadrl
 from quadrl.base.errors import QuadrlWarning
+from quadrl.base.extras import MissingLibrary, needed
 from quadrl.base.progress import ProgressBar
 from quadrl.learning.config import TrainConfig
 
@@ -145,3 +146,9 @@ def test_a_check_that_passes_logs_nothing():
     finally:
         log.removeHandler(handler)
     assert not said
+
+
+def test_a_part_of_a_missing_library_is_named_by_the_library():
+    with pytest.raises(MissingLibrary, match="quadrl train needs torchrl: python -m pip"):
+        with needed("quadrl train"):
+            raise ModuleNotFoundError(name="torchrl.envs")

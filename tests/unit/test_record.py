@@ -53,6 +53,7 @@ def older_rows(saved):
         table = np.zeros(len(now), kind)
         for name in kind.names[:-1]:
             table[name] = now[name]
+        table["size"] = kind.itemsize // 8
         for name in kind["rotor"].base.names:
             table["rotor"][name] = now["rotor"][name]
         tables[place] = table.view(float).reshape(len(table), -1)

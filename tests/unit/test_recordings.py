@@ -139,6 +139,12 @@ def test_what_the_further_columns_hold_is_not_read(tmp_path):
     assert not flown(tasks.make("trajectory", figure=str(path)), TIME).any()
 
 
+def test_times_begin_at_0(tmp_path):
+    figure = write(tmp_path / "own.csv", "t,x,y,z", (TIME + 0.1, *PLACE))
+    with refused("trajectory figure", match="row 1 is at 0.1 s"):
+        tasks.make("trajectory", figure=figure)
+
+
 def test_a_heading_in_degrees_is_refused_or_told(tmp_path):
     def made(yaw, name="yaw"):
         columns = TIME, *PLACE, yaw
@@ -147,6 +153,8 @@ def test_a_heading_in_degrees_is_refused_or_told(tmp_path):
 
     with refused("trajectory figure", match="from row 60 to 61 yaw jumps from 177 to 0 rad"):
         made(np.arange(80) * 3.0 % 180)
+    with refused("trajectory figure", match="yaw jumps from 16 to 0 rad"):
+        made(np.arange(80) * 2.0 % 18)
     with pytest.warns(QuadrlWarning, match="in radians, up to 90; call the column yaw_rad or"):
         made(0 * TIME + 90)
     assert made(0 * TIME + 90, "yaw_deg").curve.heading(TIME)[5] == pytest.approx(np.pi / 2)
@@ -234,10 +242,11 @@ def test_polynomials_of_the_crazyswarm_are_followed(tmp_path):
     expected = [0.0, 0.25, 0.5625, 1 + 0.5 - 0.0625, 1 + 1 - 0.25, 2.0, 2.0]
     np.testing.assert_allclose(flown(task, at)[:, 0], expected, atol=3e-4)
     np.testing.assert_allclose(task.curve.heading(at[:5]), 0.1 * at[:5], atol=1e-3)
-    rows[1, 0] = -1.0
-    path.write_text(",".join(names) + "\n" + "\n".join(",".join(map(str, row)) for row in rows))
-    with refused("trajectory figure", match="row 2 takes -1 s"):
-        tasks.make("trajectory", figure=str(path))
+    for rows[1, 0] in (-1.0, 0.0):
+        lines = [",".join(map(str, row)) for row in rows]
+        path.write_text("\n".join([",".join(names), *lines]))
+        with refused("trajectory figure", match=f"row 2 takes {rows[1, 0]:g} s"):
+            tasks.make("trajectory", figure=str(path))
 
 
 @pytest.mark.parametrize("size", [0.1, 1.0])

@@ -241,11 +241,11 @@ def test_evaluation_episodes_are_none_of_the_trainings():
 def test_a_trajectory_is_in_the_world_frame():
     vehicle = Vehicle()
     rollout = fly(brake, "hover", episodes=2, vehicle=vehicle)
-    trajectory, steps = rollout.trajectory(vehicle, 1), rollout.length[1]
+    trajectory, steps = rollout.trajectory(vehicle), rollout.length[0]
     assert len(trajectory.time) == steps
     assert trajectory.time[[0, -1]] == pytest.approx([0.05, 0.05 * steps])
     up = [0, 0, 3]  # the task's altitude
-    np.testing.assert_allclose(trajectory.qpos[:, :3], rollout.position[1 : steps + 1, 1] + up)
+    np.testing.assert_allclose(trajectory.qpos[:, :3], rollout.position[1 : steps + 1, 0] + up)
     np.testing.assert_allclose(trajectory.goal, np.tile(up, (steps, 1)))
     np.testing.assert_array_equal(trajectory.max_rotor_speed, vehicle.max_speed)
     assert trajectory.task == "hover"

@@ -110,6 +110,18 @@ def test_wind_that_no_rotor_holds_is_said_with_its_speed():
     assert Environment(moderate).has_begun is False
 
 
+def test_wind_that_no_rotor_holds_trims_nobody():
+    vehicle = in_real_air(VEHICLES["paper"])
+    ends = (0.0,) * 4, tuple(vehicle.max_speed)
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
+    still, hover = np.zeros((2, 3)), np.tile(vehicle.hover_speed, (2, 1))
+    start = Start(still, level, still, still, hover)
+    wind = trim.held_wind(vehicle, *ends) + np.array([[-0.7, 0.0], [0.7, 0.0]])
+    wind[:, 1] = 0.0
+    tilted = trim.trimmed(vehicle, start, wind).quaternion[:, 0] < 1
+    assert tilted.tolist() == [True, False]
+
+
 def balance(vehicle, wind):
     """Rotor speeds (R,) [rad/s] with which it keeps its place in wind (3,), by other equations."""
     free = null_space(vehicle.mixer)  # with more than four rotors many speeds give a wrench
