@@ -168,7 +168,8 @@ def policies(name: str = "") -> str:
     if not rows:
         return "None comes with quadrl."
     head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "targets missed")
-    note = POLICIES.format(flown=result["rows"][0]["episodes"], source=report.source(result, flown))
+    counts = " or ".join(f"{n:,}" for n in sorted({row["episodes"] for row in flown}))
+    note = POLICIES.format(flown=counts, source=report.source(result, flown))
     how = SHIPS.format(name=name, by=tasks.TASKS[name].trained_by) if name else ""
     return f"{how}{table(head, rows)}\n\n{note}"
 
