@@ -40,7 +40,8 @@ LOOPED = [name for name in CONTROL_MODES if name != "rotor"]
 FREE = Hover(time_limit=100.0, max_distance=1e3, altitude=500.0)
 both = pytest.mark.parametrize("name", CONTROLLERS)
 looped = pytest.mark.parametrize("name", LOOPED)
-presets = pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES)
+# In still air, in which the laws of loops and models are derived.
+presets = pytest.mark.parametrize("vehicle", [LAYOUTS[name] for name in VEHICLES], ids=VEHICLES)
 layouts = pytest.mark.parametrize("vehicle", LAYOUTS.values(), ids=LAYOUTS)
 
 
