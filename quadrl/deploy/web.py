@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.aircraft import parameters
-from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.presets import VEHICLES, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
@@ -40,6 +40,8 @@ from quadrl.evaluation.policy_file import CLIP, FORMAT
 from quadrl.rendering import drawing
 from quadrl.tasks import TASKS
 
+FLYING = {name: with_effects(vehicle, "none") for name, vehicle in VEHICLES.items()}
+"""The aircraft as they fly on the page: by the paper's equations, without noise of the air."""
 SMALLEST = 0.35  # scale of the aircraft for which goals and trails are drawn, at least
 GUST_TIME = 1.0  # [s], correlation time of the page's gusts
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -89,7 +91,7 @@ def make_book() -> tuple[dict[str, Any], str]:
     tasks = {name: TASKS[name]() for name in FLOWN}
     pairs, sources = {}, [MEMORY.format(slots=slots, size=flights.SIZE)]
     for task in tasks.values():
-        for vehicle in VEHICLES.values():
+        for vehicle in FLYING.values():
             environment = Environment(task, vehicle=vehicle, seed=0)
             source, drawn = flights.write(environment)
             about = world(environment.engine.model, vehicle.physics_timestep)
@@ -124,7 +126,7 @@ def make_book() -> tuple[dict[str, Any], str]:
             }
             for name, task in tasks.items()
         },
-        "vehicles": {name: describe(vehicle) for name, vehicle in VEHICLES.items()},
+        "vehicles": {name: describe(vehicle) for name, vehicle in FLYING.items()},
         "pairs": pairs,
         "policies": {
             file.stem: {"task": policy.task, "file": _encoded(file.read_bytes())}
@@ -141,7 +143,7 @@ def surroundings(task: Task) -> dict[str, Any]:
     environment.reset()
     asked = task.markers(environment.snapshot)
     stands = (one.moved(environment.origin) for one in asked if isinstance(one, Primitive))
-    world = drawing.world(mjcf.compile_model(VEHICLES["paper"], scene=task.scene))
+    world = drawing.world(mjcf.compile_model(FLYING["paper"], scene=task.scene))
     return shapes([*world, *stands])
 
 

@@ -19,7 +19,6 @@ from safetensors.numpy import save
 
 import quadrl
 from quadrl import tasks
-from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.files import HEADER, write_safetensors
 from quadrl.control.geometric import GeometricController
 from quadrl.core.environment import Environment
@@ -27,6 +26,7 @@ from quadrl.deploy import web
 from quadrl.evaluation.policy import SHIPPED, Policy, shipped
 from quadrl.learning.checkpoint import FORMAT as CHECKPOINT
 
+VEHICLES = web.FLYING
 PAIRS = [(task, vehicle) for task in web.FLOWN for vehicle in VEHICLES]
 # Sine and cosine are the C library's, and differ in the last bit between two of them.
 SINES = 1e-14
@@ -66,7 +66,8 @@ def node(page):
 
 
 def begun(task, vehicle, seed=0, **settings):
-    environment = Environment(task, vehicle=vehicle, engine="free_flight", seed=seed, **settings)
+    flown = VEHICLES.get(vehicle, vehicle) if isinstance(vehicle, str) else vehicle
+    environment = Environment(task, vehicle=flown, engine="free_flight", seed=seed, **settings)
     return environment, environment.flatten(environment.reset())
 
 
