@@ -129,20 +129,21 @@ def shipped(episodes: int = EPISODES, only: tuple[str, ...] = ()) -> None:
 
     Args:
         episodes: Flights of each in each condition.
-        only: Names of tasks, beside what was measured of the others; by default all.
+        only: Names of policies, beside what was measured of the others; by default all.
     """
-    rows = []
-    files = (file for task in only or [""] for file in SHIPPED.glob(f"{task}*.safetensors"))
-    for name in sorted(file.stem for file in files):
+    rows, before = [], report.load("shipped") if only else {"rows": []}
+    for name in only or sorted(file.stem for file in SHIPPED.glob("*.safetensors")):
         found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, CALM))
         targets = tasks.TASKS[found["task"]].targets
         alone = {} if (SHIPPED / f"{found['task']}_robust.safetensors").exists() else AS_FLOWN
         late = {k: evaluate(name, episodes=episodes, **x).metrics for k, x in alone.items()}
         shown = {"task", *FIGURES, *(target.metric for target in targets)}
         late = {words: {x: of[x] for x in of if x in shown} for words, of in late.items()}
-        rows.append({"policy": name} | found | {"undisturbed": still, "as_flown": late})
+        made = {"commit": report.commit(), "policy": name}
+        rows.append(made | found | {"undisturbed": still, "as_flown": late})
         say(f"{name}: {missed(targets, still)}")
-    rows = report.beside("shipped", {"rows": rows}, only)["rows"]
+    kept = (row for row in before["rows"] if row["policy"] not in only)
+    rows += [{"commit": before["commit"]} | row for row in kept]
     report.save("shipped", {"rows": sorted(rows, key=lambda row: row["policy"])})
 
 
