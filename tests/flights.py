@@ -76,6 +76,7 @@ def by_mj_step(task, seed, mode):
     vehicle = VEHICLES["paper"]
     model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.build)
     data, scene = mujoco.MjData(model), Scene(task.solids())
+    finer = round(vehicle.physics_timestep / model.opt.timestep)
     row = parameters.rows(vehicle)
     origin = np.array([0.0, 0.0, max(task.altitude, vehicle.ground_clearance)])
     solids = Solids(model, 1, origin, lambda name: getattr(model, name)[None], Threads(1, 1))
@@ -137,7 +138,10 @@ def by_mj_step(task, seed, mode):
             seen = state() if control.has_loops else before.state
             data.ctrl[:] = control.rotor_command(seen, setpoint)[0]
             command += data.ctrl / vehicle.substeps
-            mujoco.mj_step(model, data)
+            for k in range(finer):
+                if solids.moves:
+                    solids.stand(np.array([0]), (k + 0.5) / finer)
+                mujoco.mj_step(model, data)
         solids.arrive()
         errors.append(0.0)  # counts the step: `snapshot` tells the time
         now = snapshot(before.task, action, command if control.has_loops else setpoint)

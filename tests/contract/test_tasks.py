@@ -203,7 +203,7 @@ FAULTS = {
     "an error in NumPy alone": ("torch arrays fails|gives error as ndarray", error(np.array)),
     "a branch on numbers": ("fails:.*meta", error(by_branches)),
     "no gradient in the goal": (
-        "gradient by position at rest in the goal is .*nan",
+        "'error' has no gradient at rest in the goal by position; take lengths by .*norm",
         {"measure": measured_by_a_power},
     ),
     "double precision alone": (
