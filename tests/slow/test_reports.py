@@ -33,6 +33,8 @@ def results(tmp_path, monkeypatch):
     """Results, pictures and runs go to a folder of their own."""
     for name in ("RESULTS", "IMAGES", "RUNS"):
         monkeypatch.setattr(report, name, tmp_path / name.lower())
+    for folder in ("curves", "robustness"):
+        (report.IMAGES / folder).mkdir(parents=True)
     return tmp_path
 
 
