@@ -213,7 +213,7 @@ class GateRace(Task):
         """Through a frame, on the ground, or astray, (N,) bool."""
         astray = now.potentials.distance > now.task.leg + ASTRAY
         begun = (now.time > self.on_ground) | (now.task.passed > 0)
-        return self._crossed(now)[1] | astray | (touches_ground(now) & begun)
+        return self._crossed(now)[1] | astray | (touches_ground(now, bounces=self.contact) & begun)
 
     def _finished(self, now: Snapshot) -> Array:
         """Whether this control step passes the last gate of the last lap, (N,) bool."""

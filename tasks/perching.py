@@ -236,7 +236,8 @@ class Perching(Task):
         most = functools.reduce(xp.maximum, self._shares(now))
         off = now.held & (now.potentials.distance > OFF)
         away = now.potentials.distance > self.max_distance
-        return (now.held & (most > 1)) | self._struck(now) | off | away | touches_ground(now)
+        low = touches_ground(now, bounces=True)
+        return (now.held & (most > 1)) | self._struck(now) | off | away | low
 
     def _struck(self, now: Snapshot) -> Array:
         """Whether anything but the feet touches the surface first, (N,) bool."""

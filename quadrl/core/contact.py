@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from quadrl.base.rotation import Array, dot, namespace, norm
+from quadrl.base.rotation import Array, cross, dot, namespace, norm
 from quadrl.core.snapshot import Snapshot
 
 CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing
 
 
-def touches_ground(now: Snapshot) -> Array:
-    """Whether an aircraft that should fly has touched the ground, (N,) bool."""
-    return now.state.height < now.parameters.ground_clearance
+def touches_ground(now: Snapshot, *, bounces: bool = False) -> Array:
+    """Whether an aircraft that should fly has touched the ground, (N,) bool.
+
+    Args:
+        now: The snapshot.
+        bounces: Whether the ground stops aircraft, which then may have left it again.
+    """
+    lowest = _lowest(now) if bounces else now.state.height
+    return lowest < now.parameters.ground_clearance
 
 
 def stands(now: Snapshot) -> Array:
@@ -32,5 +38,15 @@ def strikes_ground(now: Snapshot) -> Array:
     above = dot(up[..., None, :], centre)  # (N, R) [m], of the discs' centres
     across = up[..., None, :] - dot(up[..., None, :], rotor.axis)[..., None] * rotor.axis
     edge = rotor.radius * norm(across)  # of what is in the plane of a disc
-    deepest = xp.max(edge - above, axis=-1)
-    return now.state.height < xp.maximum(depth, deepest)
+    # A disc that rises now may have bounced in this control step.
+    swing = dot(up[..., None, :], cross(now.state.body_rate[..., None, :], centre))
+    rising = xp.maximum(now.state.velocity[..., 2, None] + swing, 0.0 * swing)
+    risen = rising * now.parameters.control_timestep
+    deepest = xp.max(edge - above + risen, axis=-1)
+    return (now.state.height < deepest) | (_lowest(now) < depth)
+
+
+def _lowest(now: Snapshot) -> Array:
+    """The height [m] from which an aircraft that rises may have risen in this control step."""
+    rising = namespace(now.state.height).maximum(now.state.velocity[..., 2], 0.0 * now.state.height)
+    return now.state.height - rising * now.parameters.control_timestep

@@ -175,6 +175,8 @@ def test_it_begins_on_the_floor_with_its_rotors_at_rest_and_has_half_a_second_to
     state = environment.snapshot.state
     assert (0.01 <= state.position[:, 2]).all() and (state.position[:, 2] < 0.03).all()
     assert (state.rotor_speed == 0).all() and (environment.snapshot.rotor_command == 0).all()
+    # Level, since one that falls on a single foot and only climbs turns over.
+    environment.reset(start={"quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (20, 1))})
     climbing = np.arange(20) < 10
     for step in range(1, 40):
         done = environment.step(np.where(climbing[:, None], 1.0, -1.0) * np.ones((20, 4)))
@@ -265,3 +267,27 @@ def test_a_moment_costs_what_is_asked_for_five_hundredths_of_a_second():
         done = environment.step(np.zeros((2, 4)))
         cost = weight * environment.vehicle.control_timestep / 0.05
         assert done.reward_terms["time"] == pytest.approx([-cost, -cost])
+
+
+def test_who_falls_on_the_ground_has_touched_it_however_short_the_touch():
+    rows, rest = 24, np.zeros((24, 3))
+    for name, tilt, limit in (("landing", 1.0, 0.5), ("perching", 0.0, 0.2)):
+        made = Environment(name, num_envs=rows, seed=0, engine="free_flight")
+        level = [np.cos(tilt / 2), np.sin(tilt / 2), 0.0, 0.0]
+        start = rest + (3.0, 0.0, 0.0) - made.origin
+        start[:, 2] += np.linspace(0.5, 0.7, rows)
+        given = {"velocity": rest - (0.0, 0.0, 2.0), "body_rate": rest, "position": start}
+        made.reset(start=given | {"quaternion": np.tile(level, (rows, 1))})
+        struck, over = np.zeros((2, rows), dtype=bool)
+        last = made.snapshot.state.velocity[:, 2].copy()
+        for _ in range(20):
+            done = made.step(np.full((rows, 4), -1.0))
+            speed = made.snapshot.state.velocity[:, 2]
+            before = struck.copy()
+            struck |= speed > last + limit  # the ground has pushed
+            last = speed.copy()
+            over |= done.terminated
+            assert over[before].all()  # at once, or a control step later with an edge
+            if struck.all():
+                break
+        assert struck.all() and not done.is_success.any()

@@ -9,6 +9,7 @@ from helpers import refused
 import quadrl
 from quadrl.base.files import write_json
 from quadrl.base.validation import seeds
+from quadrl.cli.console import console
 from quadrl.cli.study import carry_out
 from quadrl.learning import executor
 from quadrl.learning.config import TrainConfig
@@ -250,7 +251,7 @@ def test_the_table_fits_the_terminal(monkeypatch, capsys, columns):
     row = {"task": "straight_and_level", "algo": "trpo", "variant": "", "seeds": 3}
     found = StudyResult(Path("runs/x"), (), (row | figures | spread,) * 2, {})
     monkeypatch.setattr("quadrl.learning.study.study", lambda *what, **how: found)
-    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setattr(console, "_width", columns)
     carry_out({})
     _, head, *rows = capsys.readouterr().out.splitlines()
     assert len(head) <= columns and head.split()[-1] == "training" and "variant" not in head
