@@ -59,7 +59,8 @@ def carry_out(
             kept = (column for column in columns if column[0] not in ("turning", "circling"))
             columns = [[cell.partition(" (")[0] for cell in column] for column in kept]
             said = "whose 95 % intervals, turning and circling are in table.csv"
-        numbers = len(columns) - [column[0] for column in columns].index("seeds")
+        names = [*(column[0] for column in columns), "seeds"]  # a table may be empty
+        numbers = max(0, len(columns) - names.index("seeds"))
         console.print("", make_table([*zip(*columns, strict=True)], numbers=numbers))
         say(f"\nmeans over the seeds, {said}")
         if compared:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers import refused
 
+from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
 
 pytest.importorskip("rsl_rl")
@@ -58,7 +59,7 @@ def settings(**changed):
 def test_the_batch_has_the_numbers_of_gymnasium(task, options):
     options = options | {"time_limit": 1.0}
     ours = QuadrotorVecEnv(task, COUNT, seed=3, **options)
-    id = f"quadrl/{task.title()}-v0"
+    id = TASKS[task].gymnasium_id()
     theirs = gym.make_vec(id, COUNT, autoreset_mode="SameStep", **options)
     seen, (expected, info) = ours.get_observations(), theirs.reset(seed=3)
     kinds = set()

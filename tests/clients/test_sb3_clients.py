@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNorma
 
 import quadrl  # noqa: F401 - registers the ids
 from quadrl.envs.sb3 import QuadrotorVecEnv
+from quadrl.tasks import TASKS
 from quadrl.testing import varied_actions
 
 HOVER = "quadrl/Hover-v0"
@@ -29,7 +30,7 @@ def test_its_check_env():
 def test_the_batch_is_its_own_vector_of_single_ones(task):
     settings = {"time_limit": 1.0, "vehicle": "crazyflie", "control_timestep": 0.04}
     settings |= {"start_height": 0.2} if task == "landing" else {}
-    id = f"quadrl/{task.title()}-v0"
+    id = TASKS[task].gymnasium_id()
     ours = QuadrotorVecEnv(task, COUNT, reward_terms=True, **settings)
     theirs = make_vec_env(id, COUNT, env_kwargs=settings)
     assert ours.observation_space == theirs.observation_space
