@@ -1,7 +1,7 @@
 """Effects of the air on the rotors beyond equation 7, and which of them act on an aircraft.
 
-All are off by default, which leaves the paper's equations. `engines/native/aero.h` and
-`engines/dynamics.py` have the forces, docs/physics.md the equations with their sources.
+Without any, the paper's equations are left. `engines/native/aero.h` and `engines/dynamics.py` have
+the forces, docs/physics.md the equations with their sources.
 """
 
 # pyright: reportUnnecessaryIsInstance=false

@@ -65,7 +65,7 @@ CRAZYFLIE_BRUSHLESS = Vehicle(
     ),
     drag_coefficient=1e-3,  # estimated: what is not drag of the rotors
     moment_coefficient=1e-7,  # chosen: as the brushed one's
-    aerodynamics=BRUSHLESS_AIR,  # IMRCLab flights are 4.7 times nearer with it
+    aerodynamics=BRUSHLESS_AIR,  # by default: identified in IMRCLab flights
     action_scale=400.0,  # chosen: the weakest aircraft of the randomization `full` hovers
     physics_timestep=0.0025,  # chosen: it turns faster than the brushed one
     control_timestep=0.02,  # chosen

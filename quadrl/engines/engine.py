@@ -140,7 +140,7 @@ class Engine(abc.ABC):
         """Put solids that move where they are in each step of the model.
 
         Args:
-            steps: Physics steps; one, if solids move.
+            steps: Physics steps; solids move in the first of them.
             rows: Which aircraft MuJoCo flies, (n,); None for all.
 
         Yields:
@@ -151,7 +151,7 @@ class Engine(abc.ABC):
             return
         rows = np.arange(self.num_envs) if rows is None else rows
         for k in range(steps * self.finer):
-            self.solids.stand(rows, (k + 0.5) / self.finer)
+            self.solids.stand(rows, min((k + 0.5) / self.finer, 1.0))  # then they have arrived
             yield 1
 
     def leg(self, steps: int) -> Leg:

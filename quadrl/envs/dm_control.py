@@ -81,17 +81,17 @@ class Physics(mujoco.Physics):
     def step(self, nstep: int = 1) -> None:
         """Advance by steps of the model; a NativeError without the rotors' callbacks."""
         native.check_installed()
-        finer = self.engine.finer if self.engine is not None else 1
-        left, rest = divmod(nstep, finer)  # physics steps, and a part of one
+        if (engine := self.engine) is None:
+            super().step(nstep)
+            return
+        left, rest = divmod(nstep, engine.finer)  # physics steps, and a part of one
         while left:
             steps = self.inner_loop(left) if self.inner_loop else left
-            if self.engine is not None and self.engine.fly(steps):
+            if engine.fly(steps):
                 self.forward()  # what is drawn and measured belongs to the new state
-            elif self.engine is not None:
-                for count in self.engine.contact_steps(steps):
-                    super().step(count)
             else:
-                super().step(steps)
+                for count in engine.contact_steps(steps):
+                    super().step(count)
             left -= steps
         if rest:
             super().step(rest)

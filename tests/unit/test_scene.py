@@ -614,6 +614,13 @@ def test_a_deck_that_turns_takes_an_aircraft_around():
     assert np.arctan2(matrix[1, 0], matrix[0, 0]) == pytest.approx(1.5, abs=0.03)
 
 
+def test_solids_stay_where_they_have_arrived():
+    _, made = carried(MOVES["sways"], time=0.2)
+    there = made.solids.poses.copy()
+    made.advance(3)
+    np.testing.assert_array_equal(made.solids.table["position"], there[..., :3])
+
+
 @pytest.mark.parametrize("sink", [-0.5, 0.0, 0.5])
 def test_a_touch_of_what_moves_counts_from_it(sink):
     """An aircraft falls 2 cm, from the speed of a deck that sinks or rises."""
