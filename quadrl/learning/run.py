@@ -196,12 +196,15 @@ def train_in(
 
 
 def _later(policy: Policy, scenario: Scenario, episodes: int) -> dict[float, float]:
-    """Share of the flights that succeed where commands act LATER, if that is a control step."""
+    """Share of the flights that succeed where commands act LATER, if that is a control step.
+
+    These delays take the place of drawn ones.
+    """
     vehicle, shares = scenario.vehicle, dict[float, float]()
     for later in LATER if LATER[-1] >= vehicle.control_timestep else ():
-        steps = round((vehicle.dead_time + later) / vehicle.physics_timestep)
-        late = {"dead_time": steps * vehicle.physics_timestep}
-        flown = {"engine": "free_flight", "vehicle_options": late}
+        delay = round(later / vehicle.physics_timestep) * vehicle.physics_timestep
+        late = dataclasses.replace(scenario.randomization, command_delay=(delay, delay))
+        flown = {"engine": "free_flight", "randomization": late}
         found = evaluate(policy, scenario, episodes=episodes, **flown)
         shares[later] = float(found.metrics["success_rate"])
     return shares

@@ -12,6 +12,7 @@ import pytest
 from quadrl import cli, tasks
 from quadrl.cli.flown import parse_options
 from quadrl.core.solved import Target, missed
+from quadrl.learning import run as learning_run
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.run import Run
 
@@ -109,3 +110,18 @@ def test_late_commands_lead_to_the_training_that_stands_them():
     assert said.endswith("10 ms later 98 %, 20 ms later 0 %")
     cli.parse(["train", "hover", *shlex.split(given)])
     assert json.loads(shlex.split(given)[1]) == {"command_delay": [0.0, 0.02]}
+
+
+def test_late_commands_take_the_place_of_drawn_delays(monkeypatch):
+    flown = []
+
+    def evaluate(policy, scenario, **given):
+        flown.append(given["randomization"])
+        return SimpleNamespace(metrics={"success_rate": 1.0})
+
+    monkeypatch.setattr(learning_run, "evaluate", evaluate)
+    drawn = {"mass": (0.8, 1.2), "command_delay": (0.0, 0.02)}
+    scenario = TrainConfig("hover", vehicle="crazyflie", randomization=drawn).scenario
+    assert learning_run._later(None, scenario, 1) == {0.01: 1.0, 0.02: 1.0}
+    assert [one.command_delay for one in flown] == [(0.01, 0.01), (0.02, 0.02)]
+    assert {one.mass for one in flown} == {(0.8, 1.2)}
