@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -219,7 +220,7 @@ def written(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
     for name, value in values.items():
         word = prefix + name.replace("_", "-")
         if name in PAIRS:
-            yield " ".join((word, *(f"{option}={given}" for option, given in value.items())))
+            yield " ".join((word, *(_pair(option, given) for option, given in value.items())))
         elif name in ("weather", "randomization") and isinstance(value, dict):
             yield f"{word} '{json.dumps(value)}'"
         elif isinstance(value, dict):
@@ -230,3 +231,8 @@ def written(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
             yield " ".join((word, *map(str, value)))
         else:
             yield f"{word} {value}"
+
+
+def _pair(option: str, value: Any) -> str:
+    """NAME=VALUE as the command reads it: a text as it is, anything else as JSON."""
+    return shlex.quote(f"{option}={value if isinstance(value, str) else json.dumps(value)}")

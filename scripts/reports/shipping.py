@@ -72,15 +72,16 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     """Copy a policy with its configuration, its metrics and the command that makes it again."""
     kind: Any = {name: getattr(config, name) for name in ("algo", "vehicle", "variant")}
     usual = TrainConfig(config.task, **kind)
-    named = (*FREE, "seed", "engine", "from_run")
+    named = (*FREE, "seed", "engine", "from_run", "training_options")  # the command says them
     if config.from_run:  # a second training
-        named += ("randomization", "training_options")
+        named += ("randomization",)
     free = {name: getattr(usual, name) for name in named}
     if dataclasses.replace(config, **free) != usual:
         return f"left out, {run} has other settings than `quadrl train` gives"
     policy = Policy.load(run)
     metrics = summarize(fly(policy, episodes=EPISODES))
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES}"
+    practice = {k: x for k, x in config.training_options.items() if x != usual.training_options[k]}
     still = summarize(fly(policy, episodes=EPISODES, **CALM))
     if short := missed(tasks.TASKS[config.task].targets, still):
         for old in (file, file.with_suffix(".json")):
@@ -92,7 +93,7 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
         "vehicle": (config.vehicle, TrainConfig.vehicle),
         "from": (config.from_run.partition("@")[0], ""),
         "randomization": (config.randomization, usual.randomization),
-        "training_options": (config.training_options, usual.training_options),
+        "training_options": (practice, {}),
         "engine": (config.engine, usual.engine),
         "variant": (config.variant, "ideal"),
     }

@@ -231,6 +231,14 @@ def test_the_lowest_seed_is_shipped(tmp_path, monkeypatch, capsys):
     shipping.ship((tmp_path / "b",), tmp_path / "out")
     beside = json.loads((tmp_path / "out" / "hover_robust.json").read_text())
     assert beside["command"].endswith(f"--seed {seed} --variant robust")
+    practised = {"training_options": {"faces_east": False}}  # the command says what is not usual
+    flying = Policy.pretrained("random_waypoint", variant="robust")
+    run("c", flying, seed, task="random_waypoint", variant="robust", **practised)
+    shipping.ship((tmp_path / "c",), tmp_path / "out")
+    beside = json.loads((tmp_path / "out" / "random_waypoint_robust.json").read_text())
+    assert beside["command"].endswith("--training-options faces_east=false --variant robust")
+    (tmp_path / "out" / "random_waypoint_robust.json").unlink()
+    (tmp_path / "out" / "random_waypoint_robust.safetensors").unlink()
     capsys.readouterr()
     asked = Target("position_error_m", "error over the last 2 s", 1e-12)
     monkeypatch.setattr(Hover, "targets", (asked,))  # they miss that now, and go
