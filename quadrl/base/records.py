@@ -1,8 +1,9 @@
-"""Operations on records: dataclasses of arrays with a leading axis N, which may be nested."""
+"""Operations on records: mostly dataclasses of arrays with a leading axis N, perhaps nested."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -92,6 +93,17 @@ def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) 
             reason = "what was saved is of another environment"
             allowed = f"{array.dtype} {array.shape}"
             raise QuadrlError(reason, name=name, value=found, allowed=allowed)
+
+
+def as_json(value: Any) -> Any:
+    """A value, with records of any kind in it, as JSON gives it back."""
+    return json.loads(json.dumps(value, default=_taken_apart))
+
+
+def _taken_apart(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 class Columns:

@@ -16,15 +16,12 @@ from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.docstrings import docstrings
-from quadrl.conditions.randomization import RANDOMIZATIONS
-from quadrl.conditions.weather import WEATHERS
-from quadrl.control import CONTROL_MODES, CONTROLLERS
-from quadrl.core.scenario import Conditions
-from quadrl.engines.engine import ENGINES
+from quadrl.control import CONTROLLERS
+from quadrl.core.scenario import GIVEN, Conditions
 from quadrl.learning.config import ALGORITHMS, ALIASES, MEMORIES
-from quadrl.learning.defaults import PAIRS, VARIANTS
+from quadrl.learning.defaults import VARIANTS
+from quadrl.learning.settings import PAIRED
 from quadrl.tasks import TASKS
 
 Kind = TypeVar("Kind")
@@ -50,18 +47,11 @@ Algorithm = Annotated[str, words((*ALGORITHMS, *ALIASES))]
 ControllerName = Annotated[str, words(CONTROLLERS)]
 Camera = Annotated[str, words(("follow", "track", "chase", "onboard", "fixed"))]
 SETTINGS = {
-    "task": TaskName,
     "variant": Annotated[str, words(VARIANTS)],
-    "vehicle": Annotated[str, words(VEHICLES)],
     "algo": Algorithm,
-    "control_mode": Annotated[str, words(CONTROL_MODES)],
-    "engine": Annotated[str, words(ENGINES)],
-    "weather": Annotated[str, words(WEATHERS, "JSON")],
-    "randomization": Annotated[str, words(RANDOMIZATIONS, "JSON")],
     "memory": Annotated[str, words(MEMORIES)],
-    "aerodynamics": str,
 }
-"""Of settings and conditions, by name."""
+"""Of settings, by name."""
 FLAGS = {"from_run": "from"}
 """Of settings that cannot have the name of their flag in Python."""
 
@@ -83,21 +73,24 @@ def optional(kind: Any, default: Callable[[str], str], within: str = "") -> Any:
 
     Args:
         kind: A dataclass or a TypedDict with a field for each option; a field that is a dataclass
-            is a group of options. One without a docstring is that of `Conditions`.
+            is a group of options, and `conditions` of a training are options of their own.
         default: What help says is used where an option is not given, from its whole name.
         within: The group that they are in, with a dot.
     """
     said = docstrings(Conditions) | docstrings(kind)
     fields: list[tuple[str, Any, Any]] = []
+    flown = {k: v for k, v in typing.get_type_hints(Conditions).items() if k in GIVEN}
+    hints = dict[str, Any]()
     for name, hint in typing.get_type_hints(kind).items():
+        hints |= flown if name == "conditions" else {name: hint}
+    for name, hint in hints.items():
         if typing.get_origin(hint) is ClassVar:
             continue
         show = functools.partial(lambda whole, _: default(whole), within + name)
         told = arg(name=FLAGS.get(name), help=said[name], help_behavior_hint=show)
-        if name in PAIRS:
+        if name in PAIRED:
             fields.append((name, Annotated[tuple[str, ...], told], ()))
-        elif name in SETTINGS:
-            word = Positional[SETTINGS[name]] if name == "task" else SETTINGS[name]
+        elif word := _word(name):
             fields.append((name, Annotated[word, told], ""))
         elif dataclasses.is_dataclass(hint):
             group = optional(hint, default, within=f"{within}{name}.")
@@ -106,6 +99,17 @@ def optional(kind: Any, default: Callable[[str], str], within: str = "") -> Any:
         else:
             fields.append((name, Annotated[hint | None, told], None))
     return dataclasses.make_dataclass("Options", fields, frozen=True)
+
+
+def _word(name: str) -> Any:
+    """The type of an option that is a word, or a word or JSON; None for any other."""
+    if name == "task":
+        return Positional[TaskName]
+    how = GIVEN.get(name, {})
+    if (given := how.get("given")) not in ("name", "json"):
+        return SETTINGS.get(name)
+    others = ["JSON"] if given == "json" else []
+    return Annotated[str, words(how["names"], *others)] if "names" in how else str
 
 
 @dataclass_transform(frozen_default=True)

@@ -13,17 +13,12 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, tuples
 from quadrl.cli import choices
 from quadrl.control import CONTROLLERS
-from quadrl.core.scenario import Conditions
+from quadrl.core.scenario import GIVEN, Conditions
 from quadrl.evaluation.controllers import comes_with_quadrl
 from quadrl.evaluation.policy import Policy
-from quadrl.learning.defaults import PAIRS
+from quadrl.learning.settings import PAIRED
 from quadrl.tasks import TASKS
 
-EXAMPLES = {
-    "weather": ' such as {"wind_speed": 5}',
-    "randomization": ' such as {"mass": [0.8, 1.2]}',
-}
-"""Of JSON, by the option that takes it."""
 ConditionOptions: Any = choices.optional(Conditions, lambda name: "")
 
 
@@ -47,9 +42,9 @@ def parsed(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     whole: dict[str, Any] = {k: parsed(v) if isinstance(v, dict) else v for k, v in given.items()}
     return {
-        name: parse_options(value) if name in PAIRS else parse_named(name, value)
+        name: parse_options(value) if name in PAIRED else parse_named(name, value)
         for name, value in whole.items()
-        if value not in (None, "", {}) and (value or name not in PAIRS)
+        if value not in (None, "", {}) and (value or name not in PAIRED)
     }
 
 
@@ -109,7 +104,8 @@ def parse_named(name: str, text: Any) -> Any:
     try:
         return tuples(json.loads(text))
     except (ValueError, RecursionError) as error:
-        allowed = f"a name, or JSON{EXAMPLES.get(name, '')}"
+        example = GIVEN.get(name, {}).get("example")
+        allowed = f"a name, or JSON{f' such as {json.dumps(example)}' if example else ''}"
         raise QuadrlError(f"{error}", name=name, value=text, allowed=allowed) from None
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FEW = 16  # aircraft: with less, most of the time goes into calls from Python
 
 
-shown: dict[str, Any] = dict(flat(dataclasses.asdict(TrainConfig())))
+shown: dict[str, Any] = dict(flat(TrainConfig().named()))
 """The defaults that help shows, by the names of the settings."""
 
 
@@ -42,7 +42,7 @@ def show_defaults(words: Sequence[str]) -> None:
     with contextlib.suppress(QuadrlError):  # the parser says what is wrong
         config = TrainConfig(task, **given)
         shown.clear()
-        shown.update(flat(dataclasses.asdict(config)))
+        shown.update(flat(config.named()))
 
 
 def _default(name: str) -> str:
@@ -62,7 +62,8 @@ class Train:
     """Train a policy from scratch, evaluate it, and write results and pictures to a run folder.
 
     The defaults shown are for hover, ppo and the aircraft paper. Give a task, --algo, --vehicle or
-    --variant with --help to see theirs. --dry-run says where each setting comes from.
+    --variant with --help to see theirs. --dry-run says where each setting comes from. --engine is
+    that of the training; evaluations fly in mujoco.
     """
 
     settings: Annotated[Settings, arg(name="")]  # pyright: ignore[reportInvalidTypeForm]
@@ -141,7 +142,7 @@ class Train:
             kept = (folder / names.CONFIG).exists()
             advice = f"the run is kept, {go_on}" if kept else "choose another --out"
             raise QuadrlError(f"{reason(error)}; {advice}") from error
-        say(f"\n{run.summary} (imports: {imports:.1f} s; engine: {config.engine})\n")
+        say(f"\n{run.summary} (imports: {imports:.1f} s; engine: {config.base.engine})\n")
         if run.lateness:
             say(f"{run.lateness}\n")
         if config.num_envs < FEW:

@@ -22,9 +22,10 @@ from typing import Any, cast
 
 from quadrl.aircraft import presets
 from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.records import as_json
 from quadrl.core.catalogue import TASKS
 from quadrl.core.rules import IMPORTED, import_own
-from quadrl.core.scenario import Scenario, as_json
+from quadrl.core.scenario import Scenario
 from quadrl.engines.native.compiling import cache_folder
 
 MOST_TOLD = 3

@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import functools
 import inspect
-import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Unpack, cast
@@ -23,10 +22,11 @@ from quadrl.aircraft.aerodynamics import FULL, Aerodynamics
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
+from quadrl.base.records import as_json
 from quadrl.conditions import observing, randomization
 from quadrl.conditions.observing import Observed, Observing
-from quadrl.conditions.randomization import Randomization, Randomized
-from quadrl.conditions.weather import Weather, Weathered
+from quadrl.conditions.randomization import RANDOMIZATIONS, Randomization, Randomized
+from quadrl.conditions.weather import WEATHERS, Weather, Weathered
 from quadrl.control import modes
 from quadrl.core import catalogue
 from quadrl.core.task import Task
@@ -76,34 +76,48 @@ _effects = functools.partial(validation.record, "aerodynamics", kind=Aerodynamic
 _engine = functools.partial(validation.choice, "engine", choices=ENGINES)
 
 
-def _condition(default: Any, parse: Callable[[Any], Any]) -> Any:
-    """A field with the function that makes its value of what may be given for it."""
-    return dataclasses.field(default=default, metadata={"parse": parse})
+def _condition(default: Any, parse: Callable[[Any], Any], given: str = "", **more: Any) -> Any:
+    """A field, with what may be given for it.
+
+    Args:
+        default: What stands for its default; None, in files an empty text or record, for nothing.
+        parse: Makes its value of what is given.
+        given: How commands take it: as a "name", as a name or "json", as "pairs" of names and
+            values, which add to the default ones; else as the type of its keyword says.
+        **more: The `names` that there are, and an `example` of JSON.
+    """
+    usual: Any = default if default is not None else {} if given == "pairs" else ""
+    metadata = {"parse": parse, "given": given, "usual": usual, **more}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
     """What is flown and how; `of` makes one, and `to_json` gives back what `of` takes.
 
-    To add a condition, add a field with the function that parses it, its keyword to `Conditions`,
-    and a field to `quadrl.learning.settings.TrainSettings`.
+    To add a condition, add a field here and its keyword, with its type and what help says of it, to
+    `Conditions`.
     """
 
     task: Task = dataclasses.field(metadata={"parse": catalogue.make})
     """The task with its options."""
-    vehicle: Vehicle = _condition(presets.VEHICLES["paper"], presets.resolve)
+    vehicle: Vehicle = _condition("paper", presets.resolve, "name", names=presets.VEHICLES)
     """The aircraft as it is specified; `aircraft` is what flies."""
-    aerodynamics: str | Aerodynamics | None = _condition(None, _effects)
+    aerodynamics: str | Aerodynamics | None = _condition(None, _effects, "name")
     """Effects of the air that were asked for, or that wind brings; None for the aircraft's own."""
-    weather: Weather = _condition(Weather(), Weather.of)
+    weather: Weather = _condition(
+        "calm", Weather.of, "json", names=WEATHERS, example={"wind_speed": 5}
+    )
     """What the wind is like."""
-    randomization: Randomization = _condition(Randomization(), randomization.resolve)
+    randomization: Randomization = _condition(
+        "none", randomization.resolve, "json", names=RANDOMIZATIONS, example={"mass": [0.8, 1.2]}
+    )
     """What is drawn for each aircraft at each reset and disturbs it."""
-    observe: Observing = _condition(Observing(), observing.resolve)
+    observe: Observing = _condition(None, observing.resolve, "pairs")
     """Options of the observation."""
-    control_mode: str = _condition("rotor", modes.named)
+    control_mode: str = _condition("rotor", modes.named, "name", names=modes.CONTROL_MODES)
     """What actions mean."""
-    engine: EngineName = _condition("mujoco", _engine)
+    engine: EngineName = _condition("mujoco", _engine, "name", names=ENGINES)
     """What flies it."""
 
     def __post_init__(self) -> None:
@@ -111,8 +125,10 @@ class Scenario:
         for field in dataclasses.fields(self):
             value = field.metadata["parse"](getattr(self, field.name))
             object.__setattr__(self, field.name, value)
-        if self.aerodynamics is None and not self.weather.calm:
-            object.__setattr__(self, "aerodynamics", _in_wind(self.vehicle))
+        own = self.aerodynamics is not None or self.vehicle.aerodynamics.effects
+        if not (own or self.weather.calm):
+            _check_in_wind(self.vehicle)
+            object.__setattr__(self, "aerodynamics", FULL)
         wind = self.weather.wind_speed * self.randomization.wind[1] + self.weather.gust_speed
         if wind > (resolved := self.aircraft.resolved_speed):
             reason = "faster air carries the aircraft off at a speed that its step does not resolve"
@@ -153,11 +169,8 @@ class Scenario:
         else:
             whole = _recorded(given) if isinstance(given, Mapping) else {"task": given}
         file = whole.pop("file", None)
-        new: dict[str, Any] = {
-            name: value
-            for name, value in {"task": task, **keywords}.items()
-            if value is not None or name not in KEYWORDS
-        }
+        new: dict[str, Any] = {"task": task, **keywords}
+        new = {k: value for k, value in new.items() if value is not None or k not in KEYWORDS}
         for name in ("task", "vehicle"):
             if name in new and new[name] == getattr(there := whole.get(name), "name", there):
                 del new[name]
@@ -182,10 +195,9 @@ class Scenario:
         made = catalogue.make(whole["task"])
         known = [field.name for field in dataclasses.fields(made)]
         validation.keys(f"{made.name} option", others, [*KEYWORDS, *also, *known], tried=bool(also))
-        parts: dict[str, Any] = {k: value for k, value in whole.items() if value is not None}
         made = made.replace(**validation.tuples(options | others))
-        parts |= {"task": made, "vehicle": vehicle}
-        return cls(**parts)
+        whole |= {"task": made, "vehicle": vehicle}
+        return cls(**{name: value for name, value in whole.items() if value is not None})
 
     def to_json(self) -> dict[str, Any]:
         """All of it, as JSON can hold it; `of` makes the same scenario, whatever names mean then.
@@ -203,11 +215,8 @@ class Scenario:
             found["aircraft"] = as_json(self.aircraft)
         known = presets.VEHICLES.get(self.vehicle.name, self.vehicle)
         usual = {field.name: _default(field) for field in dataclasses.fields(self.task)}
-        stands = {field.name: getattr(known, field.name) for field in dataclasses.fields(known)}
-        found["changed"] = {
-            "task": _differing(self.task, usual),
-            "vehicle": _differing(self.vehicle, stands),
-        }
+        pairs = {"task": (found["task_options"], usual), "vehicle": (found["vehicle"], known)}
+        found["changed"] = {name: _differing(*pair) for name, pair in pairs.items()}
         if not (kind := type(self.task)).__module__.startswith("quadrl."):
             with contextlib.suppress(OSError, TypeError):  # of a notebook
                 found["file"] = Path(inspect.getfile(kind)).name
@@ -236,13 +245,15 @@ class Scenario:
 
     def compile_model(self, *, drawn: bool = True) -> mujoco.MjModel:
         """The model of the aircraft in the world of the task, to draw, or lean, to simulate."""
-        task = self.task
-        return mjcf.compile_model(
-            self.aircraft, contact=task.contact, drawn=drawn, scene=task.build
-        )
+        flies, task = self.aircraft, self.task
+        return mjcf.compile_model(flies, contact=task.contact, drawn=drawn, scene=task.build)
 
 
 FIELDS = dataclasses.fields(Scenario)
+_OPTIONS: Mapping[str, Any] = {"given": "pairs", "usual": {}}
+GIVEN: dict[str, Mapping[str, Any]] = {field.name: field.metadata for field in FIELDS[1:]}
+GIVEN["task_options"] = GIVEN["vehicle_options"] = _OPTIONS
+"""How the conditions of a training are given, by keyword: see `_condition`."""
 KEYWORDS = ("task", *Conditions.__annotations__)
 """The keywords of `Scenario.of`."""
 RECORDED = (*KEYWORDS, "aircraft", "changed", "file")
@@ -264,14 +275,12 @@ def _recorded(given: Mapping[str, Any]) -> dict[str, Any]:
     return whole
 
 
-def _in_wind(vehicle: Vehicle) -> str | None:
-    """Effects of the air on an aircraft in wind, where none were asked for; None for its own.
+def _check_in_wind(vehicle: Vehicle) -> None:
+    """Refuse wind for an aircraft without effects of the air whose full set cannot be had.
 
     Raises:
-        QuadrlError: It has none of its own, and the full set is not known or not possible.
+        QuadrlError: The full set is not known or not possible.
     """
-    if vehicle.aerodynamics.effects:
-        return None
     try:
         presets.check_known(vehicle)
         presets.in_real_air(vehicle)
@@ -279,25 +288,13 @@ def _in_wind(vehicle: Vehicle) -> str | None:
         reason = f"wind acts on the rotors too: {error}"
         allowed = "the aircraft's own Aerodynamics, or 'none' for wind that acts by drag alone"
         raise QuadrlError(reason, name="aerodynamics", value=FULL, allowed=allowed) from error
-    return FULL
 
 
-def _differing(record: Any, usual: Mapping[str, Any]) -> list[str]:
-    """The names of the fields of a record whose values are not the usual ones."""
-    return [k for k, value in usual.items() if as_json(getattr(record, k)) != as_json(value)]
+def _differing(own: Mapping[str, Any], usual: Any) -> list[str]:
+    """The names of the fields of a record, as JSON has it, that are not those of the usual one."""
+    return [name for name, value in as_json(usual).items() if own[name] != value]
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:
     made = field.default_factory
     return field.default if made is dataclasses.MISSING else made()
-
-
-def as_json(value: Any) -> Any:
-    """A value as JSON gives it back."""
-    return json.loads(json.dumps(value, default=_taken_apart))
-
-
-def _taken_apart(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-    return value.tolist() if hasattr(value, "tolist") else str(value)

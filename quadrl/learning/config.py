@@ -17,24 +17,21 @@ from quadrl.aircraft.aerodynamics import FULL
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import free_name
+from quadrl.base.records import as_json
 from quadrl.base.validation import choice, number, resolved, tuples
 from quadrl.base.version import __version__
-from quadrl.conditions.observing import Observing
-from quadrl.conditions.observing import resolve as resolve_observing
-from quadrl.conditions.randomization import Randomization
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
-from quadrl.control import modes
 from quadrl.core.record import import_again, warn_of_changes
-from quadrl.core.scenario import KEYWORDS, Scenario
+from quadrl.core.scenario import GIVEN, Scenario
 from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning import foreign
-from quadrl.learning.defaults import PAIRS, flat, training_defaults
+from quadrl.learning.defaults import flat, training_defaults
 from quadrl.learning.folder import CHANGEABLE, CONFIG, read_config
 from quadrl.learning.origin import Origin, with_networks
-from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
+from quadrl.learning.settings import ALGORITHM_CONFIGS, PAIRED, USUAL, TrainSettings
 from quadrl.tasks import TASKS
 
 ALGORITHMS = tuple(ALGORITHM_CONFIGS)
@@ -62,20 +59,19 @@ class TrainConfig(TrainSettings):
         Args:
             task: Name of the task.
             recorded: The scenario of a run, as `Scenario.to_json` gave it.
-            **settings: The other fields, None for the default; the settings of an algorithm (`ppo`)
-                may be a dict with some of them.
+            **settings: The other settings, as `named` has them, None for the default; those of an
+                algorithm (`ppo`) may be a dict with some of them.
 
         Raises:
             QuadrlError: A setting is unknown or out of range.
         """
         object.__setattr__(self, "recorded", recorded)
-        settings = _given(settings)
+        settings = _given(settings.pop("conditions", {}) | settings)  # of a copy
         algo = algorithm_of(task, settings.get("algo"))
-        known = [field.name for field in dataclasses.fields(self)]
-        foreign.refuse_unknown("setting", settings, known, algo)
+        foreign.refuse_unknown("setting", settings, USUAL, algo)
         settings = with_networks(settings)
-        kind = TASKS.get(task, Task)  # an unknown task is refused with the defaults
-        vehicle = settings.setdefault("vehicle", kind.trained_on)
+        # An unknown task is refused with the defaults.
+        vehicle = settings.setdefault("vehicle", TASKS.get(task, Task).trained_on)
         variant = settings.get("variant", TrainConfig.variant)
         varied = self._known(vehicle), variant, settings.get("memory")
         values, _ = training_defaults(task, algo, *varied)
@@ -85,39 +81,35 @@ class TrainConfig(TrainSettings):
                 with_it, _ = training_defaults(task, name, *varied)
                 given = _idle(name, given, (values[name], with_it[name]), algo)
             if isinstance(given, dict):
-                known = [field.name for field in dataclasses.fields(own)]
-                foreign.refuse_unknown(f"setting of {name}", given, known, algo)
+                foreign.refuse_unknown(f"setting of {name}", given, values[name], algo)
                 given = values[name] | _given(given)
             settings[name] = resolved(name, given, own, word="setting")
-        if isinstance(given := settings.get("randomization"), Randomization):
-            settings["randomization"] = given.given() or "none"
-        if isinstance(given := settings.get("weather"), Weather):
-            settings["weather"] = dataclasses.asdict(given)
-        if isinstance(given := settings.get("observe"), Observing):
-            settings["observe"] = given.given()
-        if "control_mode" in settings:
-            settings["control_mode"] = modes.named(settings["control_mode"])
+        for name, how in GIVEN.items():
+            if dataclasses.is_dataclass(given := settings.get(name)):
+                short = getattr(given, "given", lambda record=given: as_json(record))
+                settings[name] = short() or how["usual"]
         if isinstance(given := settings.get("task_options"), dict):
             usual = values["training_options"]  # they do not replace options that are given
             values["training_options"] = {k: v for k, v in usual.items() if k not in given}
-        for name in PAIRS:
+        for name in PAIRED:
             if isinstance(settings.get(name), dict) and recorded is None:
                 settings[name] = values[name] | settings[name]
-        for name, value in (values | settings | {"task": task, "algo": algo}).items():
-            object.__setattr__(self, name, tuples(value))
-        object.__setattr__(self, "aerodynamics", self.aerodynamics or self._wind_brings())
+        whole = tuples(values | settings | {"task": task, "algo": algo})
+        whole["conditions"] = flown = {name: whole.pop(name) for name in GIVEN}
+        vars(self).update(whole)
+        flown["aerodynamics"] = flown["aerodynamics"] or self._wind_brings()
         self._check()
 
     def __repr__(self) -> str:
-        usual, values = tuples(self._defaults()[0]), dataclasses.asdict(self)
+        usual, values = tuples(self._defaults()[0]), self.named()
         own = [name for name in values if name in ("algo", "seed") or values[name] != usual[name]]
-        given = ", ".join(f"{name}={getattr(self, name)!r}" for name in own if name != "task")
+        held = {**vars(self), **self.conditions}
+        given = ", ".join(f"{name}={held[name]!r}" for name in own if name != "task")
         return f"TrainConfig({self.task!r}, {given})"
 
     def _defaults(self) -> tuple[dict[str, Any], dict[str, str]]:
-        values, sources = training_defaults(
-            self.task, self.algo, self._known(self.vehicle), self.variant, self.memory
-        )
+        chosen = self.task, self.algo, self._known(self.conditions["vehicle"])
+        values, sources = training_defaults(*chosen, self.variant, self.memory)
         if not values["aerodynamics"] and (brought := self._wind_brings()):
             values["aerodynamics"], sources["aerodynamics"] = brought, "in wind"
         if self.from_run:
@@ -129,11 +121,11 @@ class TrainConfig(TrainSettings):
 
     def _known(self, vehicle: str) -> str:
         """The aircraft whose defaults count; a run may have one that is no longer known."""
-        return TrainConfig.vehicle if self.recorded and vehicle not in VEHICLES else vehicle
+        return USUAL["vehicle"] if self.recorded and vehicle not in VEHICLES else vehicle
 
     def _wind_brings(self) -> str:
         """Effects of the air if none are given: the full set in wind, none in calm weather."""
-        return "" if Weather.of(self.weather).calm else FULL
+        return "" if Weather.of(self.conditions["weather"]).calm else FULL
 
     def sources(self) -> Iterator[tuple[str, Any, str]]:
         """Name, value and origin of every setting that this training uses.
@@ -144,7 +136,7 @@ class TrainConfig(TrainSettings):
         usual, layers = self._defaults()
         others = {*ALGORITHMS} - {self.algo}
         values = dict(flat(usual))
-        for name, value in flat(dataclasses.asdict(self)):
+        for name, value in flat(self.named()):
             if name.partition(".")[0] not in others:
                 same = name in values and tuples(values[name]) == value
                 yield name, value, layers[name] if same else "given"
@@ -167,9 +159,10 @@ class TrainConfig(TrainSettings):
         ):
             object.__setattr__(self, name, number(name, getattr(self, name), low, high, **rest))
         widths: dict[str, type] = {"hidden": tuple, "critic_hidden": tuple}
-        for name, kind in (widths | dict.fromkeys(PAIRS, dict)).items():
-            if not isinstance(value := getattr(self, name), kind):
-                raise QuadrlError(name=name, value=value, allowed=f"a {kind.__name__}")
+        values = vars(self) | self.conditions
+        for name, kind in (widths | dict.fromkeys(PAIRED, dict)).items():
+            if not isinstance(values[name], kind):
+                raise QuadrlError(name=name, value=values[name], allowed=f"a {kind.__name__}")
         for width in (*self.hidden, *self.critic_hidden):
             number("width of a hidden layer", width, 1, MAX_WIDTH, whole=True)
         batch = self.num_envs * self.rollout  # one advantage alone has no standard deviation
@@ -190,8 +183,7 @@ class TrainConfig(TrainSettings):
     @property
     def scenario(self) -> Scenario:
         """What the policy has to fly, in MuJoCo, and what it observes."""
-        observe = resolve_observing(self.observe).for_policy()
-        return Scenario.of(self.base, engine="mujoco", observe=observe)
+        return Scenario.of(self.base, engine="mujoco", observe=self.base.observe.for_policy())
 
     @property
     def training_scenario(self) -> Scenario:
@@ -201,9 +193,8 @@ class TrainConfig(TrainSettings):
     @functools.cached_property
     def base(self) -> Scenario:
         """What its settings name, or the run that it was read from has recorded; made once."""
-        given = {name: getattr(self, name, None) for name in KEYWORDS}
-        named = {name: value for name, value in given.items() if value not in (None, "", {})}
-        return Scenario.of(self.recorded or named)
+        named = {name: value for name, value in self.conditions.items() if value not in ("", {})}
+        return Scenario.of(self.recorded or {"task": self.task, **named})
 
     @property
     def iterations(self) -> int:
@@ -215,8 +206,7 @@ class TrainConfig(TrainSettings):
         scenario = self.base.to_json()
         if self.recorded:
             scenario["changed"] = self.recorded.get("changed", {})
-        whole = {"scenario": scenario, "versions": _versions()}
-        whole = dataclasses.asdict(self) | whole
+        whole = self.named() | {"scenario": scenario, "versions": _versions()}
         for name in {*ALGORITHMS} - {self.algo}:  # they do nothing
             del whole[name]
         return json.loads(json.dumps(whole))
@@ -242,8 +232,7 @@ class TrainConfig(TrainSettings):
         Raises:
             QuadrlError: Its task is not known here, or something in it cannot be used.
         """
-        names = (field.name for field in dataclasses.fields(cls))
-        given = {name: saved[name] for name in names if name in saved} | changes
+        given = {name: saved[name] for name in USUAL if name in saved} | changes
         if not isinstance(recorded := saved.get("scenario"), Mapping):
             raise QuadrlError(name="scenario of a run", value=recorded, allowed="a table")
         return cls(**given, recorded=recorded)

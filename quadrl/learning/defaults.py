@@ -23,14 +23,13 @@ from typing import Any
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.validation import IN_A_FILE, choice, keys
 from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.core.scenario import GIVEN
 from quadrl.core.task import Task
-from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
+from quadrl.learning.settings import ALGORITHM_CONFIGS, PAIRED, USUAL
 from quadrl.tasks import TASKS
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
 """Settings that the other defaults depend on, or that have no better default than another."""
-PAIRS = ("task_options", "training_options", "vehicle_options", "observe")
-"""Settings that are dicts: given entries are added to the default ones."""
 PER_STEP: dict[str, Callable[[Any, float], Any]] = {
     "gamma": lambda gamma, often: round(gamma ** (1 / often), 4),
     "rollout": lambda steps, often: max(1, round(steps * often)),
@@ -133,7 +132,7 @@ def training_defaults(
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
     choice("vehicle", vehicle, VEHICLES, IN_A_FILE)
     check_stated(kind)
-    fields, own = dataclasses.asdict(TrainSettings()), _unusual(kind, algo)
+    fields, own = merged(USUAL), _unusual(kind, algo)
     if own.get("vehicle", "paper") != vehicle:  # the numbers of another aircraft
         own.pop("vehicle_options", None)
     varied = (shared, kind.variants.get(variant, {}), OF_VEHICLE.get((variant, vehicle), {}))
@@ -165,7 +164,7 @@ def check_stated(task: type[Task]) -> None:
         QuadrlError: The message lists the settings.
     """
     stated = merged(task.training, *task.training_with.values(), *task.variants.values())
-    known = [field.name for field in dataclasses.fields(TrainSettings) if field.name not in CHOSEN]
+    known = [name for name in USUAL if name not in CHOSEN]
     keys(f"training default of {task.name}", stated, known)
 
 
@@ -190,7 +189,7 @@ def own_settings(task: Task | type[Task]) -> dict[str, Any]:
 def _unusual(task: Task | type[Task], algo: str) -> dict[str, Any]:
     """Return the same with any algorithm, at the control rate of the paper's aircraft."""
     chosen = {"vehicle": task.trained_on, "algo": task.trained_by}
-    unusual = {name: own for name, own in chosen.items() if own != getattr(TrainSettings, name)}
+    unusual = {name: own for name, own in chosen.items() if own != USUAL[name]}
     return merged(unusual, task.training, task.training_with.get(algo, {}))
 
 
@@ -219,9 +218,9 @@ def written(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
     """Nested settings as `quadrl train` takes them."""
     for name, value in values.items():
         word = prefix + name.replace("_", "-")
-        if name in PAIRS:
+        if name in PAIRED:
             yield " ".join((word, *(_pair(option, given) for option, given in value.items())))
-        elif name in ("weather", "randomization") and isinstance(value, dict):
+        elif isinstance(value, dict) and GIVEN.get(name, {}).get("given") == "json":
             yield f"{word} '{json.dumps(value)}'"
         elif isinstance(value, dict):
             yield from written(value, f"{word}.")

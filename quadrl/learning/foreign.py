@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from quadrl.base.errors import UnknownKeyword
 from quadrl.base.validation import keys
-from quadrl.learning.settings import ALGORITHM_CONFIGS, TrainSettings
+from quadrl.learning.settings import ALGORITHM_CONFIGS, USUAL
 
 SB3 = "Stable-Baselines3 has it, and trains on quadrl.envs.sb3.QuadrotorVecEnv"
 ALGORITHMS = {"sac": SB3, "td3": SB3, "ddpg": SB3, "a2c": "vpg", "pg": "vpg"}
@@ -60,7 +60,7 @@ def setting(name: str, algo: str, *, guess: bool = True) -> str:
     """
     word = name.lower().replace("-", "_").rpartition(".")[2]
     own = {one.name: f"{algo}.{one.name}" for one in dataclasses.fields(ALGORITHM_CONFIGS[algo])}
-    known = {one.name: one.name for one in dataclasses.fields(TrainSettings)} | {"out": "out"} | own
+    known = {one: one for one in USUAL} | {"out": "out"} | own
     known = {one: full for one, full in known.items() if one not in ("task", *ALGORITHM_CONFIGS)}
     for answer, elsewhere in SETTINGS.items():
         if word in elsewhere.split():

@@ -18,6 +18,7 @@ from quadrl.learning import foreign
 from quadrl.learning.config import ALIASES, TrainConfig, algorithm_of
 from quadrl.learning.defaults import merged
 from quadrl.learning.executor import PlannedRun
+from quadrl.learning.settings import USUAL
 
 KEYS = ("tasks", "algorithms", "seeds", "episodes", "settings", "only", "variants")
 SOME = ("tasks", "algorithms")
@@ -102,7 +103,7 @@ def _settings(key: str, given: Any, algorithms: list[str]) -> dict[str, Any]:
         raise QuadrlError(name=key, value=given, allowed="a table of settings of a training")
     for name in OWN.keys() & given.keys():
         raise QuadrlError(name=f"{key}.{name}", value=given[name], allowed=OWN[name])
-    known = [field.name for field in dataclasses.fields(TrainConfig) if field.name not in OWN]
+    known = [name for name in USUAL if name not in OWN]
     algo = algorithm_of(TrainConfig.task, algorithms[0])
     foreign.refuse_unknown(f"setting in {key}", given, known, algo)
     return given

@@ -108,7 +108,8 @@ class Run:
 
     def _repr_html_(self) -> str:
         config = self.config
-        head = f"{config.task}, {config.algo.upper()}, seed {config.seed}, {config.vehicle}"
+        aircraft = config.conditions["vehicle"]
+        head = f"{config.task}, {config.algo.upper()}, seed {config.seed}, {aircraft}"
         rows = [("trained", head), ("folder", str(self.folder)), ("seconds", f"{self.seconds:.1f}")]
         rows += [("", self.misses)] * bool(self.misses)
         return html_table(rows) + self.evaluation._repr_html_()

@@ -10,10 +10,13 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import number
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import DELAYS, NONE
+from quadrl.core.scenario import GIVEN
 
 LATE_OR_UNSURE = (*DELAYS, "noise", "bias")
 """What a randomization may not have where a training goes through the physics: the observation must
 follow from the state, and the rotors' commands from the action alone."""
+_SURE = f"without {', '.join(LATE_OR_UNSURE)}"
+_CONDITIONS = {name: how["usual"] for name, how in GIVEN.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,18 +146,18 @@ class APGConfig(AlgorithmConfig):
 
     def check(self, config: Any) -> None:
         """Refuse the settings with which the derivatives of the flight are not known."""
-        scenario = config.training_scenario
-        task, drawn = scenario.task, scenario.randomization
+        flown, given = config.training_scenario, config.conditions
+        task, drawn = flown.task, flown.randomization
         unsure = any(getattr(drawn, name) != getattr(NONE, name) for name in LATE_OR_UNSURE)
-        observed = scenario.observe != Observing()
+        observed = flown.observe != Observing()
         for name, value, wrong, allowed in (
-            ("engine", config.engine, config.engine != "free_flight", "'free_flight'"),
+            ("engine", flown.engine, flown.engine != "free_flight", "'free_flight'"),
             ("memory", config.memory, config.memory != "none", "'none'"),
             ("device", config.device, config.device != "cpu", "'cpu'"),
             ("task", task.name, task.contact, "a task without contact with the ground"),
             ("task", task.name, task.true_parameters, "a task that sees the specified parameters"),
-            ("observe", config.observe, observed, "left out"),
-            ("randomization", config.randomization, unsure, f"without {', '.join(LATE_OR_UNSURE)}"),
+            ("observe", given["observe"], observed, "left out"),
+            ("randomization", given["randomization"], unsure, _SURE),
         ):
             if wrong:
                 reason = "apg takes the derivatives of the whole flight, and has none for this"
@@ -169,8 +172,8 @@ ALGORITHM_CONFIGS = {"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig, "ap
 class TrainSettings:
     """The fields of `quadrl.learning.config.TrainConfig`.
 
-    Their defaults are the first layer of those of a task: see `quadrl.learning.defaults`. Those
-    without a docstring are conditions of flight, which `quadrl.core.scenario.Conditions` documents.
+    Their defaults are the first layer of those of a task: see `quadrl.learning.defaults`. Each of
+    the conditions is a setting of its own to whoever gives, reads or saves them: see `named`.
     """
 
     task: str = "hover"
@@ -183,21 +186,14 @@ class TrainSettings:
     variant: str = "ideal"
     """Group of settings: ideal (the paper's episodes), or robust (an uncertain aircraft in light
     wind, and a policy that sees what it needs for that)."""
-    vehicle: str = "paper"
-    """Name of the aircraft."""
-    vehicle_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    control_mode: str = "rotor"
-    engine: str = "free_flight"
-    """Engine of the training: free_flight (which uses MuJoCo only near the ground and solids) or
-    mujoco. Evaluations always fly in mujoco."""
-    task_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    conditions: dict[str, Any] = dataclasses.field(
+        default_factory=lambda: _CONDITIONS | {"engine": "free_flight"}
+    )
+    """The conditions of flight by keyword, as they were given: `quadrl.core.scenario.Conditions`
+    documents them. Evaluations always fly in mujoco."""
     training_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the task for the training only, such as farthest=3: a policy is weakest at the
     edge of what it was trained on."""
-    aerodynamics: str = ""
-    weather: Any = "calm"
-    randomization: Any = "none"
-    observe: dict[str, Any] = dataclasses.field(default_factory=dict)
     num_envs: int = 256
     """Aircraft simulated at the same time."""
     rollout: int = 16
@@ -250,3 +246,16 @@ class TrainSettings:
     the training."""
     episodes: int = 100
     """Episodes of the evaluation at the end."""
+
+    def named(self) -> dict[str, Any]:
+        """All of them by name, with each of the conditions as one; records are dicts."""
+        whole = dict[str, Any]()
+        for name, value in dataclasses.asdict(self).items():
+            whole |= value if name == "conditions" else {name: value}
+        return whole
+
+
+USUAL = TrainSettings().named()
+"""The defaults of all settings, by name."""
+PAIRED = ("training_options", *(name for name in GIVEN if GIVEN[name]["given"] == "pairs"))
+"""Settings that are dicts: given entries are added to the default ones."""

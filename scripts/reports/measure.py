@@ -38,15 +38,16 @@ def training(runs: Runs) -> None:
     yardstick: dict[tuple[str, str], Result] = {}
     curves: dict[str, list[Any]] = {}
     for run, config in configs.items():
-        known = {x: getattr(config, x) for x in ("task", "vehicle", "engine", "algo", "seed")}
+        whole = config.named()
+        known = {name: whole[name] for name in ("task", "vehicle", "engine", "algo", "seed")}
         took = json.loads((run / EVALUATION).read_text())["training_s"]
         steps = config.iterations * config.num_envs * config.rollout
         found.append(known | {"steps": steps, "training_s": took, "metrics": flown(run, config)})
-        task, vehicle = config.task, config.vehicle
+        task, vehicle = config.task, whole["vehicle"]
         if (task, vehicle) not in yardstick:
             metrics = flown("geometric", config)
             yardstick[task, vehicle] = {"task": task, "vehicle": vehicle, "metrics": metrics}
-        if (vehicle, config.engine) == (tasks.TASKS[task].trained_on, "free_flight"):
+        if (vehicle, whole["engine"]) == (tasks.TASKS[task].trained_on, "free_flight"):
             curves.setdefault(task, []).append(read_metrics(run / METRICS))
     for task, metrics in curves.items():
         by = {tasks.TASKS[task].trained_by: metrics}

@@ -62,7 +62,8 @@ def ship(runs: Runs, out: Path = SHIPPED) -> None:
     for config, run in sorted(found, key=lambda each: each[0].seed):
         kind = SHIPPED_AS.get(config.algo, config.algo)
         if config.variant != "ideal":
-            kind = "_".join((config.variant, config.vehicle)).removesuffix("_paper")
+            whole = config.named()
+            kind = "_".join((whole["variant"], whole["vehicle"])).removesuffix("_paper")
         chosen.setdefault(f"{config.task}_{kind}", (config, run))
     for name, (config, run) in sorted(chosen.items()):
         say(f"{name}: {copied(run, config, out / f'{name}.safetensors')}")
@@ -70,18 +71,19 @@ def ship(runs: Runs, out: Path = SHIPPED) -> None:
 
 def copied(run: Path, config: TrainConfig, file: Path) -> str:
     """Copy a policy with its configuration, its metrics and the command that makes it again."""
-    kind: Any = {name: getattr(config, name) for name in ("algo", "vehicle", "variant")}
-    usual = TrainConfig(config.task, **kind)
+    own = config.named()
+    kind = {name: own[name] for name in ("algo", "vehicle", "variant")}
+    usual = (trained := TrainConfig(config.task, **kind)).named()
     named = (*FREE, "seed", "engine", "from_run", "training_options")  # the command says them
     if config.from_run:  # a second training
         named += ("randomization",)
-    free = {name: getattr(usual, name) for name in named}
-    if dataclasses.replace(config, **free) != usual:
+    if dataclasses.replace(config, **{name: usual[name] for name in named}) != trained:
         return f"left out, {run} has other settings than `quadrl train` gives"
     policy = Policy.load(run)
     metrics = summarize(fly(policy, episodes=EPISODES))
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES}"
-    practice = {k: x for k, x in config.training_options.items() if x != usual.training_options[k]}
+    practised = usual["training_options"]
+    practice = {k: x for k, x in config.training_options.items() if x != practised[k]}
     still = summarize(fly(policy, episodes=EPISODES, **CALM))
     if short := missed(tasks.TASKS[config.task].targets, still):
         for old in (file, file.with_suffix(".json")):
@@ -90,11 +92,11 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     told = {
         "algo": (config.algo, None),
         "seed": (config.seed, None),
-        "vehicle": (config.vehicle, TrainConfig.vehicle),
+        "vehicle": (own["vehicle"], "paper"),
         "from": (config.from_run.partition("@")[0], ""),
-        "randomization": (config.randomization, usual.randomization),
+        "randomization": (own["randomization"], usual["randomization"]),
         "training_options": (practice, {}),
-        "engine": (config.engine, usual.engine),
+        "engine": (own["engine"], usual["engine"]),
         "variant": (config.variant, "ideal"),
     }
     words = written({name: value for name, (value, given) in told.items() if value != given})

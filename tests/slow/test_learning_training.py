@@ -73,7 +73,7 @@ def test_every_algorithm_continues_where_it_was_stopped(tmp_path, algo):
     policy = quadrl.Policy.load(alone)
     assert policy.metadata["algo"] == algo and policy.action_size == (6 if algo == "apg" else 4)
     assert (policy.metadata["vehicle"]["name"], policy.metadata["rotors"]) == ("hexa", 6)
-    assert policy.control_mode == config.control_mode
+    assert policy.control_mode == config.conditions["control_mode"]
 
 
 def test_an_uncertain_training_continues_and_its_policy_knows_what_it_met(tmp_path):

@@ -23,7 +23,8 @@ def some_policy(task, **settings):
     actor, _, normalisers = make_actor_critic(environment.size, environment.action_size, config)
     seen = 0.3 + torch.rand(50, environment.size)
     normalisers["observation"].update(seen)
-    return export(disturbed(actor), task, {"vehicle_options": config.vehicle_options}), actor
+    own = {"vehicle_options": config.conditions["vehicle_options"]}
+    return export(disturbed(actor), task, own), actor
 
 
 def at_rest(environment, goal, yaw):

@@ -14,8 +14,8 @@ from runs import TINY
 
 import quadrl
 from quadrl import tasks
+from quadrl.base.records import as_json
 from quadrl.cli import COMMANDS
-from quadrl.core.scenario import as_json
 from quadrl.evaluation import evaluate as evaluation
 from quadrl.learning import foreign
 from quadrl.learning.config import TrainConfig, prepare
@@ -207,7 +207,8 @@ def test_the_settings_of_a_run_are_found_again(tmp_path):
 
 def test_a_run_in_wind_says_what_the_air_does(tmp_path):
     windy = TrainConfig("hover", weather="light")
-    assert windy.aerodynamics == "full" and TINY.aerodynamics == ""
+    brought = [config.conditions["aerodynamics"] for config in (windy, TINY)]
+    assert brought == ["full", ""]
     assert ("aerodynamics", "full", "in wind") in windy.sources()
     write_config(tmp_path, windy.resolved())
     assert TrainConfig.of_folder(tmp_path) == windy
@@ -267,19 +268,21 @@ def test_a_task_may_be_trained_with_other_options_than_it_is_flown_with():
 
 def test_a_variant_is_settings_that_go_together():
     config, usual = TrainConfig("hover", variant="robust"), TrainConfig("hover")
-    assert (config.weather, usual.weather) == ("light", "calm")
+    assert (config.named()["weather"], usual.named()["weather"]) == ("light", "calm")
     landing, small = TrainConfig("landing", variant="robust"), "crazyflie_brushless"
     weights = VARIANTS["robust"]["task_options"] | {"progress_weight": 200.0}
-    assert landing.task_options == weights | {"attitude_weight": 60.0}
+    assert landing.named()["task_options"] == weights | {"attitude_weight": 60.0}
     often = config.scenario.aircraft.control_timestep / 0.02
     quick = TrainConfig("hover", variant="robust", vehicle=small)
     assert quick.steps == OF_VEHICLE["robust", small]["steps"] * often
     assert config.scenario.aircraft.action_scale > usual.scenario.aircraft.action_scale
     # What is given is added to the dicts, and stands in place of the rest.
     own = TrainConfig("hover", variant="robust", weather="calm", observe={"airspeed": True})
-    assert own.observe == config.observe | {"airspeed": True} and own.weather == "calm"
+    seen = config.conditions["observe"] | {"airspeed": True}
+    assert (own.conditions["observe"], own.conditions["weather"]) == (seen, "calm")
     assert TrainConfig(**json.loads(json.dumps(dataclasses.asdict(own)))) == own
-    assert TrainConfig("hover", variant="robust", vehicle="racer").vehicle_options == {}
+    racer = TrainConfig("hover", variant="robust", vehicle="racer")
+    assert racer.conditions["vehicle_options"] == {}
 
 
 def test_numbers_of_the_aircraft_can_differ_and_go_with_the_policy(tmp_path):
@@ -298,7 +301,7 @@ def test_numbers_of_the_aircraft_can_differ_and_go_with_the_policy(tmp_path):
 def test_a_randomization_and_options_of_the_observation_are_settings():
     drawn = quadrl.Randomization(mass=(0.9, 1.1), noise={"position": 0.01})
     config = TrainConfig("hover", randomization=drawn, observe=quadrl.Observing(airspeed=True))
-    assert config.observe == {"airspeed": True}
+    assert config.conditions["observe"] == {"airspeed": True}
     again = TrainConfig(**json.loads(json.dumps(dataclasses.asdict(config))))
     assert again == config
     assert again.scenario.randomization == drawn
@@ -306,11 +309,12 @@ def test_a_randomization_and_options_of_the_observation_are_settings():
 
 def test_a_task_names_aircraft_and_algorithm_of_its_trainings_and_no_others_options():
     config = TrainConfig("race")
-    assert (config.vehicle, config.vehicle_options) == ("racer", {"action_scale": 1250.0})
+    flown = config.conditions
+    assert (flown["vehicle"], flown["vehicle_options"]) == ("racer", {"action_scale": 1250.0})
     sources = {name: origin for name, _, origin in config.sources()}
     assert sources["vehicle"] == sources["vehicle_options.action_scale"] == "race x apg"
     assert (config.algo, sources["algo"]) == ("apg", "race x apg")
     assert TrainConfig("race", algo="ppo").algo == "ppo" and TrainConfig("hover").algo == "ppo"
-    other = TrainConfig("race", vehicle="paper")
-    assert (other.vehicle, other.vehicle_options) == ("paper", {})
-    assert TrainConfig("hover").vehicle == "paper"
+    flown = TrainConfig("race", vehicle="paper").conditions
+    assert (flown["vehicle"], flown["vehicle_options"]) == ("paper", {})
+    assert TrainConfig("hover").conditions["vehicle"] == "paper"

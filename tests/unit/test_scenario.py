@@ -47,7 +47,7 @@ def test_every_field_has_its_keyword_and_a_value_here():
     fields = {field.name for field in FIELDS}
     assert fields <= {*KEYWORDS}
     assert fields - {"task"} == {*EVERYTHING} - {"task_options", "vehicle_options"}
-    assert fields <= {field.name for field in dataclasses.fields(TrainConfig)}
+    assert fields <= {*TrainConfig().named()}
     plain, other = Scenario.of("hover"), whole()
     assert all(getattr(plain, name) != getattr(other, name) for name in fields)
 
