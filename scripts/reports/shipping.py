@@ -134,7 +134,8 @@ def shipped(episodes: int = EPISODES, only: tuple[str, ...] = ()) -> None:
         episodes: Flights of each in each condition.
         only: Names of policies, beside what was measured of the others; by default all.
     """
-    rows, before = [], report.load("shipped") if only else {"rows": []}
+    before = report.load("shipped") if only else {"rows": []}
+    rows = {row["policy"]: {"commit": before["commit"]} | row for row in before["rows"]}
     for name in only or sorted(file.stem for file in SHIPPED.glob("*.safetensors")):
         found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, CALM))
         targets = tasks.TASKS[found["task"]].targets
@@ -143,11 +144,10 @@ def shipped(episodes: int = EPISODES, only: tuple[str, ...] = ()) -> None:
         shown = {"task", *FIGURES, *(target.metric for target in targets)}
         late = {words: {x: of[x] for x in of if x in shown} for words, of in late.items()}
         made = {"commit": report.commit(), "policy": name}
-        rows.append(made | found | {"undisturbed": still, "as_flown": late})
+        rows[name] = made | found | {"undisturbed": still, "as_flown": late}
         say(f"{name}: {missed(targets, still)}")
-    kept = (row for row in before["rows"] if row["policy"] not in only)
-    rows += [{"commit": before["commit"]} | row for row in kept]
-    report.save("shipped", {"rows": sorted(rows, key=lambda row: row["policy"])})
+        # After each: one that is stopped keeps what it has flown.
+        report.save("shipped", {"rows": [rows[policy] for policy in sorted(rows)]})
 
 
 def policies(name: str = "") -> str:
