@@ -33,7 +33,7 @@ from quadrl.cli.study import Study
 from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
 from quadrl.cli.view import View
-from quadrl.core.rules import import_own
+from quadrl.core.record import import_own
 
 SHELLS = ("bash", "zsh", "fish")
 

@@ -16,7 +16,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice
 from quadrl.cli import choices
-from quadrl.core.rules import import_own
+from quadrl.core.record import import_own
 from quadrl.learning import foreign
 from quadrl.learning.config import TrainConfig, algorithm_of
 from quadrl.tasks import TASKS

@@ -11,12 +11,16 @@ import contextlib
 import dataclasses
 import hashlib
 import hmac
+import importlib.util
+import inspect
 import os
 import secrets
 import stat
+import sys
 import tempfile
+import traceback
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,7 +28,7 @@ from quadrl.aircraft import presets
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.records import as_json
 from quadrl.core.catalogue import TASKS
-from quadrl.core.rules import IMPORTED, import_own
+from quadrl.core.rules import check_rules
 from quadrl.core.scenario import Scenario
 from quadrl.engines.native.compiling import cache_folder
 
@@ -33,6 +37,8 @@ MOST_TOLD = 3
 KEY = "key"
 """The file of the key in the cache folder."""
 KEY_SIZE = 32
+IMPORTED: dict[Path, str] = {}
+"""The sha256 of each file that `import_own` has run, by its path."""
 
 
 def warn_of_changes(
@@ -60,6 +66,47 @@ def warn_of_changes(
             end = "flown: as recorded" if kept else "here it is as it is now"
             text = f"the {what} {name} of this {whose} has {had}{more}; {name} is now {has}; {end}"
             warnings.warn(text, QuadrlWarning, stacklevel=4)
+
+
+def import_own(path: Path) -> None:
+    """Run a file, which registers the user's own tasks and aircraft.
+
+    Raises:
+        QuadrlError: There is no such file, or it fails, or a task in it breaks a rule; the message
+            names the file and the line.
+    """
+    if not path.is_file():
+        raise QuadrlError(name="--import", value=str(path), allowed="the path of a Python file")
+    content, known = path.read_bytes(), set(TASKS)
+    spec: Any = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    with _located(path):
+        spec.loader.exec_module(module)
+    for kind in [kind for name, kind in TASKS.items() if name not in known]:
+        with _located(path, inspect.getsourcelines(kind)[1]):
+            check_rules(kind)
+    IMPORTED[path.resolve()] = hashlib.sha256(content).hexdigest()
+
+
+@contextlib.contextmanager
+def _located(path: Path, line: int | None = None) -> Generator[None]:
+    """Report a failure with the last line of the user's file that led to it, or a given line."""
+    try:
+        yield
+    except Exception as error:
+        frames, cause = list[traceback.FrameSummary](), error
+        while cause is not None:
+            frames += traceback.extract_tb(cause.__traceback__)
+            cause = cause.__cause__
+        lines = [
+            frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()
+        ]
+        line = error.lineno if isinstance(error, SyntaxError) else (lines or [line])[-1]
+        where = f"{path}, line {line}" if line else str(path)
+        # What a check of quadrl says is a sentence; what Python says needs its kind.
+        said = error if isinstance(error, (AssertionError, QuadrlError)) else repr(error)
+        raise QuadrlError(f"{where}: {said}") from error
 
 
 def sealed_imports() -> list[dict[str, str]]:

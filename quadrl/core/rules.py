@@ -1,108 +1,67 @@
-"""The rules that every task keeps, and the import of a user's file, whose tasks must keep them."""
+"""The rules that every task keeps: all checks of what its functions declare and give.
+
+An environment checks the values of a task when it is made, and a file of `--import` is checked
+without a flight. `quadrl.testing` adds clauses: tensors, whole flights, and every API.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import functools
-import hashlib
-import importlib.util
-import inspect
 import itertools
-import sys
-import traceback
-from collections.abc import Callable, Generator
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Generator, Iterable
+from typing import Any, cast
 
 import numpy as np
 
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import records
 from quadrl.base.docstrings import docstrings, source
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import Array
-from quadrl.core.catalogue import TASKS
-from quadrl.core.environment import Environment
+from quadrl.base.philox import SOLIDS
+from quadrl.base.rotation import Array, square_norm
+from quadrl.conditions import sensor
+from quadrl.conditions.scene import Scene
+from quadrl.conditions.sensor import Sizes
+from quadrl.core.catalogue import make
+from quadrl.core.scenario import Scenario
 from quadrl.core.snapshot import EpisodeEnd, Snapshot
 from quadrl.core.task import Task
 from quadrl.engines.rng import Rng
-from quadrl.engines.state import State
+from quadrl.engines.state import SIZES, Start, State
 
-PAPER = Vehicle()
-ROWS = 4
+ROWS, SAMPLE = 4, 64  # episodes that are begun to compare rows, and to look at values
 COORDINATES = ("position", "quaternion", "velocity", "body_rate", "rotor_speed")
 
 
-IMPORTED: dict[Path, str] = {}
-"""The sha256 of each file that `import_own` has run, by its path."""
+def seen_by(task: Task, vehicle: str = "paper") -> tuple[Parameters, int, float]:
+    """What a task is told by an environment of an aircraft, as `begun` takes it."""
+    flown = Scenario.of(task, vehicle=vehicle)
+    own = Parameters.of(parameters.rows(flown.aircraft), flown.vehicle.control_timestep)
+    return own, flown.vehicle.rotor_count, flown.altitude
 
 
-def import_own(path: Path) -> None:
-    """Run a file, which registers the user's own tasks and aircraft.
-
-    Raises:
-        QuadrlError: There is no such file, or it fails, or a task in it breaks a rule; the message
-            names the file and the line.
-    """
-    if not path.is_file():
-        raise QuadrlError(name="--import", value=str(path), allowed="the path of a Python file")
-    content, known = path.read_bytes(), set(TASKS)
-    spec: Any = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    with _located(path):
-        spec.loader.exec_module(module)
-    for kind in [kind for name, kind in TASKS.items() if name not in known]:
-        with _located(path, inspect.getsourcelines(kind)[1]):
-            check_rules(kind)
-    IMPORTED[path.resolve()] = hashlib.sha256(content).hexdigest()
-
-
-@contextlib.contextmanager
-def _located(path: Path, line: int | None = None) -> Generator[None]:
-    """Report a failure with the last line of the user's file that led to it, or a given line."""
-    try:
-        yield
-    except Exception as error:
-        frames, cause = list[traceback.FrameSummary](), error
-        while cause is not None:
-            frames += traceback.extract_tb(cause.__traceback__)
-            cause = cause.__cause__
-        lines = [
-            frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()
-        ]
-        line = error.lineno if isinstance(error, SyntaxError) else (lines or [line])[-1]
-        where = f"{path}, line {line}" if line else str(path)
-        # What a check of quadrl says is a sentence; what Python says needs its kind.
-        said = error if isinstance(error, (AssertionError, QuadrlError)) else repr(error)
-        raise QuadrlError(f"{where}: {said}") from error
-
-
-def check_rules(task: Task | type[Task], torch: Any = None) -> None:
-    """Check in about a second what can be checked without flying: declarations and functions.
+def check_rules(task: str | Task | type[Task], clauses: Iterable[Any] = ()) -> None:
+    """Check declarations and functions of a task, then what else a contract has.
 
     Args:
-        task: A task or its class.
-        torch: The module, to check the functions with tensors as well.
+        task: A task, its class, or a name of the catalogue.
+        clauses: Functions that raise an AssertionError where a task does not keep them.
 
     Raises:
         AssertionError: The first fault that is found.
     """
-    task = task() if isinstance(task, type) else task
-    check_declaration(task)
-    check_begin(task, torch)
-    check_functions(task, torch)
-    check_start(task)
+    made = task() if isinstance(task, type) else make(task)
+    for check in (check_declaration, check_begin, check_functions, check_start, *clauses):
+        check(made)
 
 
 def check_declaration(task: Task) -> None:
     """Names, units and options are written down."""
     kind = type(task)
-    settings = vars(kind).get("__dataclass_params__")
-    own = settings is not None and settings.frozen
+    own = getattr(vars(kind).get("__dataclass_params__"), "frozen", False)
     require(own, f"{kind.__name__} must be a frozen dataclass itself, not only its base")
     for attribute in ("name", "asks", "starts", "ends", "solved"):
         text = getattr(task, attribute, None)
@@ -112,77 +71,171 @@ def check_declaration(task: Task) -> None:
         require(said, f"{task.name}: {name!r} needs a size, a unit and a meaning: {term}")
     for vehicle in ("paper", "hexa"):  # with four rotors and with six
         with blame(task, f"an environment of the vehicle {vehicle!r}"):
-            Environment(task, vehicle=vehicle)
+            check_values(task, *seen_by(task, vehicle))
+            Scenario.of(task, vehicle=vehicle).compile_model(drawn=False)
     documented = docstrings(kind)
     for field in dataclasses.fields(task) if source(kind) else ():
-        text = documented.get(field.name)
-        require(text, f"{task.name}: the option {field.name} needs a docstring")
+        require(
+            documented.get(field.name), f"{task.name}: the option {field.name} needs a docstring"
+        )
 
 
-def check_begin(task: Task, torch: Any = None) -> None:
-    """A start follows from the random numbers alone, differs by row, and is the same in torch."""
-    own = Parameters.of(parameters.rows(PAPER), PAPER.control_timestep)
+def begun(
+    task: Task, own: Parameters, actions: int, height: float, rows: int = ROWS, moved: float = 0.0
+) -> Snapshot:
+    """The first moment of episodes.
 
-    def begin(keys: Array, own: Parameters) -> dict[str, Array]:
-        with blame(task, "begin"):
-            start, state = task.begin(Rng(keys, 0 * keys), own)
-            state = task.remember(start, state)
-        return _named(start, "start") | _named(state, "task")
+    Args:
+        task: The task.
+        own: Parameters of the aircraft, one row.
+        actions: Numbers in an action.
+        height: Height of the origin of the task's frame above the ground [m].
+        rows: Number of episodes.
+        moved: How much farther, faster and later each row is than the one before it.
 
-    keys = np.arange(ROWS)
+    Raises:
+        QuadrlError: `begin` gives what no task may give; the message names it.
+    """
+    task.check(own)
+    keys, rotors = np.arange(rows), own.rotor.hover_speed.shape[-1]
+    drawn: Any = task.begin(Rng(keys, 0 * keys), own)
+    if not isinstance(drawn, tuple) or not isinstance(cast(Any, drawn)[0], Start):
+        raise QuadrlError(name=f"{task.name} begin", value=drawn, allowed="a Start and a TaskState")
+    start, task_state = cast(tuple[Start, Any], drawn)
+    coordinates = {name: getattr(start, name) for name in COORDINATES}
+    for name, array in coordinates.items():
+        _check_array(task, f"{name} of begin", array, (rows, SIZES[name] or rotors), "f")
+    more = moved * np.arange(1.0, rows + 1)[:, None]
+    coordinates |= {name: coordinates[name] + more for name in ("velocity", "body_rate")}
+    coordinates["position"] = start.position + more * [0.0, 0.0, 0.1]  # where little can stand
+    start = dataclasses.replace(start, **coordinates)
+    for field in dataclasses.fields(task_state := task.remember(start, task_state)):
+        value: Any = getattr(task_state, field.name)
+        if not isinstance(value, np.ndarray) or cast(Array, value).shape[:1] != (rows,):
+            name, allowed = f"{task.name} {field.name} of begin", f"an array ({rows}, ...)"
+            raise QuadrlError(name=name, value=value, allowed=allowed)
+    if not (abs(square_norm(start.quaternion) - 1) < 1e-6).all():
+        name = f"{task.name} quaternion of begin"
+        raise QuadrlError(name=name, value=start.quaternion, allowed="of norm 1")
+    scene = Scene(task.solids())
+    scene.poses(task.place(Rng(keys, 0 * keys, SOLIDS), start, task_state), rows, np.zeros(3))
+    around = scene.nothing_near(rows) if scene.solids else None
+    state = State.of_coordinates(**coordinates, origin_height=height)
+    acts = more + np.zeros(actions), start.rotor_speed + 0.0, more[:, 0]
+    now = Snapshot(state, task_state, own, *acts, around=around)
+    now.potentials = task.measure(now)
+    for name, options in task.sensors.items():
+        made = sensor.make(name, options)
+        if made.shown and not made.last:
+            now.sensed = {**now.sensed, name: np.zeros((rows, made.width(Sizes(rotors, actions))))}
+    return now
+
+
+def check_values(task: Task, own: Parameters, actions: int, height: float) -> tuple[str, ...]:
+    """Begin a few episodes, and refuse a task whose functions return what no task may return.
+
+    The arguments are those of `begun`.
+
+    Returns:
+        Names of the reward's terms, in their order.
+
+    Raises:
+        QuadrlError: The message names the function.
+    """
+    now = begun(task, own, actions, height, rows := SAMPLE)
+    terminated = task.terminated(now)
+    _check_array(task, "terminated", terminated, (rows,), "b")
+    if terminated.any():
+        changed = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
+        changed = {k: v for k, v in changed.items() if str(v) != str(getattr(type(task), k, ""))}
+        reason = f"{terminated.sum()} of {rows} episodes would end where they begin"
+        name = f"{task.name} {'options' if changed else 'begin'}"
+        allowed = "such that episodes begin within the bounds that end them"
+        raise QuadrlError(reason, name=name, value=changed or task, allowed=allowed)
+    error = task.error(now)
+    _check_array(task, "error", error, (rows,), "f")
+    end = EpisodeEnd(terminated, ~terminated, error + 1, error, error, 1, terminated)
+    _check_array(task, "succeeded", task.succeeded(now, end), (rows,), "b")
+    terms = task.reward(now, now, end)
+    if not terms:
+        raise QuadrlError(name=f"{task.name} reward", value=terms, allowed="at least one term")
+    for name, term in terms.items():
+        _check_array(task, f"reward term {name!r}", term, (rows,), "f")
+    observation = task.observe(now)
+    if list(observation) != list(task.observation):
+        allowed = f"the declared terms in their order: {', '.join(task.observation)}"
+        raise QuadrlError(name=f"{task.name} observe", value=list(observation), allowed=allowed)
+    for name, term in task.observation.items():
+        shape = (rows, term.width(own.rotor.hover_speed.shape[-1]))
+        _check_array(task, f"observation {name!r}", observation[name], shape, "f")
+    task.update(now, now)  # so that a fault of any function shows before symbols call it
+    return tuple(terms)
+
+
+def check_reward(task: Task, done: Any) -> None:
+    """Refuse a reward that is not finite.
+
+    Raises:
+        QuadrlError: The message names the aircraft and has the terms of its reward.
+    """
+    sound = np.isfinite(done.reward)
+    if np.count_nonzero(sound) < len(sound):
+        row = int(np.argmin(sound))
+        values = {name: float(term[row]) for name, term in done.reward_terms.items()}
+        name = f"{task.name} reward of aircraft {row}"
+        raise QuadrlError(name=name, value=values, allowed="finite in every term")
+
+
+def starts(task: Task, keys: Array, own: Parameters) -> dict[str, Array]:
+    """What `begin` and `remember` of a task give for random numbers, by name."""
+    with blame(task, "begin"):
+        start, state = task.begin(Rng(keys, 0 * keys), own)
+        state = task.remember(start, state)
+    return _named(start, "start") | _named(state, "task")
+
+
+def check_begin(task: Task) -> None:
+    """A start follows from the random numbers alone, and differs by row."""
+    begin, keys, own = functools.partial(starts, task), np.arange(ROWS), seen_by(task)[0]
     batch = begin(keys, own)
     require_equal(batch, begin(keys, own), f"{task.name}: begin gives two starts for one key")
-    for i in range(ROWS):
-        row = {name: value[i : i + 1] for name, value in batch.items()}
+    for one in (slice(i, i + 1) for i in range(ROWS)):
+        row = {name: value[one] for name, value in batch.items()}
         message = f"{task.name}: begin of one aircraft and of a batch differ"
-        require_equal(begin(keys[i : i + 1], own), row, message)
+        require_equal(begin(keys[one], own), row, message)
     varied = any(np.ptp(value, axis=0).any() for value in batch.values())
     require(varied, f"{task.name}: every episode begins alike")
-    if torch:
-        tensors = own.map(torch.tensor)
-        _require_close(begin(torch.tensor(keys), tensors), batch, f"{task.name}: begin", 1e-9)
-        meta = own.map(lambda array: torch.tensor(array, device="meta"))
-        begin(torch.tensor(keys, device="meta"), meta)
 
 
-def check_functions(task: Task, torch: Any = None) -> None:
-    """Shapes are those declared; a row, a batch and torch get the same; no argument is changed."""
-    with blame(task, "a reset"):
-        environment = Environment(task, num_envs=ROWS, seed=1)
-        environment.reset()
-    before = _mapped(_frozen, environment.snapshot)
-    with blame(task, "a step"):
-        environment.step(varied_actions(1, ROWS, environment.action_size)[0])
-    now = _mapped(_frozen, environment.snapshot)
-    batch = _outputs(task, before, now)
-    for i in range(ROWS):
+def moments(task: Task) -> tuple[Snapshot, Snapshot]:
+    """Two moments of the same episodes, which nothing may change."""
+    with blame(task, "a start"):
+        before, now = (begun(task, *seen_by(task), moved=moved) for moved in (0.0, 0.1))
+    now.task = before.task
+    frozen = functools.partial(mapped, lambda array: np.broadcast_to(array, array.shape))
+    return frozen(before), frozen(now)
 
-        def row(array: np.ndarray, i: int = i) -> np.ndarray:
-            return array[i : i + 1] if len(array) == ROWS else array
 
-        alone = _outputs(task, _mapped(row, before), _mapped(row, now))
+def check_functions(task: Task) -> None:
+    """A row and a batch get the same numbers, and no argument is changed."""
+    batch = outputs(task, *(pair := moments(task)))
+    for one in (slice(i, i + 1) for i in range(ROWS)):
+        row = functools.partial(mapped, lambda x, one=one: x[one] if len(x) == ROWS else x)
         message = f"{task.name}: one aircraft and a batch get different numbers"
-        require_equal(alone, {k: value[i : i + 1] for k, value in batch.items()}, message)
-    if torch:
-        check_tensors(task, before, now, batch, torch)
+        own = {name: value[one] for name, value in batch.items()}
+        require_equal(outputs(task, *map(row, pair)), own, message)
 
 
 def check_start(task: Task) -> None:
     """What it remembers of every step, it remembers of a start that `reset` is given, too."""
-    with blame(task, "a reset from a given start"):
-        environment = Environment(task, num_envs=ROWS, seed=1)
-        environment.reset()
-        drawn, more = environment.snapshot.state, 0.1 * np.arange(1.0, ROWS + 1)[:, None]
-        start = {"position": drawn.position + more * [0.0, 0.0, 0.1]}  # where little can stand
-        start |= {name: getattr(drawn, name) + more for name in ("velocity", "body_rate")}
-        environment.reset(start=start)
-        begun = _remembered(environment.snapshot)
-        environment.step(np.zeros((ROWS, environment.action_size)))
-        after = _remembered(environment.snapshot)
-    for name, (own, value) in after.items():
+    with blame(task, "a given start"):
+        now, later = (begun(task, *seen_by(task), moved=moved) for moved in (0.1, 0.2))
+        first, later.task = _remembered(now), task.update(now, later)
+        later.potentials = task.measure(later)
+    for name, (own, value) in _remembered(later).items():
         if np.array_equal(own, value) and np.ptp(value, axis=0).any():
             message = f"{name} after every step, but not at a start that reset was given"
-            require(np.allclose(*begun[name]), f"{task.name}: {message}: make it in `remember`")
+            require(np.allclose(*first[name]), f"{task.name}: {message}: make it in `remember`")
 
 
 def _remembered(now: Snapshot) -> dict[str, tuple[Array, Array]]:
@@ -192,62 +245,7 @@ def _remembered(now: Snapshot) -> dict[str, tuple[Array, Array]]:
     return {f"{name} is {other}": (x, y) for (name, x), (other, y) in pairs if x.shape == y.shape}
 
 
-def check_tensors(
-    task: Task, before: Snapshot, now: Snapshot, expected: dict[str, Array], torch: Any
-) -> None:
-    """The functions take tensors of both precisions and of any device, and have gradients."""
-
-    def tensor(array: np.ndarray, *, dtype: Any = None, device: str = "cpu") -> Any:
-        return torch.tensor(array, dtype=dtype if array.dtype.kind == "f" else None, device=device)
-
-    def given(**settings: Any) -> dict[str, Array]:
-        return _outputs(task, *(_mapped(functools.partial(tensor, **settings), s) for s in pair))
-
-    pair = before, now
-    _require_close(given(), expected, task.name, 1e-9)
-    single = given(dtype=torch.float32)
-    _require_close(single, expected, task.name, 1e-3)
-    for name, value in single.items():
-        kept = not value.dtype.is_floating_point or value.dtype == torch.float32
-        require(kept, f"{task.name}: of float32, {name} becomes {value.dtype}")
-    for name, value in given(device="meta").items():
-        require(value.device.type == "meta", f"{task.name}: {name} leaves the device")
-    tensors = [_mapped(tensor, snapshot) for snapshot in pair]
-    # Where the aircraft is, and where every distance is zero: at rest in the goal.
-    goal = np.broadcast_to(np.asarray(task.goal(now)), now.state.position.shape)
-    rest = np.zeros_like(now.state.velocity)
-    level = np.broadcast_to([1.0, 0.0, 0.0, 0.0], now.state.quaternion.shape)
-    still = {"position": goal, "quaternion": level, "velocity": rest, "body_rate": rest}
-    height = float(now.state.height[0] - now.state.position[0, 2])
-    for moved, where in (({}, "in flight"), (still, "at rest in the goal")):
-        arrays = {name: moved.get(name, getattr(now.state, name)) for name in COORDINATES}
-        leaves = {k: torch.tensor(array, requires_grad=True) for k, array in arrays.items()}
-        state = State.of_coordinates(**leaves, origin_height=height)
-        outputs = _outputs(task, tensors[0], dataclasses.replace(tensors[1], state=state))
-        real = {name: value for name, value in outputs.items() if value.requires_grad}
-        require(real, f"{task.name}: with tensors, no output has a gradient")
-        for name, value in real.items():
-            with blame(task, f"backward of {name!r}"):
-                found = torch.autograd.grad(
-                    value.sum(), [*leaves.values()], retain_graph=True, allow_unused=True
-                )
-            for by, one in zip(leaves, found, strict=True):
-                cure = (
-                    f"by {by}; take lengths by quadrl.base.rotation.norm, whose gradient is 0 there"
-                )
-                finite = one is None or bool(one.isfinite().all())
-                require(finite, f"{task.name}: {name!r} has no gradient {where} {cure}")
-
-
-def varied_actions(steps: int, count: int, size: int = 4) -> np.ndarray:
-    """(T, N, k) float32: row 0 holds still, 1 climbs, 2 dives, the others do anything."""
-    actions = np.random.default_rng(7).uniform(-1, 1, (steps, count, size))
-    actions[:, 0] *= 0.1
-    actions[:, 1:2], actions[:, 2:3] = 1.0, -1.0
-    return actions.astype(np.float32)
-
-
-def _outputs(task: Task, before: Snapshot, now: Snapshot) -> dict[str, Array]:
+def outputs(task: Task, before: Snapshot, now: Snapshot) -> dict[str, Array]:
     """What each function of a task gives, by name."""
     rows = f"{len(now.time)} rows of {type(now.time).__module__} arrays"
     with blame(task, f"a function of {rows}"):
@@ -262,21 +260,14 @@ def _outputs(task: Task, before: Snapshot, now: Snapshot) -> dict[str, Array]:
 
 
 def _named(record: Any, prefix: str) -> dict[str, Array]:
-    fields = dataclasses.fields(record)
-    return {f"{prefix}.{field.name}": getattr(record, field.name) for field in fields}
+    return {f"{prefix}.{f.name}": getattr(record, f.name) for f in dataclasses.fields(record)}
 
 
-def _mapped(function: Callable[[Any], Any], now: Snapshot) -> Snapshot:
+def mapped(function: Callable[[Any], Any], now: Snapshot) -> Snapshot:
     """A snapshot with a function applied to every array in it."""
     mapped = records.mapped(function, now)
     mapped.parameters = now.parameters.map(function)
     return mapped
-
-
-def _frozen(array: np.ndarray) -> np.ndarray:
-    copy = np.array(array)
-    copy.flags.writeable = False
-    return copy
 
 
 def require(condition: object, message: str) -> None:
@@ -288,22 +279,7 @@ def require(condition: object, message: str) -> None:
 def require_equal(got: dict[str, Array], expected: dict[str, Array], message: str) -> None:
     """Report the first array that is not what is expected."""
     for name, value in expected.items():
-        same = np.array_equal(got[name], value)
-        require(same, f"{message}: {name} is {got[name]} and {value}")
-
-
-def _require_close(
-    got: dict[str, Array], expected: dict[str, Array], message: str, tolerance: float
-) -> None:
-    for name, value in expected.items():
-        tensor = hasattr(got[name], "detach")
-        require(tensor, f"{message} with tensors gives {name} as {type(got[name]).__name__}")
-        found = got[name].detach().numpy()
-        close = np.allclose(found, value, rtol=tolerance, atol=tolerance)
-        require(
-            close and found.shape == value.shape,
-            f"{message} with tensors gives {name} = {got[name]}, with NumPy {value}",
-        )
+        require(np.array_equal(got[name], value), f"{message}: {name} is {got[name]} and {value}")
 
 
 @contextlib.contextmanager
@@ -312,6 +288,13 @@ def blame(task: Task, what: str) -> Generator[None]:
     try:
         yield
     except Exception as error:
-        raise AssertionError(
-            f"{task.name}: {what} fails: {type(error).__name__}: {error}"
-        ) from error
+        said = f"{task.name}: {what} fails: {type(error).__name__}: {error}"
+        raise AssertionError(said) from error
+
+
+def _check_array(task: Task, what: str, value: Any, shape: tuple[int, ...], kind: str) -> None:
+    found = (tuple(getattr(value, "shape", ())), str(getattr(value, "dtype", type(value).__name__)))
+    if found[0] != shape or ("bool" if kind == "b" else "float") not in found[1]:
+        allowed = f"an array of {'bool' if kind == 'b' else 'floating-point numbers'} {shape}"
+        reason, name = f"it is {found[1]} {found[0]}", f"{task.name} {what}"
+        raise QuadrlError(reason, name=name, value=value, allowed=allowed)

@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, cast
-
-import numpy as np
+from typing import Any
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
-from quadrl.base.philox import SOLIDS
-from quadrl.base.rotation import Array, namespace, square_norm
-from quadrl.conditions import sensor
-from quadrl.conditions.scene import Scene, Surroundings
-from quadrl.conditions.sensor import Sizes
+from quadrl.base.rotation import Array, namespace
+from quadrl.conditions.scene import Surroundings
+from quadrl.core import rules
 from quadrl.core.rewards import total
 from quadrl.core.task import EpisodeEnd, Snapshot, Task
-from quadrl.engines.rng import Rng
-from quadrl.engines.state import SIZES, Start, State
+from quadrl.engines.state import State
 
 Observation = dict[str, Array]
-SAMPLE = 64  # episodes that are begun to check a task
-STARTS = "such that episodes begin within the bounds that end them"
-
+check_reward, check_task = rules.check_reward, rules.check_values  # as `Environment` calls them
 OFF = 0.05
 """Share of a time limit by which whole control steps may differ from it."""
 
@@ -189,98 +182,3 @@ def observe(task: Task, now: Snapshot, estimate: State) -> Observation:
     seen = dataclasses.replace(now, state=estimate)
     seen.potentials = task.measure(seen)
     return task.observe(seen)
-
-
-def check_reward(task: Task, done: Transition) -> None:
-    """Refuse a reward that is not finite.
-
-    Raises:
-        QuadrlError: The message names the aircraft and has the terms of its reward.
-    """
-    sound = np.isfinite(done.reward)
-    if np.count_nonzero(sound) < len(sound):
-        row = int(np.argmin(sound))
-        values = {name: float(term[row]) for name, term in done.reward_terms.items()}
-        name = f"{task.name} reward of aircraft {row}"
-        raise QuadrlError(name=name, value=values, allowed="finite in every term")
-
-
-def check_task(
-    task: Task, parameters: Parameters, actions: int, origin_height: float
-) -> tuple[str, ...]:
-    """Begin a few episodes, and refuse a task whose functions return what no task may return.
-
-    Args:
-        task: The task.
-        parameters: Parameters of the aircraft, one row.
-        actions: Numbers in an action.
-        origin_height: Height of the origin of the task's frame above the ground [m].
-
-    Returns:
-        Names of the reward's terms, in their order.
-
-    Raises:
-        QuadrlError: The message names the function.
-    """
-    task.check(parameters)
-    rows, rotors = SAMPLE, parameters.rotor.hover_speed.shape[-1]
-    keys = np.arange(rows)
-    begun = task.begin(Rng(keys, 0 * keys), parameters)
-    given: Any = begun
-    if not isinstance(given, tuple) or not isinstance(given[0], Start):
-        raise QuadrlError(name=f"{task.name} begin", value=begun, allowed="a Start and a TaskState")
-    start, task_state = begun
-    coordinates = {f.name: getattr(start, f.name) for f in dataclasses.fields(start)}
-    for name, array in coordinates.items():
-        _check_array(task, f"{name} of begin", array, (rows, SIZES[name] or rotors), "f")
-    for field in dataclasses.fields(task_state := task.remember(start, task_state)):
-        value: Any = getattr(task_state, field.name)
-        if not isinstance(value, np.ndarray) or cast(Array, value).shape[:1] != (rows,):
-            name, allowed = f"{task.name} {field.name} of begin", f"an array ({rows}, ...)"
-            raise QuadrlError(name=name, value=value, allowed=allowed)
-    if not (abs(square_norm(start.quaternion) - 1) < 1e-6).all():
-        name = f"{task.name} quaternion of begin"
-        raise QuadrlError(name=name, value=start.quaternion, allowed="of norm 1")
-    scene = Scene(task.solids())
-    scene.poses(task.place(Rng(keys, 0 * keys, SOLIDS), start, task_state), rows, np.zeros(3))
-    around = scene.nothing_near(rows) if scene.solids else None
-    state = State.of_coordinates(**coordinates, origin_height=origin_height)
-    now, _ = begin(task, state, task_state, parameters, actions, around)
-    for name, options in task.sensors.items():
-        made = sensor.make(name, options)
-        if made.shown and not made.last:
-            now.sensed = {**now.sensed, name: np.zeros((rows, made.width(Sizes(rotors, actions))))}
-    terminated = task.terminated(now)
-    _check_array(task, "terminated", terminated, (rows,), "b")
-    if terminated.any():
-        changed = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
-        changed = {k: v for k, v in changed.items() if str(v) != str(getattr(type(task), k, ""))}
-        reason = f"{terminated.sum()} of {rows} episodes would end where they begin"
-        name = f"{task.name} {'options' if changed else 'begin'}"
-        raise QuadrlError(reason, name=name, value=changed or task, allowed=STARTS)
-    error = task.error(now)
-    _check_array(task, "error", error, (rows,), "f")
-    end = EpisodeEnd(terminated, ~terminated, error + 1, error, error, 1, terminated)
-    _check_array(task, "succeeded", task.succeeded(now, end), (rows,), "b")
-    terms = task.reward(now, now, end)
-    if not terms:
-        raise QuadrlError(name=f"{task.name} reward", value=terms, allowed="at least one term")
-    for name, term in terms.items():
-        _check_array(task, f"reward term {name!r}", term, (rows,), "f")
-    observation = task.observe(now)
-    if list(observation) != list(task.observation):
-        allowed = f"the declared terms in their order: {', '.join(task.observation)}"
-        raise QuadrlError(name=f"{task.name} observe", value=list(observation), allowed=allowed)
-    for name, term in task.observation.items():
-        shape = (rows, term.width(rotors))
-        _check_array(task, f"observation {name!r}", observation[name], shape, "f")
-    task.update(now, now)  # so that a fault of any function shows before symbols call it
-    return tuple(terms)
-
-
-def _check_array(task: Task, what: str, value: Any, shape: tuple[int, ...], kind: str) -> None:
-    found = (tuple(getattr(value, "shape", ())), str(getattr(value, "dtype", type(value).__name__)))
-    if found[0] != shape or ("bool" if kind == "b" else "float") not in found[1]:
-        allowed = f"an array of {'bool' if kind == 'b' else 'floating-point numbers'} {shape}"
-        reason, name = f"it is {found[1]} {found[0]}", f"{task.name} {what}"
-        raise QuadrlError(reason, name=name, value=value, allowed=allowed)

@@ -17,7 +17,7 @@ from typing import Any
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.signals import Stopped, heeded, unheeded
-from quadrl.core.rules import import_own
+from quadrl.core.record import import_own
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.executor import POLL_SECONDS, PlannedRun
 from quadrl.learning.folder import CONFIG, EVALUATION, lock_folder

@@ -18,10 +18,10 @@ from quadrl.tasks.landing import Landing
 from quadrl.tasks.static_waypoint import StaticWaypoint
 from quadrl.testing import (
     EPISODE,
-    check_dm_control,
-    check_flight,
-    check_gymnasium,
     check_task,
+    flies_alone_as_in_a_batch,
+    keeps_dm_env,
+    keeps_gymnasium,
     varied_actions,
 )
 
@@ -256,7 +256,7 @@ def test_an_unfair_api_is_noticed(monkeypatch):
     off_by_a_bit = lambda *given: np.nextafter(fair(*given), np.inf)  # noqa: E731
     monkeypatch.setattr(QuadrotorTask, "get_reward", off_by_a_bit)
     with pytest.raises(AssertionError, match="dm_control and a batch differ: reward"):
-        check_flight(Landing(), ACTIONS[:, 3])
+        flies_alone_as_in_a_batch(Landing(), ACTIONS[:, 3])
 
 
 def test_the_check_of_dm_control_notices_a_fault(monkeypatch):
@@ -265,10 +265,10 @@ def test_the_check_of_dm_control_notices_a_fault(monkeypatch):
 
     monkeypatch.setattr(dm_control.QuadrotorTask, "get_reward", lambda self, physics: "much")
     with pytest.raises(AssertionError, match="dm_env"):
-        check_dm_control(Hover(time_limit=0.5), ACTIONS[:15, 0])
+        keeps_dm_env(Hover(time_limit=0.5), ACTIONS[:15, 0])
 
 
 def test_the_check_of_gymnasium_notices_a_fault(monkeypatch):
     monkeypatch.setattr(QuadrotorEnv, "reset", lambda self, **_: (np.zeros(22), {}))
     with pytest.raises(AssertionError, match="check_env"):
-        check_gymnasium(Hover(time_limit=0.5))
+        keeps_gymnasium(Hover(time_limit=0.5))

@@ -20,7 +20,7 @@ from quadrl.cli import main
 from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.core.environment import Environment
-from quadrl.core.rules import import_own
+from quadrl.core.record import import_own
 from quadrl.core.scenario import Scenario
 from quadrl.evaluation import robustness as disturbed
 from quadrl.evaluation.cache import FILE, digest

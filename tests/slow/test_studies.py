@@ -18,7 +18,7 @@ from processes import python
 
 import quadrl
 from quadrl import cli
-from quadrl.core.rules import import_own
+from quadrl.core.record import import_own
 from quadrl.core.scenario import Scenario
 from quadrl.learning import executor
 from quadrl.learning.cluster import carry_out_here

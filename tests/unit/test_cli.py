@@ -649,7 +649,7 @@ def test_the_tasks_of_a_file_are_checked_in_their_order(monkeypatch):
         monkeypatch.setitem(tasks.TASKS, name, None)
         monkeypatch.delitem(tasks.TASKS, name)
     checked = []
-    monkeypatch.setattr("quadrl.core.rules.check_rules", lambda kind: checked.append(kind.name))
+    monkeypatch.setattr("quadrl.core.record.check_rules", lambda kind: checked.append(kind.name))
     classes = (f"class {name.upper()}(Hover):\n    name = {name!r}\n" for name in names)
     begin = "from quadrl.tasks import register\nfrom quadrl.tasks.hover import Hover\n"
     Path("own.py").write_text(begin + "".join(f"@register\n{kind}" for kind in classes))

@@ -21,7 +21,7 @@ from quadrl.conditions.solids import Cylinder, Gate, Pose
 from quadrl.core.environment import Environment
 from quadrl.engines.native import compiling
 from quadrl.tasks.hover import Hover
-from quadrl.testing import check_compiled
+from quadrl.testing import is_the_same_compiled
 
 STEPS = 40
 SEEN = {"rotor_speed": "estimated", "airspeed": True, "disturbance": True, "action_history": 2}
@@ -343,9 +343,9 @@ def test_the_contract_flies_the_compiled_step_beside_the_written_one():
         COUNTED.append(1)
         return {"own": (1.0 if len(COUNTED) < 60 else 2.0) + 0 * now.state.speed}
 
-    check_compiled(variant(options={"time_limit": 1.0}))
+    is_the_same_compiled(variant(options={"time_limit": 1.0}))
     with pytest.raises(AssertionError, match="compiled = True.*reward"):
-        check_compiled(variant(reward=reward))
+        is_the_same_compiled(variant(reward=reward))
 
 
 PAIR = (1.0, 2.0)

@@ -11,11 +11,11 @@ import pytest
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import namespace
-from quadrl.core.rules import check_functions
 from quadrl.core.task import TaskState
 from quadrl.engines import mjcf
 from quadrl.engines.mujoco import DataEngine
 from quadrl.tasks.hover import Hover
+from quadrl.testing import takes_tensors
 
 # ------------------------------------------------------------------------------- a user's own task
 
@@ -147,7 +147,7 @@ def test_a_model_that_is_no_aircraft_is_refused(name, engine):
 
 
 def test_a_term_without_a_gradient_is_named_with_the_cure():
-    torch = pytest.importorskip("torch")
+    pytest.importorskip("torch")
 
     def reward(self, before, now, end):
         x, y = (now.state.position[..., k] for k in range(2))
@@ -156,4 +156,4 @@ def test_a_term_without_a_gradient_is_named_with_the_cure():
 
     lost = r"'miss' has no gradient at rest in the goal by position; .*quadrl.base.rotation.norm"
     with pytest.raises(AssertionError, match=lost):
-        check_functions(helpers.variant(reward=reward), torch)
+        takes_tensors(helpers.variant(reward=reward))

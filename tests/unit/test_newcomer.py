@@ -142,7 +142,7 @@ def test_a_check_that_passes_logs_nothing():
     log.addHandler(handler := logging.NullHandler())
     handler.handle = said.append
     try:
-        quadrl.testing.check_torchrl(quadrl.tasks.make("hover"))
+        quadrl.testing.keeps_torchrl(quadrl.tasks.make("hover"))
     finally:
         log.removeHandler(handler)
     assert not said

@@ -16,7 +16,7 @@ from quadrl.base.files import read_sealed_json, write_sealed_json
 from quadrl.core import record
 from quadrl.core.catalogue import TASKS
 from quadrl.core.environment import Environment
-from quadrl.core.rules import IMPORTED, import_own
+from quadrl.core.record import IMPORTED, import_own
 from quadrl.core.saving import TABLES
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE, RUN, RUN_FORMAT
