@@ -118,10 +118,12 @@ class Train:
         """Train and evaluate, and print the result."""
         began = time.perf_counter()
         with console.status("importing torch and TorchRL"):
-            from quadrl.learning.run import train_in
+            from quadrl.learning.run import train_in, would_gain
         imports = time.perf_counter() - began
         if self.resume:
             say(f"continuing {folder}")
+        elif gain := would_gain(config):
+            say(gain)
         batch = config.num_envs * config.rollout
         if config.steps % batch:
             say(f"{config.iterations * batch:,} steps: whole batches of {batch:,}")

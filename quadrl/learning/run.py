@@ -6,15 +6,21 @@ import contextlib
 import dataclasses
 import json
 import shlex
+import timeit
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from quadrl.base.errors import QuadrlWarning
 from quadrl.base.files import write_csv, write_json
 from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.units import percent
 from quadrl.control.feasibility import warn_of_unreached
+from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
@@ -45,6 +51,8 @@ COLUMNS = {
 """Columns of evaluations.csv after steps and seconds, and the metric of each."""
 LATER = (0.01, 0.02)
 """How much later [s] commands also act, as by a radio, where the largest is a control step."""
+FEW, GAIN = 20, 0.95
+"""Control steps that are flown to see what compiling gains, and the share of the time to tell."""
 STANDS = 0.98
 """Share of the flights that succeed with late commands of a policy for which they do not matter."""
 
@@ -194,6 +202,29 @@ def train_in(
         record["success_rate_later"] = {f"{s:g}": share for s, share in late.items()}
     write_json(folder / EVALUATION, found.metrics | record)
     return Run(folder, config, policy, found, seconds, late)
+
+
+def would_gain(config: TrainConfig) -> str:
+    """What `compiled = True` would gain for a task of one's own, in a line; "" for nothing."""
+    scenario, took = config.training_scenario, dict[bool, float]()
+    task, kind = scenario.task, type(scenario.task)
+    if kind.__module__.startswith("quadrl.") or vars(kind).get("compiled"):
+        return ""
+    own = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+    for asked in (False, True):
+        made = dataclasses.dataclass(frozen=True)(type("Own", (kind,), {"compiled": asked}))
+        flown = dataclasses.replace(scenario, task=made(**own))
+        environment = Environment(flown, num_envs=config.num_envs, num_threads=config.num_threads)
+        with warnings.catch_warnings():  # that it cannot be compiled
+            warnings.simplefilter("ignore", QuadrlWarning)
+            environment.reset()
+        actions = np.zeros((config.num_envs, environment.action_size))
+        times = timeit.repeat(lambda e=environment, a=actions: e.step(a), number=1, repeat=FEW)
+        took[asked] = 1e6 * min(times)
+    if environment.not_compiled or took[True] > GAIN * took[False]:
+        return ""
+    said = f"a control step of {config.num_envs} aircraft takes {took[True]:.0f} us, not"
+    return f"with `compiled = True` in the class {kind.__name__}, {said} {took[False]:.0f}"
 
 
 def _later(policy: Policy, scenario: Scenario, episodes: int) -> dict[float, float]:

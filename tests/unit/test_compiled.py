@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import math
 import os
+import re
 import warnings
 
 import helpers
@@ -20,6 +21,8 @@ from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace, look_up
 from quadrl.conditions.solids import Cylinder, Gate, Pose
 from quadrl.core.environment import Environment
 from quadrl.engines.native import compiling
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.run import would_gain
 from quadrl.tasks.hover import Hover
 from quadrl.testing import is_the_same_compiled
 
@@ -319,6 +322,16 @@ def test_a_class_asks_for_itself_and_not_for_those_that_change_it():
     assert not helpers.begun(variant(error=lambda self, now: now.time), 2).not_compiled
     inherited = type("Mine", (Hover,), {"error": lambda self, now: now.time})
     assert helpers.begun(inherited(), 2).not_compiled
+
+
+def test_a_training_says_what_compiling_a_task_of_ones_own_would_gain(monkeypatch):
+    kinds = [type(variant(name="mine", compiled=False, **own)) for own in ({}, {"error": norm})]
+    monkeypatch.setitem(tasks.TASKS, "mine", kinds[0])
+    said = r"`compiled = True` in the class \w+, a control step of 1 aircraft takes \d+ us, not \d+"
+    assert re.search(said, would_gain(TrainConfig("mine", num_envs=1)))
+    assert would_gain(TrainConfig("hover")) == ""  # it has it
+    monkeypatch.setitem(tasks.TASKS, "mine", kinds[1])  # and this cannot
+    assert would_gain(TrainConfig("mine", num_envs=1)) == ""
 
 
 def test_every_task_of_quadrl_is_compiled():
