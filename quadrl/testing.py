@@ -119,7 +119,7 @@ def flies_whole_episodes(task: Task) -> None:
         require(not constant, f"{task.name}: entries {constant} of {name!r} never change")
 
 
-def continues_what_was_saved(task: Task) -> None:
+def continues_from_a_save(task: Task) -> None:
     """What is saved in the middle of an episode can be stored, and another continues from it."""
     actions = varied_actions(6, ROWS, Environment(task).action_size)
     one, other = (Environment(task, num_envs=ROWS, seed=seed) for seed in (1, 2))
@@ -274,7 +274,7 @@ def _optional(module: str) -> Any:
 CLAUSES = (
     takes_tensors,
     flies_whole_episodes,
-    continues_what_was_saved,
+    continues_from_a_save,
     is_the_same_compiled,
     is_alike_in_every_api,
 )
