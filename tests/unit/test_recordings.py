@@ -307,7 +307,7 @@ def test_a_training_flies_and_keeps_one_curve_though_its_file_changes(tmp_path):
         ({"coefficients": None}, "not iterable"),
         ({"seconds": "soon"}, "seconds = 'soon': must be a number between"),
         ({"spacing": 0}, "spacing = 0: must be a number between"),
-        ({"file": 7}, "not int"),
+        ({"file": 7}, "not '?int"),
         ({"shape": 1}, "field of trajectory figure = 'shape'"),
     ],
 )
