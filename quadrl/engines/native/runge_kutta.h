@@ -7,6 +7,8 @@
 
 #include "aero.h"
 
+// Keeps the compiler from joining what is before it with what comes after.
+#define KEPT_APART __asm__("" ::: "memory")
 #define INLINE static inline __attribute__((always_inline))
 
 // Rows of a motion, with a column for each aircraft. Rates of change are in the same rows.
@@ -82,7 +84,11 @@ INLINE void airspeed_of(const Setting* s, const Lanes* m, double turn[3][3], dou
 // the rotors would not, since their number is not known.
 INLINE void derivative(const Aircraft* a, const Setting* s, int effects, int rotors,
                        double gravity, const Lanes* m, Lanes* d) {
-  Lanes push[3] = {{0}}, twist[3] = {{0}}, airspeed[3], up[3];
+  Lanes push[3], twist[3], airspeed[3], up[3];
+  for (int n = 0; n < 3; ++n) {
+    for (int i = 0; i < LANES; ++i) push[n][i] = twist[n][i] = 0;
+    KEPT_APART;  // GCC would clear both by string instructions, which take as long as all the rest
+  }
   for (int k = 0; k < rotors; ++k) {
     const Rotor* rotor = a->rotor + k;
     const Lanes* lever = s->lever + 6 * k;
@@ -90,8 +96,8 @@ INLINE void derivative(const Aircraft* a, const Setting* s, int effects, int rot
       const double speed = m[SPEED + k][i];
       const double thrust = aero_rotor_gain(rotor, speed, i) * speed;
       for (int n = 0; n < 3; ++n) {
-        push[n][i] += lever[n][i] * thrust;
-        twist[n][i] += lever[3 + n][i] * thrust;
+        push[n][i] = push[n][i] + lever[n][i] * thrust;
+        twist[n][i] = twist[n][i] + lever[3 + n][i] * thrust;
       }
       d[SPEED + k][i] = aero_rotor_acceleration(rotor, speed, s->command[k][i], i);
     }
@@ -172,10 +178,13 @@ INLINE void prepare(const Aircraft* a, int effects, int rotors, Setting* s) {
 INLINE void finish_step(int rotors, const World* world, const Stages* t, Lanes* m) {
   move(SPEED + rotors, m, world->timestep / 6, t->sum, m);
   Lanes* q = m + QUATERNION;
+  Lanes scale;
   for (int i = 0; i < LANES; ++i) {
-    const double scale = 1 / sqrt(q[0][i] * q[0][i] + q[1][i] * q[1][i] + q[2][i] * q[2][i] +
-                                  q[3][i] * q[3][i]);
-    for (int k = 0; k < 4; ++k) q[k][i] *= scale;
+    scale[i] = 1 / sqrt(q[0][i] * q[0][i] + q[1][i] * q[1][i] + q[2][i] * q[2][i] +
+                        q[3][i] * q[3][i]);
+  }
+  for (int k = 0; k < 4; ++k) {
+    for (int i = 0; i < LANES; ++i) q[k][i] *= scale[i];
   }
 }
 
