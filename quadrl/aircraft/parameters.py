@@ -77,6 +77,8 @@ AIRCRAFT = np.dtype(
 )
 """A row. Every number is a double."""
 ROW_SIZE = AIRCRAFT.itemsize // 8
+PLACES = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
+"""A row in which each number is its own index."""
 LAYOUT = np.frombuffer(json.dumps(AIRCRAFT.descr).encode(), dtype=np.uint8)
 """The names and shapes of its numbers, as JSON, which is saved beside rows."""
 

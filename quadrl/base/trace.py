@@ -29,8 +29,8 @@ CALLS |= {name: name for name in ("sqrt", "sin", "cos", "exp", "log", "tan", "ta
 C: dict[str, str] = {
     "negative": "-{}",
     "arctan2": "atan2({}, {})",
-    "maximum": "{0} >= {1} || {0} != {0} ? {0} : {1}",
-    "minimum": "{0} <= {1} || {0} != {0} ? {0} : {1}",
+    "maximum": "({0} >= {1}) | ({0} != {0}) ? {0} : {1}",
+    "minimum": "({0} <= {1}) | ({0} != {0}) ? {0} : {1}",
     "where": "{} ? {} : {}",
     "invert": "!{}",
     "logical_not": "!{}",

@@ -257,9 +257,10 @@ class EstimatedState(Frame):
         """Make the table for the aircraft of an engine."""
         count, rotors = engine.ctrl.shape
         super().__init__(count, rotors)
-        self._coordinates = np.zeros((count, 13 + rotors))
+        self.coordinates = np.zeros((count, 13 + rotors))
+        """What it was filled from."""
         self._limits = parameters.limits(parameters.rows(engine.vehicle))
-        motion = np.split(self._coordinates, [7, 13], axis=1)
+        motion = np.split(self.coordinates, [7, 13], axis=1)
         arrays = (*motion, engine.origin, self._limits, engine.air)
         # As `Rows` in native/state.c.
         self._rows = native.struct(*arrays, 13 + rotors, 0, self.columns, rotors)
@@ -272,7 +273,7 @@ class EstimatedState(Frame):
                 velocity [m/s], world frame, body rate [rad/s], body frame, rotor speeds [rad/s].
             rows: Which aircraft; None for all.
         """
-        self._coordinates[:] = coordinates
+        self.coordinates[:] = coordinates
         ids, count = (None, len(coordinates)) if rows is None else (rows.ctypes.data, len(rows))
         native.library().quadrl_state(self._rows.ctypes.data, count, ids, self.address)
         return self.state if rows is None else State.of_table(self.table[:, rows])

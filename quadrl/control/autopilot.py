@@ -33,6 +33,15 @@ class Laws:
         self.widths = *COORDINATES, mode.vehicle.rotor_count
         """Sizes of a row of qpos, qvel and rotor speeds, the first arguments of both functions."""
 
+    def functions(self) -> tuple[RowFunction, RowFunction]:
+        """The functions to compile: setpoint and rotor commands.
+
+        Raises:
+            NotCompilable: The mode does more than arithmetic.
+        """
+        first = RowFunction(self.setpoint, *self.widths, self.mode.size)
+        return first, RowFunction(self.command, *self.widths, first.width)
+
     def setpoint(self, qpos: Array, qvel: Array, act: Array, action: Array) -> Array:
         """The setpoint (N, n), as `ControlMode.setpoint` gives it."""
         return self.mode.setpoint(self._state(qpos, qvel, act), action)
@@ -61,10 +70,8 @@ class Autopilot:
         self.rotor_command = np.zeros(engine.act.shape)
         """The last commands (N, R) [rad/s]."""
         self._compiled: tuple[Callable[[], None], Callable[[], None]] | None = None
-        laws, live = Laws(mode, engine), (engine.qpos, engine.qvel, engine.act)
-        first = RowFunction(laws.setpoint, *laws.widths, mode.size)
-        second = RowFunction(laws.command, *laws.widths, first.width)
-        self.functions = first, second
+        live = engine.qpos, engine.qvel, engine.act
+        self.functions = first, second = Laws(mode, engine).functions()
         """The functions to compile: setpoint and rotor commands."""
         self.setpoint = np.zeros((engine.num_envs, first.width))
         """The setpoint (N, n) of this control step."""

@@ -1,48 +1,54 @@
-"""The control step of a task, compiled: `transition.finish` as one loop over rows.
+"""A compiled control step: commands, physics and the task's part in one pass over rows, in C.
 
-The functions of a task are called twice, with symbols (`quadrl.base.trace`); what they compute
-becomes a C function, and NumPy's rows fly with it. One aircraft alone would spend more time in
-eighty calls of NumPy than in its simulation. A class of tasks asks for it with `compiled = True`:
-what the functions read besides their arguments then stays as it is when they are called. A task
-whose functions do more than arithmetic runs as it is written, with the same results.
+`native/free_flight.c` drives it; what it calls is traced from the control mode and from the task
+(`core/program.py`). One aircraft alone would spend more time in eighty calls of NumPy than in its
+simulation, and many aircraft would pass through memory many times. A class of tasks asks for it
+with `compiled = True`: what the functions read besides their arguments then stays as it is when
+they are called. A task whose functions do more than arithmetic runs as it is written, with the same
+results.
 """
 
 from __future__ import annotations
 
-import ctypes
-import dataclasses
+import contextlib
 import functools
 import warnings
 import weakref
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 
-from quadrl.aircraft.parameters import AIRCRAFT, ROW_SIZE, Parameters
-from quadrl.base import records
 from quadrl.base.errors import NativeError, QuadrlWarning
+from quadrl.base.philox import START
 from quadrl.base.rotation import Array
-from quadrl.base.trace import NotCompilable, Trace, symbolic
+from quadrl.base.trace import NotCompilable
 from quadrl.conditions.scene import Surroundings
+from quadrl.control.autopilot import Laws
+from quadrl.control.modes import ControlMode
+from quadrl.core.program import FLAGS, Program
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.step import Step, WrittenStep
-from quadrl.core.step_source import FLAGS, SOURCE, Rows
+from quadrl.core.tables import Page, Tables
 from quadrl.core.task import Task
-from quadrl.core.transition import Episode, Transition, finish
+from quadrl.core.transition import Episode, Observation, Transition
 from quadrl.engines import native
-from quadrl.engines.native import compiling
-from quadrl.engines.state import State, padded
 
-MANY, FEW = 2048, 300
-"""With more rows than that, a step of fewer operations (statements of C, of which hover has 201) is
-faster in NumPy, by up to two fifths. What has more, such as a race (590), is up to 20 times slower
-there."""
+BEGINS, ENDS, FINISHES = 1, 2, 4
+"""Parts of a control step, and LEFT, BROKEN, why an aircraft is marked: as in
+native/free_flight.c."""
+LEFT, BROKEN = 1, 2
+MARKED = (1 << 32) - 1
 _REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
 """Tasks that were reported as not compiled."""
 
 
-def compiled(step: WrittenStep, now: Snapshot, episode: Episode, parameters: np.ndarray) -> Step:
+def compiled(
+    step: WrittenStep,
+    now: Snapshot,
+    episode: Episode,
+    parameters: np.ndarray,
+    mode: ControlMode,
+) -> Step:
     """Compile the step of a task that asks for it; report a task once for which it is not possible.
 
     A class asks for itself, not for those that change its functions.
@@ -52,17 +58,28 @@ def compiled(step: WrittenStep, now: Snapshot, episode: Episode, parameters: np.
         now: Any snapshot of the task.
         episode: Any of its episodes.
         parameters: Rows that the task sees, (N,) or (1,), read live.
+        mode: The control mode that flies.
     """
     if not vars(type(step.task)).get("compiled", False):
         step.not_compiled = "its class does not say `compiled = True`"
         return step
     try:
-        return CompiledStep(step, now, episode, parameters)
-    except _Faster as error:
-        step.not_compiled = str(error)
-        return step
+        return CompiledStep(step, now, episode, parameters, mode)
     except NotCompilable as error:
         return _reported(step, str(error))
+
+
+def sources(step: WrittenStep, parameters: np.ndarray, mode: ControlMode) -> list[str]:
+    """The C that a compiled step needs, to be compiled before; arguments as for `compiled`.
+
+    Raises:
+        NotCompilable: The functions of the task do more than arithmetic.
+    """
+    program = Program(step, step.snapshot, step.episode, parameters)
+    functions = [*Laws(mode, step.engine).functions(), program.function]
+    with contextlib.suppress(NotCompilable):
+        functions.append(program.start)
+    return [function.source for function in functions]
 
 
 def _reported(step: WrittenStep, reason: str) -> WrittenStep:
@@ -76,40 +93,21 @@ def _reported(step: WrittenStep, reason: str) -> WrittenStep:
     return step
 
 
-class _Faster(NotCompilable):
-    """A step that is faster as it is written."""
-
-
-class _Page:
-    """A table of all that a step gives, a row per number, and its named views."""
-
-    def __init__(self, step: CompiledStep, now: Snapshot, episode: Episode) -> None:
-        """Lay out a table for records like those."""
-        whole = np.empty((step.seen.end, step.columns))
-        table = whole[:, : step.count]
-        self.address = native.address(whole)
-        sensed = np.empty((step.sensed.end + 1, step.columns))  # at least a row has an address
-        self.sensed_address, self.sensed = native.address(sensed), sensed[:, : step.count]
-        self.kept = step.kept.views(table)
-        parts = iter(self.kept)
-        self.now, self.episode = (records.filled(like, parts) for like in (now, episode))
-        seen = step.seen.views(table)
-        self.observation = dict(zip(step.observed, seen, strict=False))
-        self.truth = dict(zip(step.observed, seen[len(step.observed) :], strict=False))
-        size = sum(array.shape[1] for array in self.observation.values())
-        self.vectors = table[step.kept.end : step.kept.end + size].T
-
-
 class CompiledStep(Step):
-    """A task's step for N rows, in C.
+    """A control step of N rows, in C.
 
-    The snapshot, the episode and the observation stand in two tables in turn, as an engine's state
-    does. The rest of a transition has a table of its own: a row for each term of the reward, for
-    their sum, for the error, and one for the flags, a byte each.
+    The snapshot, the episode and the observation stand in two tables in turn, as the engine's
+    motions do. The rest of a transition has a table of its own: a row for each term of the reward,
+    for their sum, for the error, and one for the flags, a byte each.
     """
 
     def __init__(
-        self, written: WrittenStep, now: Snapshot, episode: Episode, parameters: np.ndarray
+        self,
+        written: WrittenStep,
+        now: Snapshot,
+        episode: Episode,
+        parameters: np.ndarray,
+        mode: ControlMode,
     ) -> None:
         """Trace and compile.
 
@@ -118,182 +116,173 @@ class CompiledStep(Step):
             now: Any snapshot of the task, with those parameters.
             episode: Any of its episodes.
             parameters: Rows that the task sees, (N,) or (1,), read live.
+            mode: The control mode that flies.
 
         Raises:
             NotCompilable: The functions of the task do more than arithmetic, or there is no
                 compiler.
         """
-        world = written.engine, written.inputs, written.estimate, written.scene
-        super().__init__(written.task, written.clock, *world)
-        self._parameters = now.parameters
-        self.count, self.columns = self.engine.num_envs, padded(self.engine.num_envs)
-        # State, parameters and surroundings have tables of their own.
-        like = dataclasses.replace(now, state=None, parameters=None, around=None)
-        kept = [*records.leaves(like), *records.leaves(episode)]
-        if any(array.dtype != np.float64 for array in kept):
-            raise NotCompilable("what it remembers is not all float64")
-        self.kept = records.Columns(0, kept)
-        # Some sensors give what only policies see.
-        self._shown = [name for name in self.task.sensors if name in now.sensed]
-        self._around = now.around
-        around = records.leaves(now.around) if now.around else []
-        self.sensed = records.Columns(0, [*(now.sensed[name] for name in self._shown), *around])
-        (trace, body), (again, other) = (self._traced(like, episode) for _ in range(2))
-        constants = np.array([*trace.constants, 0.0])
-        if body != other or constants.tobytes() != np.array([*again.constants, 0.0]).tobytes():
-            raise NotCompilable("it gives something else each time")
-        if self.count > MANY and body.count(";") < FEW:
-            raise _Faster(f"NumPy is faster for {self.count} rows of so few operations")
+        world = written.inputs, written.estimate, written.scene, written.loops
+        super().__init__(written.task, written.clock, written.engine, *world)
+        self._parameters, engine = now.parameters, self.engine
+        self._program = program = Program(written, now, episode, parameters)
+        functions, estimate = Laws(mode, engine).functions(), self.estimate
+        seen = estimate.coordinates if estimate else None
         try:
-            source = SOURCE.format(flags=self.flags, body=body)
-            self._call = compiling.compile_generated(source).step
+            self._tables = Tables(program, functions, engine, self.inputs, seen, parameters)
         except NativeError as error:
             raise NotCompilable(str(error).partition("\n")[0]) from error
-        self._call.argtypes, self._call.restype = [ctypes.c_void_p, ctypes.c_int64], None
-        self._constants = constants
-        # Only what the body reads is copied: of a hundred solids a task may look at one.
-        self._wanted = [
-            (places[0], np.array([k for k in places if f"sensed[{k} * columns" in body], int))
-            for numbers in self.sensed.views(np.arange(self.sensed.end)[:, None])
-            for places in [numbers.ravel().tolist()]
-        ]
-        inputs = (getattr(self.inputs, f.name) for f in dataclasses.fields(self.inputs))
-        self._arguments = Rows(
-            *(array.ctypes.data for array in (self._constants, parameters, *inputs)),
-            estimate=self.estimate.address if self.estimate else None,
-            stride=parameters.strides[0] // 8 if len(parameters) > 1 else 0,
-            columns=self.columns,
-        )
-        self._address = ctypes.addressof(self._arguments)
-        self._pages = tuple(_Page(self, like, episode) for _ in range(2))
-        self._observation: dict[str, np.ndarray] = {}
-
-    def _traced(self, like: Snapshot, episode: Episode) -> tuple[Trace, str]:
-        """The operations of a step, and the body of its loop."""
-        trace = Trace()
-
-        def read(place: str) -> Callable[[Any], Any]:
-            return functools.partial(trace.read, place)
-
-        # Arrays whose numbers say where they stand, made by what makes the views of real ones.
-        own = Parameters.of(
-            np.arange(float(ROW_SIZE)).view(AIRCRAFT),
-            self.clock.control_timestep,
-            self.inputs.command.shape[1],
-        )
-        states = State.of_table(np.arange(len(self.engine.frames[0].table))[:, None])
-        state, last_state, estimate = (
-            records.mapped(read(f"{name}[{{}} * columns + i]"), states)
-            for name in ("state", "last_state", "estimate")
-        )
-        places = iter(self.kept.views(np.arange(self.kept.end)[:, None]))
-        before, begun = (
-            records.mapped(read("was[{} * columns + i]"), records.filled(record, places))
-            for record in (like, episode)
-        )
-        before.state, before.parameters = last_state, own.map(read("p[i * stride + {}]"))
-        sensors = self.sensed.views(np.arange(self.sensed.end)[:, None])
-        action, command = (
-            read(f"{name}[i * {size} + {{}}]")(np.arange(size)[None])
-            for name in ("action", "command")
-            for size in [getattr(self.inputs, name).shape[1]]
-        )
-        diverged = trace.inputs(np.array(["diverged[i]"], object), is_flag=True)
-        given = (
-            self.given(map(read(f"{name}[{{}} * columns + i]"), sensors))
-            for name in ("last_sensed", "sensed")
-        )
-        (before.sensed, before.around), (sensed, around) = given
-        for solids in filter(None, (before.around, around)):
-            for name in ("touched", "landed", "held"):
-                setattr(solids, name, getattr(solids, name) != 0.0)
-        seen_from = estimate if self.estimate else None
-        inputs = state, action, command, diverged, seen_from, around, sensed
-        with symbolic():
-            after, ended, done = finish(self.task, self.clock, begun, before, *inputs)
-            after.state = after.parameters = after.around = None  # type: ignore[assignment]
-            kept = [*records.leaves(after), *records.leaves(ended)]
-            return trace, trace.body(self._outputs(kept, done))
-
-    def given(self, arrays: Iterable[Any]) -> tuple[dict[str, Any], Surroundings | None]:
-        """Arrange arrays as what the task sees: sensors by name, and the solids about aircraft."""
-        rest = iter(arrays)
-        sensed = {name: next(rest) for name in self._shown}
-        return sensed, records.filled(self._around, rest) if self._around else None
-
-    def _outputs(self, kept: list[Array], done: Transition) -> dict[str, Any]:
-        """Map the places in the tables to what is written there."""
-        self.observed, self._rewarded = list(done.observation), list(done.reward_terms)
-        seen = [*done.observation.values(), *(done.truth.values() if self.estimate else ())]
-        rest = [*done.reward_terms.values(), done.reward, done.error]
-        self.seen = records.Columns(self.kept.end, seen)
-        self.flags, outputs = len(rest), dict[str, Any]()
-        numbers = np.arange(self.seen.end)[:, None]
-        for columns, arrays in ((self.kept, kept), (self.seen, seen)):
-            for places, array in zip(columns.views(numbers), arrays, strict=True):
-                values = np.broadcast_to(np.asarray(array, dtype=object), places.shape)
-                for place, value in zip(places.ravel(), values.ravel(), strict=True):
-                    outputs[f"out[{place} * columns + i]"] = value
-        for k, array in enumerate(rest):
-            outputs[f"rest[{k} * columns + i]"] = np.asarray(array, dtype=object)[0]
-        for k, name in enumerate(FLAGS):
-            outputs[f"flags[{k} * columns + i]"] = np.asarray(getattr(done, name), dtype=object)[0]
-        return outputs
+        # Where it needs no other room in between, the task's part follows at once.
+        alone = not (estimate or program.sensed.end)
+        self._ends = ENDS | (FINISHES if alone else 0)
+        self._substeps = engine.vehicle.substeps
+        self._held = 1 if self.loops else self._substeps
+        self._into = 0  # the page that the present step fills
+        self._flown = False
+        self._broken: np.ndarray | None = None
+        self._observation: dict[str, Array] = {}
 
     def begin(self, now: Snapshot, episode: Episode) -> None:
         """Make a snapshot of all rows the present one."""
-        moment = dataclasses.replace(now, state=None, parameters=None, around=None)
-        arrays = [*records.leaves(moment), *records.leaves(episode)]
-        for into, array in zip(self._pages[0].kept, arrays, strict=True):
+        page = self._tables.pages[self.engine.turn]
+        for into, array in zip(page.kept, self._program.leaves(now, episode), strict=True):
             into[:] = array
-        self._show(self._pages[0], now.sensed, now.around)
+        self._show(page, now.sensed, now.around)
+
+    def start(self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray) -> Observation | None:
+        """Begin episodes (n,) of aircraft as they are specified, in air that is at rest.
+
+        Returns:
+            The observation of those aircraft, terms (n, k); None, and nothing has changed, where
+            the functions of the task have to begin them.
+        """
+        if (starts := self._starts) is None:
+            return None
+        function, (struct, places), count = self._program.start, starts, len(rows)
+        words, room = np.array((rows, keys, episodes)), np.empty((count, function.width))
+        ids, keyed, numbered = (native.address(words) + k * words.strides[0] for k in range(3))
+        step, into, library = self._tables.address, native.address(room), native.library()
+        given = struct.ctypes.data, places.ctypes.data, len(places), ids, count
+        drawn = keyed, numbered, START, self._program.drawn
+        if library.quadrl_begin(step, *given, *drawn, into):
+            return None
+        self.engine.clear(rows)
+        library.quadrl_place(step, ids, count, into, function.width, self._program.kept.end)
+        self.engine.show(rows)
+        seen = self._program.seen.views(room[:, self.engine.motions.shape[-1] :].T)
+        return dict(zip(self._program.observed, seen, strict=False))
+
+    @functools.cached_property
+    def _starts(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The function of starts and the places that it reads; None where it cannot be compiled."""
+        try:
+            function = self._program.start
+            struct = function.struct()
+        except (NotCompilable, NativeError):
+            return None
+        return struct, self._tables.places_of(function)
+
+    @property
+    def flies(self) -> bool:
+        """Whether it flies, too, and is not only the task's part."""
+        return self.engine.flies_free
+
+    def fly(self) -> None:
+        """Command and fly the aircraft through a control step."""
+        engine = self.engine
+        self._turn()
+        if self._call(None, BEGINS | self._ends, self._substeps):
+            marked = np.flatnonzero(engine.near)
+            kinds = engine.near[marked]
+            self._mend(np.concatenate([marked[kinds == BROKEN], self._land(marked[kinds == LEFT])]))
+        else:
+            for _ in range(0, self._substeps, self._held):
+                engine.passed(self._held)
+        self._flown = True
+        engine.take_turn()
+
+    def _land(self, left: np.ndarray) -> np.ndarray:
+        """Fly aircraft (n,) that may touch something; return those that have diverged."""
+        if not len(left):
+            return left
+        for flown in range(0, self._substeps, self._held):
+            if self._call(left, 0 if flown else BEGINS, self._held):
+                self.engine.touch(left[self.engine.near[left] != 0], self._held)
+            else:
+                self.engine.passed(self._held)
+        self._call(left, self._ends, 0)
+        return left[self.engine.near[left] == BROKEN]
+
+    def _call(self, rows: np.ndarray | None, parts: int, steps: int) -> int:
+        """Do parts of a control step of some aircraft; how many are marked."""
+        step = self._tables.steps[self._into].ctypes.data
+        return self.engine.control_step(step, rows, parts, steps) & MARKED
+
+    def _turn(self) -> None:
+        """Let the present step fill the other page."""
+        self._into = 1 - self.engine.turn
+        self._rest = self._tables.fresh(self._into)
+
+    def _mend(self, broken: np.ndarray) -> None:
+        """Note aircraft that have diverged."""
+        if not len(broken):
+            return
+        self.engine.mend(broken)
+        self._broken = np.zeros(self.engine.num_envs, bool)
+        self._broken[broken] = True
+        self.note_diverged(broken)
+        if self._ends & FINISHES:
+            self._call(broken, FINISHES, 0)
+
+    def read(self) -> np.ndarray | None:
+        """Take the motion at the end of a control step; which aircraft have diverged, or None."""
+        if not self._flown:
+            self._turn()
+            if self._call(None, self._ends, 0):
+                self._mend(np.flatnonzero(self.engine.near))
+            self.engine.take_turn()
+        self._flown, (broken, self._broken) = False, (self._broken, None)
+        return broken
 
     def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
-        last, page = self._pages
-        self._pages = page, last
-        rows, (now, before) = self._arguments, self.engine.frames
-        rows.state, rows.last_state = now.address, before.address
+        tables, count = self._tables, self.engine.num_envs
+        page, last = tables.pages[self._into], tables.pages[1 - self._into]
         around = self.scene.surroundings(self.engine) if self.scene.solids else None
-        # A reset since the last step has given its rows what the sensors show then.
-        self._take(self.snapshot.sensed, self.snapshot.around, last)
-        self._take(sensed, around, page)
-        rows.sensed, rows.last_sensed = page.sensed_address, last.sensed_address
-        rest, count = np.empty((self.flags + 1, self.columns)), self.count
-        rows.was, rows.out, rows.rest = last.address, page.address, native.address(rest)
-        self._call(self._address, count)
+        if not self._ends & FINISHES:
+            # A reset since the last step has given its rows what the sensors show then.
+            tables.take(self._present.sensed, self._present.around, last)
+            tables.take(sensed, around, page)
+            self._call(None, FINISHES, 0)
         self._show(page, sensed, around)
         self._observation = page.observation.copy()
-        *terms, reward, error = rest[:-1, :count]
-        flags = rest[-1].view(np.bool_).reshape(-1, self.columns)[: len(FLAGS), :count]
+        *terms, reward, error = self._rest[:-1, :count]
+        flags = self._rest[-1].view(np.bool_).reshape(-1, tables.columns)[:, :count]
         return Transition(
             observation=self._observation,
             reward=reward,
-            reward_terms=dict(zip(self._rewarded, terms, strict=True)),
+            reward_terms=dict(zip(self._program.rewarded, terms, strict=True)),
             error=error,
             truth=page.truth or self._observation,
-            **dict(zip(FLAGS, flags, strict=True)),
+            **dict(zip(FLAGS, flags, strict=False)),
         )
 
-    def _take(
-        self, sensed: Mapping[str, np.ndarray], around: Surroundings | None, page: _Page
-    ) -> None:
-        """Write what the compiled step reads of sensors and solids into its table."""
-        given = [sensed[name] for name in self._shown] + (records.leaves(around) if around else [])
-        for array, (first, places) in zip(given, self._wanted, strict=True):
-            if places.size:
-                page.sensed[places] = array.reshape(self.count, -1)[:, places - first].T
-
     def _show(
-        self, page: _Page, sensed: Mapping[str, np.ndarray], around: Surroundings | None
+        self, page: Page, sensed: Mapping[str, np.ndarray], around: Surroundings | None
     ) -> None:
         """Make a table the present one."""
         page.now.sensed, page.now.around = sensed, around
-        page.now.state, page.now.parameters = self.engine.state, self._parameters
-        self.snapshot, self.episode = page.now, page.episode
+        page.now.parameters = self._parameters
+        self._present, self.episode = page.now, page.episode
+
+    @property
+    def snapshot(self) -> Snapshot:  # type: ignore[override]
+        """What tasks see now: live, valid until the next step."""
+        self._present.state = self.engine.state
+        return self._present
 
     def flatten(self, observation: dict[str, Array]) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""
         if observation is self._observation:
-            return self._pages[0].vectors.astype(np.float32, order="C")
+            return self._tables.pages[self.engine.turn].vectors.astype(np.float32, order="C")
         return super().flatten(observation)

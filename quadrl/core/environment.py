@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import numpy as np
 
@@ -30,8 +30,8 @@ from quadrl.conditions.weather import WeatherProcess
 from quadrl.control import modes
 from quadrl.control.autopilot import Autopilot
 from quadrl.control.trim import trimmed
-from quadrl.core import saving, transition
-from quadrl.core.compiled import compiled
+from quadrl.core import rules, saving, transition
+from quadrl.core.compiled import compiled, sources
 from quadrl.core.markers import Marker
 from quadrl.core.observation import layout
 from quadrl.core.observer import Observer
@@ -109,7 +109,7 @@ class Environment(saving.Copied):
         nominal = parameters.rows(self.vehicle)
         self._rows = engine.parameters if self._true else nominal  # those that the task sees
         self._parameters, seen = (Parameters.of(k, timestep) for k in (self._rows, nominal))
-        self.term_names = transition.check_task(self.task, seen, self.action_size, self.origin[2])
+        self.term_names = rules.check_values(self.task, seen, self.action_size, self.origin[2])
         """Names of the reward's terms, in their order."""
         senses = self.observing != Observing() or bool(self.task.sensors)
         active = senses or self.randomization != NONE
@@ -129,6 +129,12 @@ class Environment(saving.Copied):
             engine.solids.place(np.arange(self.num_envs), declared)
         self.stepwise = self.control_mode.has_loops or self.randomizer.late or self._solids_move
         """Whether a control step is flown in parts, which `control` prepares."""
+        self._plain = not (self.randomizer.active or self.observer or self.scene.solids)
+        self._plain &= not self.weather.wind_speed
+        """Whether an episode begins as the task says, and nothing else begins with it."""
+        follows = self.observer is not None and self.control_mode.has_loops
+        self._parted = self.randomizer.late or self._solids_move or follows
+        """Whether Python acts within a control step."""
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
         self._all = np.arange(self.num_envs)
         self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
@@ -143,12 +149,13 @@ class Environment(saving.Copied):
         self._flown = 0  # physics steps of this control step that `control` has commanded
         self._moves: list[np.ndarray] = []  # where solids are after each of its physics steps
         self.seed(seed)
-        self._made = frozenset(vars(self)).difference(LIVE)  # attributes that stay
+        # Attributes that stay, and those that would be taken for options.
+        self._made = frozenset(vars(self)).difference(LIVE).union(self.options)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuse to assign to what an environment was made of: the rest of it would not follow."""
         made = vars(self).get("_made")
-        if made and name[0] != "_" and (name in made or name in self.options):
+        if made and name[0] != "_" and name in made:
             allowed = f"given to `change`, as in change({name}=...), before a reset"
             raise QuadrlError(name=name, value=value, allowed=allowed)
         super().__setattr__(name, value)
@@ -235,6 +242,13 @@ class Environment(saving.Copied):
             return {name: np.zeros((0, at.stop - at.start)) for name, at in self.layout.items()}
         seeds = self.seeds if seed is None else self.seeds.renewed(seed, rows)
         place = seeds.keys[rows], seeds.episodes[rows]
+        if self._plain and not start and self._step is not None:
+            if (observation := self._step.start(rows, *place)) is not None:
+                self.seeds = seeds
+                if self.blowing:
+                    self.blowing.begin(rows, *place, None)
+                self.seeds.episodes[rows] += 1
+                return observation
         (drawn, table), seen = self.randomizer.sample(*place), self._parameters
         if table is not None and self._true:
             seen = Parameters.of(table, self._clock.control_timestep)
@@ -307,6 +321,10 @@ class Environment(saving.Copied):
         """Why the task's step is not compiled; empty where it is, from the first reset on."""
         return self._begun.not_compiled
 
+    def sources(self) -> list[str]:
+        """The C of its control step, while that runs as it is written."""
+        return sources(cast(WrittenStep, self._begun), self._rows, self.control_mode)
+
     def _take(self, now: Snapshot, episode: Episode) -> None:
         """Make a snapshot of all rows the present one."""
         # What a task remembers must not be a view of buffers that the next steps write.
@@ -315,8 +333,8 @@ class Environment(saving.Copied):
         if self._step is None:
             estimate = self.observer.frame if self.observer else None
             world = self.engine, self._inputs, estimate, self.scene
-            written = WrittenStep(self.task, self._clock, *world)
-            self._step = compiled(written, now, episode, self._rows)
+            written = WrittenStep(self.task, self._clock, *world, self.control_mode.has_loops)
+            self._step = compiled(written, now, episode, self._rows, self.control_mode)
         self._step.begin(now, episode)
 
     def step(self, action: Array) -> Transition:
@@ -333,6 +351,12 @@ class Environment(saving.Copied):
                 reward that is not finite.
             RuntimeError: There was no reset before.
         """
+        if self._begun.flies and not self._parted:
+            self._accept(action)
+            self._begun.fly()
+            if self.observer:
+                self.observer.follow(self._inputs.command, self.vehicle.control_timestep)
+            return self.finish()
         self.begin(action)
         for steps in self.commands():
             self.engine.advance(steps)
@@ -350,12 +374,11 @@ class Environment(saving.Copied):
             yield steps
             left -= steps
 
-    def begin(self, action: Array) -> None:
-        """Do the first half of a step: command the rotors, or set the setpoint of the loops."""
+    def _accept(self, action: Array) -> None:
+        """Take the action of a control step that begins, and let the conditions act."""
         if self.engine.forked:
             self.make_anew()
-        inputs = self._begun.inputs
-        taken, command = inputs.action, inputs.command
+        taken = self._inputs.action
         self._moves = self._solids_ahead() if self._solids_move else []
         taken[:] = validation.action(action, (self.num_envs, self.action_size))
         if self.blowing:
@@ -366,11 +389,16 @@ class Environment(saving.Copied):
         if self.randomizer.active:
             self.randomizer.begin_step()
         self._flown, self._inputs.diverged[:] = 0, False
+
+    def begin(self, action: Array) -> None:
+        """Do the first half of a step: command the rotors, or set the setpoint of the loops."""
+        self._accept(action)
+        taken, command = self._inputs.action, self._inputs.command
         if self.autopilot:
             command[:] = 0.0
             self.autopilot.begin()
         else:
-            command[:] = self.control_mode.setpoint(self.engine.state, taken)
+            command[:] = self.control_mode.values(taken)
             self.engine.ctrl[:] = command
             if self.observer:
                 self.observer.follow(command, self.vehicle.control_timestep)
@@ -411,7 +439,7 @@ class Environment(saving.Copied):
         if self.observer:
             self.observer.sense(self._inputs.action)
         done = self._begun.finish(self.sensed)
-        transition.check_reward(self.task, done)
+        rules.check_reward(self.task, done)
         if self.observer:
             done.observation = self.observer.observe(done)
         self.transition = done
@@ -419,11 +447,8 @@ class Environment(saving.Copied):
 
     def _read(self) -> None:
         """Compute the state, and note which aircraft have diverged."""
-        if (diverged := self.engine.read()) is not None:
-            self._inputs.diverged[diverged] = True
+        if (diverged := self._begun.read()) is not None:
             self.randomizer.forget(diverged)
-            if self.autopilot:  # what it commanded them may be no numbers
-                self._inputs.command[diverged] = self.engine.act[diverged]
 
     def flatten(self, observation: Observation) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""

@@ -13,12 +13,12 @@ import numpy as np
 
 from quadrl.base import records
 from quadrl.conditions.scene import Scene
+from quadrl.conditions.sensor import EstimatedState
 from quadrl.core import transition
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
 from quadrl.engines.engine import Engine
-from quadrl.engines.state import Frame
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -38,14 +38,45 @@ class Step(abc.ABC):
     clock: Clock  # of its episodes
     engine: Engine  # of the aircraft
     inputs: Inputs  # read live
-    estimate: Frame | None  # table of the state that is observed, read live; None for the true one
+    estimate: (
+        EstimatedState | None
+    )  # table of the state that is observed, read live; None for the true one
     scene: Scene  # the solids in the world
+    loops: bool  # whether commands change with each physics step
     snapshot: Snapshot = dataclasses.field(init=False)
     """What tasks see now: live, valid until the next step."""
     episode: Episode = dataclasses.field(init=False)
     """How far the episodes are: as live as the snapshot."""
     not_compiled: str = dataclasses.field(default="", init=False)
     """Why it is not compiled; empty where it is."""
+
+    def start(self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray) -> Observation | None:
+        """Begin episodes (n,) of aircraft as they are specified, in air that is at rest.
+
+        Returns:
+            The observation of those aircraft, terms (n, k); None, and nothing has changed, where
+            the functions of the task have to begin them.
+        """
+        return None
+
+    @property
+    def flies(self) -> bool:
+        """Whether it flies, too, and is not only the task's part."""
+        return False
+
+    def fly(self) -> None:
+        """Command and fly the aircraft through a control step."""
+        raise NotImplementedError
+
+    @abc.abstractmethod
+    def read(self) -> np.ndarray | None:
+        """Take the motion at the end of a control step; which aircraft have diverged, or None."""
+
+    def note_diverged(self, rows: np.ndarray) -> None:
+        """Note which aircraft, numbers or mask, have diverged."""
+        self.inputs.diverged[rows] = True
+        if self.loops:  # what they commanded may be no numbers
+            self.inputs.command[rows] = self.engine.act[rows]
 
     @abc.abstractmethod
     def begin(self, now: Snapshot, episode: Episode) -> None:
@@ -70,6 +101,12 @@ class WrittenStep(Step):
     def begin(self, now: Snapshot, episode: Episode) -> None:
         """Make a snapshot of all rows the present one."""
         self.snapshot, self.episode = now, episode
+
+    def read(self) -> np.ndarray | None:
+        """Take the motion at the end of a control step; which aircraft have diverged, or None."""
+        if (diverged := self.engine.read()) is not None:
+            self.note_diverged(diverged)
+        return diverged
 
     def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""

@@ -10,13 +10,11 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
 from quadrl.conditions.scene import Surroundings
-from quadrl.core import rules
 from quadrl.core.rewards import total
 from quadrl.core.task import EpisodeEnd, Snapshot, Task
 from quadrl.engines.state import State
 
 Observation = dict[str, Array]
-check_reward, check_task = rules.check_reward, rules.check_values  # as `Environment` calls them
 OFF = 0.05
 """Share of a time limit by which whole control steps may differ from it."""
 

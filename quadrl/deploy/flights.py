@@ -20,13 +20,14 @@ where it does not call `follow`.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from quadrl.aircraft.parameters import AIR, AIRCRAFT, ROW_SIZE, Parameters
+from quadrl.aircraft.parameters import AIR, PLACES, ROW_SIZE, Parameters
 from quadrl.aircraft.vehicle import MAX_ROTORS, commanded
 from quadrl.base import records
 from quadrl.base.rotation import Array, to_body
@@ -36,9 +37,9 @@ from quadrl.conditions.sensors import Aim, RotorSpeed, felt, moving
 from quadrl.control.geometric import GeometricController
 from quadrl.control.reading import Reading
 from quadrl.core.environment import Environment
+from quadrl.core.program import Draws
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.transition import Clock, Episode, Observation, Transition, begin, finish
-from quadrl.engines.rng import Rng
 from quadrl.engines.state import FIRST, State
 
 PARTS = {
@@ -104,8 +105,7 @@ class _Memory:
 
     def parameters(self) -> Parameters:
         """The aircraft's row; each number says where it stands."""
-        places = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
-        own = Parameters.of(places, self._timestep, self._rotors)
+        own = Parameters.of(PLACES, self._timestep, self._rotors)
         return own.map(lambda numbers: self.read("parameters", numbers))
 
     def state(self) -> State:
@@ -135,21 +135,6 @@ class _Memory:
         placed = [records.filled(record, places) for record in like]
         found = [records.mapped(lambda numbers: self.read("kept", numbers), one) for one in placed]
         return [*found, self.read("kept", np.array([columns.end]))]
-
-
-class _Draws(Rng):
-    """Random numbers that are symbols."""
-
-    def __init__(self, memory: _Memory) -> None:
-        """Begin with the first number."""
-        self.used, self._memory = 0, memory
-
-    def uniform(self, low: float, high: float, size: int | None = None) -> Array:
-        """Numbers in [low, high): (1,), or (1, size)."""
-        count = 1 if size is None else size
-        drawn = self._memory.read("drawn", np.arange(self.used, self.used + count)[None])
-        self.used += count
-        return low + (high - low) * (drawn[..., 0] if size is None else drawn)
 
 
 def write(environment: Environment) -> tuple[str, int]:
@@ -189,7 +174,7 @@ def write(environment: Environment) -> tuple[str, int]:
         }
 
     memory = _Memory(environment)
-    draws = _Draws(memory)
+    draws = Draws(functools.partial(memory.read, "drawn"))
     start, task_state = task.begin(draws, memory.parameters())
     placed = np.concatenate([start.position + origin, start.quaternion], axis=-1)
     motion = np.concatenate([start.velocity, start.body_rate], axis=-1)

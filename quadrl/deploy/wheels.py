@@ -65,9 +65,10 @@ def steps(tasks: Iterable[str]) -> list[str]:
                     randomization=randomization,
                 )
                 environment.reset()
-                if pilot := environment.autopilot:
+                found += environment.sources()
+                if environment.autopilot:
                     back = Reversed(environment.control_mode, environment.engine)
-                    found += (f.source for f in (*pilot.functions, *back.functions))
+                    found += (f.source for f in back.functions)
         return list(dict.fromkeys(found))
 
 

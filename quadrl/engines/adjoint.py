@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR
-from quadrl.aircraft.parameters import AIR, AIRCRAFT, MAX_ROTORS, ROW_SIZE, Parameters
+from quadrl.aircraft.parameters import AIR, MAX_ROTORS, PLACES, Parameters
 from quadrl.base.rotation import Array
 from quadrl.base.trace import Trace
 from quadrl.engines import dynamics, native
@@ -32,8 +32,6 @@ COORDINATES = 13
 """Size of a motion without rotor speeds: 7 of qpos, 6 of qvel."""
 STEP_ROWS = 4 * (COORDINATES + MAX_ROTORS) + 4
 """Rows of `Step` in native/adjoint.c, of LANES numbers each."""
-PLACES = np.arange(float(ROW_SIZE)).view(AIRCRAFT)
-"""A row of parameters in which each number is its own index."""
 SOURCE = """enum {{ EFFECTS = {effects}, ROTORS = {rotors} }};
 static const double c[] = {{{constants}}};
 

@@ -6,6 +6,7 @@ An engine takes rotor commands, advances some physics steps, and reports which a
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Iterator
 from typing import Literal
 
@@ -86,20 +87,91 @@ class Engine(abc.ABC):
         # Two frames in turn: the last state stays whole while the next one is computed.
         self.frames = [Frame(self.num_envs, vehicle.rotor_count) for _ in range(2)]
         self._middle: Frame | None = None
+        self.motions = np.zeros((2, self.num_envs, 13 + vehicle.rotor_count))
+        """qpos, qvel and rotor speeds at the end of a control step and of the one before, in turn:
+        those that compiled steps leave, and those of resets."""
+        self.turn = 0
+        """Which of them is the present one."""
+        self._behind = False  # whether the frame is to be filled from it
         library = native.library()
+        self._step = library.quadrl_step
         self._kernel, self._first_unsound = library.quadrl_state, library.quadrl_unsound_air
         self._limits = parameters.limits(self.parameters)
         arrays = (self.qpos, self.qvel, self.act, self.origin, self._limits, self.air)
         stride = self._limits.shape[1] if len(self._limits) > 1 else 0
-        sizes = self.frames[0].columns, vehicle.rotor_count
+        sizes = stride, self.frames[0].columns, vehicle.rotor_count
         # As `Rows` in native/state.c.
-        self._rows = native.struct(*arrays, self.qpos.strides[0] // 8, stride, *sizes)
+        self._rows = native.struct(*arrays, self.qpos.strides[0] // 8, *sizes)
         self._address = self._rows.ctypes.data
+        self._motions = [
+            native.struct(*np.split(motion, [7, 13], axis=1), *arrays[3:], motion.shape[1], *sizes)
+            for motion in self.motions
+        ]
 
     @property
     def state(self) -> State:
         """The current state, views of live buffers that are valid for one more step."""
+        if self._behind:
+            self.frames.reverse()
+            motion = self._motions[self.turn].ctypes.data
+            self._kernel(motion, self.num_envs, None, self.frames[0].address)
+            self._behind = False
         return self.frames[0].state
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Largest speed [m/s] and body rate [rad/s] of each aircraft, (N or 1, 2), live."""
+        return self._limits
+
+    @property
+    def flies_free(self) -> bool:
+        """Whether free flight flies the aircraft that can touch nothing."""
+        return self._free_flight is not None
+
+    @functools.cached_property
+    def near(self) -> np.ndarray:
+        """Marks (N,) int8 of a control step in C: left to MuJoCo, or broken."""
+        flies = self._free_flight
+        return np.zeros(self.num_envs, np.int8) if flies is None else flies.near
+
+    @functools.cached_property
+    def rows(self) -> np.ndarray:
+        """The simulation as `Rows` in native/flight.h."""
+        if self._free_flight is not None:
+            return self._free_flight.rows
+        self._kept = parameters.numbers(self.parameters[:1])
+        fields = self.qpos, self.qvel, self.act, self.ctrl, None, self.air, self._kept, None
+        return native.struct(*fields, self.near, None, None, *self._row_sizes())
+
+    def _row_sizes(self) -> tuple[int, ...]:
+        return self.qpos.strides[0] // 8, 0, self.vehicle.rotor_count, 0
+
+    def control_step(self, step: int, rows: np.ndarray | None, parts: int, steps: int) -> int:
+        """Call `quadrl_step` of native/free_flight.c.
+
+        Args:
+            step: Address of its `Step`.
+            rows: Which aircraft, (n,) int64; None for all.
+            parts: Which parts of the control step.
+            steps: Physics steps.
+
+        Returns:
+            As it does.
+        """
+        if rows is not None:
+            return self._step(step, rows.ctypes.data, 0, len(rows), parts, steps)
+        return self._threads.call(lambda at, end: self._step(step, None, at, end, parts, steps))
+
+    def show(self, rows: np.ndarray) -> None:
+        """Let the state of aircraft (n,) be that of their motion, which was replaced."""
+        if not self._behind:
+            motion, ids = self._motions[self.turn].ctypes.data, rows.ctypes.data
+            self._kernel(motion, len(rows), ids, self.frames[0].address)
+
+    def take_turn(self) -> None:
+        """Let the other of `motions` be the present one, which a control step has filled."""
+        self.turn, self._behind = 1 - self.turn, True
+        self.solids.arrive()
 
     @abc.abstractmethod
     def _model_field(self, name: str) -> np.ndarray:
@@ -135,6 +207,18 @@ class Engine(abc.ABC):
     @abc.abstractmethod
     def advance(self, steps: int) -> None:
         """Fly some physics steps with the commands in `ctrl`."""
+
+    @abc.abstractmethod
+    def touch(self, rows: np.ndarray | None, steps: int) -> None:
+        """Let MuJoCo fly some physics steps of aircraft (n,) that may touch something, or of all.
+
+        Raises:
+            NativeError: The rotor callbacks were removed.
+        """
+
+    def passed(self, steps: int) -> None:
+        """Count physics steps that were not flown by MuJoCo."""
+        return
 
     def contact_steps(self, steps: int, rows: np.ndarray | None = None) -> Iterator[int]:
         """Put solids that move where they are in each step of the model.
@@ -182,6 +266,7 @@ class Engine(abc.ABC):
         """
         self.frames.reverse()
         self.solids.arrive()
+        self._behind = False
         if not self._fill(None):
             return None
         table, last = (frame.table for frame in self.frames)
@@ -190,12 +275,28 @@ class Engine(abc.ABC):
         broken = ~(sound & (table[FIRST["angular_speed"]] <= self._limits[:, 1]))
         rows = np.flatnonzero(broken)
         table[:, rows] = last[:, rows]
+        self._mend(rows, State.of_table(table[:, rows]))
+        return broken
+
+    def mend(self, rows: np.ndarray) -> None:
+        """Give aircraft (n,) that diverged in a compiled step their last good motion.
+
+        It comes before the turn.
+
+        Raises:
+            QuadrlError: One of them has a parameter that is not finite.
+        """
+        motion, last = self.motions[1 - self.turn], self.motions[self.turn]
+        motion[rows] = last[rows]
+        position, *rest = np.split(motion[rows], [3, 7, 10, 13], axis=1)
+        self._mend(rows, Start(position - self.origin, *rest))
+
+    def _mend(self, rows: np.ndarray, good: Start | State) -> None:
         air = self.air[rows]
         self.clear(rows)
         self.air[rows] = air
-        self._write(rows, State.of_table(table[:, rows]))
+        self._write(rows, good)
         self._check_parameters(rows)
-        return broken
 
     def peek(self) -> State:
         """The state in the middle of a control step, in separate buffers, unchecked."""
@@ -257,7 +358,9 @@ class Engine(abc.ABC):
         self.clear(rows)
         self._write(rows, start)
         self._fill(rows)
+        self._note(rows)
         if len(rows) == self.num_envs:
+            self._behind = False
             return self.state
         return State.of_table(self.frames[0].table[:, rows])
 
@@ -294,6 +397,8 @@ class Engine(abc.ABC):
         if "solids" in saved:
             self.solids.restore(saved["solids"])
         self._fill(None)
+        self._note(np.arange(self.num_envs))
+        self._behind = False
 
     def _saved(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """The result of `save`, from the rows of the simulation."""
@@ -312,6 +417,11 @@ class Engine(abc.ABC):
         self.qpos[rows] = np.concatenate([start.position + self.origin, start.quaternion], axis=-1)
         self.qvel[rows] = np.concatenate([start.velocity, start.body_rate], axis=-1)
         self.act[rows] = start.rotor_speed
+
+    def _note(self, rows: np.ndarray) -> None:
+        """Keep the motion of aircraft (n,) as the present one."""
+        parts = self.qpos[rows], self.qvel[rows], self.act[rows]
+        self.motions[self.turn, rows] = np.concatenate(parts, axis=1)
 
     def _fill(self, rows: np.ndarray | None) -> int:
         """Run the C kernel, and return how many aircraft are not sound."""

@@ -51,7 +51,8 @@ class FreeFlight:
         _check(model)
         self._kernel, self._threads = native.library().quadrl_free_flight, threads
         self.world = world(model, step)
-        self._near = np.zeros(len(fields["qpos"]), dtype=np.int8)
+        self.near = np.zeros(len(fields["qpos"]), dtype=np.int8)
+        """Marks of the aircraft that were left to MuJoCo."""
         # As the kernels read them: the row, or blocks of LANES rows side by side.
         self.parameters, block, rotors = table, 0, fields["act"].shape[1]
         if len(table) > 1:
@@ -60,12 +61,12 @@ class FreeFlight:
             self.parameters[:] = numbers(table[:1])[0, : block // LANES, None]
             self.write(np.arange(len(table)), table)
         live, about = [fields[name] for name in FIELDS], (solids.table, solids.nearby)
-        arrays = (*live, self.parameters, self.world, self._near, *about)
+        arrays = (*live, self.parameters, self.world, self.near, *about)
         sizes = (live[0].strides[0] // 8, block, rotors, len(solids.geoms))
         self._alive = arrays  # the kernel knows their addresses
-        # As `Rows` in native/free_flight.c.
-        self._rows = native.struct(*arrays, *sizes)
-        self._address = self._rows.ctypes.data
+        self.rows = native.struct(*arrays, *sizes)
+        """It as `Rows` in native/flight.h."""
+        self._address = self.rows.ctypes.data
 
     def write(self, rows: np.ndarray, table: np.ndarray) -> None:
         """Take parameters (n,) of some aircraft (n,)."""
@@ -81,7 +82,7 @@ class FreeFlight:
         """
         address = self._address
         marked = self._threads.call(lambda first, end: self._kernel(address, first, end, steps))
-        return np.flatnonzero(self._near) if marked else None
+        return np.flatnonzero(self.near) if marked else None
 
 
 def world(model: mujoco.MjModel, step: float) -> np.ndarray:

@@ -90,9 +90,17 @@ class BatchEngine(Engine):
         near = None
         if self._free_flight and (near := self._free_flight.advance(steps)) is None:
             return
+        self.touch(near, steps)
+
+    def touch(self, rows: np.ndarray | None, steps: int) -> None:
+        """Let MuJoCo fly some physics steps of aircraft (n,) that may touch something, or of all.
+
+        Raises:
+            NativeError: The rotor callbacks were removed.
+        """
         native.check_installed()
-        for count in self.contact_steps(steps, near):
-            self.batch.step(near, nstep=count)
+        for count in self.contact_steps(steps, rows):
+            self.batch.step(rows, nstep=count)
 
     def clear(self, rows: np.ndarray) -> None:
         """Reset MuJoCo's warm starts and warnings of some aircraft."""
@@ -146,9 +154,21 @@ class DataEngine(Engine):
             NativeError: The rotor callbacks were removed.
         """
         if not self.fly(steps):
-            native.check_installed()
-            for count in self.contact_steps(steps):
-                mujoco.mj_step(self.model, self.data, count)
+            self.touch(None, steps)
+
+    def touch(self, rows: np.ndarray | None, steps: int) -> None:
+        """Let MuJoCo fly some physics steps.
+
+        Raises:
+            NativeError: The rotor callbacks were removed.
+        """
+        native.check_installed()
+        for count in self.contact_steps(steps):
+            mujoco.mj_step(self.model, self.data, count)
+
+    def passed(self, steps: int) -> None:
+        """Count physics steps that were not flown by MuJoCo."""
+        self.data.time += steps * self.vehicle.physics_timestep
 
     def fly(self, steps: int) -> bool:
         """Advance in free flight if possible, and return whether it was.
@@ -157,7 +177,7 @@ class DataEngine(Engine):
         """
         if self._free_flight is None or self._free_flight.advance(steps) is not None:
             return False
-        self.data.time += steps * self.vehicle.physics_timestep
+        self.passed(steps)
         return True
 
     def clear(self, rows: np.ndarray) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import numpy as np
 
 from quadrl.base.rotation import Array
 from quadrl.base.trace import Trace, symbolic, symbols
+from quadrl.engines import native
 from quadrl.engines.native import compiling
 
 SOURCE = """#include <math.h>
@@ -26,7 +28,7 @@ SOURCE = """#include <math.h>
 #include <string.h>
 {export}
 #pragma GCC optimize("no-trapping-math")
-enum {{ LANES = 8, IN = {taken}, OUT = {given}, CONSTANTS = {constants} }};
+enum {{ LANES = 8, IN = {taken}, OUT = {given} }};
 typedef double Lanes[LANES];
 // An array of `width` numbers a row: row i stands at i * stride.
 typedef struct {{
@@ -34,12 +36,19 @@ typedef struct {{
   int64_t stride, width;
 }} Rows;
 
-VECTORISED static void compute(const double* constants, const Lanes* restrict x,
-                               Lanes* restrict y) {{
-  double c[CONSTANTS];  // which may be read on either side of a choice
-  memcpy(c, constants, sizeof c);
-  for (int i = 0; i < LANES; ++i) {{
+static inline __attribute__((always_inline)) void compute_one(
+    const double* restrict c, const Lanes* restrict x, Lanes* restrict y, int i) {{
     {body}
+}}
+
+// One row needs no vectors, and sines of one row only.
+QUADRL_EXPORT VECTORISED void compute(const double* constants, const Lanes* restrict x,
+                                      Lanes* restrict y, int rows) {{
+  {constants}
+  if (rows == 1) {{
+    compute_one(c, x, y, 0);
+  }} else {{
+    for (int i = 0; i < LANES; ++i) compute_one(c, x, y, i);
   }}
 }}
 
@@ -55,39 +64,54 @@ QUADRL_EXPORT void run(const double* constants, const Rows* in, const Rows* out,
         }}
       }}
     }}
-    compute(constants, (const Lanes*)x, y);
+    compute(constants, (const Lanes*)x, y, filled);
     for (int k = 0; k < OUT; ++k) {{
       for (int i = 0; i < filled; ++i) out->at[(row + i) * out->stride + k] = y[k][i];
     }}
   }}
 }}
 """
+COPIED = 512
+"""Most constants that a function copies, so that it may read them on either side of a choice."""
 
 
 class RowFunction:
     """A pure function of rows, in C."""
 
-    def __init__(self, function: Callable[..., Array], *widths: int) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Array],
+        *widths: int,
+        sound: bool = True,
+        max_operations: float = math.inf,
+    ) -> None:
         """Trace a function, which is compiled at its first use.
 
         Args:
             function: Takes arrays (N, k) and returns one (N, j).
             *widths: Numbers k in a row of each argument.
+            sound: Whether comparisons may drop a NaN.
+            max_operations: Largest number of operations.
 
         Raises:
             NotCompilable: The function does more than arithmetic.
         """
-        trace, taken = Trace(max_operations=math.inf, sound=True), sum(widths)
-        whole = trace.read("x[{}][i]", np.arange(taken)[None])
+        trace, self.taken = Trace(max_operations, sound), sum(widths)
+        whole = trace.read("x[{}][i]", np.arange(self.taken)[None])
         ends = np.cumsum([0, *widths])
         with symbolic():
             result = function(*(whole[:, a:b] for a, b in zip(ends, ends[1:], strict=False)))[0]
         self.width = len(result)
         """Numbers j in a row of its result."""
         body = trace.body({f"y[{k}][i]": value for k, value in enumerate(result)})
+        self.reads = sorted({int(k) for k in re.findall(r"\bx\[(\d+)\]", body)})
+        """Which of the numbers it takes it reads."""
         export = (Path(compiling.__file__).parent / "export.h").read_text()
-        self._constants = np.array([*trace.constants, 0.0])
-        sizes = {"taken": taken, "given": self.width, "constants": len(self._constants)}
+        self.constants = np.array([*trace.constants, 0.0])
+        count, kept = len(self.constants), "const double* c = constants;"
+        if count <= COPIED:
+            kept = f"double c[{count}];\n  memcpy(c, constants, sizeof c);"
+        sizes = {"taken": self.taken, "given": self.width, "constants": kept}
         self.source = SOURCE.format(export=export, body=body, **sizes)
         """Its C, without the constants."""
 
@@ -101,6 +125,15 @@ class RowFunction:
         run.argtypes, run.restype = [*3 * (ctypes.c_void_p,), ctypes.c_int64], None
         return run
 
+    def struct(self) -> np.ndarray:
+        """It as `Function` in native/free_flight.c.
+
+        Raises:
+            NativeError: There is no compiler, or it refused the source.
+        """
+        compute = ctypes.cast(compiling.compile_generated(self.source).compute, ctypes.c_void_p)
+        return native.struct(compute.value, self.constants, self.taken, self.width)
+
     def on(self, *arrays: np.ndarray) -> Callable[[], None]:
         """The function bound to arrays, whose numbers may change but not their places in memory.
 
@@ -112,8 +145,8 @@ class RowFunction:
         """
         compiled = self.load()
         places = [[a.ctypes.data, a.strides[0] // 8, a.shape[1]] for a in arrays]
-        kept = arrays, np.array(places), self._constants
-        rows, constants = kept[1].ctypes.data, self._constants.ctypes.data
+        kept = arrays, np.array(places), self.constants
+        rows, constants = kept[1].ctypes.data, self.constants.ctypes.data
         last, count = rows + 24 * (len(arrays) - 1), len(arrays[0])
 
         def run(kept: Any = kept) -> None:  # which keeps them alive

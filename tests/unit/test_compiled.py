@@ -6,7 +6,6 @@ import functools
 import math
 import os
 import re
-import warnings
 
 import helpers
 import numpy as np
@@ -64,7 +63,9 @@ def same_flights(one, other, steps=STEPS, seed=0):
         done = given[1][0]
         over = done.terminated | done.truncated
         if over.any():
-            one.reset(over), other.reset(over)
+            begun = [e.reset(over) for e in (one, other)]
+            for name, term in begun[1].items():
+                np.testing.assert_array_equal(begun[0][name], term, err_msg=name)
         ended += int(over.sum())
     return ended
 
@@ -73,6 +74,9 @@ SETTINGS = {
     "one": (1, {}),
     "batch": (21, {"vehicle": "racer", "engine": "free_flight"}),
     "loops": (3, {"vehicle": "hexa", "control_mode": "velocity"}),
+    # Some come near the ground, which MuJoCo flies, at other physics steps than their neighbours.
+    "loops in free flight": (21, {"control_mode": "thrust_body_rate", "engine": "free_flight"}),
+    "drawn": (9, {"engine": "free_flight", "randomization": {"mass": (0.7, 0.9)}}),
     "randomized": (4, {"randomization": "full", "observe": SEEN}),
 }
 # A batch of each task; the rest concerns a task's step alike, whatever it computes. The contract
@@ -88,6 +92,38 @@ def test_the_same_bits_as_the_functions_of_the_task(task, name):
     one, other = pair(tasks.TASKS[task], options, num_envs=count, **settings)
     assert not one.not_compiled
     assert same_flights(one, other) >= count
+
+
+@pytest.mark.parametrize("mode", ["rotor", "position"])
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_who_diverges_ends_as_in_python_and_neighbours_fly_on(engine, mode):
+    one, other = pair(num_envs=11, engine=engine, control_mode=mode)
+    for environment in (one, other):
+        helpers.idle(environment)
+        environment.engine.qvel[[2, 9], 0] = np.nan, 1e7  # no number, and faster than a step sees
+    given = [(helpers.idle(e), e.snapshot) for e in (one, other)]
+    found, expected = (arrays({"done": d, "now": now}) for d, now in given)
+    for name, array in expected.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    np.testing.assert_array_equal(np.flatnonzero(given[0][0].diverged), [2, 9])
+    same_flights(one, other, 5)
+
+
+def test_a_step_that_fails_leaves_the_last_one_to_look_at(monkeypatch):
+    environment = helpers.begun("landing", 3, engine="free_flight")
+    helpers.idle(environment)
+    before = arrays(environment.snapshot)
+    before = {name: array.copy() for name, array in before.items()}
+
+    def removed(rows, steps):
+        raise NativeError("the rotor callbacks were removed")
+
+    monkeypatch.setattr(environment.engine, "touch", removed)
+    environment.engine.qpos[1, 2] = 0.05  # MuJoCo has to fly it
+    with pytest.raises(NativeError, match="removed"):
+        helpers.idle(environment)
+    for name, array in arrays(environment.snapshot).items():
+        np.testing.assert_array_equal(array, before[name], err_msg=name)
 
 
 def moved(self, before, now, end):
@@ -524,19 +560,3 @@ def test_sums_and_choices_over_an_axis():
         return chosen + spread * first[..., 0] + np.sum(rest, axis=-1, keepdims=True)[..., 0]
 
     np.testing.assert_array_equal(run(compute, *columns), compute(*columns))
-
-
-def test_many_rows_of_few_operations_fly_as_they_are_written():
-    """Which is faster there, and gives the same bits; a race has many operations."""
-    assert not helpers.begun("race", 2049, engine="free_flight").not_compiled
-    few = helpers.begun("hover", 9, engine="free_flight")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        many = helpers.begun("hover", 2049, engine="free_flight")
-    assert "faster" in many.not_compiled and not few.not_compiled
-    actions = np.random.default_rng(0).uniform(-1, 1, (20, 2049, 4))
-    for action in actions:
-        one, other = few.step(action[:9]), many.step(action)
-        np.testing.assert_array_equal(one.reward, other.reward[:9])
-        for name, term in one.observation.items():
-            np.testing.assert_array_equal(term, other.observation[name][:9])

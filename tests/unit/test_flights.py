@@ -33,6 +33,7 @@ class Memory:
 
     def read(self, engine):
         """The state, as the engine knows it."""
+        assert engine.state is engine.frames[0].state  # which it has filled
         state = engine.frames[0]
         self["state"][: len(state.table)] = state.table[:, 0]
 

@@ -44,6 +44,12 @@ _KERNELS = {
     "unsound_air": (_INTEGER, _POINTER, _INTEGER),
     "clearance": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER),
     "free_flight": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _INTEGER),
+    "step": (_INTEGER, _POINTER, _POINTER, *[_INTEGER] * 4),
+    "begin": (
+        *(_INTEGER, _POINTER, _POINTER, _POINTER, _INTEGER, _POINTER, _INTEGER),
+        *(_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER),
+    ),
+    "place": (None, _POINTER, _POINTER, _INTEGER, _POINTER, _INTEGER, _INTEGER),
     "weather": (None, _POINTER, _INTEGER, _POINTER, _INTEGER),
     "estimate": (None, _POINTER, _INTEGER),
     "push": (None, _INTEGER, *[_POINTER] * 3, _INTEGER, *[_REAL] * 3, _POINTER, _INTEGER),

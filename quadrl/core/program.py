@@ -1,0 +1,231 @@
+"""The task's part of a control step as a function of the numbers of a row.
+
+The functions of a task are called with symbols (`quadrl.base.trace`): what `transition.finish`
+makes of a motion, an action and what the task remembers becomes C, which a control step of
+`native/free_flight.c` calls.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from quadrl.aircraft.parameters import PLACES, ROW_SIZE, Parameters
+from quadrl.base import records
+from quadrl.base.rotation import Array
+from quadrl.base.trace import MAX_OPERATIONS, NotCompilable
+from quadrl.conditions.scene import Surroundings
+from quadrl.core.snapshot import Snapshot
+from quadrl.core.step import WrittenStep
+from quadrl.core.transition import Episode, Transition, begin, finish
+from quadrl.engines.rng import Rng
+from quadrl.engines.rowwise import RowFunction
+from quadrl.engines.state import State
+
+FLAGS = ("terminated", "truncated", "is_success", "diverged")
+"""The last numbers that it gives; `BYTES` in native/free_flight.c."""
+MAX_DRAWN = 64
+"""Most random numbers of a start that is compiled."""
+
+
+class Draws(Rng):
+    """Random numbers of the start of an episode that are symbols."""
+
+    def __init__(self, read: Callable[[Array], Array]) -> None:
+        """Begin with the first number.
+
+        Args:
+            read: Gives the symbols of the numbers at places (...), the first one at 0.
+        """
+        self.used, self._read = 0, read
+
+    def uniform(self, low: float, high: float, size: int | None = None) -> Array:
+        """Numbers in [low, high): (1,), or (1, size)."""
+        count = 1 if size is None else size
+        drawn = self._read(np.arange(self.used, self.used + count)[None])
+        self.used += count
+        return low + (high - low) * (drawn[..., 0] if size is None else drawn)
+
+
+class Program:
+    """`transition.finish` for a row, compiled at its first use.
+
+    It takes the motion (qpos, qvel and rotor speeds) and whether it has diverged; then the numbers
+    of `parts`. It gives those that the next step looks at and those of the
+    observation (`kept`, `seen`), the terms of the reward, their sum, the error, and FLAGS.
+    """
+
+    def __init__(
+        self, written: WrittenStep, now: Snapshot, episode: Episode, parameters: np.ndarray
+    ) -> None:
+        """Trace the functions.
+
+        Args:
+            written: The step as it is written.
+            now: Any snapshot of the task.
+            episode: Any of its episodes.
+            parameters: Rows that the task sees, (N,) or (1,).
+
+        Raises:
+            NotCompilable: The functions of the task do more than arithmetic.
+        """
+        self.written, self.task = written, written.task
+        # State, parameters and surroundings have places of their own.
+        self._like = dataclasses.replace(now, state=None, parameters=None, around=None)
+        self._episode, self._around = episode, now.around
+        kept = [*records.leaves(self._like), *records.leaves(episode)]
+        if any(array.dtype != np.float64 for array in kept):
+            raise NotCompilable("what it remembers is not all float64")
+        self.kept = records.Columns(0, kept)
+        """Where the numbers that the next step looks at stand in its table."""
+        # Some sensors give what only policies see.
+        self.shown = [name for name in self.task.sensors if name in now.sensed]
+        """Sensors that the task looks at."""
+        around = records.leaves(now.around) if now.around else []
+        self.sensed = records.Columns(0, [*(now.sensed[name] for name in self.shown), *around])
+        """Where the numbers of these, and of the solids about an aircraft, stand in a table."""
+        inputs, motion = written.inputs, written.engine.motions.shape[-1]
+        self.parts = {
+            "last_motion": motion,
+            "action": inputs.action.shape[1],
+            "command": inputs.command.shape[1],
+            "was": self.kept.end,
+            "last_sensed": self.sensed.end,
+            "sensed": self.sensed.end,
+            "estimate": motion if written.estimate else 0,
+            "parameters": ROW_SIZE,
+        }
+        """How many numbers of each kind it takes after the motion and the flag."""
+        self._rotors = int(parameters["rotor_count"][0])
+        widths = motion, 1, *self.parts.values()
+        given: Any = {"sound": False, "max_operations": MAX_OPERATIONS}
+        made, again = (RowFunction(self._finish, *widths, **given) for _ in range(2))
+        if (made.source, made.constants.tobytes()) != (again.source, again.constants.tobytes()):
+            raise NotCompilable("it gives something else each time")
+        self.function = made
+        """The function itself."""
+        self.drawn = 0
+        """How many random numbers a start takes, once it was traced."""
+
+    @functools.cached_property
+    def start(self) -> RowFunction:
+        """`Task.begin` up to the first observation, for a row.
+
+        It takes random numbers and parameters. It gives a motion, and the numbers that `function`
+        gives before the reward.
+
+        Raises:
+            NotCompilable: The starts of the task are more than arithmetic.
+        """
+        widths = MAX_DRAWN, ROW_SIZE
+        return RowFunction(self._start, *widths, sound=False, max_operations=MAX_OPERATIONS)
+
+    def _finish(
+        self,
+        motion: Array,
+        diverged: Array,
+        last: Array,
+        action: Array,
+        command: Array,
+        was: Array,
+        last_sensed: Array,
+        sensed: Array,
+        estimate: Array,
+        parameters: Array,
+    ) -> Array:
+        """The step of a row, arrays (1, k) of symbols."""
+        places = iter(self.kept.views(was.T))
+        before, begun = (records.filled(like, places) for like in (self._like, self._episode))
+        before.state = self._state(last)
+        before.parameters = self._parameters(parameters)
+        before.sensed, before.around = self._flagged(last_sensed)
+        seen, about = self._flagged(sensed)
+        after, ended, done = finish(
+            *(self.task, self.written.clock, begun, before, self._state(motion)),
+            *(action, command, diverged[:, 0] != 0.0),
+            self._state(estimate) if self.written.estimate else None,
+            about,
+            seen,
+        )
+        after.state = after.parameters = after.around = None  # type: ignore[assignment]
+        kept = [*records.leaves(after), *records.leaves(ended)]
+        return np.array([*self._values(kept, done)], dtype=object)[None]
+
+    def _start(self, drawn: Array, parameters: Array) -> Array:
+        """The start of an episode, arrays (1, k) of symbols."""
+        draws = Draws(lambda places: drawn[0, places])
+        own = self._parameters(parameters)
+        start, task_state = self.task.begin(draws, own)
+        task_state = self.task.remember(start, task_state)
+        self.drawn = draws.used
+        parts = start.position + self.written.engine.origin, start.quaternion
+        motion = np.concatenate(
+            [*parts, start.velocity, start.body_rate, start.rotor_speed], axis=-1
+        )
+        state = self._state(motion)
+        now, episode = begin(self.task, state, task_state, own, self.parts["action"])
+        seen = self.task.observe(now)
+        now.state = now.parameters = None  # type: ignore[assignment]
+        kept = [*records.leaves(now), *records.leaves(episode)]
+        return np.array([*motion[0], *self._numbers(kept, [*seen.values()])], dtype=object)[None]
+
+    def _parameters(self, numbers: Array) -> Parameters:
+        own = Parameters.of(PLACES, self.written.clock.control_timestep, self._rotors)
+        return own.map(lambda places: numbers[0, places.astype(int)])
+
+    def _state(self, motion: Array) -> State:
+        origin = self.written.engine.origin
+        parts = np.split(motion[:, 3:], [4, 7, 10], axis=1)
+        height = float(origin[2])
+        return State.of_coordinates(motion[:, :3] - origin, *parts, origin_height=height)
+
+    def _values(self, kept: list[Array], done: Transition) -> Iterator[Any]:
+        """All that it gives, a number after the other."""
+        self.observed, self.rewarded = list(done.observation), list(done.reward_terms)
+        truth = done.truth.values() if self.written.estimate else ()
+        seen = [*done.observation.values(), *truth]
+        self.seen = records.Columns(self.kept.end, seen)
+        yield from self._numbers(kept, seen)
+        flags = (getattr(done, name) for name in FLAGS)
+        for array in (*done.reward_terms.values(), done.reward, done.error, *flags):
+            yield np.asarray(array, dtype=object)[0]
+
+    def _numbers(self, kept: list[Array], seen: list[Array]) -> Iterator[Any]:
+        """Arrays as the numbers that stand in the table."""
+        numbers = np.arange(self.seen.end)[:, None]
+        for columns, arrays in ((self.kept, kept), (self.seen, seen)):
+            for places, array in zip(columns.views(numbers), arrays, strict=True):
+                yield from np.broadcast_to(np.asarray(array, dtype=object), places.shape).ravel()
+
+    def _flagged(self, numbers: Array) -> tuple[dict[str, Any], Surroundings | None]:
+        sensed, around = self.given(self.sensed.views(numbers.T))
+        for name in ("touched", "landed", "held") if around else ():
+            setattr(around, name, getattr(around, name) != 0.0)
+        return sensed, around
+
+    def given(self, arrays: Iterable[Any]) -> tuple[dict[str, Any], Surroundings | None]:
+        """Arrange arrays as what the task sees: sensors by name, and the solids about aircraft."""
+        rest = iter(arrays)
+        sensed = {name: next(rest) for name in self.shown}
+        return sensed, records.filled(self._around, rest) if self._around else None
+
+    def records(self, table: np.ndarray) -> tuple[Snapshot, Episode]:
+        """The snapshot, but for what has no place in the table, and the episode, as its views."""
+        parts = iter(self.kept.views(table))
+        now, episode = (records.filled(like, parts) for like in (self._like, self._episode))
+        return now, episode
+
+    def leaves(self, now: Snapshot, episode: Episode) -> list[np.ndarray]:
+        """The arrays of a snapshot and its episode that stand in the table."""
+        moment = dataclasses.replace(now, state=None, parameters=None, around=None)
+        return [*records.leaves(moment), *records.leaves(episode)]
+
+    def sources(
+        self, sensed: Mapping[str, np.ndarray], around: Surroundings | None
+    ) -> list[np.ndarray]:
+        """The arrays that stand in the table of `sensed`."""
+        return [sensed[name] for name in self.shown] + (records.leaves(around) if around else [])
