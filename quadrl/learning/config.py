@@ -66,7 +66,11 @@ class TrainConfig(TrainSettings):
             QuadrlError: A setting is unknown or out of range.
         """
         object.__setattr__(self, "recorded", recorded)
-        settings = _given(settings.pop("conditions", {}) | settings)  # of a copy
+        conditions = settings.pop("conditions", None) or {}  # of a copy
+        if not isinstance(conditions, Mapping):
+            allowed = "a mapping of conditions by name"
+            raise QuadrlError(name="conditions", value=conditions, allowed=allowed)
+        settings = _given({**conditions, **settings})
         algo = algorithm_of(task, settings.get("algo"))
         foreign.refuse_unknown("setting", settings, USUAL, algo)
         settings = with_networks(settings)
