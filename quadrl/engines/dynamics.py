@@ -187,10 +187,11 @@ def rotor_wrench(
         change = change + (rest + change) * (most / (1 - most))  # lift / (1 - most)
     drag = (p.rotor_drag[..., None] * speed)[..., None] * across
     push = change[..., None] * rotor.axis - drag
-    # Smoothly, the moment cannot move the centre of lift farther than that.
+    # Smoothly, the moment cannot move the centre of lift farther than that. What is added is the
+    # smallest number for a rotor at rest that single precision has, too.
     most = MOST_OFFSET * rotor.disc_radius * rotor.thrust_coefficient * speed
     slope = p.flapping_moment[..., None]
-    share = most / namespace(speed).sqrt(most * most + slope * slope * p_square + 1e-40)
+    share = most / namespace(speed).sqrt(most * most + slope * slope * p_square + 1e-37)
     flap = (slope * speed * share)[..., None] * cross(across, rotor.axis)
     flap = stack(flap[..., 0], p.flapping_pitch[..., None] * flap[..., 1], flap[..., 2])
     inertia = rotor.spin * p.rotor_inertia[..., None]

@@ -6,7 +6,9 @@ import helpers
 import mujoco
 import numpy as np
 import pytest
+import torch
 
+from quadrl.aircraft.aerodynamics import ROTOR_EFFECTS
 from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import MAX_ROTORS, Vehicle
@@ -107,3 +109,24 @@ def test_the_accelerations_of_mujoco_are_the_derivative(name):
         (acceleration[:, :3], acceleration[:, 3:], spin_up), expected, strict=True
     ):
         np.testing.assert_allclose(got, value, rtol=0, atol=1e-12 * np.abs(value).max())
+
+
+def test_a_rotor_at_rest_has_a_derivative_without_subnormal_numbers():
+    """As graphics processors compute, in single precision."""
+    case = Case.of(next(iter(helpers.IN_AIR)))
+    still = {name: torch.zeros(getattr(case.motion, name).shape) for name in FIELDS}
+    still |= {
+        "quaternion": torch.tensor([[1.0, 0, 0, 0]] * COUNT),
+        "position": 3 + still["position"],
+    }
+    given = Parameters.of(case.table).map(lambda array: torch.tensor(array, dtype=torch.float32))
+    command, air = (torch.zeros(array.shape) for array in (case.command, case.air))
+    assert torch.set_flush_denormal(True)
+    try:
+        rate = dynamics.derivative(
+            given, dynamics.Motion(**still), command, air, 0.0, ROTOR_EFFECTS
+        )
+    finally:
+        torch.set_flush_denormal(False)
+    for name in FIELDS:
+        assert torch.isfinite(getattr(rate, name)).all(), name

@@ -172,7 +172,7 @@ AERO double aero_flapping_share(const Aircraft* a, const Rotor* rotor, double sp
   const double flap = a->flapping_moment[i];
   const double most =
       MOST_OFFSET * rotor->disc_radius[i] * rotor->thrust_coefficient[i] * speed;
-  return most / sqrt(most * most + flap * flap * p_square + 1e-40);
+  return most / sqrt(most * most + flap * flap * p_square + 1e-37);
 }
 
 // Effects of the air on the rotors beyond equation 7, and of their inertia.
