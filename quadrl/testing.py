@@ -16,7 +16,7 @@ import importlib.util
 import logging
 import unittest
 import warnings
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
@@ -278,12 +278,10 @@ CLAUSES = (
     is_the_same_compiled,
     is_alike_in_every_api,
 )
+check_task: Callable[[str | Task | type[Task]], None]
 check_task = functools.partial(rules.check_rules, clauses=CLAUSES)
 """Check the whole contract of a task, alone and in every API.
 
-Args:
-    task: A task, its class, or a name of the catalogue.
-
-Raises:
-    AssertionError: The first fault that is found.
+It takes a task, its class, or a name of the catalogue. The first fault that is found is an
+AssertionError.
 """
