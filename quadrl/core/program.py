@@ -102,7 +102,7 @@ class Program:
         """How many numbers of each kind it takes after the motion and the flag."""
         self._rotors = int(parameters["rotor_count"][0])
         widths = motion, 1, *self.parts.values()
-        given: Any = {"sound": False, "max_operations": MAX_OPERATIONS}
+        given: Any = {"sound": False, "max_operations": MAX_OPERATIONS, "fixed": motion + 1}
         made, again = (RowFunction(self._finish, *widths, **given) for _ in range(2))
         if (made.source, made.constants.tobytes()) != (again.source, again.constants.tobytes()):
             raise NotCompilable("it gives something else each time")
@@ -122,7 +122,8 @@ class Program:
             NotCompilable: The starts of the task are more than arithmetic.
         """
         widths = MAX_DRAWN, ROW_SIZE
-        return RowFunction(self._start, *widths, sound=False, max_operations=MAX_OPERATIONS)
+        given: Any = {"sound": False, "max_operations": MAX_OPERATIONS, "fixed": MAX_DRAWN}
+        return RowFunction(self._start, *widths, **given)
 
     def _finish(
         self,

@@ -9,7 +9,7 @@ import numpy as np
 from quadrl.aircraft.parameters import ROW_SIZE
 from quadrl.base.rotation import Array
 from quadrl.conditions.scene import Surroundings
-from quadrl.core.program import Program
+from quadrl.core.program import MAX_DRAWN, Program
 from quadrl.core.step import Inputs
 from quadrl.engines import native
 from quadrl.engines.engine import Engine
@@ -102,8 +102,8 @@ class Tables:
 
     def places_of(self, start: RowFunction) -> np.ndarray:
         """The places of the parameters that a function of a start reads, which come last in it."""
-        first, row, stride = start.taken - ROW_SIZE, self._parameters.ctypes.data, self._stride
-        return _read([(row + 8 * k, stride, first + k) for k in range(ROW_SIZE)], start)
+        row, stride = self._parameters.ctypes.data, self._stride
+        return _read([(row + 8 * k, stride, MAX_DRAWN + k) for k in range(ROW_SIZE)], start)
 
     @property
     def _stride(self) -> int:
@@ -124,22 +124,21 @@ class Tables:
             "estimate": (motions[turn] if estimate is None else estimate, motion, 1),
             "parameters": (self._parameters, self._stride, 1),
         }
-        function = self._program.function
-        number, places = function.taken - sum(parts.values()), list[Place]()
+        number, places = motion + 1, list[Place]()
         for name, count in parts.items():
             array, across, along = tables[name]
             first = array.ctypes.data
             places += [(first + 8 * k * along, across, number + k) for k in range(count)]
             number += count
-        return _read(places, function)
+        return _read(places, self._program.function)
 
     def _read_of_sensed(self) -> list[tuple[int, np.ndarray]]:
         """Where each array begins in the tables of what is sensed, and which places are read."""
-        parts, read = self._program.parts, self._program.function.reads
-        first, found = self._program.function.taken - sum(parts.values()), set[int]()
-        for name, count in parts.items():
+        first, found = self._engine.motions.shape[-1] + 1, set[int]()
+        for name, count in self._program.parts.items():
             if name in ("sensed", "last_sensed"):
-                found |= {k - first for k in read if first <= k < first + count}
+                read = (k - first for k in self._program.function.places)
+                found |= {k for k in read if 0 <= k < count}
             first += count
         numbers = np.arange(self._program.sensed.end)[:, None]
         places = [array.ravel().tolist() for array in self._program.sensed.views(numbers)]
@@ -158,5 +157,6 @@ class Tables:
 
 def _read(places: list[Place], function: RowFunction) -> np.ndarray:
     """Those that a function reads, as `Place`s of native/free_flight.c, (n, 3)."""
-    read = {*function.reads}
-    return np.array([place for place in places if place[2] in read], np.int64).reshape(-1, 3)
+    at = function.places
+    read = [(first, stride, at[number]) for first, stride, number in places if number in at]
+    return np.array(read, np.int64).reshape(-1, 3)

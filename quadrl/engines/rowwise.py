@@ -84,6 +84,7 @@ class RowFunction:
         *widths: int,
         sound: bool = True,
         max_operations: float = math.inf,
+        fixed: int | None = None,
     ) -> None:
         """Trace a function, which is compiled at its first use.
 
@@ -92,20 +93,27 @@ class RowFunction:
             *widths: Numbers k in a row of each argument.
             sound: Whether comparisons may drop a NaN.
             max_operations: Largest number of operations.
+            fixed: How many of the first numbers the C takes in any case; it takes of the others
+                those that it reads. None for all.
 
         Raises:
             NotCompilable: The function does more than arithmetic.
         """
-        trace, self.taken = Trace(max_operations, sound), sum(widths)
-        whole = trace.read("x[{}][i]", np.arange(self.taken)[None])
+        trace, taken = Trace(max_operations, sound), sum(widths)
+        whole = trace.read("x[{}][i]", np.arange(taken)[None])
         ends = np.cumsum([0, *widths])
         with symbolic():
             result = function(*(whole[:, a:b] for a, b in zip(ends, ends[1:], strict=False)))[0]
         self.width = len(result)
         """Numbers j in a row of its result."""
         body = trace.body({f"y[{k}][i]": value for k, value in enumerate(result)})
-        self.reads = sorted({int(k) for k in re.findall(r"\bx\[(\d+)\]", body)})
-        """Which of the numbers it takes it reads."""
+        read = {int(k) for k in re.findall(r"\bx\[(\d+)\]", body)}
+        kept = range(taken) if fixed is None else sorted(read.union(range(fixed)))
+        self.places = {number: place for place, number in enumerate(kept)}
+        """Where the C takes each of the numbers."""
+        body = re.sub(r"\bx\[(\d+)\]", lambda found: f"x[{self.places[int(found[1])]}]", body)
+        self.taken = len(self.places)
+        """How many numbers the C takes."""
         export = (Path(compiling.__file__).parent / "export.h").read_text()
         self.constants = np.array([*trace.constants, 0.0])
         count, kept = len(self.constants), "const double* c = constants;"

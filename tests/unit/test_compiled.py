@@ -20,6 +20,7 @@ from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace, look_up
 from quadrl.conditions.solids import Cylinder, Gate, Pose
 from quadrl.core.environment import Environment
 from quadrl.engines.native import compiling
+from quadrl.engines.rowwise import RowFunction
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.run import would_gain
 from quadrl.tasks.hover import Hover
@@ -560,3 +561,13 @@ def test_sums_and_choices_over_an_axis():
         return chosen + spread * first[..., 0] + np.sum(rest, axis=-1, keepdims=True)[..., 0]
 
     np.testing.assert_array_equal(run(compute, *columns), compute(*columns))
+
+
+def test_a_function_takes_what_it_reads_of_a_hundred_posts_and_no_more():
+    made = RowFunction(lambda row: row[:, 50:51] * row[:, 99:] - row[:, :1], 100, fixed=2)
+    assert made.places == {0: 0, 1: 1, 50: 2, 99: 3} and made.taken == 4
+    x, y = np.zeros((4, 8)), np.zeros((1, 8))  # for eight rows
+    x[:] = np.arange(1.0, 5.0)[:, None] + np.arange(8)
+    compute = compiling.compile_generated(made.source).compute
+    compute(*(ctypes.c_void_p(a.ctypes.data) for a in (made.constants, x, y)), 8)
+    np.testing.assert_array_equal(y[0], x[2] * x[3] - x[0])
