@@ -86,11 +86,13 @@ def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) 
     Raises:
         QuadrlError: The message names the array.
     """
+    reason = "what was saved is of another environment"
+    if others := sorted(saved.keys() - own.keys()):
+        raise QuadrlError(reason, name=others[0], value="an array", allowed="none: it has no such")
     for name, array in own.items():
         kept = saved.get(name)
         if kept is None or (kept.shape, kept.dtype) != (array.shape, array.dtype):
             found = None if kept is None else f"{kept.dtype} {kept.shape}"
-            reason = "what was saved is of another environment"
             allowed = f"{array.dtype} {array.shape}"
             raise QuadrlError(reason, name=name, value=found, allowed=allowed)
 

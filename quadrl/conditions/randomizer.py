@@ -11,12 +11,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from quadrl.aircraft.parameters import numbers
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import PARAMETERS, PUSHES
 from quadrl.base.rotation import Array
-from quadrl.conditions.randomization import AGES
-from quadrl.conditions.sampler import AircraftSampler
-from quadrl.conditions.weather import Weather
+from quadrl.conditions.process import Process
+from quadrl.conditions.randomization import AGES, OFF
+from quadrl.conditions.sampler import AircraftSampler, Drawn
 from quadrl.engines import native
 from quadrl.engines.engine import Engine
 from quadrl.engines.rng import uniform
@@ -24,8 +25,10 @@ from quadrl.engines.rng import uniform
 SAVED = ("drawn", "place", "steps", "queue", "past", "newest")
 
 
-class Randomizer:
+class Randomizer(Process):
     """Randomizes N aircraft."""
+
+    name = "randomizer"
 
     def __init__(self, sampler: AircraftSampler, engine: Engine, *, active: bool) -> None:
         """Set up the arrays.
@@ -68,40 +71,29 @@ class Randomizer:
         self._delay = np.zeros(count, np.int64)  # [physics steps]
         self._ages = np.zeros((len(AGES), count), np.int64)  # [physics steps]
 
-    def sample(
-        self, keys: np.ndarray, episodes: np.ndarray
-    ) -> tuple[Array | None, np.ndarray | None]:
+    def sample(self, keys: np.ndarray, episodes: np.ndarray) -> Drawn:
         """Draw the numbers of episodes (n,); nothing changes yet.
-
-        Returns:
-            Numbers (n, k), or None if nothing depends on them, and rows of parameters (n,), or None
-            if all aircraft are the specified one.
 
         Raises:
             QuadrlError: One of the aircraft cannot hover.
         """
         if not self.active:
-            return None, None
-        sampler = self.sampler
+            return Drawn()
+        sampler, table = self.sampler, None
         drawn = sampler.sample(uniform(keys, episodes, PARAMETERS, 0, len(sampler.names)))
-        if not sampler.randomization.per_row:
-            return drawn, None
-        table = sampler.table(drawn)
-        sampler.check_hover(table)
-        return drawn, table
+        if sampler.randomization.per_row:
+            table = sampler.table(drawn)
+            sampler.check_hover(table)
+        own = sampler.randomization.wind != OFF
+        return Drawn(drawn, table, sampler.columns(drawn, "wind")[:, 0] if own else None)
 
-    def begin(
-        self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray, drawn: Array | None
-    ) -> None:
-        """Begin episodes (n,) with the numbers from `sample`, after the aircraft were placed.
-
-        Until the first command arrives, the rotors keep their speed.
-        """
-        if drawn is None:
+    def begin(self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray, drawn: Drawn) -> None:
+        """Begin episodes (n,); until the first command arrives, the rotors keep their speed."""
+        if drawn.numbers is None:
             return
         self.place[:, rows], self.steps[rows] = (keys, episodes), 0
         self.drawn = self.drawn.copy()
-        self.drawn[rows] = drawn
+        self.drawn[rows] = drawn.numbers
         self._set_delay()
         if self.late:
             self.queue[:, rows] = self._engine.act[rows]
@@ -138,12 +130,6 @@ class Randomizer:
         steps = [np.rint(self.column(name) / step).astype(np.int64) for name in names]
         self._delay, self._ages = self._dead + steps[0], np.array(steps[1:])
 
-    def wind_speed(self, drawn: Array | None, weather: Weather) -> Array | None:
-        """Wind speed (n,) [m/s] with the numbers from `sample`; None for the weather's."""
-        if drawn is None or self.sampler.randomization.wind == (1.0, 1.0):
-            return None
-        return weather.wind_speed * self.sampler.columns(drawn, "wind")[:, 0]
-
     def delayed(self, command: Array, steps: int) -> Array:
         """Queue a command (N, R) [rad/s] for some physics steps; return the one that arrives."""
         if not self.late:
@@ -174,8 +160,10 @@ class Randomizer:
         motion, rate = np.where(self._ages[..., None], past, now)
         return motion, rate
 
-    def begin_step(self) -> None:
+    def act(self) -> None:
         """Count a control step that begins, and push the aircraft that are drawn for it."""
+        if not self.active:
+            return
         if self._chance > 0:
             keys, episodes = (array.ctypes.data for array in self.place)
             place = keys, episodes, self.steps.ctypes.data, PUSHES
@@ -186,15 +174,22 @@ class Randomizer:
         self.steps += 1
 
     def save(self) -> dict[str, np.ndarray]:
-        """Copies of the arrays."""
-        return {name: np.array(getattr(self, name)) for name in SAVED}
+        """Copies of the arrays; none where nothing depends on what is drawn."""
+        return {name: np.array(getattr(self, name)) for name in SAVED if self.active}
 
-    def check_saved(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Refuse arrays, by their names in a saved environment, that cannot be from `save`.
+    def check(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Refuse aircraft and numbers that this randomization does not draw.
 
         Raises:
             QuadrlError: The message names the array.
         """
+        table, own = saved["engine.begun"], numbers(self._engine.begun)
+        drawn = self.sampler.randomization.per_row and self.sampler.explains(table)
+        if not (drawn or np.array_equal(table, own)):
+            reason = "the state was saved with another aircraft"
+            raise QuadrlError(reason, name="engine.begun", value=table, allowed="this aircraft's")
+        if not self.active:
+            return
         drawn, newest = saved["randomizer.drawn"], saved["randomizer.newest"]
         for name, value, within in (
             ("drawn", drawn, self.sampler.contains(drawn)),
@@ -204,7 +199,7 @@ class Randomizer:
                 allowed = "of an environment with the same randomization"
                 raise QuadrlError(name=f"randomizer.{name}", value=value, allowed=allowed)
 
-    def restore(self, saved: dict[str, np.ndarray]) -> None:
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
         """Restore what `save` returned."""
         for name, value in saved.items():
             setattr(self, name, np.array(value))

@@ -38,6 +38,18 @@ EXCHANGES = 3
 """Enough rounds: in layouts of four to eight rotors, more find no worse aircraft."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """What episodes (n,) have drawn from a randomization."""
+
+    numbers: Array | None = None  # (n, k), a column for each of `AircraftSampler.names`
+    """None where nothing depends on them."""
+    table: np.ndarray | None = None  # (n,) rows of parameters
+    """None where all aircraft are the specified one."""
+    wind: Array | None = None  # (n,)
+    """Factor of the weather's mean wind; None where it is the weather's."""
+
+
 class AircraftSampler:
     """The numbers that episodes draw from a randomization, and the aircraft that they make."""
 

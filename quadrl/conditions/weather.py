@@ -26,6 +26,8 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import WEATHER
 from quadrl.base.rotation import Array, stack
 from quadrl.base.validation import number, resolved
+from quadrl.conditions.process import Process
+from quadrl.conditions.sampler import Drawn
 from quadrl.engines import native
 from quadrl.engines.air import FIXED, ROWS, fixed_of, mean_wind
 from quadrl.engines.rng import FULL_TURN, Rng
@@ -110,11 +112,13 @@ def noise_time_of(vehicle: Vehicle) -> float:
     return 10 * radius / induced
 
 
-class WeatherProcess:
+class WeatherProcess(Process):
     """The weather of the aircraft of an engine, with a table of a column for each.
 
     An aircraft's weather depends only on its key and the number of its episode.
     """
+
+    name = "weather"
 
     def __init__(
         self, weather: Weather, engine: Engine, time_limit: float, noise_time: float = 0.0
@@ -161,41 +165,31 @@ class WeatherProcess:
             return None
         return cls(weather, engine, time_limit, noise_time)
 
-    def begin(
-        self, rows: np.ndarray, keys: Array, episodes: Array, wind_speed: Array | None = None
-    ) -> None:
-        """Begin episodes, and write their first air.
-
-        Args:
-            rows: Numbers (n,) of the aircraft, which were placed already.
-            keys: Keys (n,) int64 of those rows.
-            episodes: Numbers (n,) int64 of the episodes.
-            wind_speed: Wind speed (n,) [m/s] of each; None for the weather's.
-        """
+    def begin(self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray, drawn: Drawn) -> None:
+        """Begin episodes (n,), and write their first air."""
         self._streams[:, rows] = keys, episodes
-        if wind_speed is not None:
-            self._write(rows, fixed_of(wind_speed, *self._setting))
+        if drawn.wind is not None:
+            speed = self.weather.wind_speed * drawn.wind
+            self._write(rows, fixed_of(speed, *self._setting))
             self._varied = True
         gust = self.weather.gust_speed
         bearing, gust_bearing, begins = self._drawn(keys, episodes)
-        drawn = {
+        blows = {
             "east": np.cos(bearing),
             "north": np.sin(bearing),
             "gust_start": self._latest * begins,
             "gust_east": gust * np.cos(gust_bearing),
             "gust_north": gust * np.sin(gust_bearing),
         }
-        self._write(rows, drawn)
+        self._write(rows, blows)
         self._kernel(self._address, len(rows), rows.ctypes.data, True)
 
-    def mean_wind(
-        self, keys: Array, episodes: Array, height: Array, wind_speed: Array | None = None
-    ) -> Array:
+    def mean_wind(self, keys: Array, episodes: Array, height: Array, drawn: Drawn) -> Array:
         """Mean wind (n, 2) [m/s] towards east and north, at heights (n,) [m] in episodes.
 
         The other arguments are as in `begin`.
         """
-        speed = self.weather.wind_speed if wind_speed is None else wind_speed
+        speed = self.weather.wind_speed * (1.0 if drawn.wind is None else drawn.wind)
         mean = mean_wind(speed, self.weather.roughness, height)
         bearing, *_ = self._drawn(keys, episodes)
         return stack(mean * np.cos(bearing), mean * np.sin(bearing))
@@ -208,7 +202,7 @@ class WeatherProcess:
             return (0.0 * wind + self.weather.direction,) * 2 + (begins,)
         return FULL_TURN * wind, FULL_TURN * gust, begins
 
-    def advance(self) -> None:
+    def act(self) -> None:
         """Advance the weather of all aircraft by a control step, and write their air."""
         self._kernel(self._address, self._table.shape[1], None, False)
 

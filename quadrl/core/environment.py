@@ -136,6 +136,8 @@ class Environment(saving.Copied):
         self._parted = self.randomizer.late or self._solids_move or follows
         """Whether Python acts within a control step."""
         self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
+        acting = self.randomizer, self.blowing, self.observer
+        self._processes = [process for process in acting if process]
         self._all = np.arange(self.num_envs)
         self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
         """Which episode each row flies."""
@@ -245,22 +247,21 @@ class Environment(saving.Copied):
         if self._plain and not start and self._step is not None:
             if (observation := self._step.start(rows, *place)) is not None:
                 self.seeds = seeds
-                if self.blowing:
-                    self.blowing.begin(rows, *place, None)
+                for process in self._processes:
+                    process.begin(rows, *place, self.randomizer.sample(*place))
                 self.seeds.episodes[rows] += 1
                 return observation
-        (drawn, table), seen = self.randomizer.sample(*place), self._parameters
-        if table is not None and self._true:
-            seen = Parameters.of(table, self._clock.control_timestep)
+        drawn, seen = self.randomizer.sample(*place), self._parameters
+        if drawn.table is not None and self._true:
+            seen = Parameters.of(drawn.table, self._clock.control_timestep)
         begun, task_state = self.task.begin(Rng(*place), seen)
         # Up to here nothing is written, and `place` refuses before it writes.
         begun = begun.replaced(start or {}, rows, self.num_envs)
         if start:
             self._refuse_underground(start, begun)
-        wind_speed = self.randomizer.wind_speed(drawn, self.weather)
         if self.blowing and self.weather.wind_speed and not {*(start or ())} - {"position"}:
             height = begun.position[:, 2] + self.origin[2]
-            mean = self.blowing.mean_wind(*place, height, wind_speed)
+            mean = self.blowing.mean_wind(*place, height, drawn)
             begun = trimmed(self.vehicle, begun, mean)
         task_state = self.task.remember(begun, task_state)
         poses = None  # of the solids, where they do not stay
@@ -270,15 +271,14 @@ class Environment(saving.Copied):
         # Practice of a task in which they touch may begin in one, and is over at once.
         if self.scene.solids and ("position" in (start or ()) or not self.task.contact):
             self.scene.check_start(self.engine, rows, begun, poses)
-        state = self.engine.place(rows, begun, table, poses)
+        state = self.engine.place(rows, begun, drawn.table, poses)
         self.seeds = seeds
-        self.randomizer.begin(rows, *place, drawn)
-        if self.blowing:
-            self.blowing.begin(rows, *place, wind_speed)
+        for process in self._processes:
+            process.begin(rows, *place, drawn)
         around = self.scene.surroundings(self.engine, rows) if self.scene.solids else None
         given = task_state, seen, self.action_size, around
         now, episode = transition.begin(self.task, state, *given)
-        observation = self.observer.begin(rows, now) if self.observer else self.task.observe(now)
+        observation = self.observer.first(rows, now) if self.observer else self.task.observe(now)
         self.seeds.episodes[rows] += 1
         if len(rows) == self.num_envs:
             self._take(now, episode)
@@ -381,13 +381,11 @@ class Environment(saving.Copied):
         taken = self._inputs.action
         self._moves = self._solids_ahead() if self._solids_move else []
         taken[:] = validation.action(action, (self.num_envs, self.action_size))
-        if self.blowing:
-            self.blowing.advance()
+        for process in self._processes:
+            process.act()
         self.engine.check_air()
         if self.scene.solids:
             self.engine.hits[:] = 0.0
-        if self.randomizer.active:
-            self.randomizer.begin_step()
         self._flown, self._inputs.diverged[:] = 0, False
 
     def begin(self, action: Array) -> None:
@@ -477,8 +475,8 @@ class Environment(saving.Copied):
         return (*asked, *self.scene.primitives(self.engine, row))
 
     def _memory(self) -> saving.Memory:
-        begun, parts = self._begun, (self.randomizer, self.observer, self.blowing)
-        return saving.Memory(self.engine, self.seeds, begun.snapshot, begun.episode, *parts)
+        begun, parts = self._begun, self._processes
+        return saving.Memory(self.engine, self.seeds, begun.snapshot, begun.episode, parts)
 
     def save(self) -> dict[str, np.ndarray]:
         """Return all that the next steps depend on, as arrays: `restore` continues bit for bit."""

@@ -12,6 +12,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 from quadrl.conditions.observing import Observing
+from quadrl.conditions.process import Process
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.conditions.sensor import Channel, EstimatedState, Moment, Sizes
 from quadrl.core.observation import ObservationTerm, layout
@@ -22,8 +23,10 @@ from quadrl.engines.engine import Engine
 from quadrl.engines.state import State
 
 
-class Observer:
+class Observer(Process):
     """Observes N aircraft with errors, delays, further sensors and histories."""
+
+    name = "observer"
 
     def __init__(
         self, options: Observing, task: Task, engine: Engine, actions: int, randomizer: Randomizer
@@ -101,7 +104,7 @@ class Observer:
         for channel in self._early:
             channel.follow(self._specified, command, seconds)
 
-    def begin(self, rows: np.ndarray, now: Snapshot) -> dict[str, Array]:
+    def first(self, rows: np.ndarray, now: Snapshot) -> dict[str, Array]:
         """Begin episodes (n,) and return their first observation, from their snapshot (n, ...)."""
         moment = self._moment(now.state, self._engine.wind[rows], now.action, rows)
         for channel in self._early:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -12,9 +12,7 @@ from quadrl.aircraft.parameters import AIRCRAFT, LAYOUT, refitted
 from quadrl.base import records
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import MAX_SEED, Seed, seeds_of_rows
-from quadrl.conditions.randomizer import Randomizer
-from quadrl.conditions.weather import WeatherProcess
-from quadrl.core.observer import Observer
+from quadrl.conditions.process import Process
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.transition import Episode
 from quadrl.engines.engine import Engine
@@ -84,16 +82,11 @@ class Memory:
     seeds: Seeds
     snapshot: Snapshot
     episode: Episode
-    randomizer: Randomizer
-    observer: Observer | None
-    weather: WeatherProcess | None
+    processes: Sequence[Process]
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> dict[str, Engine | Process]:
         """Parts that save arrays of their own, by the name that these begin with."""
-        drawn = self.randomizer if self.randomizer.active else None
-        parts = {"engine": self.engine, "randomizer": drawn}
-        parts |= {"observer": self.observer, "weather": self.weather}
-        return {name: part for name, part in parts.items() if part is not None}
+        return {"engine": self.engine, **{process.name: process for process in self.processes}}
 
     def save(self) -> dict[str, np.ndarray]:
         """Copies of all arrays by name."""
@@ -125,29 +118,18 @@ class Memory:
         """
         own = self.save()
         records.check_alike(saved, own)
-        (present, table), sampler = TABLES, self.randomizer.sampler
         for name in own:
-            begins = name.startswith(("randomizer.", "observer.", "episode."))
-            checked = begins or name in ("engine.rows", "engine.solids", present, *MOMENT)
-            if checked and not np.isfinite(saved[name]).all():
+            # What a task remembers is its own.
+            if not (name.startswith("task.") or np.isfinite(saved[name]).all()):
                 raise QuadrlError(name=name, value=saved[name], allowed="finite")
         self._check_counters(saved)
-        if self.randomizer.active:
-            self.randomizer.check_saved(saved)
-        drawn = sampler.randomization.per_row and sampler.explains(saved[table])
-        if not (drawn or np.array_equal(saved[table], own[table])):
-            reason = "the state was saved with another aircraft"
-            raise QuadrlError(reason, name=table, value=saved[table], allowed="this aircraft's")
+        for process in self.processes:
+            process.check(saved)
         now, then = (np.ascontiguousarray(saved[name]).view(AIRCRAFT) for name in TABLES)
         for name in MADE_OF:
             if not np.array_equal(now[name], then[name]):
                 allowed = "as when the episode began: it does not change in flight"
-                raise QuadrlError(name=f"{present} {name}", value=now[name], allowed=allowed)
-        if self.weather:
-            self.weather.check(saved)
-        elif "weather.table" in saved:
-            reason = "the state was saved in wind"
-            raise QuadrlError(reason, name="weather", value=None, allowed="the saved one's")
+                raise QuadrlError(name=f"{TABLES[0]} {name}", value=now[name], allowed=allowed)
 
     def _check_counters(self, saved: Mapping[str, np.ndarray]) -> None:
         """Refuse seeds and counters that are out of range or contradict each other.

@@ -226,7 +226,7 @@ def test_the_pushes_are_the_definition(engine):
             way = np.stack([level * np.cos(heading), level * np.sin(heading), height], axis=1)
             hit = u[:, 0] < 1 - math.exp(-20.0 * PAPER.control_timestep)
             expected[:, first : first + 3] += size * hit[:, None] * way
-        disturbances.begin_step()
+        disturbances.act()
         np.testing.assert_allclose(qvel, expected, rtol=0, atol=1e-14)
         hits += hit.sum()
     assert 20 < hits < 80  # of 100, with a chance of 0.63

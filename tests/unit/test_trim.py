@@ -16,6 +16,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.presets import VEHICLES, in_real_air, resolve
 from quadrl.base.errors import QuadrlWarning
 from quadrl.base.rotation import heading_of, norm
+from quadrl.conditions.sampler import Drawn
 from quadrl.conditions.weather import WEATHERS, Weather
 from quadrl.control import trim
 from quadrl.control.feasibility import Reach, held_wind, lift_on_feet, warn_of_unreached
@@ -43,7 +44,7 @@ def acceleration(environment):
     """Right after a reset, in the mean wind alone, without noise (N, 3) [m/s^2] and [rad/s^2]."""
     engine, blowing = environment.engine, environment.blowing
     place = blowing.save()["streams"]
-    mean = blowing.mean_wind(*place, engine.qpos[:, 2])
+    mean = blowing.mean_wind(*place, engine.qpos[:, 2], Drawn())
     wind = np.concatenate([mean, 0 * mean[:, :1]], axis=1)
     motion = Motion(
         *np.split(engine.qpos, [3], axis=1), *np.split(engine.qvel, [3], axis=1), engine.act

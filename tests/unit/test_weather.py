@@ -13,6 +13,7 @@ from scipy import stats
 from quadrl import tasks
 from quadrl.aircraft import parameters
 from quadrl.aircraft.vehicle import Vehicle
+from quadrl.conditions.sampler import Drawn
 from quadrl.conditions.weather import WEATHERS, Weather, WeatherProcess
 from quadrl.engines import air
 
@@ -27,7 +28,7 @@ def process(weather, count=1, noise_time=0.0, time_limit=10.0, seed=0, altitude=
     task = tasks.make("hover", altitude=altitude)
     engine = helpers.begun(task, count, engine="free_flight").engine
     made = WeatherProcess(weather, engine, time_limit, noise_time)
-    made.begin(np.arange(count), seed + np.arange(count), np.zeros(count, dtype=np.int64))
+    made.begin(np.arange(count), seed + np.arange(count), np.zeros(count, dtype=np.int64), Drawn())
     return made, engine
 
 
@@ -40,7 +41,7 @@ def blown(weather, steps, **settings):
     made, engine = process(weather, **settings)
     winds = [engine.wind.copy()]
     for _ in range(steps):
-        made.advance()
+        made.act()
         winds.append(engine.wind.copy())
     return np.array(winds), made
 
@@ -53,7 +54,7 @@ def blown(weather, steps, **settings):
 def test_c_is_the_definition_bit_for_bit(count, noise_time, as_array):
     made, engine = process(GUSTY, count, noise_time)
     numbers = np.arange(count)
-    made.begin(numbers, 2**40 + numbers, 2**33 + 7 * numbers)
+    made.begin(numbers, 2**40 + numbers, 2**33 + 7 * numbers, Drawn())
     engine.qpos[:, 2] = np.geomspace(0.01, 500.0, count)
     height, rotors = as_array(engine.qpos[:, 2].copy()), 4 if noise_time else 0
     streams = tuple(map(as_array, made.save()["streams"]))
@@ -69,7 +70,7 @@ def test_c_is_the_definition_bit_for_bit(count, noise_time, as_array):
             assert not (np.signbit(wind) & (wind == 0)).any()
         noise = np.stack([np.asarray(now[name]) for name in air.NOISE], axis=-1)
         np.testing.assert_array_equal(engine.air[:, 3:], noise * (np.arange(8) < rotors))
-        made.advance()
+        made.act()
         now = definition.advanced(now, streams, rotors)
 
 
@@ -183,11 +184,11 @@ def test_the_wind_has_the_deviations_and_correlations_of_the_spectra(step_share)
     vehicle = dataclasses.replace(Vehicle(), control_timestep=STEP / step_share)
     engine = helpers.begun("hover", 3000, engine="free_flight", vehicle=vehicle).engine
     made = WeatherProcess(dataclasses.replace(LIGHT, direction=math.pi / 2), engine, 10.0)
-    made.begin(np.arange(3000), np.arange(3000), np.zeros(3000, np.int64))
+    made.begin(np.arange(3000), np.arange(3000), np.zeros(3000, np.int64), Drawn())
     engine.qpos[:, 2] = 0.01  # no mean wind
     winds = []
     for _ in range(60 * step_share + 1):
-        made.advance()
+        made.act()
         winds.append(engine.wind.copy())
     # The wind blows north: left of it is west.
     along, left, up = np.moveaxis(np.array(winds)[::step_share], -1, 0)[[1, 0, 2]]
@@ -241,8 +242,8 @@ def test_noise_of_the_lift_is_of_first_order_and_changes_no_wind():
     plain, other = process(GUSTY, count)
     noise = []
     for _ in range(20):
-        made.advance()
-        plain.advance()
+        made.act()
+        plain.act()
         noise.append(engine.air[:, 3:7].copy())
         np.testing.assert_array_equal(engine.wind, other.wind)
     noise = np.array(noise)
@@ -268,17 +269,17 @@ def test_calm_air_costs_nothing_and_changes_nothing():
 
 
 def test_rows_may_have_a_wind_speed_of_their_own():
-    speeds = np.array([0.0, 3.0, 7.72, 20.0])
+    factors = np.array([0.0, 0.4, 1.0, 2.6])
     numbers = np.arange(4), np.arange(4), np.zeros(4, np.int64)
     made, engine = process(LIGHT, 4)
-    made.begin(*numbers, wind_speed=speeds)
+    made.begin(*numbers, Drawn(wind=factors))
     for _ in range(5):
-        made.advance()
-    for i, speed in enumerate(speeds):
+        made.act()
+    for i, speed in enumerate(LIGHT.wind_speed * factors):
         same, other = process(dataclasses.replace(LIGHT, wind_speed=float(speed)), 4)
-        same.begin(*numbers)
+        same.begin(*numbers, Drawn())
         for _ in range(5):
-            same.advance()
+            same.act()
         np.testing.assert_array_equal(engine.wind[i], other.wind[i])
     assert not engine.wind[0].any()
 
@@ -290,7 +291,7 @@ def test_what_was_saved_in_another_weather_is_not_taken_up():
     before = severe.engine.air.copy()
     for environment, saved, name in (
         (severe, light.save(), "weather.table"),
-        (calm, light.save(), "weather"),
+        (calm, light.save(), "weather.streams"),
         (light, calm.save(), "weather.table"),
     ):
         with helpers.refused(name) as caught:
