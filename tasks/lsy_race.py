@@ -192,7 +192,7 @@ class LsyRace(GateRace):
         close = xp.clip(1 - cast(Distances, now.potentials).clearance / ROOM, 0.0, 1.0)
         nearer = self._way_left(now.task, before.state.position)
         nearer = nearer - self._way_left(now.task, now.state.position)
-        nearer = xp.minimum(nearer, self.paid_speed * now.parameters.control_timestep)
+        nearer = xp.clip(nearer, None, self.paid_speed * now.parameters.control_timestep)
         return {
             "progress": self.progress_weight * nearer,
             **self.passage(before, now, end),

@@ -125,7 +125,7 @@ def _in_a_line(box: str, words: Sequence[str]) -> str:
         return f"{name} = {given}: must be {KINDS.get(kind, kind)}"
     if found := re.search(r"Unrecognized (?:or misplaced )?options: ([^\s,]+)", text):
         return f"{_unknown(found[1].partition('=')[0], box, command, words)}; see {where}"
-    if found := re.search(r"Missing value for argument '(\S+)'", text):
+    if found := re.search(r"Missing value for argument '[(']*([^\s',)]+)", text):
         return f"{found[1]} needs a value; see {where}"
     if found := re.search(r"Missing from .*?: (.*?) \(required\)", text):
         return f"missing: {found[1]} See {where}"

@@ -75,7 +75,7 @@ def client(page, host="localhost:{}", origin="http://localhost:{}", **options):
     with socket.create_connection(("localhost", port), timeout=20) as plug:
         address, origin = f"ws://{host.format(port)}/", origin and origin.format(port)
         settings = {"subprotocols": [f"viser-v{viser.__version__}"], "compression": None}
-        settings |= {"max_size": None, "max_queue": None, "origin": origin, "sock": plug}
+        settings |= {"max_size": None, "max_queue": 10_000, "origin": origin, "sock": plug}
         with connect(address, **settings, **options) as connection:
             yield connection
 
