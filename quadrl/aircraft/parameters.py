@@ -104,6 +104,17 @@ def numbers(table: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(table).view(np.float64).reshape(len(table), -1)
 
 
+def field(table: np.ndarray, name: str) -> np.ndarray:
+    """A view of a field of rows (n,), such as "mass" or "rotor.max_speed".
+
+    It is (n, 1), (n, 3), or of the rotors that there are (n, R), (n, R, 3).
+    """
+    if name.startswith("rotor."):
+        count = int(table["rotor_count"][0]) if len(table) else 0
+        return table["rotor"][name.removeprefix("rotor.")][:, :count]
+    return table[name].reshape(len(table), -1)
+
+
 def refitted(saved: np.ndarray, layout: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Rows (n, size) that were saved when a row had fewer numbers, as rows (n, ROW_SIZE).
 
@@ -193,6 +204,13 @@ class Parameters:
         arrays: dict[str, Any] = {n: table[n] for n in AIRCRAFT.names or () if n != "rotor"}
         arrays["rotor"] = {name: rotor[name] for name in ROTOR.names or ()}
         return cls(arrays | {"control_timestep": control_timestep})
+
+    @classmethod
+    def of_symbols(cls, numbers: Array, control_timestep: float, rotors: int) -> Parameters:
+        """A row by name from its numbers (1, ROW_SIZE), which a tracer reads."""
+        return cls.of(PLACES, control_timestep, rotors).map(
+            lambda places: numbers[0, places.astype(int)]
+        )
 
     def map(self, function: Callable[[Array], Array]) -> Parameters:
         """The same with a function applied to every array."""

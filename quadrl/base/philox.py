@@ -21,6 +21,7 @@ START, PARAMETERS, SOLIDS = 0, 1, 2
 WEATHER, TURBULENCE = 8, 9  # drawn once an episode; drawn at each control step
 NOISE, PUSHES = 16, 17  # drawn at each control step
 SENSORS = 1 << 30  # the first of two for each sensor, its noise and its bias
+EVENTS = 1 << 31  # the first of one for each event
 MASK = 0xFFFFFFFF
 """Of a 32-bit word."""
 Seed = int | Sequence[int | None] | None

@@ -42,7 +42,7 @@ def parsed(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     whole: dict[str, Any] = {k: parsed(v) if isinstance(v, dict) else v for k, v in given.items()}
     return {
-        name: parse_options(value) if name in PAIRED else parse_named(name, value)
+        name: parse_options(value, _alone(name)) if name in PAIRED else parse_named(name, value)
         for name, value in whole.items()
         if value not in (None, "", {}) and (value or name not in PAIRED)
     }
@@ -109,8 +109,16 @@ def parse_named(name: str, text: Any) -> Any:
         raise QuadrlError(f"{error}", name=name, value=text, allowed=allowed) from None
 
 
-def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
+def _alone(name: str) -> Any:
+    return GIVEN.get(name, {}).get("alone")
+
+
+def parse_options(pairs: tuple[str, ...], alone: Any = None) -> dict[str, Any]:
     """Options given as NAME=VALUE; a value is read as JSON where it is valid, lists as tuples.
+
+    Args:
+        pairs: As they were typed.
+        alone: The value of a NAME alone; None where it needs one.
 
     Raises:
         QuadrlError: One has no equals sign, or stands there twice.
@@ -118,13 +126,13 @@ def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
     options: dict[str, Any] = {}
     for pair in pairs:
         name, equals, text = pair.partition("=")
-        if not equals:
+        if not equals and alone is None:
             allowed = "NAME=VALUE, such as time_limit=5"
             raise QuadrlError(name="task option", value=pair, allowed=allowed)
         if name in options:
             raise QuadrlError(name=name, value=pair, allowed="given once")
         try:
-            options[name] = tuples(json.loads(text))
+            options[name] = tuples(json.loads(text)) if equals else alone
         except (ValueError, RecursionError):
             options[name] = text
     return options

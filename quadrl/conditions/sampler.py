@@ -101,8 +101,11 @@ class AircraftSampler:
             self._check_ends()
         if randomization.moment:
             self._check_moment()
+        self.extremes = self._specified
+        """Rows of the aircraft in which a rotor has most, or least, to do in hover."""
         if randomization.per_row:
-            self.check_hover(self.table(self._corners()))
+            self.extremes = self.table(self._corners())
+            self.check_hover(self.extremes)
 
     def sample(self, shares: Array) -> Array:
         """Numbers (n, k), a column for each of `names`, from shares in [0, 1) of the ranges."""
@@ -147,24 +150,18 @@ class AircraftSampler:
             # The lag is a time and the parameter a rate.
             apply = np.divide if name == "lag" else np.multiply
             for field in AFFECTS[name]:
-                numbers = self._field(table, field)
+                numbers = parameters.field(table, field)
                 apply(numbers, factor, out=numbers)
         if self.randomization.inertia_axes != OFF:
             inertia = table["inertia"]
             np.minimum(inertia, inertia.sum(-1, keepdims=True) - inertia, out=inertia)
         # The origin of the body is the centre of mass, so the rotors move instead of it.
         shift = self.columns(drawn, "centre_of_mass_x", 3)
-        self._field(table, *AFFECTS["centre_of_mass"])[:] -= shift[:, None]
+        parameters.field(table, *AFFECTS["centre_of_mass"])[:] -= shift[:, None]
         for name, unit in zip(STEADY, self._units, strict=True):
-            self._field(table, *AFFECTS[name])[:] = unit * self.columns(drawn, f"{name}_x", 3)
+            parameters.field(table, *AFFECTS[name])[:] = unit * self.columns(drawn, f"{name}_x", 3)
         parameters.refresh(table, self._vehicle.physics_timestep)
         return table
-
-    def _field(self, table: np.ndarray, name: str) -> np.ndarray:
-        """A view of a field of rows, as `AFFECTS` names it: (n, 1), (n, 3), (n, R), (n, R, 3)."""
-        if name.startswith("rotor."):
-            return table["rotor"][name.removeprefix("rotor.")][:, : self._vehicle.rotor_count]
-        return table[name].reshape(len(table), -1)
 
     def explains(self, saved: np.ndarray) -> bool:
         """Whether rows of parameters differ from the specified ones only in what may be drawn."""
@@ -172,7 +169,7 @@ class AircraftSampler:
         own = np.repeat(self._specified, len(table))
         for name in self.randomization.given().keys() & AFFECTS.keys():
             for field in AFFECTS[name]:
-                self._field(own, field)[:] = self._field(table, field)
+                parameters.field(own, field)[:] = parameters.field(table, field)
         parameters.refresh(own, self._vehicle.physics_timestep)
         return np.array_equal(own.view(np.float64).reshape(saved.shape), saved)
 

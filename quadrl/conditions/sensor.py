@@ -17,6 +17,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SENSORS as STREAMS
 from quadrl.base.rotation import Array
 from quadrl.base.validation import IN_A_FILE, choice, number, record, registered, whole_steps
+from quadrl.conditions.event import Events
 from quadrl.conditions.randomization import LONGEST_DELAY
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.engines import native
@@ -56,6 +57,7 @@ class Moment:
     """The same, of the true state."""
     observed: Array = None  # (n, m), all measured entries as they are seen, with their delays
     memory: Memory = dataclasses.field(default_factory=Memory)  # what the sensor itself remembers
+    events: Events | None = None  # what happens in flight, where something does
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +69,7 @@ class Sizes:
     entries: int = 0
     truth: int = 0
     drawn: int = 0
+    happening: int = 0
     observed: int = 0
 
 

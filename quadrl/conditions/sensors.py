@@ -362,21 +362,23 @@ class ObservationHistory(History):
 
 @register_sensor
 class Privileged(Sensor):
-    """For the critic alone: the task's true entries, what was drawn, and the wind.
+    """For the critic alone: the task's true entries, what was drawn, what events do, and the wind.
 
-    What was drawn lies between -1 and 1 in its range; the wind [m/s] is in the body frame.
+    What was drawn lies between -1 and 1 in its range; what events do is 0 where it is nothing, as
+    `Events.seen` gives it; the wind [m/s] is in the body frame.
     """
 
     name, unit, measured, shown, last = "privileged", "", False, False, True
 
     def width(self, sizes: Sizes) -> int:
         """All of these."""
-        return sizes.truth + sizes.drawn + 3
+        return sizes.truth + sizes.drawn + sizes.happening + 3
 
     def sense(self, now: Moment) -> Array:
-        """The true entries, what was drawn and the wind, side by side."""
+        """The true entries, what was drawn, what happens and the wind, side by side."""
         wind, drawn = to_body(now.true.rotation, now.wind), now.randomizer.scaled(now.rows)
-        return np.concatenate([*now.truth.values(), drawn, wind], axis=-1)
+        happening = [now.events.seen(now.rows)] if now.events else []
+        return np.concatenate([*now.truth.values(), drawn, *happening, wind], axis=-1)
 
 
 def pushed(past: Array, newest: Array) -> Array:

@@ -21,6 +21,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SOLIDS, Seed
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
+from quadrl.conditions.event import Events, scales
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import NONE
 from quadrl.conditions.randomizer import Randomizer
@@ -86,16 +87,17 @@ class Environment(saving.Copied):
         self.observing, self.weather = self.scenario.observe, self.scenario.weather
         sampler = AircraftSampler(self.scenario.randomization, self.vehicle)
         self.randomization = sampler.randomization
+        per_row = self.randomization.per_row or scales(self.scenario.events)
         if not isinstance(engine, Engine):
             validation.number("num_envs", num_envs, 1, mujoco.MAX_ENVS, whole=True)
-            per_row = row_memory(self.task, self.vehicle, sampler, self.observing)
-            machine.check_memory(f"num_envs = {num_envs}", num_envs * per_row)
+            single = row_memory(self.task, self.vehicle, sampler, self.observing, per_row)
+            machine.check_memory(f"num_envs = {num_envs}", num_envs * single)
             world = self.vehicle, self.scenario.compile_model(drawn=False), num_envs
-            settings: Any = {"num_threads": num_threads, "per_row": self.randomization.per_row}
+            settings: Any = {"num_threads": num_threads, "per_row": per_row}
             altitude = self.scenario.altitude
             engine = mujoco.make(self.scenario.engine, *world, altitude=altitude, **settings)
-        elif self.randomization.per_row and len(engine.parameters) < engine.num_envs:
-            allowed = "made with per_row=True, since parameters are drawn"
+        elif per_row and len(engine.parameters) < engine.num_envs:
+            allowed = "made with per_row=True, since aircraft differ"
             raise QuadrlError(name="engine", value=engine, allowed=allowed)
         self.scene = Scene(self.task.solids())
         self.scene.check(engine)
@@ -105,6 +107,7 @@ class Environment(saving.Copied):
         timestep = self.vehicle.control_timestep
         self._clock = Clock.of(self.task, timestep)
         self.time_limit_steps = self._clock.time_limit_steps
+        lasts = self.time_limit_steps * timestep
         self._true = self.task.true_parameters and self.randomization.per_row
         nominal = parameters.rows(self.vehicle)
         self._rows = engine.parameters if self._true else nominal  # those that the task sees
@@ -114,10 +117,15 @@ class Environment(saving.Copied):
         senses = self.observing != Observing() or bool(self.task.sensors)
         active = senses or self.randomization != NONE
         self.randomizer = Randomizer(sampler, engine, active=active)
+        self.blowing = WeatherProcess.of(self.weather, engine, lasts)
+        self.events: Events | None = None  # what happens in flight, where something does
+        if happening := self.scenario.events:
+            given = engine, sampler, lasts
+            self.events = Events(happening, *given, calm=self.blowing is None)
         self.observer: Observer | None = None  # the task then observes the true state
         if senses or self.randomization.uncertain:
             given = self.observing, self.task, engine, self.action_size, self.randomizer
-            self.observer = Observer(*given)
+            self.observer = Observer(*given, self.events)
         terms = self.observer.terms if self.observer else self.task.observation
         self.layout = layout(terms, self.vehicle.rotor_count)
         """Where each named term of the observation stands in the flat vector."""
@@ -135,8 +143,7 @@ class Environment(saving.Copied):
         follows = self.observer is not None and self.control_mode.has_loops
         self._parted = self.randomizer.late or self._solids_move or follows
         """Whether Python acts within a control step."""
-        self.blowing = WeatherProcess.of(self.weather, engine, self.time_limit_steps * timestep)
-        acting = self.randomizer, self.blowing, self.observer
+        acting = self.randomizer, self.blowing, self.events, self.observer
         self._processes = [process for process in acting if process]
         self._all = np.arange(self.num_envs)
         self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
@@ -397,7 +404,7 @@ class Environment(saving.Copied):
             self.autopilot.begin()
         else:
             command[:] = self.control_mode.values(taken)
-            self.engine.ctrl[:] = command
+            self.engine.command(command)
             if self.observer:
                 self.observer.follow(command, self.vehicle.control_timestep)
 
@@ -417,7 +424,7 @@ class Environment(saving.Copied):
             steps = 1
             self.engine.solids.move(self._moves[self._flown], self.vehicle.physics_timestep)
         self._flown += steps
-        self.engine.ctrl[:] = self.randomizer.delayed(command, steps)
+        self.engine.command(self.randomizer.delayed(command, steps))
         return steps
 
     def _solids_ahead(self) -> list[np.ndarray]:
@@ -474,6 +481,10 @@ class Environment(saving.Copied):
         asked = (marker.moved(self.origin) for marker in self.task.markers(alone))
         return (*asked, *self.scene.primitives(self.engine, row))
 
+    def happening(self, row: int = 0) -> str:
+        """What pictures say of the events in the flight of an aircraft."""
+        return self.events.told(row) if self.events else ""
+
     def _memory(self) -> saving.Memory:
         begun, parts = self._begun, self._processes
         return saving.Memory(self.engine, self.seeds, begun.snapshot, begun.episode, parts)
@@ -506,7 +517,9 @@ class Environment(saving.Copied):
         return self.observer.again() if self.observer else self.task.observe(now)
 
 
-def row_memory(task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Observing) -> float:
+def row_memory(
+    task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Observing, per_row: bool
+) -> float:
     """Least memory that one more aircraft takes [bytes], as measured, plus that of histories."""
     rotors, (command, *ages) = vehicle.rotor_count, (most for _, most in sampler.delays.values())
     aged, late = max(ages), command + round(vehicle.dead_time / vehicle.physics_timestep)
@@ -516,4 +529,4 @@ def row_memory(task: Task, vehicle: Vehicle, sampler: AircraftSampler, seen: Obs
     observations, actions = (getattr(sensors.get(name), "length", 0) for name in names)
     kept = single * (1 + observations) + 13 * aged + rotors * max(late, aged)
     flat = single * (1 + observations) + rotors * actions
-    return 3_000 + 5_000 * sampler.randomization.per_row + 8 * (kept + 2 * flat)
+    return 3_000 + 5_000 * per_row + 8 * (kept + 2 * flat)

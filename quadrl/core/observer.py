@@ -11,6 +11,7 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
+from quadrl.conditions.event import Events
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.process import Process
 from quadrl.conditions.randomizer import Randomizer
@@ -29,7 +30,13 @@ class Observer(Process):
     name = "observer"
 
     def __init__(
-        self, options: Observing, task: Task, engine: Engine, actions: int, randomizer: Randomizer
+        self,
+        options: Observing,
+        task: Task,
+        engine: Engine,
+        actions: int,
+        randomizer: Randomizer,
+        events: Events | None = None,
     ) -> None:
         """Lay out the observation.
 
@@ -39,12 +46,13 @@ class Observer(Process):
             engine: Flies the aircraft.
             actions: Numbers in an action.
             randomizer: Randomizer of those aircraft.
+            events: What happens to them in flight, where something does.
 
         Raises:
             QuadrlError: The delay or the rate of a sensor does not fit the control step, or it has
                 the name of an entry of the task.
         """
-        self._task, self._engine, self._randomizer = task, engine, randomizer
+        self._task, self._engine, self._randomizer, self._events = task, engine, randomizer, events
         vehicle, rotors = engine.vehicle, engine.vehicle.rotor_count
         timestep, sampler = vehicle.control_timestep, randomizer.sampler
         self._specified = Parameters.of(parameters.rows(vehicle), timestep)
@@ -59,7 +67,8 @@ class Observer(Process):
             sum(term.width(rotors) for term in terms.values())
             for terms in (self.terms, task.observation)
         )
-        sizes = Sizes(rotors, actions, entries, truth, len(sampler.spread))
+        happening = events.width if events else 0
+        sizes = Sizes(rotors, actions, entries, truth, len(sampler.spread), happening)
         measured = [sensor for sensor in sensors.values() if sensor.measured]
         observed = sum(sensor.width(sizes) for sensor in measured)
         sizes = dataclasses.replace(sizes, observed=observed)
@@ -137,7 +146,7 @@ class Observer(Process):
 
     def _moment(self, true: State, wind: Array, action: Array, rows: np.ndarray | None) -> Moment:
         known = self._specified, self._randomizer, rows, self.frame
-        return Moment(true, true, true.rotor_speed, wind, action, *known)
+        return Moment(true, true, true.rotor_speed, wind, action, *known, events=self._events)
 
     def _look(
         self,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.aircraft.parameters import PLACES, ROW_SIZE, Parameters
+from quadrl.aircraft.parameters import ROW_SIZE, Parameters
 from quadrl.base import records
 from quadrl.base.rotation import Array
 from quadrl.base.trace import MAX_OPERATIONS, NotCompilable
@@ -175,8 +175,7 @@ class Program:
         return np.array([*motion[0], *self._numbers(kept, [*seen.values()])], dtype=object)[None]
 
     def _parameters(self, numbers: Array) -> Parameters:
-        own = Parameters.of(PLACES, self.written.clock.control_timestep, self._rotors)
-        return own.map(lambda places: numbers[0, places.astype(int)])
+        return Parameters.of_symbols(numbers, self.written.clock.control_timestep, self._rotors)
 
     def _state(self, motion: Array) -> State:
         origin = self.written.engine.origin

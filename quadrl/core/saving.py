@@ -146,6 +146,7 @@ class Memory:
             allowed = f"whole numbers from 0 to {MOST_STEPS:.0f}"
             raise QuadrlError(name="episode.steps", value=steps, allowed=allowed)
         counted = {"time": steps * self.engine.vehicle.control_timestep, "randomizer.steps": steps}
+        counted["events.steps"] = steps
         for name, expected in counted.items():
             if name in saved and not np.array_equal(saved[name], expected):
                 allowed = "that of episode.steps, which was saved beside it"

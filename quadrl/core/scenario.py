@@ -23,7 +23,10 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
 from quadrl.base.records import as_json
+from quadrl.conditions import events as happens
 from quadrl.conditions import observing, randomization
+from quadrl.conditions.event import Event
+from quadrl.conditions.events import Happens
 from quadrl.conditions.observing import Observed, Observing
 from quadrl.conditions.randomization import RANDOMIZATIONS, Randomization, Randomized
 from quadrl.conditions.weather import WEATHERS, Weather, Weathered
@@ -59,6 +62,9 @@ class Conditions(TypedDict, total=False, extra_items=Any):
     randomization: Randomized
     """Randomization of each aircraft at each reset: none, light or full, or JSON such as '{"mass":
     [0.8, 1.2]}'; in Python also a Randomization, or some of its fields."""
+    events: Happens
+    """What happens in flight, with options: battery, rotor_failure, rotor_damage, payload or
+    gust_front, such as battery rotor_failure='{"at": 3}'; in Python also a name, or several."""
     observe: Observed
     """Options of the observation: fields of `quadrl.Observing`, such as action_history=2."""
     control_mode: str | None
@@ -84,7 +90,8 @@ def _condition(default: Any, parse: Callable[[Any], Any], given: str = "", **mor
         parse: Makes its value of what is given.
         given: How commands take it: as a "name", as a name or "json", as "pairs" of names and
             values, which add to the default ones; else as the type of its keyword says.
-        **more: The `names` that there are, and an `example` of JSON.
+        **more: The `names` that there are, an `example` of JSON, and in pairs the value of a name
+            `alone`.
     """
     usual: Any = default if default is not None else {} if given == "pairs" else ""
     metadata = {"parse": parse, "given": given, "usual": usual, **more}
@@ -113,6 +120,8 @@ class Scenario:
         "none", randomization.resolve, "json", names=RANDOMIZATIONS, example={"mass": [0.8, 1.2]}
     )
     """What is drawn for each aircraft at each reset and disturbs it."""
+    events: Mapping[str, Event] = _condition(None, happens.resolve, "pairs", alone={})
+    """What happens to aircraft in flight, by name."""
     observe: Observing = _condition(None, observing.resolve, "pairs")
     """Options of the observation."""
     control_mode: str = _condition("rotor", modes.named, "name", names=modes.CONTROL_MODES)
@@ -126,10 +135,11 @@ class Scenario:
             value = field.metadata["parse"](getattr(self, field.name))
             object.__setattr__(self, field.name, value)
         own = self.aerodynamics is not None or self.vehicle.aerodynamics.effects
-        if not (own or self.weather.calm):
+        if not (own or self.calm):
             _check_in_wind(self.vehicle)
             object.__setattr__(self, "aerodynamics", FULL)
         wind = self.weather.wind_speed * self.randomization.wind[1] + self.weather.gust_speed
+        wind += sum(event.strongest_wind for event in self.events.values())
         if wind > (resolved := self.aircraft.resolved_speed):
             reason = "faster air carries the aircraft off at a speed that its step does not resolve"
             allowed = f"mean wind and gust together up to {resolved:.3g} m/s, for this aircraft"
@@ -231,6 +241,12 @@ class Scenario:
     def altitude(self) -> float:
         """Height of the origin of the task's frame above the ground [m]."""
         return max(self.task.altitude, self.aircraft.ground_clearance)
+
+    @property
+    def calm(self) -> bool:
+        """Whether the air never moves."""
+        fronts = (event.strongest_wind for event in self.events.values())
+        return self.weather.calm and not any(fronts)
 
     @property
     def mean_wind(self) -> float:

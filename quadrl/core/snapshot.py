@@ -154,6 +154,7 @@ class Rollout:
     is_success: np.ndarray  # (N,) bool
     diverged: np.ndarray  # (N,) bool
     markers: tuple[Any, ...]  # (T,) of what the task shows of the first aircraft, world frame
+    events: tuple[str, ...]  # (T,) of what is said of the events of its flight
     origin: np.ndarray  # (3,) [m], of the task frame in the world frame
     control_timestep: float  # [s]
     task: Any  # the Task that was flown
@@ -183,6 +184,7 @@ class Rollout:
             max_rotor_speed=vehicle.max_speed,
             task=self.task.name,
             markers=self.markers[steps],
+            events=self.events[steps],
             outcome=outcome(self.terminated[0], True, self.is_success[0]),
             wind=wind if wind.any() else None,
         )

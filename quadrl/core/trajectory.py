@@ -43,6 +43,7 @@ class Trajectory:
     task: str  # its name
     # World frame; one tuple per state, or one for all.
     markers: Sequence[Shown] = ((),)
+    events: Sequence[str] = ("",)  # what has happened to the aircraft; one per state, or for all
     outcome: str = ""  # how the episode ended, shown with the last state
     wind: Array | None = None  # (T, 3) [m/s], world frame; None for calm air
     # What was flown, as `Scenario.to_json` gives it; pictures and videos carry it.
@@ -80,6 +81,7 @@ class Trajectory:
             reward=self.reward[before],
             goal=np.where(jump, self.goal[before], linear(self.goal)),
             markers=markers,
+            events=[self.events[k] for k in before] if len(self.events) > 1 else self.events,
             wind=None if self.wind is None else linear(self.wind),
         )
 

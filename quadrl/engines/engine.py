@@ -67,6 +67,9 @@ class Engine(abc.ABC):
         )
         self.air = fields["userdata"][:, : parameters.AIR]
         self.wind = self.air[:, :3]
+        self.ceiling = np.full(self.ctrl.shape, np.inf)
+        """Largest commands (N, R) [rad/s] that the rotors take, live; for what limits them in
+        flight."""
         self._threads = Threads(self.num_envs, threads)
         placed = self.model, self.num_envs, self.origin, self._model_field
         self.solids = Solids(*placed, self._threads)
@@ -79,7 +82,7 @@ class Engine(abc.ABC):
         rows = self._model_field("body_user")[:, 1]
         self.parameters = rows.view(parameters.AIRCRAFT)[:, 0]
         self.begun = self.parameters.copy()
-        flown = self.model, fields, self.parameters, self._threads, self.solids
+        flown = self.model, fields, self.ceiling, self.parameters, self._threads, self.solids
         step = vehicle.physics_timestep
         self._free_flight = FreeFlight(*flown, step) if name == "free_flight" else None
         self.finer = round(step / self.model.opt.timestep)
@@ -140,11 +143,15 @@ class Engine(abc.ABC):
         if self._free_flight is not None:
             return self._free_flight.rows
         self._kept = parameters.numbers(self.parameters[:1])
-        fields = self.qpos, self.qvel, self.act, self.ctrl, None, self.air, self._kept, None
-        return native.struct(*fields, self.near, None, None, *self._row_sizes())
+        fields = self.qpos, self.qvel, self.act, self.ctrl, None, self.air, self.ceiling
+        return native.struct(*fields, self._kept, None, self.near, None, None, *self._row_sizes())
 
     def _row_sizes(self) -> tuple[int, ...]:
         return self.qpos.strides[0] // 8, 0, self.vehicle.rotor_count, 0
+
+    def command(self, wanted: np.ndarray) -> None:
+        """Command the rotors, (N, R) [rad/s], within the ceiling."""
+        np.minimum(wanted, self.ceiling, out=self.ctrl)
 
     def control_step(self, step: int, rows: np.ndarray | None, parts: int, steps: int) -> int:
         """Call `quadrl_step` of native/free_flight.c.

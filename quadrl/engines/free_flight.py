@@ -30,6 +30,7 @@ class FreeFlight:
         self,
         model: mujoco.MjModel,
         fields: dict[str, np.ndarray],
+        ceiling: np.ndarray,
         table: np.ndarray,
         threads: Threads,
         solids: Solids,
@@ -40,6 +41,7 @@ class FreeFlight:
         Args:
             model: A model of `quadrl.engines.mjcf`.
             fields: Live arrays (N, k) of FIELDS, all with one stride between aircraft.
+            ceiling: Largest commands (N, R) [rad/s], live.
             table: Rows of parameters (N,), or one (1,) for all, which is live.
             threads: Threads to fly on.
             solids: The solids about the aircraft.
@@ -61,7 +63,7 @@ class FreeFlight:
             self.parameters[:] = numbers(table[:1])[0, : block // LANES, None]
             self.write(np.arange(len(table)), table)
         live, about = [fields[name] for name in FIELDS], (solids.table, solids.nearby)
-        arrays = (*live, self.parameters, self.world, self.near, *about)
+        arrays = (*live, ceiling, self.parameters, self.world, self.near, *about)
         sizes = (live[0].strides[0] // 8, block, rotors, len(solids.geoms))
         self._alive = arrays  # the kernel knows their addresses
         self.rows = native.struct(*arrays, *sizes)

@@ -52,21 +52,29 @@ QUADRL_EXPORT VECTORISED void compute(const double* constants, const Lanes* rest
   }}
 }}
 
-QUADRL_EXPORT void run(const double* constants, const Rows* in, const Rows* out, int64_t n) {{
+// Computes n rows, those of a list or the first ones.
+QUADRL_EXPORT void run(const double* constants, const Rows* in, const Rows* out, int64_t n,
+                       const int64_t* ids) {{
   Lanes x[IN], y[OUT];
-  for (int64_t row = 0; row < n; row += LANES) {{
-    const int filled = n - row < LANES ? (int)(n - row) : LANES;
+  for (int64_t first = 0; first < n; first += LANES) {{
+    const int filled = n - first < LANES ? (int)(n - first) : LANES;
+    int64_t row[LANES];
+    for (int i = 0; i < LANES; ++i) {{  // spare lanes: twins
+      const int64_t at = first + (i < filled ? i : 0);
+      row[i] = ids ? ids[at] : at;
+    }}
     Lanes* next = x;
     for (const Rows* r = in; next < x + IN; ++r) {{
       for (int64_t k = 0; k < r->width; ++k, ++next) {{
-        for (int i = 0; i < LANES; ++i) {{  // spare lanes: twins
-          (*next)[i] = r->at[(row + (i < filled ? i : 0)) * r->stride + k];
-        }}
+        for (int i = 0; i < LANES; ++i) (*next)[i] = r->at[row[i] * r->stride + k];
       }}
     }}
     compute(constants, (const Lanes*)x, y, filled);
-    for (int k = 0; k < OUT; ++k) {{
-      for (int i = 0; i < filled; ++i) out->at[(row + i) * out->stride + k] = y[k][i];
+    next = y;
+    for (const Rows* r = out; next < y + OUT; ++r) {{
+      for (int64_t k = 0; k < r->width; ++k, ++next) {{
+        for (int i = 0; i < filled; ++i) r->at[row[i] * r->stride + k] = (*next)[i];
+      }}
     }}
   }}
 }}
@@ -130,7 +138,8 @@ class RowFunction:
             NativeError: There is no compiler, or it refused the source.
         """
         run = compiling.compile_generated(self.source).run
-        run.argtypes, run.restype = [*3 * (ctypes.c_void_p,), ctypes.c_int64], None
+        run.argtypes = [*3 * (ctypes.c_void_p,), ctypes.c_int64, ctypes.c_void_p]
+        run.restype = None
         return run
 
     def struct(self) -> np.ndarray:
@@ -142,23 +151,39 @@ class RowFunction:
         compute = ctypes.cast(compiling.compile_generated(self.source).compute, ctypes.c_void_p)
         return native.struct(compute.value, self.constants, self.taken, self.width)
 
-    def on(self, *arrays: np.ndarray) -> Callable[[], None]:
+    def on(self, *arrays: np.ndarray, results: int = 1) -> Callable[..., None]:
         """The function bound to arrays, whose numbers may change but not their places in memory.
 
         Args:
-            *arrays: Its arguments and then its result, float64, each row contiguous.
+            *arrays: Its arguments and then its result, float64, each row contiguous; the result may
+                stand in the same place as an argument.
+            results: In how many arrays the numbers of the result stand, one after the other.
+
+        Returns:
+            Computes the rows of a list (n,) int64, or all.
 
         Raises:
             NativeError: There is no compiler, or it refused the source.
         """
         compiled = self.load()
-        places = [[a.ctypes.data, a.strides[0] // 8, a.shape[1]] for a in arrays]
-        kept = arrays, np.array(places), self.constants
-        rows, constants = kept[1].ctypes.data, self.constants.ctypes.data
-        last, count = rows + 24 * (len(arrays) - 1), len(arrays[0])
+        first, places = 0, list[list[int]]()
+        for array in arrays[:-results]:
+            taken = [k for k in range(array.shape[1]) if first + k in self.places]
+            stride, first = array.strides[0] // 8, first + array.shape[1]
+            # A piece for each run of numbers that the C takes.
+            for k in taken:
+                if k - 1 in taken:
+                    places[-1][2] += 1
+                else:
+                    places.append([array.ctypes.data + 8 * k, stride, 1])
+        given = [[a.ctypes.data, a.strides[0] // 8, a.shape[1]] for a in arrays[-results:]]
+        kept = arrays, np.array(places), np.array(given), self.constants
+        taken, given, constants = (array.ctypes.data for array in kept[1:])
+        count = len(arrays[0])
 
-        def run(kept: Any = kept) -> None:  # which keeps them alive
-            compiled(constants, rows, last, count)
+        def run(rows: np.ndarray | None = None, kept: Any = kept) -> None:  # keeps them alive
+            some = (count, None) if rows is None else (len(rows), rows.ctypes.data)
+            compiled(constants, taken, given, *some)
 
         return run
 

@@ -72,7 +72,7 @@ def fly(
     everyone = np.ones(episodes, dtype=bool)
     states, moments = [_while(everyone, _state(environment))], list[dict[str, np.ndarray]]()
     remembered: list[dict[str, np.ndarray]] = []
-    markers = []
+    markers, events = [], list[str]()
     alive = everyone.copy()
     shape = episodes, environment.action_size
     length = np.zeros(episodes, dtype=int)
@@ -82,6 +82,7 @@ def fly(
         now = environment.step(taken)
         observation = environment.flatten(now.observation)
         markers.append(environment.markers())
+        events.append(environment.happening())
         states.append(_while(alive, _state(environment)))
         snapshot = environment.snapshot
         moment = {
@@ -105,6 +106,7 @@ def fly(
         length=length,
         **ends,
         markers=tuple(markers),
+        events=tuple(events),
         origin=np.array(environment.origin),
         control_timestep=environment.vehicle.control_timestep,
         task=flown,

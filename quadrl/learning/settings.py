@@ -157,6 +157,7 @@ class APGConfig(AlgorithmConfig):
             ("task", task.name, task.contact, "a task without contact with the ground"),
             ("task", task.name, task.true_parameters, "a task that sees the specified parameters"),
             ("observe", given["observe"], observed, "left out"),
+            ("events", given["events"], bool(flown.events), "left out"),
             ("randomization", given["randomization"], unsure, _SURE),
         ):
             if wrong:

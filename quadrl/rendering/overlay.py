@@ -23,6 +23,7 @@ FIRST, LINE = 43, 23  # where the lines begin, and from one to the next
 DIAL, DIAL_LEFT = 90, 194  # diameter of the horizon, and where it begins
 BARS, BAR = 302, 21  # where the bars begin, and from one to the next
 TOP, BOTTOM, BELOW = 17, 108, 113  # of the bars, and of what is written below them
+CHIP = 42  # from a line below the panel to the next
 ROOM = 0.8  # share of a picture's width that the panel may take
 GREY, WHITE, DARK = (150, 163, 180), (236, 240, 246), (44, 52, 64)
 OUTCOMES = {SUCCESS: (38, 148, 84), FAILURE: (196, 58, 54), TIME_OVER: (176, 124, 30)}
@@ -75,6 +76,7 @@ class Panel:
         shares: ArrayLike,
         attitude: ArrayLike = (1.0, 0.0, 0.0, 0.0),
         outcome: str = "",
+        events: str = "",
     ) -> None:
         """Draw into a picture, in place.
 
@@ -84,6 +86,7 @@ class Panel:
             shares: Speeds of the rotors (R,), 1 at most.
             attitude: (w, x, y, z), for the horizon.
             outcome: How the episode ended.
+            events: What has happened to the aircraft.
         """
         margin = round(MARGIN * self._scale)
         width, height = self._background.size
@@ -104,9 +107,11 @@ class Panel:
             for upper, fill in ((TOP, DARK), (level, self._colours[rotor])):
                 draw.rectangle((*self._at(left, upper), *self._at(left + 12, BOTTOM)), fill=fill)
         corner[:] = np.asarray(image)
-        if outcome:
-            below = MARGIN + self._height + 10
-            self.write(picture, outcome, MARGIN, below, OUTCOMES.get(outcome, DARK), 225)
+        below = MARGIN + self._height + 10
+        for text, fill in ((events, DARK), (outcome, OUTCOMES.get(outcome, DARK))):
+            if text:
+                self.write(picture, text, MARGIN, below, fill, 225)
+                below += CHIP
 
     def write(
         self,

@@ -66,25 +66,25 @@ class Pictures:
         renderer = Renderer(model, self._width, self._height)
         with contextlib.suppress(RenderingUnavailable):  # without Pillow
             colours = [mjcf.rotor_colour(rotor.position) for rotor in vehicle.rotors]
-            windy = not self._environment.weather.calm
+            windy = not self._environment.scenario.calm
             panel = Panel(self._height, task_title(task.name), colours, windy)
             self._panel = panel if panel.fits(self._width, self._height) else None
         return renderer
 
     def _values(self, row: int) -> tuple[Any, ...]:
-        """Arguments of `Panel.draw` for a row: values, rotor speeds, attitude, outcome."""
+        """Arguments of `Panel.draw` for a row: all after the picture."""
         environment = self._environment
         now, done, reward, end = environment.snapshot, environment.transition, 0.0, ""
         time, error = float(now.time[row]), environment.task.error(now)[row]
         if done is not None and time > 0:  # it is of this episode
             error, reward = done.error[row], done.reward[row]
             end = outcome(done.terminated[row], done.truncated[row], done.is_success[row])
-        calm = environment.weather.calm
-        wind = None if calm else float(norm(environment.engine.wind[row]))
+        wind = None if environment.scenario.calm else float(norm(environment.engine.wind[row]))
         moment = time, float(error), float(now.state.speed[row]), float(reward)
         values = flight_lines(*moment, wind)
         shares = now.state.rotor_speed[row] / environment.vehicle.max_speed
-        return [*values.values()], shares, environment.engine.qpos[row][3:7], end
+        attitude, events = environment.engine.qpos[row][3:7], environment.happening(row)
+        return [*values.values()], shares, attitude, end, events
 
     def close(self) -> None:
         """Free the renderer."""
@@ -129,7 +129,7 @@ class LiveFlight:
             self._view = view if begins else eased(view, self._view, seconds)
             size = renderer.scale, renderer.aspect
             shown = moving_camera(keeping(self._view[None], position[None], *size)[0])
-        if not environment.weather.calm:
+        if not environment.scenario.calm:
             wind = environment.engine.wind[row]  # since the last picture
             self._drift = self._drift + wind * seconds
             markers = (*markers, *streaks(position, wind, self._drift, renderer.scale))

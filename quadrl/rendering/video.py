@@ -107,9 +107,11 @@ def render_trajectory(
         for each in (wind, flight.rotor_speed)
     )
     strength = np.linalg.norm(wind, axis=1)
-    markers = flight.markers
+    markers, events = flight.markers, flight.events
     if len(markers) == 1:
         markers = [markers[0]] * len(position)
+    if len(events) == 1:
+        events = [events[0]] * len(position)
     with Renderer(model, width, height, fine=fine) as renderer:
         angles = renderer.spins * turned
         cameras: Sequence[str | mujoco.MjvCamera] = [camera] * len(position)
@@ -142,7 +144,7 @@ def render_trajectory(
                 values = flight_lines(*moment, strength[k] if windy else None)
                 shares = flight.rotor_speed[k] / flight.max_rotor_speed
                 end = flight.outcome if k == last else ""
-                panel.draw(picture, [*values.values()], shares, flight.qpos[k, 3:], end)
+                panel.draw(picture, [*values.values()], shares, flight.qpos[k, 3:], end, events[k])
             for _ in same:
                 yield picture
 

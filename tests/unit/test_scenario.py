@@ -30,6 +30,7 @@ EVERYTHING = {
     "aerodynamics": "full",
     "weather": "light",
     "randomization": {"mass": (0.9, 1.1), "noise": {"position": 0.01}},
+    "events": {"battery": {"charge": 0.9}},
     "observe": {"action_history": 2},
     "control_mode": "velocity",
     "engine": "free_flight",

@@ -94,7 +94,8 @@ static int effects_of(const Aircraft* a, int rotors, const double low[LANES]) {
 
 // Addresses of the rows of a simulation. qpos (7), qvel (6), act, ctrl (one per rotor), warm (6,
 // MuJoCo's warm start, cleared) and air (AIR: wind [m/s, world], noise of the rotors' thrust) of
-// aircraft i are at i * stride doubles. parameters: with block = 0 a row for all, an Aircraft of
+// aircraft i are at i * stride doubles. ceiling: the
+// largest commands that the rotors take, side by side. parameters: with block = 0 a row for all, an Aircraft of
 // one lane; else those of aircraft i..i+LANES-1 side by side at i / LANES * block doubles, an
 // Aircraft without the rotors that there are not. rotors: the number that all have, at most
 // MAX_ROTORS. world: NULL where MuJoCo flies them all, and then parameters are not looked at.
@@ -102,7 +103,7 @@ static int effects_of(const Aircraft* a, int rotors, const double low[LANES]) {
 // of each. Filled by quadrl/engines.
 typedef struct {
   double *qpos, *qvel, *act, *ctrl, *warm;
-  const double *air, *parameters;
+  const double *air, *ceiling, *parameters;
   const World* world;
   char* near;  // one per aircraft
   const Solid* solids;

@@ -82,20 +82,22 @@ static void call(const Function* f, const Lanes* x, Lanes* y, int filled) {
   }
 }
 
-// Commands the rotors of a block for the next physics steps, from the motion or from the setpoint.
+// Commands the rotors of a block for the next physics steps, from the motion or from the setpoint,
+// within their ceiling; the mean is of what is wanted.
 static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean, Lanes* x) {
   const int rotors = (int)s->rows->rotors, motion = SPEED + rotors;
-  if (!s->loops) {
-    for (int k = 0; k < rotors; ++k) {
-      for (int i = 0; i < LANES; ++i) mean[k][i] = b->s.command[k][i] = setpoint[k][i];
-    }
-    return;
+  if (s->loops) {
+    memcpy(x, b->m, motion * sizeof(Lanes));
+    memcpy(x + motion, setpoint, s->begin->given * sizeof(Lanes));
+    call(s->command, (const Lanes*)x, b->s.command, b->filled);
   }
-  memcpy(x, b->m, motion * sizeof(Lanes));
-  memcpy(x + motion, setpoint, s->begin->given * sizeof(Lanes));
-  call(s->command, (const Lanes*)x, b->s.command, b->filled);
   for (int k = 0; k < rotors; ++k) {
-    for (int i = 0; i < LANES; ++i) mean[k][i] += b->s.command[k][i] / s->substeps;
+    for (int i = 0; i < LANES; ++i) {
+      const double ceiling = s->rows->ceiling[b->row[i] * rotors + k];
+      const double wanted = s->loops ? b->s.command[k][i] : setpoint[k][i];
+      mean[k][i] = s->loops ? mean[k][i] + wanted / s->substeps : wanted;
+      b->s.command[k][i] = ceiling < wanted ? ceiling : wanted;
+    }
   }
 }
 

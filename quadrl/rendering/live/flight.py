@@ -81,7 +81,7 @@ class Flight:
 
         Args:
             controller: A `Policy`, or any function of observations.
-            scenario: What is flown. Where its weather is not calm, the spectator's wind is ignored.
+            scenario: What is flown. Where it is not calm, the spectator's wind is ignored.
             num_envs: N, at most MAX_AIRCRAFT.
             seed: Row i has the seed `seed + i`.
 
@@ -131,7 +131,7 @@ class Flight:
     def step(self) -> None:
         """Fly one control step in the wind that is set, and begin anew the episodes that end."""
         environment, timestep = self.environment, self.vehicle.control_timestep
-        if self.scenario.weather.calm:
+        if self.scenario.calm:
             environment.engine.wind[:] = self.wind
         done = environment.step(np.clip(self._act(self._observation), -1.0, 1.0))
         self._observation = np.array(environment.flatten(done.observation))

@@ -34,6 +34,8 @@ def html(flight: Flight, row: int) -> str:
         "return": f"{flight.total[row]:.0f}",
         "episodes": f"{flight.episodes}, {flight.successes} successful",
     }
+    if events := flight.environment.happening(row):
+        lines["events"] = events
     table = "".join(LINE.format(CELL.format(*pair)) for pair in lines.items())
     bars = []
     for k, rotor in enumerate(flight.vehicle.rotors):
