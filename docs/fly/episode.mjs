@@ -2,7 +2,9 @@
 //
 // What happens from outside is a list of events { step, kind, values }, by the control step that
 // they come before. A push changes the velocity (world frame) and the body rates (body frame); a
-// wind event sets the mean wind (world frame) and the standard deviation of the gusts.
+// wind event sets the mean wind (world frame) and the standard deviation of the gusts; a rotor
+// event leaves a rotor, numbered from 1 on, a share of its largest speed; a payload is a share of
+// the aircraft's mass, and 0 drops it.
 
 import { Flight } from "./flight.mjs";
 
@@ -55,6 +57,8 @@ export class Episode {
     if (action) this.past[0].action = action;
     for (const { kind, values } of this.events.filter((event) => event.step === this.steps)) {
       if (kind === "push") values.forEach((value, k) => (flight.qvel[k] += value));
+      else if (kind === "rotor") flight.weaken(...values);
+      else if (kind === "payload") flight.load(...values);
       else this.air = { mean: values.slice(0, 3), deviation: values[3] };
     }
     this.#blow();

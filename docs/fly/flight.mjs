@@ -53,7 +53,7 @@ export class Flight {
     new Float64Array(kernel.functions.memory.buffer, this.memory, book.flightSize).fill(0);
     const motion = ["qpos", "qvel", "act", "ctrl", "wind"];
     const seen = ["observation", "felt", "share", "modelled", "aim"];
-    for (const part of [...motion, ...seen, "action", "scale", "given", "drawn"]) {
+    for (const part of [...motion, ...seen, "action", "scale", "given", "drawn", "flown", "ceiling"]) {
       this[part] = kernel.view(slot, part);
     }
     this.keys = kernel.view(slot, "keys", BigInt64Array);
@@ -66,7 +66,7 @@ export class Flight {
     const { rotors } = this.vehicle;
     this.scale[0] = this.vehicle.actionScale;
     this.estimates = false; // whether the rotor speeds that are seen follow from the commands
-    const flown = "qpos qvel act ctrl warm wind parameters world near solids nearby";
+    const flown = "qpos qvel act ctrl warm wind ceiling flown world near solids nearby";
     this.#point("flight_rows", flown, [0, 0, rotors, 0]);
     this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, rotors]);
   }
@@ -98,6 +98,8 @@ export class Flight {
     this.call("begin");
     this.diverged[0] = 0;
     this.wind.fill(0);
+    this.flown.set(this.vehicle.row);
+    this.ceiling.fill(Infinity);
     this.first();
   }
 
@@ -124,11 +126,22 @@ export class Flight {
     return this.kernel.functions.quadrl_free_flight(rows, 0n, ONE, BigInt(steps)) === 0n;
   }
 
+  // Leaves a rotor, numbered from 1 on, a share of its largest speed.
+  weaken(rotor, left) {
+    this.ceiling[rotor - 1] = left * this.vehicle.maxSpeed[rotor - 1];
+  }
+
+  // Lets it carry a share of its mass at its centre of mass.
+  load(share) {
+    const place = this.kernel.book.massPlace;
+    this.flown[place] = (1 + share) * this.vehicle.row[place];
+  }
+
   // Flies a physics step with the commands of the aircraft's dead time ago; whether as `advance`.
   tick() {
     const command = this.ctrl.slice();
     this.late.push(command);
-    this.ctrl.set(this.late.shift());
+    this.ctrl.set(this.late.shift().map((wanted, k) => Math.min(wanted, this.ceiling[k])));
     const clear = this.advance();
     this.ctrl.set(command);
     return clear;

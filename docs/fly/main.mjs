@@ -13,6 +13,8 @@ const RATES = [0.25, 0.5, 1, 2];
 const LONGEST_FRAME = 0.25; // [s]; a page that was hidden does not catch up
 const TUMBLE = 0.35; // of the largest body rate that stays resolved, at most TUMBLE_MOST
 const TUMBLE_MOST = 6; // [rad/s]
+// What lasts, where nothing happens: the wind and its gusts; the slider's rotor and what is left of it; the payload.
+const CALM = { wind: [0, 0, 0, 0], rotor: [1, 1], payload: [0] };
 const LABELS = {
   ppo: "PPO", trpo: "TRPO", gae: "Policy gradient", vpg: "Policy gradient", apg: "APG", robust: "Robust",
 };
@@ -63,7 +65,7 @@ class Page {
     }
     if (strange.length) this.say(`Not understood in the link: ${strange.join(", ").slice(0, 80)}.`);
     this.orbit.distance = this.#distance();
-    this.showWind();
+    this.showSliders();
   }
 
   get vehicle() {
@@ -110,16 +112,15 @@ class Page {
     this.showSettings();
   }
 
-  // The same episode from its start: in the present wind, or with everything that happened in it.
+  // The same episode from its start: as the sliders are, or with everything that happened in it.
   again(replayed = false) {
-    const wind = this.wind();
+    const lasting = Object.keys(CALM).map((kind) => ({ step: 0, kind, values: this.set(kind) }));
     this.settings.at = 0;
     if (!replayed) {
-      const blows = wind.some((x) => x !== 0);
-      this.settings.events = blows ? [{ step: 0, kind: "wind", values: wind }] : [];
+      this.settings.events = lasting.filter(({ kind, values }) => values.some((x, k) => x !== CALM[kind][k]));
     }
     this.begin();
-    this.showWind();
+    this.showSliders();
     this.pause(false);
     this.remember();
   }
@@ -148,7 +149,7 @@ class Page {
   event(kind, values) {
     const { step } = this, { events } = this.settings;
     const last = events.at(-1);
-    if (kind === "wind" && last?.kind === "wind" && last.step === step) events.pop();
+    if (kind !== "push" && last?.kind === kind && last.step === step) events.pop();
     events.push({ step, kind, values: rounded(values) });
     this.remember();
   }
@@ -167,16 +168,22 @@ class Page {
     this.event("push", [0, 0, 0, rate * Math.cos(angle), rate * Math.sin(angle), 0]);
   }
 
-  // Mean wind (3) and deviation of the gusts, as the sliders say.
-  wind() {
+  // The values of an event that lasts, as the sliders say.
+  set(kind) {
+    if (kind === "rotor") return [1, Number(at("rotor").value)];
+    if (kind === "payload") return [Number(at("payload").value)];
     const speed = Number(at("wind").value), from = (Number(at("bearing").value) * Math.PI) / 180;
     return rounded([speed * Math.cos(from), speed * Math.sin(from), 0, Number(at("gusts").value)]);
   }
 
-  // Sets the sliders to the wind of the link at this moment.
-  showWind() {
-    const past = ({ kind, step }) => kind === "wind" && step <= this.step;
-    const [east, north, , gusts] = this.settings.events.filter(past).at(-1)?.values ?? [0, 0, 0, 0];
+  // Sets the sliders to what the link says of this moment.
+  showSliders() {
+    const past = this.settings.events.filter(({ step }) => step <= this.step);
+    const last = (kind) => past.findLast((event) => event.kind === kind && (kind !== "rotor" || event.values[0] === 1));
+    const values = (kind) => last(kind)?.values ?? CALM[kind];
+    const [east, north, , gusts] = values("wind");
+    at("rotor").value = values("rotor")[1];
+    at("payload").value = values("payload")[0];
     at("wind").value = Math.hypot(east, north);
     at("bearing").value = ((Math.atan2(north, east) * 180) / Math.PI + 360) % 360;
     at("gusts").value = gusts;
@@ -283,6 +290,9 @@ class Page {
     for (const name of ["wind", "gusts", "push"]) {
       at(`${name}-value`).textContent = `${Number(at(name).value).toFixed(1)} m/s`;
     }
+    for (const name of ["rotor", "payload"]) {
+      at(`${name}-value`).textContent = `${(100 * Number(at(name).value)).toFixed(0)} %`;
+    }
     at("bearing-value").textContent = `${Number(at("bearing").value).toFixed(0)}°`;
     pressed("rate", this.rate);
   }
@@ -379,9 +389,10 @@ class Page {
         currentTarget.blur();
       };
     }
-    for (const id of ["wind", "bearing", "gusts"]) {
+    const sliders = { wind: "wind", bearing: "wind", gusts: "wind", rotor: "rotor", payload: "payload" };
+    for (const [id, kind] of Object.entries(sliders)) {
       at(id).oninput = () => this.showValues();
-      at(id).onchange = () => this.event("wind", this.wind());
+      at(id).onchange = () => this.event(kind, this.set(kind));
     }
     at("push").oninput = () => this.showValues();
     const keys = {

@@ -43,7 +43,8 @@ from quadrl.core.transition import Clock, Episode, Observation, Transition, begi
 from quadrl.engines.state import FIRST, State
 
 PARTS = {
-    "parameters": ROW_SIZE,  # the aircraft's row
+    "parameters": ROW_SIZE,  # the aircraft's row, as it is specified
+    "flown": ROW_SIZE,  # the one that flies: the same, with what happens to it
     "limits": 2,  # its largest speed [m/s] and spin [rad/s]: as in `Rows` of state.c
     "world": 4,  # physics step [s], gravity along z [m/s^2], floor and reach [m]: `World` of C
     "origin": 3,  # of the task's frame [m], world
@@ -54,6 +55,7 @@ PARTS = {
     "ctrl": MAX_ROTORS,
     "warm": 6,
     "wind": AIR,
+    "ceiling": MAX_ROTORS,  # largest commands [rad/s]
     "state": FIRST["rotor_speed"] + MAX_ROTORS,  # as native/state.c fills it
     "kept": 64,  # what the task remembers, the distances, how far the episode is
     "action": MAX_ROTORS,

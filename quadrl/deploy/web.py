@@ -115,6 +115,7 @@ def make_book() -> tuple[dict[str, Any], str]:
         "layout": {name: [flights.LAYOUT[name], size] for name, size in flights.PARTS.items()},
         "flightSize": flights.SIZE,
         "startStream": START,
+        "massPlace": int(parameters.PLACES["mass"][0]),
         "gustTime": GUST_TIME,
         "smoothing": Disturbance.smoothing,
         "policy": {"format": FORMAT, "header": HEADER, "clip": CLIP},

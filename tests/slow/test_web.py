@@ -105,13 +105,13 @@ def test_policies_act_as_in_python(node):
         np.testing.assert_allclose(found, action, rtol=0, atol=1e-5)
 
 
-def fly(task, vehicle, controller, events=(), steps=200, **settings):
+def fly(task, vehicle, controller, pushes=(), steps=200, **settings):
     """The flight in Python: what each control step saw, did and gave."""
     environment, observation = begun(task, vehicle, 3, **settings)
     engine, flown = environment.engine, []
     for step in range(steps):
         seen, action = observation[0], np.asarray(controller(observation))
-        for event in (event for event in events if event["step"] == step):
+        for event in (event for event in pushes if event["step"] == step):
             if event["kind"] == "push":
                 engine.qvel[0] += event["values"]
             else:
@@ -151,6 +151,21 @@ PUSHES = [
     {"step": 20, "kind": "wind", "values": [1.5, -0.5, 0.0, 0.0]},
     {"step": 40, "kind": "push", "values": [0.8, -0.4, 0.2, 1.0, -2.0, 0.0]},
 ]
+
+
+def test_what_happens_to_an_aircraft_is_what_happens_in_python(node):
+    step, events = VEHICLES["paper"].control_timestep, []
+    for at, kind, *values in ((0, "payload", 0.2), (30, "payload", 0.0), (60, "rotor", 2, 0.6)):
+        events.append({"step": at, "kind": kind, "values": values})
+    happening = {"payload": {"mass": 0.2, "at": 30 * step}}
+    happening["rotor_failure"] = {"rotor": 2, "left": 0.6, "at": 60 * step}
+    policy = Policy.load(SHIPPED / f"{TRAINED}.safetensors")
+    expected = fly("hover", "paper", policy, events=happening)
+    _, differences = compared(node, expected, "hover", "paper", TRAINED, events)
+    assert differences["coordinates"] < 1e-5 and differences["observation"] < 1e-5
+    # And it is seen: neither flight is the undisturbed one.
+    calm = fly("hover", "paper", policy)
+    assert abs(expected[10]["error"] - calm[10]["error"]) > 0.01
 
 
 @pytest.mark.parametrize("events", ([], PUSHES), ids=("calm", "pushed"))
@@ -257,10 +272,12 @@ def test_files_that_cannot_fly_are_refused(node, tmp_path):
 
 def test_a_link_keeps_the_settings(node):
     settings = {"task": "static_waypoint", "aircraft": "racer", "left": "static_waypoint_ppo"}
-    settings |= {"right": "geometric", "seed": 12, "at": 34, "events": PUSHES}
+    others = [{"step": 9, "kind": "rotor", "values": [3, 0.5]}]
+    others.append({"step": 9, "kind": "payload", "values": [0.25]})
+    settings |= {"right": "geometric", "seed": 12, "at": 34, "events": PUSHES + others}
     (found,) = node(dict(job="link", settings=settings))
     assert found == settings
-    wrong = "#task=constructor&aircraft=%3Cb%3E&seed=-1&at=1e99&events=push@1:1;wind@x:1,2,3,4"
+    wrong = "#task=constructor&aircraft=%3Cb%3E&seed=-1&at=1e99&events=push@1:1;wind@x:1,2,3,4;payload@1:-2"
     (found,) = node(dict(job="open", fragment=wrong))
     assert found == {"task": "hover", "aircraft": "paper", "left": "", "right": "geometric",
                      "seed": 0, "at": 20000, "events": []}  # fmt: skip
