@@ -277,7 +277,8 @@ def test_a_link_keeps_the_settings(node):
     settings |= {"right": "geometric", "seed": 12, "at": 34, "events": PUSHES + others}
     (found,) = node(dict(job="link", settings=settings))
     assert found == settings
-    wrong = "#task=constructor&aircraft=%3Cb%3E&seed=-1&at=1e99&events=push@1:1;wind@x:1,2,3,4;payload@1:-2"
+    wrong = "#task=constructor&aircraft=%3Cb%3E&seed=-1&at=1e99"
+    wrong += "&events=push@1:1;wind@x:1,2,3,4;payload@1:-2"
     (found,) = node(dict(job="open", fragment=wrong))
     assert found == {"task": "hover", "aircraft": "paper", "left": "", "right": "geometric",
                      "seed": 0, "at": 20000, "events": []}  # fmt: skip
