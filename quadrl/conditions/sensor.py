@@ -17,7 +17,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SENSORS as STREAMS
 from quadrl.base.rotation import Array
 from quadrl.base.validation import IN_A_FILE, choice, number, record, registered, whole_steps
-from quadrl.conditions.event import Events
+from quadrl.conditions.event_process import Events
 from quadrl.conditions.randomization import LONGEST_DELAY
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.engines import native

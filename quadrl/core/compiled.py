@@ -182,14 +182,11 @@ class CompiledStep(Step):
             return None
         return struct, self._tables.places_of(function)
 
-    @property
-    def flies(self) -> bool:
-        """Whether it flies, too, and is not only the task's part."""
-        return self.engine.flies_free
-
-    def fly(self) -> None:
-        """Command and fly the aircraft through a control step."""
+    def fly(self) -> bool:
+        """Command and fly the aircraft through a control step; False where that is not its part."""
         engine = self.engine
+        if engine.name != "free_flight":
+            return False
         self._turn()
         if self._call(None, BEGINS | self._ends, self._substeps):
             marked = np.flatnonzero(engine.near)
@@ -200,6 +197,7 @@ class CompiledStep(Step):
                 engine.passed(self._held)
         self._flown = True
         engine.take_turn()
+        return True
 
     def _land(self, left: np.ndarray) -> np.ndarray:
         """Fly aircraft (n,) that may touch something; return those that have diverged."""

@@ -21,7 +21,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SOLIDS, Seed
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array
-from quadrl.conditions.event import Events, scales
+from quadrl.conditions.event_process import Events, scales
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import NONE
 from quadrl.conditions.randomizer import Randomizer
@@ -358,13 +358,13 @@ class Environment(saving.Copied):
                 reward that is not finite.
             RuntimeError: There was no reset before.
         """
-        if self._begun.flies and not self._parted:
-            self._accept(action)
-            self._begun.fly()
+        begun = self._begun
+        self._accept(action)
+        if not self._parted and begun.fly():
             if self.observer:
                 self.observer.follow(self._inputs.command, self.vehicle.control_timestep)
             return self.finish()
-        self.begin(action)
+        self._command()
         for steps in self.commands():
             self.engine.advance(steps)
         return self.finish()
@@ -398,6 +398,9 @@ class Environment(saving.Copied):
     def begin(self, action: Array) -> None:
         """Do the first half of a step: command the rotors, or set the setpoint of the loops."""
         self._accept(action)
+        self._command()
+
+    def _command(self) -> None:
         taken, command = self._inputs.action, self._inputs.command
         if self.autopilot:
             command[:] = 0.0

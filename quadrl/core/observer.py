@@ -11,7 +11,7 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
-from quadrl.conditions.event import Events
+from quadrl.conditions.event_process import Events
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.process import Process
 from quadrl.conditions.randomizer import Randomizer

@@ -38,9 +38,7 @@ class Step(abc.ABC):
     clock: Clock  # of its episodes
     engine: Engine  # of the aircraft
     inputs: Inputs  # read live
-    estimate: (
-        EstimatedState | None
-    )  # table of the state that is observed, read live; None for the true one
+    estimate: EstimatedState | None  # the state that is observed, live; None for the true one
     scene: Scene  # the solids in the world
     loops: bool  # whether commands change with each physics step
     snapshot: Snapshot = dataclasses.field(init=False)
@@ -59,14 +57,9 @@ class Step(abc.ABC):
         """
         return None
 
-    @property
-    def flies(self) -> bool:
-        """Whether it flies, too, and is not only the task's part."""
+    def fly(self) -> bool:
+        """Command and fly the aircraft through a control step; False where that is not its part."""
         return False
-
-    def fly(self) -> None:
-        """Command and fly the aircraft through a control step."""
-        raise NotImplementedError
 
     @abc.abstractmethod
     def read(self) -> np.ndarray | None:

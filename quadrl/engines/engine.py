@@ -99,9 +99,10 @@ class Engine(abc.ABC):
         library = native.library()
         self._step = library.quadrl_step
         self._kernel, self._first_unsound = library.quadrl_state, library.quadrl_unsound_air
-        self._limits = parameters.limits(self.parameters)
-        arrays = (self.qpos, self.qvel, self.act, self.origin, self._limits, self.air)
-        stride = self._limits.shape[1] if len(self._limits) > 1 else 0
+        self.limits = parameters.limits(self.parameters)
+        """Largest speed [m/s] and body rate [rad/s] of each aircraft, (N or 1, 2), live."""
+        arrays = (self.qpos, self.qvel, self.act, self.origin, self.limits, self.air)
+        stride = self.limits.shape[1] if len(self.limits) > 1 else 0
         sizes = stride, self.frames[0].columns, vehicle.rotor_count
         # As `Rows` in native/state.c.
         self._rows = native.struct(*arrays, self.qpos.strides[0] // 8, *sizes)
@@ -121,16 +122,6 @@ class Engine(abc.ABC):
             self._behind = False
         return self.frames[0].state
 
-    @property
-    def limits(self) -> np.ndarray:
-        """Largest speed [m/s] and body rate [rad/s] of each aircraft, (N or 1, 2), live."""
-        return self._limits
-
-    @property
-    def flies_free(self) -> bool:
-        """Whether free flight flies the aircraft that can touch nothing."""
-        return self._free_flight is not None
-
     @functools.cached_property
     def near(self) -> np.ndarray:
         """Marks (N,) int8 of a control step in C: left to MuJoCo, or broken."""
@@ -144,10 +135,8 @@ class Engine(abc.ABC):
             return self._free_flight.rows
         self._kept = parameters.numbers(self.parameters[:1])
         fields = self.qpos, self.qvel, self.act, self.ctrl, None, self.air, self.ceiling
-        return native.struct(*fields, self._kept, None, self.near, None, None, *self._row_sizes())
-
-    def _row_sizes(self) -> tuple[int, ...]:
-        return self.qpos.strides[0] // 8, 0, self.vehicle.rotor_count, 0
+        sizes = self.qpos.strides[0] // 8, 0, self.vehicle.rotor_count, 0
+        return native.struct(*fields, self._kept, None, self.near, None, None, *sizes)
 
     def command(self, wanted: np.ndarray) -> None:
         """Command the rotors, (N, R) [rad/s], within the ceiling."""
@@ -207,7 +196,7 @@ class Engine(abc.ABC):
         self._model_field("site_pos")[np.ix_(rows, self.model.actuator_trnid[:, 0])] = rotor[
             "position"
         ]
-        self._limits[rows] = parameters.limits(table)
+        self.limits[rows] = parameters.limits(table)
         if self._free_flight is not None:
             self._free_flight.write(rows, table)
 
@@ -278,8 +267,8 @@ class Engine(abc.ABC):
             return None
         table, last = (frame.table for frame in self.frames)
         sound = (np.abs(table) < mujoco.mjMAXVAL).all(axis=0)
-        sound &= table[FIRST["speed"]] <= self._limits[:, 0]
-        broken = ~(sound & (table[FIRST["angular_speed"]] <= self._limits[:, 1]))
+        sound &= table[FIRST["speed"]] <= self.limits[:, 0]
+        broken = ~(sound & (table[FIRST["angular_speed"]] <= self.limits[:, 1]))
         rows = np.flatnonzero(broken)
         table[:, rows] = last[:, rows]
         self._mend(rows, State.of_table(table[:, rows]))
@@ -373,7 +362,7 @@ class Engine(abc.ABC):
 
     def _check_start(self, rows: np.ndarray, start: Start, table: np.ndarray | None) -> None:
         """Refuse a start that the physics step does not resolve, by the rules of native/state.c."""
-        limits = self._limits if table is None else parameters.limits(table)
+        limits = self.limits if table is None else parameters.limits(table)
         limits = limits if len(limits) in (1, len(rows)) else limits[rows]
         most = np.array([mujoco.mjMAXVAL])
         step = f"a physics_timestep shorter than {self.vehicle.physics_timestep} s resolves more"

@@ -36,9 +36,8 @@ typedef struct {
 } Place;
 
 // What a control step reads and fills. motion: 7 of qpos, 6 of qvel and one per rotor of each
-// aircraft, at the end of this control step. setpoint, command: as many
-// numbers a row as the first function gives, and one per rotor [rad/s], the mean over the control
-// step. limits: largest speed [m/s] and body rate [rad/s] of aircraft i at i * limit_stride.
+// aircraft, at the end of this control step. setpoint, mean: as many numbers a row as the first
+// function gives, and one per rotor [rad/s], the mean of the commands over the control step. limits: largest speed [m/s] and body rate [rad/s] of aircraft i at i * limit_stride.
 // diverged: a byte a row. `finish` takes the motion, whether it has diverged, and what is at
 // `reads` places; it gives `kept` numbers for the table `out`, then as many as go to the table
 // `rest`, both with `columns` columns, and as the last ones BYTES flags. `reward` is the one in
