@@ -64,12 +64,16 @@ class Randomizer(Process):
         """For each physics step of a control step, how many steps can be flown at once: until a
         command changes or a motion has to be remembered."""
         self.active = active or self.late
-        length = 1 + max(most, self._aged)
+        # Long enough that a control step can be flown twice: see native/free_flight.c.
+        length = max(most, self._aged) + vehicle.substeps
         self.queue = np.zeros((length, count, rotors))  # [rad/s]
         self.past = np.zeros((length if self._aged else 0, count, 13))  # qpos, qvel before it
         self.newest = np.zeros(1, np.int64)  # where in both
         self._delay = np.zeros(count, np.int64)  # [physics steps]
         self._ages = np.zeros((len(AGES), count), np.int64)  # [physics steps]
+        late = self.queue, self.past if self._aged else None, self._delay, self.newest
+        self.rows = native.struct(*late, length, count)
+        """What is late, as `Late` in native/free_flight.c; the arrays stay where they are."""
 
     def sample(self, keys: np.ndarray, episodes: np.ndarray) -> Drawn:
         """Draw the numbers of episodes (n,); nothing changes yet.
@@ -128,7 +132,7 @@ class Randomizer(Process):
         step = self._engine.vehicle.physics_timestep
         names = "command_delay", *AGES
         steps = [np.rint(self.column(name) / step).astype(np.int64) for name in names]
-        self._delay, self._ages = self._dead + steps[0], np.array(steps[1:])
+        self._delay[:], self._ages[:] = self._dead + steps[0], steps[1:]
 
     def delayed(self, command: Array, steps: int) -> Array:
         """Queue a command (N, R) [rad/s] for some physics steps; return the one that arrives."""
@@ -144,6 +148,10 @@ class Randomizer(Process):
             self.past[first % length] = self._coordinates
         self.newest[0] = (first + steps - 1) % length
         return arrived
+
+    def passed(self) -> None:
+        """Count a control step whose commands were queued in C."""
+        self.newest[0] = (self.newest[0] + self._engine.vehicle.substeps) % len(self.queue)
 
     def aged(self) -> tuple[Array, Array]:
         """Coordinates of the drawn ages: as old as the motion, and as the body rate, (N, 13) each.
@@ -201,6 +209,7 @@ class Randomizer(Process):
 
     def restore(self, saved: Mapping[str, np.ndarray]) -> None:
         """Restore what `save` returned."""
+        self.drawn = self.drawn.copy()
         for name, value in saved.items():
-            setattr(self, name, np.array(value))
+            getattr(self, name)[:] = value
         self._set_delay()

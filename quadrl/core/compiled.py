@@ -14,7 +14,7 @@ import contextlib
 import functools
 import warnings
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -33,8 +33,8 @@ from quadrl.core.task import Task
 from quadrl.core.transition import Episode, Observation, Transition
 from quadrl.engines import native
 
-BEGINS, ENDS, FINISHES = 1, 2, 4
-"""Parts of a control step, and LEFT, BROKEN, why an aircraft is marked: as in
+ENDS, FINISHES = 1, 2
+"""Parts of a control step after its physics, and LEFT, BROKEN, why an aircraft is marked: as in
 native/free_flight.c."""
 LEFT, BROKEN = 1, 2
 MARKED = (1 << 32) - 1
@@ -123,7 +123,7 @@ class CompiledStep(Step):
                 compiler.
         """
         world = written.inputs, written.estimate, written.scene, written.loops
-        super().__init__(written.task, written.clock, written.engine, *world)
+        super().__init__(written.task, written.clock, written.engine, *world, written.randomizer)
         self._parameters, engine = now.parameters, self.engine
         self._program = program = Program(written, now, episode, parameters)
         functions, estimate = Laws(mode, engine).functions(), self.estimate
@@ -136,7 +136,6 @@ class CompiledStep(Step):
         alone = not (estimate or program.sensed.end)
         self._ends = ENDS | (FINISHES if alone else 0)
         self._substeps = engine.vehicle.substeps
-        self._held = 1 if self.loops else self._substeps
         self._into = 0  # the page that the present step fills
         self._flown = False
         self._broken: np.ndarray | None = None
@@ -188,13 +187,14 @@ class CompiledStep(Step):
         if engine.name != "free_flight":
             return False
         self._turn()
-        if self._call(None, BEGINS | self._ends, self._substeps):
+        if self._call(None, self._ends, 0, self._substeps):
             marked = np.flatnonzero(engine.near)
             kinds = engine.near[marked]
             self._mend(np.concatenate([marked[kinds == BROKEN], self._land(marked[kinds == LEFT])]))
         else:
-            for _ in range(0, self._substeps, self._held):
-                engine.passed(self._held)
+            for first, end in self._pieces():
+                engine.passed(end - first)
+        self.randomizer.passed()
         self._flown = True
         engine.take_turn()
         return True
@@ -203,18 +203,24 @@ class CompiledStep(Step):
         """Fly aircraft (n,) that may touch something; return those that have diverged."""
         if not len(left):
             return left
-        for flown in range(0, self._substeps, self._held):
-            if self._call(left, 0 if flown else BEGINS, self._held):
-                self.engine.touch(left[self.engine.near[left] != 0], self._held)
+        for first, end in self._pieces():
+            if self._call(left, 0, first, end):
+                self.engine.touch(left[self.engine.near[left] != 0], end - first)
             else:
-                self.engine.passed(self._held)
-        self._call(left, self._ends, 0)
+                self.engine.passed(end - first)
+        self._call(left, self._ends)
         return left[self.engine.near[left] == BROKEN]
 
-    def _call(self, rows: np.ndarray | None, parts: int, steps: int) -> int:
-        """Do parts of a control step of some aircraft; how many are marked."""
+    def _pieces(self) -> Iterator[tuple[int, int]]:
+        """The physics steps that are flown at once: the first one, and the one after the last."""
+        first = 0
+        while first < self._substeps:
+            yield first, (first := first + int(self._tables.held[first]))
+
+    def _call(self, rows: np.ndarray | None, parts: int, first: int = 0, end: int = 0) -> int:
+        """Do physics steps and parts of a control step of some aircraft; how many are marked."""
         step = self._tables.steps[self._into].ctypes.data
-        return self.engine.control_step(step, rows, parts, steps) & MARKED
+        return self.engine.control_step(step, rows, parts, first, end) & MARKED
 
     def _turn(self) -> None:
         """Let the present step fill the other page."""
@@ -230,13 +236,13 @@ class CompiledStep(Step):
         self._broken[broken] = True
         self.note_diverged(broken)
         if self._ends & FINISHES:
-            self._call(broken, FINISHES, 0)
+            self._call(broken, FINISHES)
 
     def read(self) -> np.ndarray | None:
         """Take the motion at the end of a control step; which aircraft have diverged, or None."""
         if not self._flown:
             self._turn()
-            if self._call(None, self._ends, 0):
+            if self._call(None, self._ends):
                 self._mend(np.flatnonzero(self.engine.near))
             self.engine.take_turn()
         self._flown, (broken, self._broken) = False, (self._broken, None)
@@ -251,7 +257,7 @@ class CompiledStep(Step):
             # A reset since the last step has given its rows what the sensors show then.
             tables.take(self._present.sensed, self._present.around, last)
             tables.take(sensed, around, page)
-            self._call(None, FINISHES, 0)
+            self._call(None, FINISHES)
         self._show(page, sensed, around)
         self._observation = page.observation.copy()
         *terms, reward, error = self._rest[:-1, :count]

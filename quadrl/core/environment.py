@@ -141,7 +141,7 @@ class Environment(saving.Copied):
         self._plain &= not self.weather.wind_speed
         """Whether an episode begins as the task says, and nothing else begins with it."""
         follows = self.observer is not None and self.control_mode.has_loops
-        self._parted = self.randomizer.late or self._solids_move or follows
+        self._parted = self._solids_move or follows
         """Whether Python acts within a control step."""
         acting = self.randomizer, self.blowing, self.events, self.observer
         self._processes = [process for process in acting if process]
@@ -340,7 +340,8 @@ class Environment(saving.Copied):
         if self._step is None:
             estimate = self.observer.frame if self.observer else None
             world = self.engine, self._inputs, estimate, self.scene
-            written = WrittenStep(self.task, self._clock, *world, self.control_mode.has_loops)
+            world = *world, self.control_mode.has_loops, self.randomizer
+            written = WrittenStep(self.task, self._clock, *world)
             self._step = compiled(written, now, episode, self._rows, self.control_mode)
         self._step.begin(now, episode)
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from quadrl.base import records
+from quadrl.conditions.randomizer import Randomizer
 from quadrl.conditions.scene import Scene
 from quadrl.conditions.sensor import EstimatedState
 from quadrl.core import transition
@@ -41,6 +42,7 @@ class Step(abc.ABC):
     estimate: EstimatedState | None  # the state that is observed, live; None for the true one
     scene: Scene  # the solids in the world
     loops: bool  # whether commands change with each physics step
+    randomizer: Randomizer  # says which of them are late
     snapshot: Snapshot = dataclasses.field(init=False)
     """What tasks see now: live, valid until the next step."""
     episode: Episode = dataclasses.field(init=False)

@@ -16,7 +16,7 @@ from quadrl.engines.engine import Engine
 from quadrl.engines.rowwise import RowFunction
 from quadrl.engines.state import padded
 
-REST = 12
+REST = 14
 """Index of `rest` in `Step` of native/free_flight.c; `flags` follows."""
 Place = tuple[int, int, int]
 """Address of a number of the first row, stride between rows, and which one it is."""
@@ -75,7 +75,10 @@ class Tables:
         structs = [function.struct() for function in made]
         sizes = inputs.action.shape[1], limits.shape[1] if len(limits) > 1 else 0
         sizes = *sizes, program.seen.end, len(program.rewarded), self.columns
-        more = program.written.loops, engine.vehicle.substeps
+        loops, randomizer = program.written.loops, program.written.randomizer
+        more, late = (loops, engine.vehicle.substeps), randomizer.rows if randomizer.late else None
+        self.held = np.array([1] * len(randomizer.held) if loops else randomizer.held)
+        """For each physics step of a control step, how many are flown at once from there on."""
         self.steps: list[np.ndarray] = []
         """A `Step` of native/free_flight.c for each page."""
         self._alive: list[object] = [made, structs, setpoint, engine.rows]  # C has the addresses
@@ -83,7 +86,8 @@ class Tables:
             places = self._places(turn, inputs, estimate)
             flown = inputs.action, limits, engine.motions[turn], setpoint, inputs.command
             filled = inputs.diverged, places, page.whole, None, None, len(places)
-            step = native.struct(engine.rows, *structs, *flown, *filled, *sizes, *more)
+            about = engine.rows, late, self.held
+            step = native.struct(*about, *structs, *flown, *filled, *sizes, *more)
             self.steps.append(step)
             self._alive.append(places)
         self._wanted = self._read_of_sensed()

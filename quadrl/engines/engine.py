@@ -142,21 +142,25 @@ class Engine(abc.ABC):
         """Command the rotors, (N, R) [rad/s], within the ceiling."""
         np.minimum(wanted, self.ceiling, out=self.ctrl)
 
-    def control_step(self, step: int, rows: np.ndarray | None, parts: int, steps: int) -> int:
+    def control_step(
+        self, step: int, rows: np.ndarray | None, parts: int, begin: int, end: int
+    ) -> int:
         """Call `quadrl_step` of native/free_flight.c.
 
         Args:
             step: Address of its `Step`.
             rows: Which aircraft, (n,) int64; None for all.
             parts: Which parts of the control step.
-            steps: Physics steps.
+            begin: The first of the physics steps.
+            end: The one after the last of them.
 
         Returns:
             As it does.
         """
         if rows is not None:
-            return self._step(step, rows.ctypes.data, 0, len(rows), parts, steps)
-        return self._threads.call(lambda at, end: self._step(step, None, at, end, parts, steps))
+            return self._step(step, rows.ctypes.data, 0, len(rows), parts, begin, end)
+        done = parts, begin, end
+        return self._threads.call(lambda at, last: self._step(step, None, at, last, *done))
 
     def show(self, rows: np.ndarray) -> None:
         """Let the state of aircraft (n,) be that of their motion, which was replaced."""

@@ -74,14 +74,17 @@ def test_histories_are_those_of_the_flight_the_newest_first():
 def test_each_part_of_the_estimate_is_as_old_as_is_drawn_for_each_row(engine, mode):
     given = {"observation_delay": (0.0, 0.07), "rate_delay": (0.01, 0.03)}
     settings = {"engine": engine, "control_mode": mode, "randomization": given}
-    environment = helpers.begun("hover", 30, **settings)
-    flown, log, rows = environment.engine, [], np.arange(30)
-    advance = flown.advance
-    flown.advance = lambda steps: (advance(steps), log.append(helpers.coordinates(flown)))[0]
-    log.append(helpers.coordinates(flown))
+    environment, twin = (helpers.begun("hover", 30, **settings) for _ in range(2))
+    flown, log, rows = environment.engine, [helpers.coordinates(twin.engine)], np.arange(30)
     begun = np.zeros(30, int)
     for action in helpers.random_actions(9, 30, environment.action_size):
         environment.step(action)
+        twin.begin(action)  # the same in parts, which show each physics step
+        for steps in twin.commands():
+            twin.engine.advance(steps)
+            log.append(helpers.coordinates(twin.engine))
+        twin.finish()
+        np.testing.assert_array_equal(helpers.coordinates(flown), log[-1])
         drawn = environment.randomizer.shown()
         for name, parts in {
             "observation_delay": {"position": (0, 3), "quaternion": (3, 7), "velocity": (7, 10)},
@@ -96,6 +99,7 @@ def test_each_part_of_the_estimate_is_as_old_as_is_drawn_for_each_row(engine, mo
         np.testing.assert_array_equal(environment.observer.frame.state.rotor_speed, flown.act)
         if len(log) == 21:
             environment.reset(rows % 3 == 0)
+            twin.reset(rows % 3 == 0)
             log[-1], begun[::3] = helpers.coordinates(flown), 20
     assert len(log) == 46  # every physics step was seen
 

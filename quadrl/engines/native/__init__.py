@@ -44,7 +44,7 @@ _KERNELS = {
     "unsound_air": (_INTEGER, _POINTER, _INTEGER),
     "clearance": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER),
     "free_flight": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _INTEGER),
-    "step": (_INTEGER, _POINTER, _POINTER, *[_INTEGER] * 4),
+    "step": (_INTEGER, _POINTER, _POINTER, *[_INTEGER] * 5),
     "begin": (
         *(_INTEGER, _POINTER, _POINTER, _POINTER, _INTEGER, _POINTER, _INTEGER),
         *(_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER),

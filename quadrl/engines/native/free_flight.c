@@ -35,16 +35,29 @@ typedef struct {
   int64_t stride, number;
 } Place;
 
+// Commands that arrive late, and motions that are remembered. queue: commands of the last `length`
+// physics steps, one per rotor of each of `rows` aircraft, the newest at `newest`; past: as many
+// motions (qpos, qvel), each of before its step, or NULL. delay: of each aircraft, in physics steps;
+// less than `length` by the physics steps of a control step. Filled by quadrl/conditions.
+typedef struct {
+  double *queue, *past;
+  const int64_t *delay, *newest;
+  int64_t length, rows;
+} Late;
+
 // What a control step reads and fills. motion: 7 of qpos, 6 of qvel and one per rotor of each
 // aircraft, at the end of this control step. setpoint, mean: as many numbers a row as the first
 // function gives, and one per rotor [rad/s], the mean of the commands over the control step. limits: largest speed [m/s] and body rate [rad/s] of aircraft i at i * limit_stride.
 // diverged: a byte a row. `finish` takes the motion, whether it has diverged, and what is at
 // `reads` places; it gives `kept` numbers for the table `out`, then as many as go to the table
 // `rest`, both with `columns` columns, and as the last ones BYTES flags. `reward` is the one in
-// `rest` that must be finite. loops: whether commands change with each of the `substeps` physics
-// steps. Filled by quadrl/core/compiled.py.
+// `rest` that must be finite. late: NULL where commands arrive at once. loops: whether commands
+// change with each of the `substeps` physics steps; held: from each of these, for how many they
+// stay. Filled by quadrl/core/compiled.py.
 typedef struct {
   const Rows* rows;
+  const Late* late;
+  const int64_t* held;
   const Function *begin, *command, *finish;
   const double *action, *limits;
   double *motion, *setpoint, *mean;
@@ -57,8 +70,8 @@ typedef struct {
 enum { BYTES = 4, LEFT = 1, BROKEN = 2 };
 // How far ahead tables are fetched, which have more rows than a processor follows by itself.
 enum { AHEAD = 2 * LANES };
-// Parts of a control step: take the action, end with a sound motion, finish the task's step.
-enum { BEGINS = 1, ENDS = 2, FINISHES = 4 };
+// Parts of a control step after its physics: end with a sound motion, finish the task's step.
+enum { ENDS = 1, FINISHES = 2 };
 
 // Which motions are such that MuJoCo calls them stable and a physics step resolves them.
 VECTORISED static void resolve(const Lanes* m, int rotors, const Lanes limits[2],
@@ -81,9 +94,28 @@ static void call(const Function* f, const Lanes* x, Lanes* y, int filled) {
   }
 }
 
+// Queues the commands of a block for some physics steps, and takes those that arrive in the first.
+static void arrive(const Late* late, Block* b, int rotors, int64_t first, int64_t steps) {
+  for (int i = 0; i < b->filled; ++i) {  // spare lanes may fly another aircraft
+    const int64_t row = b->row[i], newest = *late->newest + 1 + first;
+    for (int64_t step = 0; step < steps; ++step) {
+      double* to = late->queue + ((newest + step) % late->length * late->rows + row) * rotors;
+      for (int k = 0; k < rotors; ++k) to[k] = b->s.command[k][i];
+    }
+    const int64_t then = (newest + late->length - late->delay[row]) % late->length;
+    const double* from = late->queue + (then * late->rows + row) * rotors;
+    for (int k = 0; k < rotors; ++k) b->s.command[k][i] = from[k];
+    if (late->past) {
+      double* kept = late->past + (newest % late->length * late->rows + row) * SPEED;
+      for (int k = 0; k < SPEED; ++k) kept[k] = b->m[k][i];
+    }
+  }
+}
+
 // Commands the rotors of a block for the next physics steps, from the motion or from the setpoint,
 // within their ceiling; the mean is of what is wanted.
-static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean, Lanes* x) {
+static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean, Lanes* x,
+                    int64_t first, int64_t steps) {
   const int rotors = (int)s->rows->rotors, motion = SPEED + rotors;
   if (s->loops) {
     memcpy(x, b->m, motion * sizeof(Lanes));
@@ -92,22 +124,29 @@ static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean,
   }
   for (int k = 0; k < rotors; ++k) {
     for (int i = 0; i < LANES; ++i) {
-      const double ceiling = s->rows->ceiling[b->row[i] * rotors + k];
       const double wanted = s->loops ? b->s.command[k][i] : setpoint[k][i];
       mean[k][i] = s->loops ? mean[k][i] + wanted / s->substeps : wanted;
-      b->s.command[k][i] = ceiling < wanted ? ceiling : wanted;
+      b->s.command[k][i] = wanted;
+    }
+  }
+  if (s->late) arrive(s->late, b, rotors, first, steps);
+  for (int k = 0; k < rotors; ++k) {
+    for (int i = 0; i < LANES; ++i) {
+      const double ceiling = s->rows->ceiling[b->row[i] * rotors + k], given = b->s.command[k][i];
+      b->s.command[k][i] = ceiling < given ? ceiling : given;
     }
   }
 }
 
-// Takes the action or what was made of it, and commands and flies some physics steps. Marks the
-// aircraft that may touch something in near; theirs and the others' commands are written.
-static void fly_on(const Step* s, Block* b, int64_t parts, int64_t steps, Lanes* x) {
+// Takes the action or what was made of it, and commands and flies physics steps first..end-1 of the
+// control step. Marks the aircraft that may touch something in near; theirs and the others' commands
+// are written.
+static void fly_on(const Step* s, Block* b, int64_t first, int64_t end, Lanes* x) {
   const Rows* r = s->rows;
   const int rotors = (int)r->rotors, motion = SPEED + rotors;
   const int64_t numbers = s->begin->given;
   Lanes setpoint[numbers], mean[MAX_ROTORS];
-  if (parts & BEGINS) {
+  if (first == 0) {
     memcpy(x, b->m, motion * sizeof(Lanes));
     for (int64_t k = 0; k < s->actions; ++k) {
       for (int i = 0; i < LANES; ++i) x[motion + k][i] = s->action[b->row[i] * s->actions + k];
@@ -121,10 +160,9 @@ static void fly_on(const Step* s, Block* b, int64_t parts, int64_t steps, Lanes*
     }
   }
   char left[LANES] = {0};
-  const int64_t held = s->loops ? 1 : steps;
-  for (int64_t flown = 0; flown < steps; flown += held) {
-    command(s, b, (const Lanes*)setpoint, mean, x);
-    advance(r, b, held);
+  for (int64_t flown = first; flown < end; flown += s->held[flown]) {
+    command(s, b, (const Lanes*)setpoint, mean, x, flown, s->held[flown]);
+    advance(r, b, s->held[flown]);
     for (int i = 0; i < b->filled; ++i) left[i] |= r->near[b->row[i]];
   }
   for (int i = 0; i < b->filled; ++i) {
@@ -185,12 +223,12 @@ VECTORISED static int64_t finish(const Step* s, const Block* b, Lanes* x) {
   return unsound;
 }
 
-// Does some parts of a control step, and some physics steps in it, for aircraft first..last-1 of a
+// Does physics steps begin..end-1 and some parts of a control step for aircraft first..last-1 of a
 // list (NULL: of all; first is a multiple of LANES then). Marks in near those that are LEFT, with
 // the motion of before, since they may touch something, and those that end BROKEN, which have none
 // in `motion`. Returns how many these are, plus 2^32 for each whose reward is not finite.
 QUADRL_EXPORT int64_t quadrl_step(const Step* s, const int64_t* ids, int64_t first, int64_t last,
-                                  int64_t parts, int64_t steps) {
+                                  int64_t parts, int64_t begin, int64_t end) {
   const Rows* r = s->rows;
   const int rotors = (int)r->rotors, motion = SPEED + rotors;
   Block b;
@@ -207,8 +245,8 @@ QUADRL_EXPORT int64_t quadrl_step(const Step* s, const int64_t* ids, int64_t fir
         for (int k = 0; k < motion; ++k) b.m[k][i] = s->motion[b.row[i] * motion + k];
       }
     }
-    if (steps) {
-      fly_on(s, &b, parts, steps, x);
+    if (begin < end) {
+      fly_on(s, &b, begin, end, x);
     } else {
       for (int i = 0; i < b.filled; ++i) r->near[b.row[i]] = 0;
     }
@@ -228,7 +266,7 @@ QUADRL_EXPORT int64_t quadrl_step(const Step* s, const int64_t* ids, int64_t fir
         for (int k = 0; k < motion && sound[i]; ++k) s->motion[at * motion + k] = b.m[k][i];
       }
     }
-    if (steps) store(r, &b);
+    if (begin < end) store(r, &b);
     for (int i = 0; i < b.filled; ++i) marked += r->near[b.row[i]] != 0;
     if (parts & FINISHES) marked += finish(s, &b, x) << 32;
   }
