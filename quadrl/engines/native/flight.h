@@ -132,6 +132,9 @@ static void load(const Rows* r, const int64_t* ids, int64_t first, int64_t last,
   b->a = own;
   if (r->block && !ids) {
     b->a = (const Aircraft*)(r->parameters + first / LANES * r->block);
+    // Those of the next ones, which do not follow each other as they are read.
+    const double* next = r->parameters + (first / LANES + 1) * r->block;
+    for (int64_t k = 0; k < r->block && first + LANES < last; k += LANES) __builtin_prefetch(next + k);
   } else if (r->block) {
     for (int i = 0; i < LANES; ++i) {
       const double* from = r->parameters + b->row[i] / LANES * r->block + b->row[i] % LANES;
