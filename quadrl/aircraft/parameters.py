@@ -104,6 +104,11 @@ def numbers(table: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(table).view(np.float64).reshape(len(table), -1)
 
 
+def named(numbers: np.ndarray) -> np.ndarray:
+    """Rows (n,) from their doubles (n, ROW_SIZE); a view where these lie side by side."""
+    return np.ascontiguousarray(numbers).view(AIRCRAFT)[:, 0]
+
+
 def field(table: np.ndarray, name: str) -> np.ndarray:
     """A view of a field of rows (n,), such as "mass" or "rotor.max_speed".
 

@@ -165,7 +165,7 @@ class AircraftSampler:
 
     def explains(self, saved: np.ndarray) -> bool:
         """Whether rows of parameters differ from the specified ones only in what may be drawn."""
-        table = saved.copy().view(parameters.AIRCRAFT)[:, 0]
+        table = parameters.named(saved.copy())
         own = np.repeat(self._specified, len(table))
         for name in self.randomization.given().keys() & AFFECTS.keys():
             for field in AFFECTS[name]:

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from quadrl.aircraft.parameters import AIRCRAFT, LAYOUT, refitted
+from quadrl.aircraft.parameters import LAYOUT, named, refitted
 from quadrl.base import records
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import MAX_SEED, Seed, seeds_of_rows
@@ -125,7 +125,7 @@ class Memory:
         self._check_counters(saved)
         for process in self.processes:
             process.check(saved)
-        now, then = (np.ascontiguousarray(saved[name]).view(AIRCRAFT) for name in TABLES)
+        now, then = (named(saved[name]) for name in TABLES)
         for name in MADE_OF:
             if not np.array_equal(now[name], then[name]):
                 allowed = "as when the episode began: it does not change in flight"

@@ -390,10 +390,10 @@ class Engine(abc.ABC):
         """Restore what `save` returned."""
 
     def _restore_state(self, saved: dict[str, np.ndarray]) -> None:
-        table = np.ascontiguousarray(saved["parameters"]).view(parameters.AIRCRAFT)[:, 0]
+        table = parameters.named(saved["parameters"])
         if not np.array_equal(table, self.parameters):
             self.write_parameters(np.arange(len(table)), table)
-        self.begun[:] = np.ascontiguousarray(saved["begun"]).view(parameters.AIRCRAFT)[:, 0]
+        self.begun[:] = parameters.named(saved["begun"])
         if "solids" in saved:
             self.solids.restore(saved["solids"])
         self._fill(None)
