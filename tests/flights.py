@@ -100,8 +100,8 @@ def by_mj_step(task, seed, mode):
 
     def snapshot(remembered, action, command):
         time = np.array([len(errors) * vehicle.control_timestep])
-        around = scene.surroundings(world) if scene.solids else None
-        now = Snapshot(state(), remembered, own, action, command, time, around=around)
+        seen = scene.world(world)
+        now = Snapshot(state(), remembered, own, action, command, time, world=seen)
         return dataclasses.replace(now, potentials=task.measure(now))
 
     def move(substep):

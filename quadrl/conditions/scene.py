@@ -2,14 +2,13 @@
 
 A task declares its solids (`Task.solids`) and places them at each reset (`Task.place`), each row
 for itself. Aircraft collide with them in both engines; free flight hands an aircraft that comes
-near one to MuJoCo. The `Surroundings` of a snapshot have clearances and hits.
+near one to MuJoCo. `Scene.world` measures clearances and hits.
 """
 
 # pyright: reportUnnecessaryIsInstance=false
 # What users give is checked, whatever its annotation promises.
 from __future__ import annotations
 
-import dataclasses
 import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -20,14 +19,14 @@ import numpy as np
 from quadrl.aircraft.parameters import HELD, MARK
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, cross
+from quadrl.base.rotation import cross
 from quadrl.base.validation import MAX_OPTION
 from quadrl.conditions.solids import MIN_LENGTH, Pose, Solid, heading
+from quadrl.conditions.world import FAR, World
 from quadrl.engines.engine import Engine
 from quadrl.engines.solids import KINDS, MOTION
 from quadrl.engines.state import Start
 
-FAR = 1000.0  # [m]
 FASTEST, WIDEST = 100.0, 0.5
 """The fastest that a solid may move [m/s], and how far it may turn in a physics step [rad]."""
 HIDDEN = 3
@@ -35,20 +34,6 @@ HIDDEN = 3
 ELSEWHERE = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
 """Pose with which the geoms are compiled: MuJoCo would assume that geoms at the origin, upright,
 stay there."""
-
-
-@dataclasses.dataclass(slots=True)
-class Surroundings:
-    """The surroundings of aircraft in a world with K solids, arrays (N, ...)."""
-
-    names: tuple[str, ...]  # of the solids
-    position: Array  # (N, K, 3) [m] of their centres, task frame
-    clearance: Array  # (N,) [m], free at least between the aircraft and the nearest solid
-    touched: Array  # (N, K) bool, which one was touched fastest in this control step
-    touch_speed: Array  # (N,) [m/s], of that touch towards the solid; 0 without one
-    landed: Array  # (N,) bool, whether a foot has touched a solid
-    touch: Array  # (N, 4) of that moment: speed into it and along it [m/s], cosine, rate [rad/s]
-    held: Array  # (N,) bool, whether a foot has touched a solid that grips
 
 
 class Scene:
@@ -69,6 +54,7 @@ class Scene:
         """Names of the solids, in order."""
         if len(set(self.names)) < len(self.names):
             raise QuadrlError(name="solids", value=self.names, allowed="a name of its own for each")
+        self._places = {name: k for k, name in enumerate(self.names)}
         counts = [len(solid.parts) for solid in self.solids]
         self._first = (np.cumsum(counts) - counts).astype(int).tolist()
         """Number of the first geom of each solid."""
@@ -193,14 +179,15 @@ class Scene:
             value, allowed = start.position[inside[0]], f"outside of {', '.join(self.names)}"
             raise QuadrlError(reason, name="position at the start", value=value, allowed=allowed)
 
-    def nothing_near(self, count: int) -> Surroundings:
-        """The surroundings of aircraft (n,) far from every solid, for use without an engine."""
-        position = np.tile([solid.position for solid in self.solids], (count, 1, 1))
+    def nothing_near(self, count: int) -> World:
+        """The world of aircraft (n,) far from every solid, for use without an engine."""
+        declared = np.array([solid.position for solid in self.solids]).reshape(-1, 3)
+        position = np.tile(declared, (count, 1, 1))
         touched = np.zeros((count, len(self.solids)), dtype=bool)
         far, never = np.full(count, FAR), np.zeros(count, dtype=bool)
         touch = np.zeros((count, HELD - 1))
-        measured = position + 0.0, far, touched, 0.0 * far, never, touch, never
-        return Surroundings(self.names, *measured)
+        measured = position, far, touched, 0.0 * far, never, touch, never
+        return World(self._places, *measured)
 
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
         """The solids as pictures show them, at their poses in a row."""
@@ -212,12 +199,14 @@ class Scene:
             for (solid, part), pose, size in zip(parts, poses, sizes, strict=True)
         )
 
-    def surroundings(self, engine: Engine, rows: np.ndarray | None = None) -> Surroundings:
-        """The present surroundings of some aircraft (n,) of an engine, or of all.
+    def world(self, engine: Engine, rows: np.ndarray | None = None) -> World | None:
+        """The present world about some aircraft (n,) of an engine, or of all; None without solids.
 
-        They are copies, except for the positions of all aircraft's solids: if no solid moves, these
-        are live, since they then change only with an episode.
+        Its arrays are copies, except for the positions of all aircraft's solids: if no solid moves,
+        these are live, since they then change only with an episode.
         """
+        if not self.solids:
+            return None
         chosen = slice(None) if rows is None else rows
         which, speed = engine.hits[chosen].T
         touched = np.zeros((len(which), len(self.solids)), dtype=bool)
@@ -228,7 +217,7 @@ class Scene:
         feet = engine.feet[chosen].copy()
         landed, held = feet[:, 0] > 0, feet[:, HELD] > 0
         measured = centres, clear, touched, speed.copy(), landed, feet[:, 1:HELD], held
-        return Surroundings(self.names, *measured)
+        return World(self._places, *measured)
 
 
 def _checked(

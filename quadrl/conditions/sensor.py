@@ -20,6 +20,7 @@ from quadrl.base.validation import IN_A_FILE, choice, number, record, registered
 from quadrl.conditions.event_process import Events
 from quadrl.conditions.randomization import LONGEST_DELAY
 from quadrl.conditions.randomizer import Randomizer
+from quadrl.conditions.world import World, above_ground
 from quadrl.engines import native
 from quadrl.engines.engine import Engine
 from quadrl.engines.rng import normal, uniform
@@ -58,6 +59,12 @@ class Moment:
     observed: Array = None  # (n, m), all measured entries as they are seen, with their delays
     memory: Memory = dataclasses.field(default_factory=Memory)  # what the sensor itself remembers
     events: Events | None = None  # what happens in flight, where something does
+    world: World = None  # type: ignore[assignment] - of this moment; far from all without solids
+
+    @property
+    def above_ground(self) -> Array:
+        """Height of the lowest part above the ground, (n,) [m]; the ground is no solid."""
+        return above_ground(self.true, self.parameters)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -198,6 +198,27 @@ class Airspeed(Sensor):
 
 
 @register_sensor
+class Clearance(Sensor):
+    """Free distance to the nearest solid or to the ground, whichever is nearer."""
+
+    name, unit = "clearance", "m"
+    formula = "least of: distance to the nearest solid, height of the lowest part, reach"
+
+    reach: float = 10.0
+    """Largest distance that is seen [m]; all that is farther away reads so."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        super().__post_init__()
+        number("clearance reach", self.reach, 0, MAX)
+
+    def sense(self, now: Moment) -> Array:
+        """As it is measured from the true state."""
+        free = np.minimum(now.world.clearance, now.above_ground)
+        return np.minimum(free, self.reach)[:, None]
+
+
+@register_sensor
 class Disturbance(Sensor):
     """Acceleration that weight and specified thrust do not explain, body frame."""
 

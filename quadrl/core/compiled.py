@@ -22,7 +22,7 @@ from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.philox import START
 from quadrl.base.rotation import Array
 from quadrl.base.trace import NotCompilable
-from quadrl.conditions.scene import Surroundings
+from quadrl.conditions.world import World
 from quadrl.control.autopilot import Laws
 from quadrl.control.modes import ControlMode
 from quadrl.core.program import FLAGS, Program
@@ -122,8 +122,8 @@ class CompiledStep(Step):
             NotCompilable: The functions of the task do more than arithmetic, or there is no
                 compiler.
         """
-        world = written.inputs, written.estimate, written.scene, written.loops
-        super().__init__(written.task, written.clock, written.engine, *world, written.randomizer)
+        flown = written.engine, written.inputs, written.estimate, written.loops
+        super().__init__(written.task, written.clock, *flown, written.randomizer)
         self._parameters, engine = now.parameters, self.engine
         self._program = program = Program(written, now, episode, parameters)
         functions, estimate = Laws(mode, engine).functions(), self.estimate
@@ -146,7 +146,7 @@ class CompiledStep(Step):
         page = self._tables.pages[self.engine.turn]
         for into, array in zip(page.kept, self._program.leaves(now, episode), strict=True):
             into[:] = array
-        self._show(page, now.sensed, now.around)
+        self._show(page, now.sensed, now.world)
 
     def start(self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray) -> Observation | None:
         """Begin episodes (n,) of aircraft as they are specified, in air that is at rest.
@@ -248,17 +248,16 @@ class CompiledStep(Step):
         self._flown, (broken, self._broken) = False, (self._broken, None)
         return broken
 
-    def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
+    def finish(self, sensed: Mapping[str, np.ndarray], world: World | None) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
         tables, count = self._tables, self.engine.num_envs
         page, last = tables.pages[self._into], tables.pages[1 - self._into]
-        around = self.scene.surroundings(self.engine) if self.scene.solids else None
         if not self._ends & FINISHES:
             # A reset since the last step has given its rows what the sensors show then.
-            tables.take(self._present.sensed, self._present.around, last)
-            tables.take(sensed, around, page)
+            tables.take(self._present.sensed, self._present.world, last)
+            tables.take(sensed, world, page)
             self._call(None, FINISHES)
-        self._show(page, sensed, around)
+        self._show(page, sensed, world)
         self._observation = page.observation.copy()
         *terms, reward, error = self._rest[:-1, :count]
         flags = self._rest[-1].view(np.bool_).reshape(-1, tables.columns)[:, :count]
@@ -271,11 +270,9 @@ class CompiledStep(Step):
             **dict(zip(FLAGS, flags, strict=False)),
         )
 
-    def _show(
-        self, page: Page, sensed: Mapping[str, np.ndarray], around: Surroundings | None
-    ) -> None:
+    def _show(self, page: Page, sensed: Mapping[str, np.ndarray], world: World | None) -> None:
         """Make a table the present one."""
-        page.now.sensed, page.now.around = sensed, around
+        page.now.sensed, page.now.world = sensed, world
         page.now.parameters = self._parameters
         self._present, self.episode = page.now, page.episode
 

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from quadrl.base.rotation import Array, cross, dot, namespace, norm
+from quadrl.base.rotation import Array, cross, dot, namespace
+from quadrl.conditions.world import (
+    centre_of_discs,
+    depth_of_discs,
+    depth_of_feet,
+    depth_of_hull,
+)
 from quadrl.core.snapshot import Snapshot
 
 CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing
@@ -21,29 +27,20 @@ def touches_ground(now: Snapshot, *, bounces: bool = False) -> Array:
 
 def stands(now: Snapshot) -> Array:
     """Whether a foot is on the ground, (N,) bool."""
-    up, foot = now.state.rotation[..., 2, :], now.parameters.foot
-    # The lowest of four feet that mirror each other.
-    depth = (
-        abs(up[..., 0]) * foot[..., 0] + abs(up[..., 1]) * foot[..., 1] - up[..., 2] * foot[..., 2]
-    )
+    depth = depth_of_feet(now.state.rotation[..., 2, :], now.parameters)
     return now.state.height - depth < CONTACT_HEIGHT
 
 
 def strikes_ground(now: Snapshot) -> Array:
     """Whether the hull or a rotor has hit the ground, (N,) bool."""
-    xp, rotor = namespace(now.state.height), now.parameters.rotor
-    up = now.state.rotation[..., 2, :]
-    depth = norm(up * now.parameters.hull)
-    centre = rotor.position + now.parameters.rotor_height[..., None, None] * rotor.axis
-    above = dot(up[..., None, :], centre)  # (N, R) [m], of the discs' centres
-    across = up[..., None, :] - dot(up[..., None, :], rotor.axis)[..., None] * rotor.axis
-    edge = rotor.radius * norm(across)  # of what is in the plane of a disc
+    xp, up = namespace(now.state.height), now.state.rotation[..., 2, :]
     # A disc that rises now may have bounced in this control step.
-    swing = dot(up[..., None, :], cross(now.state.body_rate[..., None, :], centre))
+    turning = cross(now.state.body_rate[..., None, :], centre_of_discs(now.parameters))
+    swing = dot(up[..., None, :], turning)
     rising = xp.maximum(now.state.velocity[..., 2, None] + swing, 0.0 * swing)
     risen = rising * now.parameters.control_timestep
-    deepest = xp.max(edge - above + risen, axis=-1)
-    return (now.state.height < deepest) | (_lowest(now) < depth)
+    deepest = xp.max(depth_of_discs(up, now.parameters) + risen, axis=-1)
+    return (now.state.height < deepest) | (_lowest(now) < depth_of_hull(up, now.parameters))
 
 
 def _lowest(now: Snapshot) -> Array:

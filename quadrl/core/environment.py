@@ -282,8 +282,8 @@ class Environment(saving.Copied):
         self.seeds = seeds
         for process in self._processes:
             process.begin(rows, *place, drawn)
-        around = self.scene.surroundings(self.engine, rows) if self.scene.solids else None
-        given = task_state, seen, self.action_size, around
+        world = self.scene.world(self.engine, rows)
+        given = task_state, seen, self.action_size, world
         now, episode = transition.begin(self.task, state, *given)
         observation = self.observer.first(rows, now) if self.observer else self.task.observe(now)
         self.seeds.episodes[rows] += 1
@@ -339,9 +339,8 @@ class Environment(saving.Copied):
         now.sensed = self.sensed
         if self._step is None:
             estimate = self.observer.frame if self.observer else None
-            world = self.engine, self._inputs, estimate, self.scene
-            world = *world, self.control_mode.has_loops, self.randomizer
-            written = WrittenStep(self.task, self._clock, *world)
+            flown = self.engine, self._inputs, estimate, self.control_mode.has_loops
+            written = WrittenStep(self.task, self._clock, *flown, self.randomizer)
             self._step = compiled(written, now, episode, self._rows, self.control_mode)
         self._step.begin(now, episode)
 
@@ -445,9 +444,10 @@ class Environment(saving.Copied):
     def finish(self) -> Transition:
         """Do the second half of a step, after the engine has advanced."""
         self._read()
+        world = self.scene.world(self.engine)
         if self.observer:
-            self.observer.sense(self._inputs.action)
-        done = self._begun.finish(self.sensed)
+            self.observer.sense(self._inputs.action, world)
+        done = self._begun.finish(self.sensed, world)
         rules.check_reward(self.task, done)
         if self.observer:
             done.observation = self.observer.observe(done)
@@ -514,8 +514,7 @@ class Environment(saving.Copied):
             raise
         now, episode = self._memory().restore(saved)
         now.sensed = self.sensed
-        if self.scene.solids:
-            now.around = self.scene.surroundings(self.engine)
+        now.world = self.scene.world(self.engine)
         now.potentials = self.task.measure(now)
         self._take(now, episode)
         return self.observer.again() if self.observer else self.task.observe(now)

@@ -9,13 +9,16 @@ import numpy as np
 
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
+from quadrl.base import records
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 from quadrl.conditions.event_process import Events
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.process import Process
 from quadrl.conditions.randomizer import Randomizer
+from quadrl.conditions.scene import Scene
 from quadrl.conditions.sensor import Channel, EstimatedState, Moment, Sizes
+from quadrl.conditions.world import World
 from quadrl.core.observation import ObservationTerm, layout
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import Task
@@ -56,6 +59,7 @@ class Observer(Process):
         vehicle, rotors = engine.vehicle, engine.vehicle.rotor_count
         timestep, sampler = vehicle.control_timestep, randomizer.sampler
         self._specified = Parameters.of(parameters.rows(vehicle), timestep)
+        self._far = Scene(()).nothing_near(engine.num_envs)
         sensors = options.made(task.sensors, uncertain=sampler.randomization.uncertain)
         self.frame = EstimatedState(engine) if "estimate" in sensors else None
         """Table of the estimated state; None where the true one is seen."""
@@ -115,7 +119,7 @@ class Observer(Process):
 
     def first(self, rows: np.ndarray, now: Snapshot) -> dict[str, Array]:
         """Begin episodes (n,) and return their first observation, from their snapshot (n, ...)."""
-        moment = self._moment(now.state, self._engine.wind[rows], now.action, rows)
+        moment = self._moment(now.state, self._engine.wind[rows], now.action, rows, now.world)
         for channel in self._early:
             channel.begin(moment)
         self._show_sensed()
@@ -126,9 +130,9 @@ class Observer(Process):
         flat = self._present()[rows]
         return {name: flat[:, part] for name, part in self.layout.items()}
 
-    def sense(self, action: Array) -> None:
+    def sense(self, action: Array, world: World | None) -> None:
         """Estimate the state and let the sensors measure, after a control step with an action."""
-        self._now = self._moment(self._engine.state, self._engine.wind, action, None)
+        self._now = self._moment(self._engine.state, self._engine.wind, action, None, world)
         for channel in self._early:
             channel.step(self._now)
         self._show_sensed()
@@ -144,9 +148,23 @@ class Observer(Process):
         self.observation = {name: flat[:, part] for name, part in self.layout.items()}
         return self.observation
 
-    def _moment(self, true: State, wind: Array, action: Array, rows: np.ndarray | None) -> Moment:
+    def _far_from_all(self, rows: np.ndarray | None) -> World:
+        """The world where the task declares no solids."""
+        far = self._far
+        return far if rows is None else records.mapped(lambda array: array[rows], far)
+
+    def _moment(
+        self,
+        true: State,
+        wind: Array,
+        action: Array,
+        rows: np.ndarray | None,
+        world: World | None,
+    ) -> Moment:
+        seen = world or self._far_from_all(rows)
         known = self._specified, self._randomizer, rows, self.frame
-        return Moment(true, true, true.rotor_speed, wind, action, *known, events=self._events)
+        given = true, true, true.rotor_speed, wind, action, *known
+        return Moment(*given, events=self._events, world=seen)
 
     def _look(
         self,

@@ -18,7 +18,7 @@ from quadrl.aircraft.parameters import ROW_SIZE, Parameters
 from quadrl.base import records
 from quadrl.base.rotation import Array
 from quadrl.base.trace import MAX_OPERATIONS, NotCompilable
-from quadrl.conditions.scene import Surroundings
+from quadrl.conditions.world import World
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.step import WrittenStep
 from quadrl.core.transition import Episode, Transition, begin, finish
@@ -74,9 +74,9 @@ class Program:
             NotCompilable: The functions of the task do more than arithmetic.
         """
         self.written, self.task = written, written.task
-        # State, parameters and surroundings have places of their own.
-        self._like = dataclasses.replace(now, state=None, parameters=None, around=None)
-        self._episode, self._around = episode, now.around
+        # State, parameters and world have places of their own.
+        self._like = dataclasses.replace(now, state=None, parameters=None, world=None)
+        self._episode, self._world = episode, now.world
         kept = [*records.leaves(self._like), *records.leaves(episode)]
         if any(array.dtype != np.float64 for array in kept):
             raise NotCompilable("what it remembers is not all float64")
@@ -85,8 +85,8 @@ class Program:
         # Some sensors give what only policies see.
         self.shown = [name for name in self.task.sensors if name in now.sensed]
         """Sensors that the task looks at."""
-        around = records.leaves(now.around) if now.around else []
-        self.sensed = records.Columns(0, [*(now.sensed[name] for name in self.shown), *around])
+        world = records.leaves(now.world) if now.world else []
+        self.sensed = records.Columns(0, [*(now.sensed[name] for name in self.shown), *world])
         """Where the numbers of these, and of the solids about an aircraft, stand in a table."""
         inputs, motion = written.inputs, written.engine.motions.shape[-1]
         self.parts = {
@@ -143,7 +143,7 @@ class Program:
         before, begun = (records.filled(like, places) for like in (self._like, self._episode))
         before.state = self._state(last)
         before.parameters = self._parameters(parameters)
-        before.sensed, before.around = self._flagged(last_sensed)
+        before.sensed, before.world = self._flagged(last_sensed)
         seen, about = self._flagged(sensed)
         after, ended, done = finish(
             *(self.task, self.written.clock, begun, before, self._state(motion)),
@@ -152,7 +152,7 @@ class Program:
             about,
             seen,
         )
-        after.state = after.parameters = after.around = None  # type: ignore[assignment]
+        after.state = after.parameters = after.world = None  # type: ignore[assignment]
         kept = [*records.leaves(after), *records.leaves(ended)]
         return np.array([*self._values(kept, done)], dtype=object)[None]
 
@@ -201,17 +201,17 @@ class Program:
             for places, array in zip(columns.views(numbers), arrays, strict=True):
                 yield from np.broadcast_to(np.asarray(array, dtype=object), places.shape).ravel()
 
-    def _flagged(self, numbers: Array) -> tuple[dict[str, Any], Surroundings | None]:
-        sensed, around = self.given(self.sensed.views(numbers.T))
-        for name in ("touched", "landed", "held") if around else ():
-            setattr(around, name, getattr(around, name) != 0.0)
-        return sensed, around
+    def _flagged(self, numbers: Array) -> tuple[dict[str, Any], World | None]:
+        sensed, world = self.given(self.sensed.views(numbers.T))
+        for name in ("touched", "landed", "held") if world else ():
+            setattr(world, name, getattr(world, name) != 0.0)
+        return sensed, world
 
-    def given(self, arrays: Iterable[Any]) -> tuple[dict[str, Any], Surroundings | None]:
+    def given(self, arrays: Iterable[Any]) -> tuple[dict[str, Any], World | None]:
         """Arrange arrays as what the task sees: sensors by name, and the solids about aircraft."""
         rest = iter(arrays)
         sensed = {name: next(rest) for name in self.shown}
-        return sensed, records.filled(self._around, rest) if self._around else None
+        return sensed, records.filled(self._world, rest) if self._world else None
 
     def records(self, table: np.ndarray) -> tuple[Snapshot, Episode]:
         """The snapshot, but for what has no place in the table, and the episode, as its views."""
@@ -221,11 +221,9 @@ class Program:
 
     def leaves(self, now: Snapshot, episode: Episode) -> list[np.ndarray]:
         """The arrays of a snapshot and its episode that stand in the table."""
-        moment = dataclasses.replace(now, state=None, parameters=None, around=None)
+        moment = dataclasses.replace(now, state=None, parameters=None, world=None)
         return [*records.leaves(moment), *records.leaves(episode)]
 
-    def sources(
-        self, sensed: Mapping[str, np.ndarray], around: Surroundings | None
-    ) -> list[np.ndarray]:
+    def sources(self, sensed: Mapping[str, np.ndarray], world: World | None) -> list[np.ndarray]:
         """The arrays that stand in the table of `sensed`."""
-        return [sensed[name] for name in self.shown] + (records.leaves(around) if around else [])
+        return [sensed[name] for name in self.shown] + (records.leaves(world) if world else [])

@@ -119,10 +119,10 @@ def begun(
         raise QuadrlError(name=name, value=start.quaternion, allowed="of norm 1")
     scene = Scene(task.solids())
     scene.poses(task.place(Rng(keys, 0 * keys, SOLIDS), start, task_state), rows, np.zeros(3))
-    around = scene.nothing_near(rows) if scene.solids else None
+    world = scene.nothing_near(rows) if scene.solids else None
     state = State.of_coordinates(**coordinates, origin_height=height)
     acts = more + np.zeros(actions), start.rotor_speed + 0.0, more[:, 0]
-    now = Snapshot(state, task_state, own, *acts, around=around)
+    now = Snapshot(state, task_state, own, *acts, world=world)
     now.potentials = task.measure(now)
     for name, options in task.sensors.items():
         made = sensor.make(name, options)

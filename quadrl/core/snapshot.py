@@ -13,8 +13,7 @@ from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
-from quadrl.base.validation import choice
-from quadrl.conditions.scene import Surroundings
+from quadrl.conditions.world import World, above_ground
 from quadrl.core.trajectory import Trajectory, outcome
 from quadrl.engines.state import State
 
@@ -51,27 +50,35 @@ class Snapshot:
     sensed: Mapping[str, Array] = dataclasses.field(  # values of the task's sensors, (N, size) each
         default_factory=dict[str, Array]
     )
-    around: Surroundings | None = None  # solids around the aircraft, if the task has any
+    world: World | None = None  # of this moment; None where the task declares no solids
+
+    @property
+    def above_ground(self) -> Array:
+        """Height of its lowest part above the ground, (N,) [m], which is no solid."""
+        return above_ground(self.state, self.parameters)
 
     @property
     def clearance(self) -> Array:
-        """Lower bound of the distance from the aircraft to the nearest solid, (N,) [m]."""
-        return self._surroundings.clearance
+        """Lower bound of the distance from the aircraft to the nearest solid, (N,) [m].
+
+        The ground, which may be nearer, is apart: `above_ground`.
+        """
+        return self._solids.clearance
 
     @property
     def touched(self) -> Array:
         """Which of K solids it touched (the fastest touch of this control step), (N, K) bool."""
-        return self._surroundings.touched
+        return self._solids.touched
 
     @property
     def touch_speed(self) -> Array:
         """Speed of this touch, (N,) [m/s]; 0 without a touch."""
-        return self._surroundings.touch_speed
+        return self._solids.touch_speed
 
     @property
     def landed(self) -> Array:
         """Whether a foot has touched a solid, in this episode, (N,) bool."""
-        return self._surroundings.landed
+        return self._solids.landed
 
     @property
     def touch(self) -> Array:
@@ -80,24 +87,23 @@ class Snapshot:
         Speed into the solid and along it [m/s], cosine of the angle between the body's z axis and
         its normal, body rate [rad/s].
         """
-        return self._surroundings.touch
+        return self._solids.touch
 
     @property
     def held(self) -> Array:
         """Whether a foot has touched a solid that grips, in this episode, (N,) bool."""
-        return self._surroundings.held
+        return self._solids.held
 
     def solid(self, name: str) -> Array:
-        """Centre of a solid, (N, 3) [m], task frame."""
-        around = self._surroundings
-        return around.position[..., around.names.index(choice("solid", name, around.names)), :]
+        """Centre of a solid, (N, 3) [m], task frame; (N, count, 3) of one with a `count`."""
+        return self._solids.solid(name)
 
     @property
-    def _surroundings(self) -> Surroundings:
-        if self.around is None:
+    def _solids(self) -> World:
+        if self.world is None:
             reason = "there is nothing to touch: the task declares no solids"
             raise QuadrlError(reason, name="solids", value=(), allowed="at least one")
-        return self.around
+        return self.world
 
 
 @dataclasses.dataclass(slots=True)

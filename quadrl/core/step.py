@@ -13,8 +13,8 @@ import numpy as np
 
 from quadrl.base import records
 from quadrl.conditions.randomizer import Randomizer
-from quadrl.conditions.scene import Scene
 from quadrl.conditions.sensor import EstimatedState
+from quadrl.conditions.world import World
 from quadrl.core import transition
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import Task
@@ -40,7 +40,6 @@ class Step(abc.ABC):
     engine: Engine  # of the aircraft
     inputs: Inputs  # read live
     estimate: EstimatedState | None  # the state that is observed, live; None for the true one
-    scene: Scene  # the solids in the world
     loops: bool  # whether commands change with each physics step
     randomizer: Randomizer  # says which of them are late
     snapshot: Snapshot = dataclasses.field(init=False)
@@ -78,11 +77,12 @@ class Step(abc.ABC):
         """Make a snapshot of all rows the present one."""
 
     @abc.abstractmethod
-    def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
+    def finish(self, sensed: Mapping[str, np.ndarray], world: World | None) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does.
 
         Args:
             sensed: What the sensors give now, (N, size) by name.
+            world: The world about the aircraft; None where the task declares no solids.
         """
 
     def flatten(self, observation: Observation) -> np.ndarray:
@@ -103,14 +103,14 @@ class WrittenStep(Step):
             self.note_diverged(diverged)
         return diverged
 
-    def finish(self, sensed: Mapping[str, np.ndarray]) -> Transition:
+    def finish(self, sensed: Mapping[str, np.ndarray], world: World | None) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
         inputs, estimate = records.copied(self.inputs), self.estimate
         self.snapshot, self.episode, done = transition.finish(
             *(self.task, self.clock, self.episode, self.snapshot, self.engine.state),
             *(inputs.action, inputs.command, inputs.diverged),
             estimate.state if estimate else None,
-            self.scene.surroundings(self.engine) if self.scene.solids else None,
+            world,
             sensed,
         )
         # What a task remembers must not be a view of buffers that the next steps write.

@@ -8,7 +8,7 @@ import numpy as np
 
 from quadrl.aircraft.parameters import ROW_SIZE
 from quadrl.base.rotation import Array
-from quadrl.conditions.scene import Surroundings
+from quadrl.conditions.world import World
 from quadrl.core.program import MAX_DRAWN, Program
 from quadrl.core.step import Inputs
 from quadrl.engines import native
@@ -148,12 +148,12 @@ class Tables:
         places = [array.ravel().tolist() for array in self._program.sensed.views(numbers)]
         return [(own[0], np.array([k for k in own if k in found], int)) for own in places]
 
-    def take(self, sensed: Mapping[str, Array], around: Surroundings | None, page: Page) -> None:
+    def take(self, sensed: Mapping[str, Array], world: World | None, page: Page) -> None:
         """Write what the task's part reads of sensors and solids into a page.
 
         Only that is copied: of a hundred solids a task may look at one.
         """
-        given = self._program.sources(sensed, around)
+        given = self._program.sources(sensed, world)
         for array, (first, places) in zip(given, self._wanted, strict=True):
             if places.size:
                 page.sensed[places] = array.reshape(self.count, -1)[:, places - first].T

@@ -9,7 +9,7 @@ from typing import Any
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
-from quadrl.conditions.scene import Surroundings
+from quadrl.conditions.world import World
 from quadrl.core.rewards import total
 from quadrl.core.task import EpisodeEnd, Snapshot, Task
 from quadrl.engines.state import State
@@ -89,7 +89,7 @@ def begin(
     task_state: Any,
     parameters: Parameters,
     actions: int,
-    around: Surroundings | None = None,
+    world: World | None = None,
 ) -> tuple[Snapshot, Episode]:
     """The snapshot with which episodes begin.
 
@@ -99,13 +99,13 @@ def begin(
         task_state: What the task remembers, (n, ...).
         parameters: Parameters of the aircraft.
         actions: Numbers in an action.
-        around: The solids about the aircraft; None where there are none.
+        world: The world about the aircraft; None where the task declares no solids.
     """
     xp = namespace(state.speed)
     time, *none = (0.0 * state.speed for _ in range(4))
     action = xp.stack([time] * actions, axis=-1)
     given = task_state, parameters, action, state.rotor_speed + 0.0, time
-    now = Snapshot(state, *given, around=around)
+    now = Snapshot(state, *given, world=world)
     now.potentials = task.measure(now)
     return now, Episode(*none)
 
@@ -120,7 +120,7 @@ def finish(
     rotor_command: Array,
     diverged: Array,
     estimate: State | None = None,
-    around: Surroundings | None = None,
+    world: World | None = None,
     sensed: Mapping[str, Array] | None = None,
 ) -> tuple[Snapshot, Episode, Transition]:
     """The transition to a new state.
@@ -135,7 +135,7 @@ def finish(
         rotor_command: (N, R) [rad/s], mean over the control step.
         diverged: (N,) bool, where the simulation broke down.
         estimate: The state that is observed; None for the true one, which all else looks at.
-        around: The solids about the aircraft; None where there are none.
+        world: The world about the aircraft; None where the task declares no solids.
         sensed: What the sensors give now, (N, size) by name.
 
     Returns:
@@ -145,7 +145,7 @@ def finish(
     steps = episode.steps + 1.0
     time = steps * clock.control_timestep
     given = before.task, before.parameters, action, rotor_command, time
-    now = Snapshot(state, *given, sensed=sensed or {}, around=around)
+    now = Snapshot(state, *given, sensed=sensed or {}, world=world)
     now.potentials = task.measure(now)
     terminated = task.terminated(now) | diverged
     truncated = (steps >= clock.time_limit_steps) & ~terminated

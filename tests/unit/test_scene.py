@@ -375,7 +375,7 @@ class Posted(Hover):
 
 def test_pictures_have_solids_where_they_stand_in_the_episode():
     environment = begun(Posted(), num_envs=2)
-    where = environment.snapshot.around.position + environment.origin
+    where = environment.snapshot.world.position + environment.origin
     for row in range(2):
         post, ball = environment.markers(row)[-2:]
         assert (post.shape, ball.shape) == ("cylinder", "sphere") and post.glow == 0.0
@@ -820,11 +820,11 @@ def test_what_a_snapshot_has_of_moving_solids_stays_as_it_was():
     }
     environment = begun(type("Leaving", (Hover,), moves)(), num_envs=2)
     environment.step(np.zeros((2, 4)))
-    around = environment.snapshot.around
-    place = around.position.copy()
+    world = environment.snapshot.world
+    place = world.position.copy()
     environment.step(np.zeros((2, 4)))
-    np.testing.assert_array_equal(around.position, place)
-    assert (environment.snapshot.around.position != place).any()
+    np.testing.assert_array_equal(world.position, place)
+    assert (environment.snapshot.world.position != place).any()
 
 
 @pytest.mark.parametrize("other_sign", [1.0, -1.0])
