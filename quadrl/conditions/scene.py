@@ -21,7 +21,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import cross
 from quadrl.base.validation import MAX_OPTION
-from quadrl.conditions.solids import MIN_LENGTH, Pose, Solid, heading
+from quadrl.conditions.solids import MIN_LENGTH, Pose, Solid
 from quadrl.conditions.world import FAR, World
 from quadrl.engines.engine import Engine
 from quadrl.engines.solids import KINDS, MOTION
@@ -31,6 +31,7 @@ FASTEST, WIDEST = 100.0, 0.5
 """The fastest that a solid may move [m/s], and how far it may turn in a physics step [rad]."""
 HIDDEN = 3
 """Geom group that pictures do not show: they draw the solids where they are in the episode."""
+UPRIGHT = 1.0, 0.0, 0.0, 0.0
 ELSEWHERE = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
 """Pose with which the geoms are compiled: MuJoCo would assume that geoms at the origin, upright,
 stay there."""
@@ -54,11 +55,16 @@ class Scene:
         """Names of the solids, in order."""
         if len(set(self.names)) < len(self.names):
             raise QuadrlError(name="solids", value=self.names, allowed="a name of its own for each")
-        self._places = {name: k for k, name in enumerate(self.names)}
-        counts = [len(solid.parts) for solid in self.solids]
-        self._first = (np.cumsum(counts) - counts).astype(int).tolist()
-        """Number of the first geom of each solid."""
-        parts = [(s.position, part.size, part.offset) for s in self.solids for part in s.parts]
+        ends = np.cumsum([0, *(solid.count or 1 for solid in self.solids)]).tolist()
+        self._places: dict[str, int | slice] = {
+            solid.name: slice(*ends[k : k + 2]) if solid.count else ends[k]
+            for k, solid in enumerate(self.solids)
+        }
+        self._parts = [(s, part) for s in self.solids for part in (s.count or 1) * s.parts]
+        """The geoms: the solid that each is of, and its part."""
+        self._first = np.cumsum([0, *((s.count or 1) * len(s.parts) for s in self.solids)]).tolist()
+        """Number of the first geom of each solid, and of all."""
+        parts = [(solid.position, part.size, part.offset) for solid, part in self._parts]
         self._declared = np.array(parts, dtype=float).reshape(-1, 3, 3).swapaxes(0, 1)
         """Centres (K, 3) of the geoms' solids, task frame, and the geoms' sizes and offsets from
         them [m]."""
@@ -66,10 +72,12 @@ class Scene:
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the geoms to a world; each row has poses of its own."""
         position, quaternion = ELSEWHERE
-        for index, solid in enumerate(self.solids):
+        each = ((s, k) for s in self.solids for k in (range(s.count) if s.count else [None]))
+        for index, (solid, number) in enumerate(each):
+            name = solid.name if number is None else f"{solid.name}[{number}]"
             for k, part in enumerate(solid.parts):
                 geom = spec.worldbody.add_geom(
-                    name=f"{solid.name}_{k}", type=part.kind, size=part.size, pos=position,
+                    name=f"{name}_{k}", type=part.kind, size=part.size, pos=position,
                     quat=quaternion, rgba=solid.rgba, contype=1, conaffinity=0, group=HIDDEN,
                 )  # fmt: skip
                 geom.userdata = [MARK, index, *part.offset, solid.grip, *np.zeros(12)]
@@ -82,7 +90,7 @@ class Scene:
         Raises:
             QuadrlError: The message names the solids.
         """
-        if len(engine.solids.geoms) != sum(len(solid.parts) for solid in self.solids):
+        if len(engine.solids.geoms) != len(self._parts):
             allowed = f"made with the solids of the task: {', '.join(self.names) or 'none'}"
             raise QuadrlError(name="engine", value=engine, allowed=allowed)
 
@@ -112,32 +120,20 @@ class Scene:
         if unknown := set(placed) - set(self.names):
             raise QuadrlError(name="place", value=sorted(unknown), allowed=", ".join(self.names))
         if last is None:
-            centres, sizes, offsets = self._declared
-            made = np.zeros((count, len(centres), 13))
-            made[..., :3], made[..., 3] = centres + origin + offsets, 1.0
-            made[..., 7:10], made[..., 10:] = sizes, offsets
-            if all(pose.size is None for pose in placed.values()):
-                made = made[..., :7].copy()
+            sized = any(pose.size is not None for pose in placed.values())
+            centres, *own = self._declared
+            turns = np.tile(UPRIGHT, (len(centres), 1))
+            declared = [centres + origin + own[1], turns, *(own if sized else ())]
+            made = np.tile(np.hstack(declared), (count, 1, 1))
         else:
             made = last.copy()
-        for solid, first in zip(self.solids, self._first, strict=True):
-            if (pose := placed.get(solid.name)) is None:
-                continue
-            position = _checked(f"position of {solid.name}", pose.position, (count, 3))
-            turn = heading(np.zeros(count))
-            if pose.quaternion is not None:
-                turn = _unit(f"quaternion of {solid.name}", pose.quaternion, count)
-            own = solid
-            if pose.size is not None:
-                own = solid.sized(_checked_size(solid, pose.size, made))
-            for k, part in enumerate(own.parts, first):
-                if pose.size is not None:
-                    numbers = np.broadcast_arrays(*part.size, *part.offset)
-                    made[:, k, 7:] = np.stack(numbers, axis=-1)
-                has_sizes = made.shape[-1] > 7
-                offset = made[:, k, 10:] if has_sizes else np.asarray(part.offset, dtype=float)
-                made[:, k, :3] = position + origin + _rotated(turn, offset)
-                made[:, k, 3:7] = turn
+        for k, solid in enumerate(self.solids):
+            if (pose := placed.get(solid.name)) is not None:
+                own = made[:, self._first[k] : self._first[k + 1]]
+                if last is not None:
+                    own[..., 3:7] = UPRIGHT
+                shape = count, solid.count or 1, len(solid.parts), made.shape[-1]
+                _place(solid, pose, origin, own.reshape(shape))
         return made
 
     def check_move(self, last: np.ndarray, poses: np.ndarray, timestep: float) -> None:
@@ -151,7 +147,7 @@ class Scene:
         turn = 2 * np.arccos(np.minimum(cosine, 1.0))
         if len(wrong := np.argwhere((speed > FASTEST) | (turn > WIDEST))):
             row, geom = map(int, wrong[0])
-            solid = self.names[int(np.searchsorted(self._first, geom, side="right")) - 1]
+            solid = self._parts[geom][0].name
             raise QuadrlError(
                 "else it would throw what it touches",
                 name=f"speed [m/s] of {solid} in `move`, and turn [rad] in a physics step",
@@ -181,9 +177,10 @@ class Scene:
 
     def nothing_near(self, count: int) -> World:
         """The world of aircraft (n,) far from every solid, for use without an engine."""
-        declared = np.array([solid.position for solid in self.solids]).reshape(-1, 3)
+        each = [(s.count or 1) * [s.position] for s in self.solids]
+        declared = np.array([place for places in each for place in places], float).reshape(-1, 3)
         position = np.tile(declared, (count, 1, 1))
-        touched = np.zeros((count, len(self.solids)), dtype=bool)
+        touched = np.zeros(position.shape[:2], dtype=bool)
         far, never = np.full(count, FAR), np.zeros(count, dtype=bool)
         touch = np.zeros((count, HELD - 1))
         measured = position, far, touched, 0.0 * far, never, touch, never
@@ -191,12 +188,11 @@ class Scene:
 
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
         """The solids as pictures show them, at their poses in a row."""
-        parts = ((solid, part) for solid in self.solids for part in solid.parts)
         poses = engine.solids.poses[row].copy()
         sizes = engine.solids.table["size"][row].copy()
         return tuple(
             Primitive(KINDS[part.kind], size, pose[:3], pose[3:7], solid.rgba, glow=0.0)
-            for (solid, part), pose, size in zip(parts, poses, sizes, strict=True)
+            for (solid, part), pose, size in zip(self._parts, poses, sizes, strict=True)
         )
 
     def world(self, engine: Engine, rows: np.ndarray | None = None) -> World | None:
@@ -209,7 +205,7 @@ class Scene:
             return None
         chosen = slice(None) if rows is None else rows
         which, speed = engine.hits[chosen].T
-        touched = np.zeros((len(which), len(self.solids)), dtype=bool)
+        touched = np.zeros((len(which), engine.solids.centres.shape[1]), dtype=bool)
         hitting = np.flatnonzero(which)
         touched[hitting, which[hitting].astype(int) - 1] = True
         clear, centres = engine.clearance(rows), engine.solids.centres[chosen]
@@ -228,34 +224,54 @@ def _checked(
         found = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
         found = np.zeros(0)
-    if found.shape != shape or not ((found >= least) & (found <= MAX_OPTION)).all():
+    # NaN, as the least of all, is no number from `least` on.
+    if found.shape != shape or not (found.min() >= least and found.max() <= MAX_OPTION):
         allowed = f"an array {shape} of numbers between {least:g} and {MAX_OPTION:g}"
         raise QuadrlError(name=name, value=given, allowed=allowed)
     return found
 
 
-def _unit(name: str, given: Any, count: int) -> np.ndarray:
-    """Unit quaternions (n, 4), from such whose length may be off by 1 %."""
-    turn = _checked(name, given, (count, 4))
+def _place(solid: Solid, pose: Pose, origin: np.ndarray, made: np.ndarray) -> None:
+    """Write poses into upright ones (n, count, P, 7 or 13) of the P parts of a kind of solid."""
+    rows, number, _, size = made.shape
+    each = (rows,) if solid.count is None else (rows, number)
+    place = _checked(f"position of {solid.name}", pose.position, (*each, 3))
+    turn, own = None, solid
+    if pose.quaternion is not None:
+        turn = _unit(f"quaternion of {solid.name}", pose.quaternion, (*each, 4))
+        turn = turn.reshape(rows, number, 4)
+    if pose.size is not None:
+        name = f"size of {solid.name} ({', '.join(solid.lengths)})"
+        if size == 7:
+            allowed = "None in `move` where `place` gives none"
+            raise QuadrlError(name=name, value=pose.size, allowed=allowed)
+        lengths = _checked(name, pose.size, (*each, len(solid.lengths)), MIN_LENGTH)
+        own = solid.sized(lengths.reshape(rows, number, -1))
+    for k, part in enumerate(own.parts):
+        at = made[:, :, k]
+        if pose.size is not None:
+            at[..., 7:] = np.stack(np.broadcast_arrays(*part.size, *part.offset), axis=-1)
+        for j, numbers in enumerate(np.moveaxis(place.reshape(rows, number, 3), -1, 0)):
+            np.add(numbers, origin[j], out=at[..., j])  # in long loops, of all solids
+        offset = at[..., 10:] if size > 7 else np.asarray(part.offset, dtype=float)
+        if offset.any():
+            at[..., :3] += offset if turn is None else _rotated(turn, offset)
+        if turn is not None:
+            at[..., 3:7] = turn
+
+
+def _unit(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Unit quaternions (..., 4), from such whose length may be off by 1 %."""
+    turn = _checked(name, given, shape)
     length = np.linalg.norm(turn, axis=-1, keepdims=True)
-    if len(wrong := np.flatnonzero(abs(length - 1) > 0.01)):
-        raise QuadrlError(name=name, value=turn[wrong[0]], allowed="(w, x, y, z) of length 1")
+    wrong = abs(length[..., 0] - 1) > 0.01
+    if wrong.any():
+        raise QuadrlError(name=name, value=turn[wrong][0], allowed="(w, x, y, z) of length 1")
     return turn / length
 
 
-def _checked_size(solid: Solid, size: Any, poses: np.ndarray) -> np.ndarray:
-    """Lengths (n, k) of a solid, where each row has its own."""
-    name = f"size of {solid.name} ({', '.join(solid.lengths)})"
-    if poses.shape[-1] == 7:
-        allowed = "None in `move` where `place` gives none"
-        raise QuadrlError(name=name, value=size, allowed=allowed)
-    return _checked(name, size, (len(poses), len(solid.lengths)), MIN_LENGTH)
-
-
 def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """A vector (3,) or vectors (n, 3) turned by unit quaternions (n, 4)."""
-    if not vector.any():
-        return vector
-    w, axis = quaternion[:, :1], quaternion[:, 1:]
+    """A vector (3,) or vectors (..., 3) turned by unit quaternions (..., 4)."""
+    w, axis = quaternion[..., :1], quaternion[..., 1:]
     twice = 2 * cross(axis, vector)
     return vector + w * twice + cross(axis, twice)

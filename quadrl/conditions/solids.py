@@ -16,6 +16,7 @@ from quadrl.base.validation import MAX_OPTION, number, numbers
 
 Vector = tuple[float, float, float]
 MIN_LENGTH = 1 / MAX_OPTION  # [m]
+MAX_COUNT = 10_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +44,9 @@ class Solid(abc.ABC):
     grip: float = 0.0
     """With how many times its weight it holds an aircraft whose feet touch it; none by default. The
     rotors of who is held stop for the rest of the episode."""
+    count: int | None = None
+    """How many there are of the kind, which are placed together; None for a single one, whose
+    arrays have no axis of them."""
 
     def __post_init__(self) -> None:
         """Validate the name, the numbers and the lengths."""
@@ -52,6 +56,8 @@ class Solid(abc.ABC):
             given = numbers(f"{self.name} {name}", getattr(self, name), size, *ends)
             object.__setattr__(self, name, given)
         number(f"{self.name} grip", self.grip, 0, MAX_OPTION)
+        if self.count is not None:
+            number(f"{self.name} count", self.count, 1, MAX_COUNT, whole=True)
         for name in self.lengths:
             number(f"{self.name} {name}", getattr(self, name), MIN_LENGTH, MAX_OPTION)
 
@@ -62,9 +68,9 @@ class Solid(abc.ABC):
         return tuple(f.name for f in fields if f.type in ("float", float) and f.name != "grip")
 
     def sized(self, size: np.ndarray) -> Solid:
-        """The same with lengths (n, k) [m]: sizes and offsets of its parts are of arrays (n,)."""
+        """The same with lengths (..., k) [m]: its parts have sizes and offsets of arrays (...)."""
         made = copy.copy(self)
-        for name, length in zip(self.lengths, size.T, strict=True):
+        for name, length in zip(self.lengths, np.moveaxis(size, -1, 0), strict=True):
             object.__setattr__(made, name, length)
         return made
 
@@ -146,7 +152,10 @@ class Gate(Solid):
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """Where a solid stands in each episode, and how large it is."""
+    """Where a solid stands in each episode, and how large it is.
+
+    Those of a solid with a `count` have one more axis: (n, count, ...).
+    """
 
     position: Array  # (n, 3) [m] of its centre, task frame
     quaternion: Array = None  # (n, 4) (w, x, y, z); None for upright, its x axis to the east

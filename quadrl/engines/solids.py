@@ -8,7 +8,6 @@ that free flight can hand an aircraft that comes near one to MuJoCo.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 
 import mujoco
@@ -68,7 +67,7 @@ class Solids:
         self._threads, self._kernel = threads, native.library().quadrl_clearance
         self._outline, self._middles = _outline(model), _middles(model)
         _, which, *offset = model.geom_user[self.geoms].T[:5] if len(self.geoms) else [[]] * 5
-        self._first = np.unique(which, return_index=True)[1]  # geom of each solid
+        self._first = np.unique(which, return_index=True)[1]  # geom of each solid, (S,)
         self._declared = np.hstack([model.geom_size[self.geoms], np.transpose(offset)])  # (K, 6)
         self.centres = np.zeros((count, len(self._first), 3))
         """Centres of the S solids, (N, S, 3) [m], task frame, live."""
@@ -99,32 +98,36 @@ class Solids:
         if poses.shape[-1] != self.poses.shape[-1]:
             self.poses, poses = self._with_sizes(self.poses), self._with_sizes(poses)
             self._last = self.poses.copy()
-        if self.moves or not np.array_equal(self.poses[rows], poses):  # most stand where they stood
+        if self.moves:
             self.poses[rows], self._last[rows], self.motion[rows] = poses, poses, 0.0
             self.nearby["leap"][rows] = 0.0
-            self._stand(rows, poses)
+        self._stand(rows, poses, None if self.moves else self.poses)
 
     def _with_sizes(self, poses: np.ndarray) -> np.ndarray:
         """The poses with the declared sizes and offsets where they have none, (n, K, 13)."""
         own = np.broadcast_to(self._declared, (len(poses), *self._declared.shape))
         return poses if poses.shape[-1] > 7 else np.concatenate([poses, own], axis=-1)
 
-    def _stand(self, rows: np.ndarray, poses: np.ndarray) -> None:
-        """Write poses of the geoms of some rows for both engines."""
-        position, quaternion, own = poses[..., :3], poses[..., 3:7], poses[..., 7:]
-        turn = rotation_matrix(quaternion)
-        self.nearby["place"][rows] = np.nan
-        self.table["position"][rows] = position
-        self.table["turn"][rows] = turn.reshape(*turn.shape[:-2], 9)
-        places, offset = np.ix_(rows, self.geoms), self._declared[self._first, 3:]
-        if own.size:
-            offset, sizes = own[:, self._first, 3:], own[..., :3]
-            self.table["size"][rows] = self._field("geom_size")[places] = sizes
-            self._field("geom_rbound")[places] = np.linalg.norm(sizes, axis=-1)
-        offset = turn[:, self._first] @ offset[..., None]
-        self.centres[rows] = position[:, self._first] - offset[..., 0] - self._origin
-        self._field("geom_pos")[places] = position
-        self._field("geom_quat")[places] = quaternion
+    def _stand(self, rows: np.ndarray, poses: np.ndarray, own: np.ndarray | None = None) -> None:
+        """Write poses of the geoms of some rows for both engines.
+
+        Args:
+            rows: Which rows, (n,).
+            poses: The poses, (n, K, 7 or 13).
+            own: Poses (N, K, 7 or 13) that stand written, which become those: only what differs is
+                written then, since most stand where they stood. None to write all.
+        """
+        if not len(self.geoms):
+            return
+        poses, names = np.ascontiguousarray(poses), ["geom_pos", "geom_quat"]
+        names += ["geom_size", "geom_rbound"] if poses.shape[-1] > 7 else []
+        fields = [self._field(name) for name in names]
+        sizes = poses.shape[-1], len(self.geoms), len(self._first), fields[0].shape[1]
+        arrays = poses, own, rows, self.geoms, self._first, self._declared, self._origin
+        where = *fields, *[None] * (4 - len(fields)), self.centres, self.table, self.nearby
+        # As `Placing` in native/solids.c.
+        given = native.struct(*arrays, *where, *sizes)
+        native.library().quadrl_stand(given.ctypes.data, len(rows))
 
     def move(self, poses: np.ndarray, timestep: float) -> None:
         """Move the solids of all rows to poses, as `place` takes them, within a physics step [s].
@@ -172,20 +175,16 @@ class Solids:
         """Restore what `save` returned."""
         poses, motion = np.split(saved, [-6], axis=-1)
         self.place(np.arange(len(poses)), poses)
-        self.motion[:] = motion
+        self.motion[:], self.moves = motion, self.moves or bool(motion.any())
 
-    def clearance(
-        self, qpos: np.ndarray, rows: np.ndarray | None = None, balls: np.ndarray | None = None
-    ) -> np.ndarray:
+    def clearance(self, qpos: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Lower bound of each aircraft's distance to the nearest solid, (n,) [m].
 
         Args:
             qpos: (N, 7), live.
             rows: Which aircraft (n,); None for all.
-            balls: From which balls, as `_outline` gives them; None for those.
         """
-        out = np.full(len(qpos) if rows is None else len(rows), np.inf)
-        balls = self._outline if balls is None else balls
+        out, balls = np.full(len(qpos) if rows is None else len(rows), np.inf), self._outline
         if len(self.geoms) and len(balls):
             arrays = (qpos, balls, self.table, self.nearby)
             # As `Rows` in native/solids.c.
@@ -205,17 +204,15 @@ class Solids:
             poses: Where solids would be, as `place` takes them; None for where they are.
             qpos: Where aircraft would be, (n, 7).
         """
-        if poses is None:  # the lists of the nearest serve the start, too
-            places = np.empty((len(self.table), 7))
-            places[rows] = qpos
-            return self.clearance(places, rows, self._middles) < 0
-        then, count, poses = copy.copy(self), len(rows), self._with_sizes(poses)
-        then.table, then.nearby = self.table[rows], np.zeros(count, NEARBY)
-        then.nearby["place"] = np.nan
-        then.table["position"], then.table["size"] = poses[..., :3], poses[..., 7:10]
-        then.table["turn"] = rotation_matrix(poses[..., 3:7]).reshape(count, -1, 9)
-        places = np.ascontiguousarray(qpos)
-        return then.clearance(places, np.arange(count), self._middles) < 0
+        found = np.zeros(len(rows), bool)
+        if len(self.geoms) and len(self._middles):
+            poses = np.ascontiguousarray(self.poses[rows] if poses is None else poses)
+            arrays = np.ascontiguousarray(qpos), self._middles, poses, self._declared, self.table
+            sizes = poses.shape[-1], len(self.geoms), len(self._middles)
+            # As `Start` in native/solids.c.
+            given = native.struct(*arrays, found, *sizes)
+            native.library().quadrl_inside(given.ctypes.data, len(rows))
+        return found
 
 
 def _touching(model: mujoco.MjModel) -> np.ndarray:

@@ -5,11 +5,11 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
-from helpers import begun
+from helpers import begun, refused
 
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.conditions.sensor import Sensor, register_sensor
-from quadrl.conditions.solids import Cylinder, Pose
+from quadrl.conditions.solids import Cylinder, Gate, Pose, Sphere, heading
 from quadrl.core.environment import Environment
 from quadrl.engines.mjcf import compile_model
 from quadrl.tasks.hover import Hover
@@ -144,3 +144,116 @@ def test_over_open_ground_the_clearance_is_the_height_of_the_feet(engine):
         found = environment.step(np.full((3, 4), 0.2)).observation["clearance"][:, 0]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
     assert (found > first)[:2].all()
+
+
+@dataclasses.dataclass(frozen=True)
+class Grove(Hover):
+    """Posts of random thickness and gates that drift and turn, placed by arrays or one by one."""
+
+    name = "grove"
+    compiled = True
+    together: bool = True
+
+    def solids(self):
+        if self.together:
+            return [Gate("gate", opening=1.5, count=2), Cylinder("post", height=6.0, count=4)]
+        gates = [Gate(f"gate{k}", opening=1.5) for k in range(2)]
+        return gates + [Cylinder(f"post{k}", height=6.0) for k in range(4)]
+
+    def laid(self, name, pose):
+        """Poses by name, from arrays (n, count, k)."""
+        if self.together:
+            return {name: pose}
+        parts = {f.name: getattr(pose, f.name) for f in dataclasses.fields(pose)}
+        return {
+            f"{name}{k}": Pose(**{f: None if a is None else a[:, k] for f, a in parts.items()})
+            for k in range(pose.position.shape[1])
+        }
+
+    def move(self, state, time):
+        drift = 1.5 + 0.3 * time[:, None] * [1.0, -1.0]
+        place = np.stack([drift, -drift, 0.0 * drift], axis=-1)
+        return self.laid("gate", Pose(place, heading(0.4 * time[:, None] + [0.0, 1.0])))
+
+    def place(self, rng, start, state):
+        off = rng.uniform(-1.0, 1.0, 8).reshape(-1, 4, 2)
+        off += np.where(off < 0.0, -0.5, 0.5)
+        size = np.concatenate([0.05 * abs(off[..., :1]), 5.0 + abs(off[..., 1:])], axis=-1)
+        place = np.concatenate([off, 0.0 * off[..., :1]], axis=-1)
+        return super().place(rng, start, state) | self.laid("post", Pose(place, size=size))
+
+    def reward(self, before, now, end):
+        if self.together:
+            near = now.solid("post")[..., 2, 0] - now.solid("gate")[..., 1, 1]
+        else:
+            near = now.solid("post2")[..., 0] - now.solid("gate1")[..., 1]
+        return {"near": near, "hit": now.touched[..., 3] * 1.0}
+
+
+@pytest.mark.parametrize(("engine", "count"), [("mujoco", 1), ("free_flight", 24)])
+def test_solids_that_are_placed_together_are_those_that_are_placed_alone(engine, count):
+    rng, hits = np.random.default_rng(4), 0
+    made = Grove(), Grove(together=False)
+    pair = [Environment(task, num_envs=count, seed=1, engine=engine) for task in made]
+    for step in range(36):
+        if step % 12 == 0:
+            for each in pair:
+                each.reset(np.arange(0, count, 1 if not step else 2))
+        action = rng.uniform(-0.6, 0.6, (count, 4))
+        found, expected = (each.step(action) for each in pair)
+        np.testing.assert_array_equal(found.reward, expected.reward)
+        one, other = (each.snapshot for each in pair)
+        for name, number in (("gate", 2), ("post", 4)):
+            alone = [other.solid(f"{name}{k}") for k in range(number)]
+            np.testing.assert_array_equal(one.solid(name), np.stack(alone, axis=1))
+        for name in ("clearance", "touched", "touch_speed"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        hits += one.touched.sum()
+    assert (hits or count == 1) and not pair[0].not_compiled
+    saved, other_saved = (each.save() for each in pair)
+    np.testing.assert_array_equal(saved["engine.solids"], other_saved["engine.solids"])
+    for shown, expected in zip(*(each.markers() for each in pair), strict=True):
+        np.testing.assert_array_equal(shown.position, expected.position)
+    restored = Environment(Grove(), num_envs=count, seed=8, engine=engine)
+    restored.restore(saved)
+    found, expected = (each.step(action).reward for each in (restored, pair[0]))
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, 10_001, "many", np.nan])
+def test_a_count_is_a_whole_number_from_1_on(count):
+    with refused("tree count"):
+        Sphere("tree", count=count)
+
+
+TREES = [Sphere("tree", radius=0.2, count=3)]
+
+
+@pytest.mark.parametrize(
+    ("pose", "name"),
+    [
+        (Pose(np.zeros((2, 3))), "position of tree"),
+        (Pose(np.zeros((2, 2, 3))), "position of tree"),
+        (Pose(np.where(np.eye(3), np.nan, 9.0)[None].repeat(2, 0)), "position of tree"),
+        (Pose(np.full((2, 3, 3), np.inf)), "position of tree"),
+        (Pose(np.zeros((2, 3, 3)), np.ones((2, 4))), "quaternion of tree"),
+        (Pose(np.zeros((2, 3, 3)), np.ones((2, 3, 4))), "quaternion of tree"),
+        (Pose(np.zeros((2, 3, 3)), size=np.ones((2, 1))), "size of tree (radius)"),
+        (Pose(np.zeros((2, 3, 3)), size=np.full((2, 3, 1), np.nan)), "size of tree (radius)"),
+    ],
+)
+def test_poses_of_another_shape_or_without_a_place_are_refused_and_change_nothing(pose, name):
+    far, given = 5.0 * np.arange(1.0, 4.0)[:, None] * [1.0, 0.0, 0.0], list[Pose]()
+
+    def place(self, rng, start, state):
+        return {"tree": given[0] if given else Pose(np.tile(far, (len(state.goal), 1, 1)))}
+
+    own = {"solids": lambda self: TREES, "place": place}
+    environment = begun(type("Trees", (Hover,), own)(), num_envs=2)
+    environment.step(np.zeros((2, 4)))
+    saved = environment.save()
+    given.append(pose)
+    with refused(name):
+        environment.reset()
+    for key, array in environment.save().items():
+        np.testing.assert_array_equal(array, saved[key])

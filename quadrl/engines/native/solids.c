@@ -1,7 +1,8 @@
-// Clearance of aircraft from the solids around them.
+// Poses of solids, and the clearance of aircraft from them.
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
+#include <string.h>
 
 #include "export.h"
 #include "solids.h"
@@ -23,7 +24,113 @@ typedef struct {
   int64_t stride, count, parts;
 } Rows;
 
+// Poses of `count` geoms, each of `width` numbers (7 or 13), as quadrl/engines/solids.py has them, of
+// the aircraft in ids, to be written where both engines read them: fields of a model with `geoms`
+// geoms in each row, those of the solids being `which`; `singles` centres of solids, of which each
+// begins with the geom `first`; and the table. declared: size and offset (6) of each geom. own: the
+// poses of all rows that stand written; NULL for unknown. size, bound: NULL for poses of 7 numbers.
+typedef struct {
+  const double* poses;
+  double* own;
+  const int64_t *ids, *which, *first;
+  const double *declared, *origin;
+  double *position, *quaternion, *size, *bound, *centres;
+  Solid* solids;
+  Nearby* nearby;
+  int64_t width, count, singles, geoms;
+} Placing;
+
+// Starts of aircraft: qpos (7) of each, the `parts` balls of it that must be free, and poses of
+// `count` geoms as above, the kinds of which stand in `solids`. inside: a byte for each.
+typedef struct {
+  const double* qpos;
+  const Ball* balls;
+  const double *poses, *declared;
+  const Solid* solids;
+  uint8_t* inside;
+  int64_t width, count, parts;
+} Start;
+
 enum { AHEAD = 4, CACHE_LINE = 64 };  // aircraft, bytes
+
+// Rotation matrix to the world of a unit quaternion.
+static void rotation(const double q[4], double r[9]) {
+  const double w = q[0], x = q[1], y = q[2], z = q[3];
+  const double made[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+                          2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                          2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
+  memcpy(r, made, sizeof(made));
+}
+
+// A place of the body frame in the world, of an aircraft at p with the rotation matrix r.
+static void to_world(const double p[3], const double r[9], const double c[3], double place[3]) {
+  for (int j = 0; j < 3; ++j) {
+    place[j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
+  }
+}
+
+// Writes poses of the solids of n aircraft.
+QUADRL_EXPORT void quadrl_stand(const Placing* to, int64_t n) {
+  const int64_t width = to->width, size = to->count * width;
+  for (int64_t row = 0; row < n; ++row) {
+    const int64_t i = to->ids[row];
+    const double* given = to->poses + row * size;
+    double* own = to->own ? to->own + i * size : NULL;
+    if (own && !memcmp(own, given, size * sizeof(*own))) continue;
+    to->nearby[i].place[0] = NAN;
+    Solid* solids = to->solids + i * to->count;
+    for (int64_t k = 0; k < to->count; ++k) {
+      const double* pose = given + k * width;
+      const int64_t geom = i * to->geoms + to->which[k];
+      Solid* solid = solids + k;
+      memcpy(solid->position, pose, sizeof(solid->position));
+      memcpy(to->position + 3 * geom, pose, sizeof(solid->position));
+      if (!own || memcmp(own + k * width + 3, pose + 3, 4 * sizeof(*pose))) {
+        rotation(pose + 3, solid->turn);
+        memcpy(to->quaternion + 4 * geom, pose + 3, 4 * sizeof(*pose));
+      }
+      if (to->size) {
+        const double* s = pose + 7;
+        memcpy(solid->size, s, sizeof(solid->size));
+        memcpy(to->size + 3 * geom, s, sizeof(solid->size));
+        to->bound[geom] = sqrt(s[0] * s[0] + s[1] * s[1] + s[2] * s[2]);
+      }
+    }
+    for (int64_t s = 0; s < to->singles; ++s) {
+      const int64_t k = to->first[s];
+      const double *pose = given + k * width, *t = solids[k].turn;
+      const double* off = to->size ? pose + 10 : to->declared + 6 * k + 3;
+      double* centre = to->centres + 3 * (i * to->singles + s);
+      for (int j = 0; j < 3; ++j) {
+        const double turned = t[3 * j] * off[0] + t[3 * j + 1] * off[1] + t[3 * j + 2] * off[2];
+        centre[j] = pose[j] - turned - to->origin[j];
+      }
+    }
+    if (own) memcpy(own, given, size * sizeof(*own));
+  }
+}
+
+// Whether a ball of an aircraft would begin in a solid, for n aircraft.
+QUADRL_EXPORT void quadrl_inside(const Start* starts, int64_t n) {
+  for (int64_t i = 0; i < n; ++i) {
+    const double* p = starts->qpos + 7 * i;
+    double r[9], place[3];
+    rotation(p + 3, r);
+    for (int64_t k = 0; k < starts->count && !starts->inside[i]; ++k) {
+      const double* pose = starts->poses + (i * starts->count + k) * starts->width;
+      const double* size = starts->width > 7 ? pose + 7 : starts->declared + 6 * k;
+      Solid solid = {.kind = starts->solids[k].kind};
+      memcpy(solid.size, size, sizeof(solid.size));
+      memcpy(solid.position, pose, sizeof(solid.position));
+      if (is_beyond(&solid, p, starts->balls->reach)) continue;
+      rotation(pose + 3, solid.turn);
+      for (const Ball* ball = starts->balls; ball < starts->balls + starts->parts; ++ball) {
+        to_world(p, r, ball->centre, place);
+        starts->inside[i] |= solid_distance(&solid, place) < ball->radius;
+      }
+    }
+  }
+}
 
 // Whether no solid that is not listed may be the nearest of any part of an aircraft that has come a
 // way: the first listed one is that much farther at most, and an unlisted one that much nearer.
@@ -40,11 +147,8 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
   for (int64_t row = first; row < last; ++row) {
     const int64_t i = ids ? ids[row] : row;
     const double* p = rows->qpos + i * rows->stride;
-    const double w = p[3], x = p[4], y = p[5], z = p[6];
-    const double r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-                         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-                         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
-    double least = HUGE_VAL;
+    double r[9], least = HUGE_VAL;
+    rotation(p + 3, r);
     const Solid* solids = rows->solids + i * rows->count;
     Nearby* list = rows->nearby + i;
     // The list of an aircraft ahead is not in the cache: fetch it as far as its two nearest solids.
@@ -81,9 +185,7 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
         // The distance from something convex grows at least as its slope says.
         if (away > 0 && away + off - ball->radius > least + ROUNDING) continue;
         double place[3];
-        for (int j = 0; j < 3; ++j) {
-          place[j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
-        }
+        to_world(p, r, c, place);
         const double free = solid_distance(solid, place) - ball->radius;
         least = free < least ? free : least;
       }

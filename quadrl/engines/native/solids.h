@@ -84,12 +84,23 @@ static double way_since(const Nearby* list, const double point[3]) {
   return sqrt(squares) + ROUNDING;
 }
 
+// Whether all of a solid is farther from a point than that, by a ball about it.
+static inline int is_beyond(const Solid* s, const double point[3], double distance) {
+  const double reach = distance + s->size[0] + s->size[1] + s->size[2] + ROUNDING;
+  double squares = 0;
+  for (int k = 0; k < 3; ++k) {
+    squares += (point[k] - s->position[k]) * (point[k] - s->position[k]);
+  }
+  return squares > reach * reach;
+}
+
 // Lists the solids nearest to a point.
 static void list_nearest(const Solid* solids, int64_t count, const double point[3], Nearby* list) {
   double* sorted = list->distance;
   int64_t which[LISTED + 1] = {0};
   for (int k = 0; k <= LISTED; ++k) sorted[k] = HUGE_VAL;
   for (int64_t s = 0; s < count; ++s) {
+    if (is_beyond(solids + s, point, sorted[LISTED])) continue;  // most need no closer look
     const double distance = solid_distance(solids + s, point);
     int k = LISTED;
     if (distance >= sorted[k]) continue;
