@@ -40,22 +40,15 @@ def above_ground(state: State, parameters: Parameters) -> Array:
     Of hull, feet and rotor discs, as they end episodes: feet are points there, and discs flat.
     """
     xp, up = namespace(state.height), state.rotation[..., 2, :]
-    deepest = xp.maximum(depth_of_feet(up, parameters), depth_of_hull(up, parameters))
-    discs = xp.max(depth_of_discs(up, parameters), axis=-1)
-    return state.height - xp.maximum(deepest, discs)
+    depth = xp.maximum(depth_of_feet(up, parameters), depth_of_hull(up, parameters))
+    depth = xp.maximum(depth, xp.max(depth_of_discs(up, parameters), axis=-1))
+    return state.height - depth
 
 
 def depth_of_feet(up: Array, parameters: Parameters) -> Array:
-    """Depth of the lowest foot below the centre of mass, (N,) [m].
-
-    Args:
-        up: The vertical (N, 3) in the body frame.
-        parameters: Parameters of the aircraft.
-    """
-    foot = parameters.foot  # the other three mirror it
-    return (
-        abs(up[..., 0]) * foot[..., 0] + abs(up[..., 1]) * foot[..., 1] - up[..., 2] * foot[..., 2]
-    )
+    """Depth of the lowest foot below the centre of mass, (N,) [m]; `up` is (N, 3), body frame."""
+    x, y, z = (parameters.foot[..., k] for k in range(3))  # the other three mirror it
+    return abs(up[..., 0]) * x + abs(up[..., 1]) * y - up[..., 2] * z
 
 
 def depth_of_hull(up: Array, parameters: Parameters) -> Array:

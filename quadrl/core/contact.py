@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 from quadrl.base.rotation import Array, cross, dot, namespace
-from quadrl.conditions.world import (
-    centre_of_discs,
-    depth_of_discs,
-    depth_of_feet,
-    depth_of_hull,
-)
+from quadrl.conditions.world import centre_of_discs, depth_of_discs, depth_of_feet, depth_of_hull
 from quadrl.core.snapshot import Snapshot
 
 CONTACT_HEIGHT = 0.005  # [m], of the lowest foot at which the aircraft counts as standing

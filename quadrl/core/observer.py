@@ -119,7 +119,7 @@ class Observer(Process):
 
     def first(self, rows: np.ndarray, now: Snapshot) -> dict[str, Array]:
         """Begin episodes (n,) and return their first observation, from their snapshot (n, ...)."""
-        moment = self._moment(now.state, self._engine.wind[rows], now.action, rows, now.world)
+        moment = self._moment(now.state, now.action, rows, now.world)
         for channel in self._early:
             channel.begin(moment)
         self._show_sensed()
@@ -132,7 +132,7 @@ class Observer(Process):
 
     def sense(self, action: Array, world: World | None) -> None:
         """Estimate the state and let the sensors measure, after a control step with an action."""
-        self._now = self._moment(self._engine.state, self._engine.wind, action, None, world)
+        self._now = self._moment(self._engine.state, action, None, world)
         for channel in self._early:
             channel.step(self._now)
         self._show_sensed()
@@ -148,23 +148,14 @@ class Observer(Process):
         self.observation = {name: flat[:, part] for name, part in self.layout.items()}
         return self.observation
 
-    def _far_from_all(self, rows: np.ndarray | None) -> World:
-        """The world where the task declares no solids."""
-        far = self._far
-        return far if rows is None else records.mapped(lambda array: array[rows], far)
-
     def _moment(
-        self,
-        true: State,
-        wind: Array,
-        action: Array,
-        rows: np.ndarray | None,
-        world: World | None,
+        self, true: State, action: Array, rows: np.ndarray | None, world: World | None
     ) -> Moment:
-        seen = world or self._far_from_all(rows)
-        known = self._specified, self._randomizer, rows, self.frame
-        given = true, true, true.rotor_speed, wind, action, *known
-        return Moment(*given, events=self._events, world=seen)
+        chosen = slice(None) if rows is None else rows
+        seen = self._engine.wind[chosen], action, self._specified, self._randomizer, rows
+        about = world or records.mapped(lambda array: array[chosen], self._far)
+        given = true, true, true.rotor_speed, *seen, self.frame
+        return Moment(*given, events=self._events, world=about)
 
     def _look(
         self,

@@ -8,6 +8,7 @@ that free flight can hand an aircraft that comes near one to MuJoCo.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import mujoco
@@ -101,7 +102,7 @@ class Solids:
         if self.moves:
             self.poses[rows], self._last[rows], self.motion[rows] = poses, poses, 0.0
             self.nearby["leap"][rows] = 0.0
-        self._stand(rows, poses, None if self.moves else self.poses)
+        self._stand(rows, poses, None if self.moves else self.poses)  # most stand where they stood
 
     def _with_sizes(self, poses: np.ndarray) -> np.ndarray:
         """The poses with the declared sizes and offsets where they have none, (n, K, 13)."""
@@ -111,19 +112,15 @@ class Solids:
     def _stand(self, rows: np.ndarray, poses: np.ndarray, own: np.ndarray | None = None) -> None:
         """Write poses of the geoms of some rows for both engines.
 
-        Args:
-            rows: Which rows, (n,).
-            poses: The poses, (n, K, 7 or 13).
-            own: Poses (N, K, 7 or 13) that stand written, which become those: only what differs is
-                written then, since most stand where they stood. None to write all.
+        With those of all rows that stand written, `own`, only what differs, there, too.
         """
         if not len(self.geoms):
             return
-        poses, names = np.ascontiguousarray(poses), ["geom_pos", "geom_quat"]
-        names += ["geom_size", "geom_rbound"] if poses.shape[-1] > 7 else []
+        poses = np.ascontiguousarray(poses)
+        names = "geom_pos", "geom_quat", *(("geom_size", "geom_rbound")[: poses.shape[-1] - 7])
         fields = [self._field(name) for name in names]
         sizes = poses.shape[-1], len(self.geoms), len(self._first), fields[0].shape[1]
-        arrays = poses, own, rows, self.geoms, self._first, self._declared, self._origin
+        arrays = poses, self._declared, self._origin, rows, self.geoms, self._first, own
         where = *fields, *[None] * (4 - len(fields)), self.centres, self.table, self.nearby
         # As `Placing` in native/solids.c.
         given = native.struct(*arrays, *where, *sizes)
@@ -177,14 +174,18 @@ class Solids:
         self.place(np.arange(len(poses)), poses)
         self.motion[:], self.moves = motion, self.moves or bool(motion.any())
 
-    def clearance(self, qpos: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+    def clearance(
+        self, qpos: np.ndarray, rows: np.ndarray | None = None, balls: np.ndarray | None = None
+    ) -> np.ndarray:
         """Lower bound of each aircraft's distance to the nearest solid, (n,) [m].
 
         Args:
             qpos: (N, 7), live.
             rows: Which aircraft (n,); None for all.
+            balls: From which balls, as `_outline` gives them; None for those.
         """
-        out, balls = np.full(len(qpos) if rows is None else len(rows), np.inf), self._outline
+        out = np.full(len(qpos) if rows is None else len(rows), np.inf)
+        balls = self._outline if balls is None else balls
         if len(self.geoms) and len(balls):
             arrays = (qpos, balls, self.table, self.nearby)
             # As `Rows` in native/solids.c.
@@ -204,15 +205,26 @@ class Solids:
             poses: Where solids would be, as `place` takes them; None for where they are.
             qpos: Where aircraft would be, (n, 7).
         """
-        found = np.zeros(len(rows), bool)
-        if len(self.geoms) and len(self._middles):
-            poses = np.ascontiguousarray(self.poses[rows] if poses is None else poses)
-            arrays = np.ascontiguousarray(qpos), self._middles, poses, self._declared, self.table
-            sizes = poses.shape[-1], len(self.geoms), len(self._middles)
-            # As `Start` in native/solids.c.
-            given = native.struct(*arrays, found, *sizes)
-            native.library().quadrl_inside(given.ctypes.data, len(rows))
-        return found
+        poses = self.poses[rows] if poses is None else poses
+        # Few solids are so near that a ball about them reaches an aircraft, and are looked at.
+        squares = np.zeros(poses.shape[:2])
+        for j in range(3):
+            offset = poses[..., j] - qpos[:, j, None]
+            squares += np.square(offset, out=offset)
+        sizes = poses[..., 7:10] if poses.shape[-1] > 7 else self._declared[:, :3]
+        reach = self._middles[:, 4].max(initial=0.0) + sizes.sum(axis=-1)
+        row, k = np.nonzero(squares <= reach**2)
+        then, near = copy.copy(self), poses[row, k][:, None]
+        then.geoms, then.table = self.geoms[:1], self.table[rows[row], k][:, None]
+        then.nearby = np.zeros(len(row), NEARBY)
+        then.nearby["place"] = np.nan
+        then.table["position"] = near[..., :3]
+        then.table["size"] = np.broadcast_to(sizes, (*squares.shape, 3))[row, k][:, None]
+        then.table["turn"] = rotation_matrix(near[..., 3:7]).reshape(-1, 1, 9)
+        places, inside = np.ascontiguousarray(qpos[row]), np.zeros(len(rows), dtype=bool)
+        free = then.clearance(places, np.arange(len(row)), self._middles)
+        inside[row[free < 0]] = True
+        return inside
 
 
 def _touching(model: mujoco.MjModel) -> np.ndarray:

@@ -305,6 +305,7 @@ def turned_by(quaternion):
         (lambda: Box("wall", length=-1.0), "wall length"),
         (lambda: Cylinder("post", height="2 m"), "post height"),  # pyright: ignore
         (lambda: Sphere("no name"), "solid"),
+        *((lambda k=k: Sphere("tree", count=k), "tree count") for k in (0, 1.5, 10_001, np.nan)),
         (lambda: Sphere("ball", position=(0.0, np.nan, 0.0)), r"ball position\[1\]"),
         (lambda: Sphere("ball", position=(0.0, 0.0, 1e10)), r"ball position\[2\]"),
         (lambda: Sphere("ball", position=(0.0, 0.0)), "ball position"),  # pyright: ignore

@@ -44,7 +44,6 @@ _KERNELS = {
     "unsound_air": (_INTEGER, _POINTER, _INTEGER),
     "clearance": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _POINTER, _POINTER),
     "stand": (None, _POINTER, _INTEGER),
-    "inside": (None, _POINTER, _INTEGER),
     "free_flight": (_INTEGER, _POINTER, _INTEGER, _INTEGER, _INTEGER),
     "step": (_INTEGER, _POINTER, _POINTER, *[_INTEGER] * 5),
     "begin": (

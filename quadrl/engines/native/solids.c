@@ -24,49 +24,28 @@ typedef struct {
   int64_t stride, count, parts;
 } Rows;
 
-// Poses of `count` geoms, each of `width` numbers (7 or 13), as quadrl/engines/solids.py has them, of
-// the aircraft in ids, to be written where both engines read them: fields of a model with `geoms`
-// geoms in each row, those of the solids being `which`; `singles` centres of solids, of which each
-// begins with the geom `first`; and the table. declared: size and offset (6) of each geom. own: the
-// poses of all rows that stand written; NULL for unknown. size, bound: NULL for poses of 7 numbers.
+// Poses of `count` geoms about each aircraft in ids, of `width` numbers (7 or 13), as
+// quadrl/engines/solids.py has them, and where both engines read them: the geoms `which` of the
+// `geoms` in the fields of the models, centres of the solids, each of which begins with the geom
+// `first`, and the table. declared: size and offset (6) of each geom. own: the poses of all that
+// stand written; NULL for none. size, bound: NULL for poses of 7 numbers.
 typedef struct {
-  const double* poses;
-  double* own;
+  const double *poses, *declared, *origin;
   const int64_t *ids, *which, *first;
-  const double *declared, *origin;
-  double *position, *quaternion, *size, *bound, *centres;
+  double *own, *position, *quaternion, *size, *bound, *centres;
   Solid* solids;
   Nearby* nearby;
   int64_t width, count, singles, geoms;
 } Placing;
-
-// Starts of aircraft: qpos (7) of each, the `parts` balls of it that must be free, and poses of
-// `count` geoms as above, the kinds of which stand in `solids`. inside: a byte for each.
-typedef struct {
-  const double* qpos;
-  const Ball* balls;
-  const double *poses, *declared;
-  const Solid* solids;
-  uint8_t* inside;
-  int64_t width, count, parts;
-} Start;
 
 enum { AHEAD = 4, CACHE_LINE = 64 };  // aircraft, bytes
 
 // Rotation matrix to the world of a unit quaternion.
 static void rotation(const double q[4], double r[9]) {
   const double w = q[0], x = q[1], y = q[2], z = q[3];
-  const double made[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-                          2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-                          2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
-  memcpy(r, made, sizeof(made));
-}
-
-// A place of the body frame in the world, of an aircraft at p with the rotation matrix r.
-static void to_world(const double p[3], const double r[9], const double c[3], double place[3]) {
-  for (int j = 0; j < 3; ++j) {
-    place[j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
-  }
+  r[0] = 1 - 2 * (y * y + z * z), r[1] = 2 * (x * y - w * z), r[2] = 2 * (x * z + w * y);
+  r[3] = 2 * (x * y + w * z), r[4] = 1 - 2 * (x * x + z * z), r[5] = 2 * (y * z - w * x);
+  r[6] = 2 * (x * z - w * y), r[7] = 2 * (y * z + w * x), r[8] = 1 - 2 * (x * x + y * y);
 }
 
 // Writes poses of the solids of n aircraft.
@@ -107,28 +86,6 @@ QUADRL_EXPORT void quadrl_stand(const Placing* to, int64_t n) {
       }
     }
     if (own) memcpy(own, given, size * sizeof(*own));
-  }
-}
-
-// Whether a ball of an aircraft would begin in a solid, for n aircraft.
-QUADRL_EXPORT void quadrl_inside(const Start* starts, int64_t n) {
-  for (int64_t i = 0; i < n; ++i) {
-    const double* p = starts->qpos + 7 * i;
-    double r[9], place[3];
-    rotation(p + 3, r);
-    for (int64_t k = 0; k < starts->count && !starts->inside[i]; ++k) {
-      const double* pose = starts->poses + (i * starts->count + k) * starts->width;
-      const double* size = starts->width > 7 ? pose + 7 : starts->declared + 6 * k;
-      Solid solid = {.kind = starts->solids[k].kind};
-      memcpy(solid.size, size, sizeof(solid.size));
-      memcpy(solid.position, pose, sizeof(solid.position));
-      if (is_beyond(&solid, p, starts->balls->reach)) continue;
-      rotation(pose + 3, solid.turn);
-      for (const Ball* ball = starts->balls; ball < starts->balls + starts->parts; ++ball) {
-        to_world(p, r, ball->centre, place);
-        starts->inside[i] |= solid_distance(&solid, place) < ball->radius;
-      }
-    }
   }
 }
 
@@ -185,7 +142,9 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
         // The distance from something convex grows at least as its slope says.
         if (away > 0 && away + off - ball->radius > least + ROUNDING) continue;
         double place[3];
-        to_world(p, r, c, place);
+        for (int j = 0; j < 3; ++j) {
+          place[j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
+        }
         const double free = solid_distance(solid, place) - ball->radius;
         least = free < least ? free : least;
       }

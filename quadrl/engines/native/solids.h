@@ -75,23 +75,16 @@ typedef struct {
   Solid solid[LISTED];
 } Nearby;
 
-// Distance of a point from the place of a list [m].
-static double way_since(const Nearby* list, const double point[3]) {
+// Square of the distance between two points [m^2].
+static inline double squared(const double one[3], const double other[3]) {
   double squares = 0;
-  for (int k = 0; k < 3; ++k) {
-    squares += (point[k] - list->place[k]) * (point[k] - list->place[k]);
-  }
-  return sqrt(squares) + ROUNDING;
+  for (int k = 0; k < 3; ++k) squares += (one[k] - other[k]) * (one[k] - other[k]);
+  return squares;
 }
 
-// Whether all of a solid is farther from a point than that, by a ball about it.
-static inline int is_beyond(const Solid* s, const double point[3], double distance) {
-  const double reach = distance + s->size[0] + s->size[1] + s->size[2] + ROUNDING;
-  double squares = 0;
-  for (int k = 0; k < 3; ++k) {
-    squares += (point[k] - s->position[k]) * (point[k] - s->position[k]);
-  }
-  return squares > reach * reach;
+// Distance of a point from the place of a list [m].
+static double way_since(const Nearby* list, const double point[3]) {
+  return sqrt(squared(point, list->place)) + ROUNDING;
 }
 
 // Lists the solids nearest to a point.
@@ -100,8 +93,11 @@ static void list_nearest(const Solid* solids, int64_t count, const double point[
   int64_t which[LISTED + 1] = {0};
   for (int k = 0; k <= LISTED; ++k) sorted[k] = HUGE_VAL;
   for (int64_t s = 0; s < count; ++s) {
-    if (is_beyond(solids + s, point, sorted[LISTED])) continue;  // most need no closer look
-    const double distance = solid_distance(solids + s, point);
+    const Solid* solid = solids + s;
+    // Most need no closer look, since not even a ball about them comes so near.
+    const double far = sorted[LISTED] + solid->size[0] + solid->size[1] + solid->size[2] + ROUNDING;
+    if (squared(point, solid->position) > far * far) continue;
+    const double distance = solid_distance(solid, point);
     int k = LISTED;
     if (distance >= sorted[k]) continue;
     for (; k > 0 && !(distance >= sorted[k - 1]); --k) {
