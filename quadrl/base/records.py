@@ -3,39 +3,57 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from quadrl.base.errors import QuadrlError
 
 
-def mapped(function: Callable[[Any], Any], record: Any) -> Any:
-    """A record with a function applied to each of its arrays; other values stay."""
-    values = {}
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        if dataclasses.is_dataclass(value):
-            value = mapped(function, value)
-        elif hasattr(value, "dtype"):
-            value = function(value)
-        values[field.name] = value
-    return type(record)(**values)
+def named(record: Any, prefix: str = "") -> dict[str, Any]:
+    """The values in a record by name, in the order of its fields, none of them a record or a tuple.
+
+    A value of a record within it has the name "FIELD.NAME", of a tuple of records "FIELD.0.NAME".
+    """
+    if isinstance(record, tuple):
+        parts = enumerate(cast(tuple[Any, ...], record))
+    else:
+        kind = cast(Any, type(record))
+        parts = ((name, getattr(record, name)) for name in _fields(kind))
+    found: dict[str, Any] = {}
+    for name, value in parts:
+        inner = not hasattr(value, "dtype")  # most are arrays, which costs the least to see
+        if inner and (dataclasses.is_dataclass(value) or isinstance(value, tuple)):
+            found |= named(value, f"{prefix}{name}.")
+        else:
+            found[f"{prefix}{name}"] = value
+    return found
+
+
+@functools.cache
+def _fields(kind: type[Any]) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(kind))
 
 
 def leaves(record: Any) -> list[Any]:
     """A record's arrays, in the order of its fields."""
-    found: list[Any] = []
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        if dataclasses.is_dataclass(value):
-            found += leaves(value)
-        elif hasattr(value, "dtype"):
-            found.append(value)
-    return found
+    return [value for value in named(record).values() if hasattr(value, "dtype")]
+
+
+def mapped(function: Callable[[Any], Any], record: Any) -> Any:
+    """A record with a function applied to each of its arrays; other values stay."""
+    if hasattr(record, "dtype"):
+        return function(record)
+    if isinstance(record, tuple):
+        return tuple(mapped(function, part) for part in cast(tuple[Any, ...], record))
+    if not dataclasses.is_dataclass(record):
+        return record
+    kind: Any = type(record)
+    return kind(**{name: mapped(function, getattr(record, name)) for name in _fields(kind)})
 
 
 def filled(like: Any, arrays: Iterator[Any]) -> Any:
@@ -50,34 +68,25 @@ def copied(record: Any) -> Any:
 
 def owned(record: Any) -> Any:
     """The same record if its arrays are neither views nor read-only, else a copy."""
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        if value.base is not None or not value.flags.writeable:
-            return copied(record)
-    return record
+    own = all(array.base is None and array.flags.writeable for array in leaves(record))
+    return record if own else copied(record)
 
 
 def put(record: Any, rows: np.ndarray, fresh: Any) -> None:
     """Write rows (n,) of a record from another (n, ...)."""
-    for field in dataclasses.fields(record):
-        into, value = getattr(record, field.name), getattr(fresh, field.name)
-        if dataclasses.is_dataclass(into):
-            put(into, rows, value)
-        elif isinstance(into, np.ndarray):
-            into[rows] = value
+    for into, value in zip(leaves(record), leaves(fresh), strict=True):
+        into[rows] = value
 
 
 def arrays(prefix: str, record: Any) -> dict[str, np.ndarray]:
-    """Copies of a record's arrays by name, "PREFIX.FIELD"."""
-    fields = dataclasses.fields(record)
+    """Copies of a record's arrays by name, "PREFIX.NAME"."""
     # In C's order, as every file format wants them.
-    return {f"{prefix}.{f.name}": np.array(getattr(record, f.name), order="C") for f in fields}
+    return {name: np.array(value, order="C") for name, value in named(record, f"{prefix}.").items()}
 
 
 def of_arrays(prefix: str, like: Any, saved: Mapping[str, np.ndarray]) -> Any:
     """A record like another one, from the arrays that `arrays` returned."""
-    fields = dataclasses.fields(like)
-    return type(like)(**{field.name: np.array(saved[f"{prefix}.{field.name}"]) for field in fields})
+    return filled(like, (np.array(saved[name]) for name in named(like, f"{prefix}.")))
 
 
 def check_alike(saved: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) -> None:

@@ -109,10 +109,10 @@ def begun(
     coordinates |= {name: coordinates[name] + more for name in ("velocity", "body_rate")}
     coordinates["position"] = start.position + more * [0.0, 0.0, 0.1]  # where little can stand
     start = dataclasses.replace(start, **coordinates)
-    for field in dataclasses.fields(task_state := task.remember(start, task_state)):
-        value: Any = getattr(task_state, field.name)
+    task_state = task.remember(start, task_state)
+    for field, value in records.named(task_state).items():
         if not isinstance(value, np.ndarray) or cast(Array, value).shape[:1] != (rows,):
-            name, allowed = f"{task.name} {field.name} of begin", f"an array ({rows}, ...)"
+            name, allowed = f"{task.name} {field} of begin", f"an array ({rows}, ...)"
             raise QuadrlError(name=name, value=value, allowed=allowed)
     if not (abs(square_norm(start.quaternion) - 1) < 1e-6).all():
         name = f"{task.name} quaternion of begin"
@@ -191,7 +191,7 @@ def starts(task: Task, keys: Array, own: Parameters) -> dict[str, Array]:
     with blame(task, "begin"):
         start, state = task.begin(Rng(keys, 0 * keys), own)
         state = task.remember(start, state)
-    return _named(start, "start") | _named(state, "task")
+    return records.named(start, "start.") | records.named(state, "task.")
 
 
 def check_begin(task: Task) -> None:
@@ -256,11 +256,7 @@ def outputs(task: Task, before: Snapshot, now: Snapshot) -> dict[str, Array]:
         terms, seen = task.reward(before, now, end), task.observe(now)
         updated = task.update(before, now)
     outputs = {"error": error, "terminated": terminated, "succeeded": succeeded, **terms, **seen}
-    return outputs | _named(now.potentials, "potentials") | _named(updated, "task")
-
-
-def _named(record: Any, prefix: str) -> dict[str, Array]:
-    return {f"{prefix}.{f.name}": getattr(record, f.name) for f in dataclasses.fields(record)}
+    return outputs | records.named(now.potentials, "potentials.") | records.named(updated, "task.")
 
 
 def mapped(function: Callable[[Any], Any], now: Snapshot) -> Snapshot:

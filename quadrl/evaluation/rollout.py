@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Callable
 from typing import Any, Unpack
@@ -68,7 +67,6 @@ def fly(
     steps, known = environment.time_limit_steps, records.leaves(environment.snapshot.task)
     numbers = 24 + 2 * len(environment.vehicle.rotors) + sum(a.size for a in known) // episodes
     machine.check_memory(f"{episodes} flights of {steps} steps", 16.0 * numbers * steps * episodes)
-    own_fields = [field.name for field in dataclasses.fields(environment.snapshot.task)]
     everyone = np.ones(episodes, dtype=bool)
     states, moments = [_while(everyone, _state(environment))], list[dict[str, np.ndarray]]()
     remembered: list[dict[str, np.ndarray]] = []
@@ -93,8 +91,7 @@ def fly(
             "wind": environment.engine.wind,
         }
         moments.append(_while(alive, moment))
-        own = {name: getattr(snapshot.task, name) for name in own_fields}
-        remembered.append(_while(alive, own))
+        remembered.append(_while(alive, records.named(snapshot.task)))
         length += alive
         for name, flag in ends.items():
             flag |= alive & getattr(now, name)
