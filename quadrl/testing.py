@@ -137,7 +137,7 @@ def continues_from_a_save(task: Task) -> None:
 
 def is_the_same_compiled(task: Task) -> None:
     """The step that the class has compiled gives what its functions give, episode after episode."""
-    if not vars(type(task)).get("compiled"):
+    if not task.asks_compiled:
         return
     kind = dataclasses.dataclass(frozen=True)(type("Written", (type(task),), {"compiled": False}))
     options = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from quadrl.core.catalogue import TASKS, make, register
+from quadrl.core.catalogue import COMPOSED, TASKS, make, register
+from quadrl.core.one_of import OneOf
 from quadrl.tasks.deck_landing import DeckLanding
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
@@ -23,3 +24,4 @@ for _task in (
     *(Race, Recovery, Trajectory, Perching, DeckLanding, LsyRace),
 ):
     register(_task)
+COMPOSED[OneOf.name] = OneOf

@@ -8,7 +8,9 @@ from quadrl.base.validation import IN_A_FILE, choice, registered
 from quadrl.core.task import Task
 
 TASKS: dict[str, type[Task]] = {}
-"""Every registered task by name."""
+"""Every registered task by name, but for those in `COMPOSED`."""
+COMPOSED: dict[str, type[Task]] = {}
+"""Tasks that are made of others: no name alone says what to fly, so that no list has them."""
 
 
 def register(task: type[Task]) -> type[Task]:
@@ -17,8 +19,15 @@ def register(task: type[Task]) -> type[Task]:
     Raises:
         QuadrlError: It is not a Task subclass with a name, or another task has the name.
     """
-    TASKS[registered("task", task, Task, TASKS)] = task
+    TASKS[registered("task", task, Task, TASKS | COMPOSED)] = task
     return task
+
+
+def kind(name: str | Task) -> type[Task]:
+    """The class of a task already made, or of a name, as for `make`."""
+    if isinstance(name, Task):
+        return type(name)
+    return COMPOSED[name] if name in COMPOSED else TASKS[choice("task", name, TASKS, IN_A_FILE)]
 
 
 def make(name: str | Task, **options: Any) -> Task:
@@ -31,5 +40,4 @@ def make(name: str | Task, **options: Any) -> Task:
     Raises:
         QuadrlError: Unknown task or option; the message lists the choices.
     """
-    task = name if isinstance(name, Task) else TASKS[choice("task", name, TASKS, IN_A_FILE)]()
-    return task.replace(**options)
+    return name.replace(**options) if isinstance(name, Task) else kind(name).of({}, **options)

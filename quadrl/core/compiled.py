@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from quadrl.base.errors import NativeError, QuadrlWarning
-from quadrl.base.philox import START
+from quadrl.base.philox import MEMBERS, START
 from quadrl.base.rotation import Array
 from quadrl.base.trace import NotCompilable
 from quadrl.conditions.world import World
@@ -60,7 +60,7 @@ def compiled(
         parameters: Rows that the task sees, (N,) or (1,), read live.
         mode: The control mode that flies.
     """
-    if not vars(type(step.task)).get("compiled", False):
+    if not step.task.asks_compiled:
         step.not_compiled = "its class does not say `compiled = True`"
         return step
     try:
@@ -162,7 +162,7 @@ class CompiledStep(Step):
         ids, keyed, numbered = (native.address(words) + k * words.strides[0] for k in range(3))
         step, into, library = self._tables.address, native.address(room), native.library()
         given = struct.ctypes.data, places.ctypes.data, len(places), ids, count
-        drawn = keyed, numbered, START, self._program.drawn
+        drawn = keyed, numbered, START, self._program.drawn, MEMBERS
         if library.quadrl_begin(step, *given, *drawn, into):
             return None
         self.engine.clear(rows)

@@ -16,6 +16,7 @@ import numpy as np
 
 from quadrl.aircraft.parameters import ROW_SIZE, Parameters
 from quadrl.base import records
+from quadrl.base.philox import START
 from quadrl.base.rotation import Array
 from quadrl.base.trace import MAX_OPERATIONS, NotCompilable
 from quadrl.conditions.world import World
@@ -35,13 +36,18 @@ MAX_DRAWN = 64
 class Draws(Rng):
     """Random numbers of the start of an episode that are symbols."""
 
-    def __init__(self, read: Callable[[Array], Array]) -> None:
+    def __init__(self, read: Callable[[Array], Array], first: int = 0) -> None:
         """Begin with the first number.
 
         Args:
-            read: Gives the symbols of the numbers at places (...), the first one at 0.
+            read: Gives the symbols of the numbers at places (...).
+            first: The place of the first one; with 1, the first one of MEMBERS is before it.
         """
-        self.used, self._read = 0, read
+        self.used, self._read = first, read
+
+    def stream(self, number: int) -> Draws:
+        """START again, or MEMBERS, from the first number on."""
+        return Draws(self._read, int(number == START))
 
     def uniform(self, low: float, high: float, size: int | None = None) -> Array:
         """Numbers in [low, high): (1,), or (1, size)."""
@@ -109,20 +115,20 @@ class Program:
         self.function = made
         """The function itself."""
         self.drawn = 0
-        """How many random numbers a start takes, once it was traced."""
+        """How many random numbers of START a start takes, once it was traced."""
 
     @functools.cached_property
     def start(self) -> RowFunction:
         """`Task.begin` up to the first observation, for a row.
 
-        It takes random numbers and parameters. It gives a motion, and the numbers that `function`
-        gives before the reward.
+        It takes random numbers, one of MEMBERS and MAX_DRAWN of START, and parameters. It gives a
+        motion, and the numbers that `function` gives before the reward.
 
         Raises:
             NotCompilable: The starts of the task are more than arithmetic.
         """
-        widths = MAX_DRAWN, ROW_SIZE
-        given: Any = {"sound": False, "max_operations": MAX_OPERATIONS, "fixed": MAX_DRAWN}
+        widths = 1 + MAX_DRAWN, ROW_SIZE
+        given: Any = {"sound": False, "max_operations": MAX_OPERATIONS, "fixed": 1 + MAX_DRAWN}
         return RowFunction(self._start, *widths, **given)
 
     def _finish(
@@ -158,11 +164,14 @@ class Program:
 
     def _start(self, drawn: Array, parameters: Array) -> Array:
         """The start of an episode, arrays (1, k) of symbols."""
-        draws = Draws(lambda places: drawn[0, places])
+
+        def read(places: Array) -> Array:
+            self.drawn = max(self.drawn, *places.flat)
+            return drawn[0, places]
+
         own = self._parameters(parameters)
-        start, task_state = self.task.begin(draws, own)
+        start, task_state = self.task.begin(Draws(read, 1), own)
         task_state = self.task.remember(start, task_state)
-        self.drawn = draws.used
         parts = start.position + self.written.engine.origin, start.quaternion
         motion = np.concatenate(
             [*parts, start.velocity, start.body_rate, start.rotor_speed], axis=-1

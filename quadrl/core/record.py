@@ -176,9 +176,9 @@ def _task(record: Mapping[str, Any], flown: Scenario) -> tuple[Any, ...]:
     """The options of a record's task, those of its name today, and those that are flown."""
     if record.get("task") != flown.task.name or "task_options" not in record:
         return {}, {}, {}
-    today, own = as_json(type(flown.task)()), record["changed"].get("task", ())
+    today, own = as_json(flown.task.usual()), record["changed"].get("task", ())
     was = today | dict(record["task_options"])
-    return was, today | {name: was.get(name) for name in own}, flown.task
+    return was, today | {name: was.get(name) for name in own}, flown.task.to_json()
 
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

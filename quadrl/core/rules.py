@@ -156,6 +156,8 @@ def check_values(task: Task, own: Parameters, actions: int, height: float) -> tu
     _check_array(task, "error", error, (rows,), "f")
     end = EpisodeEnd(terminated, ~terminated, error + 1, error, error, 1, terminated)
     _check_array(task, "succeeded", task.succeeded(now, end), (rows,), "b")
+    for seconds in task.duration(now) or ():
+        _check_array(task, "duration", seconds, (rows,), "f")
     terms = task.reward(now, now, end)
     if not terms:
         raise QuadrlError(name=f"{task.name} reward", value=terms, allowed="at least one term")

@@ -202,10 +202,10 @@ class Scenario:
         if file and isinstance(wanted := whole["task"], str) and wanted not in catalogue.TASKS:
             allowed = f"a task of {file}, with which it was saved: give --import {file}"
             raise QuadrlError(name="task", value=wanted, allowed=allowed)
-        made = catalogue.make(whole["task"])
-        known = [field.name for field in dataclasses.fields(made)]
-        validation.keys(f"{made.name} option", others, [*KEYWORDS, *also, *known], tried=bool(also))
-        made = made.replace(**validation.tuples(options | others))
+        kind = catalogue.kind(whole["task"])
+        known = [field.name for field in dataclasses.fields(kind)]
+        validation.keys(f"{kind.name} option", others, [*KEYWORDS, *also, *known], tried=bool(also))
+        made = catalogue.make(whole["task"], **validation.tuples(options | others))
         whole |= {"task": made, "vehicle": vehicle}
         return cls(**{name: value for name, value in whole.items() if value is not None})
 
@@ -218,13 +218,13 @@ class Scenario:
             what in task and vehicle was not what their names meant; and `file`, the name of that in
             which a task of one's own is defined.
         """
-        found: dict[str, Any] = {"task": self.task.name, "task_options": as_json(self.task)}
+        found: dict[str, Any] = {"task": self.task.name, "task_options": self.task.to_json()}
         values = {field.name: getattr(self, field.name) for field in FIELDS[1:]}
         found |= {name: as_json(value) for name, value in values.items() if value is not None}
         if isinstance(self.aerodynamics, str):
             found["aircraft"] = as_json(self.aircraft)
         known = presets.VEHICLES.get(self.vehicle.name, self.vehicle)
-        usual = {field.name: _default(field) for field in dataclasses.fields(self.task)}
+        usual = self.task.usual()
         pairs = {"task": (found["task_options"], usual), "vehicle": (found["vehicle"], known)}
         found["changed"] = {name: _differing(*pair) for name, pair in pairs.items()}
         if not (kind := type(self.task)).__module__.startswith("quadrl."):
@@ -309,8 +309,3 @@ def _check_in_wind(vehicle: Vehicle) -> None:
 def _differing(own: Mapping[str, Any], usual: Any) -> list[str]:
     """The names of the fields of a record, as JSON has it, that are not those of the usual one."""
     return [name for name, value in as_json(usual).items() if own[name] != value]
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    made = field.default_factory
-    return field.default if made is dataclasses.MISSING else made()

@@ -115,7 +115,7 @@ class EpisodeEnd:
     steps: Array  # control steps so far
     error_sum: Array  # [m], sum of the task's error over these steps
     final_sum: Array  # [m], sum over the last `settle_steps` before the time limit
-    settle_steps: int
+    settle_steps: Array | int  # or (N,), where it differs by row
     succeeded: Array = None  # bool; only the reward sees it
 
     @property
@@ -168,6 +168,19 @@ class Rollout:
     def __repr__(self) -> str:
         steps, flights = self.error.shape
         return f"Rollout of {self.task.name}: {flights} flights, {steps} control steps at most"
+
+    def part(self, rows: np.ndarray, task: Any, remembered: Mapping[str, np.ndarray]) -> Rollout:
+        """Some of the flights, by their numbers (n,), with the task of theirs and its memory."""
+        steps, times = int(self.length[rows].max()), len(self.error)
+
+        def own(values: Array) -> Array:  # (T, N, ...), or (S, N, ...)
+            return values[: steps + len(values) - times, rows]
+
+        changed = {k: own(v) for k, v in vars(self).items() if getattr(v, "ndim", 0) > 1}
+        ends = ("length", "terminated", "is_success", "diverged")
+        changed |= {k: getattr(self, k)[rows] for k in ends}
+        changed["remembered"] = {k: own(v) for k, v in remembered.items()}
+        return dataclasses.replace(self, **changed, task=task, markers=())
 
     @property
     def success_time(self) -> np.ndarray:

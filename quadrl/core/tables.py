@@ -107,7 +107,7 @@ class Tables:
     def places_of(self, start: RowFunction) -> np.ndarray:
         """The places of the parameters that a function of a start reads, which come last in it."""
         row, stride = self._parameters.ctypes.data, self._stride
-        return _read([(row + 8 * k, stride, MAX_DRAWN + k) for k in range(ROW_SIZE)], start)
+        return _read([(row + 8 * k, stride, 1 + MAX_DRAWN + k) for k in range(ROW_SIZE)], start)
 
     @property
     def _stride(self) -> int:

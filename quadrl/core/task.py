@@ -13,13 +13,14 @@ import abc
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import mujoco
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
+from quadrl.base.records import as_json
 from quadrl.base.rotation import Array, norm, to_body
 from quadrl.base.validation import keys, like, number
 from quadrl.conditions.scene import Scene
@@ -140,6 +141,11 @@ class Task(abc.ABC):
         if self.settle_time != Task.settle_time:
             number(f"{self.name} settle_time", self.settle_time, 0, self.time_limit)
 
+    @property
+    def asks_compiled(self) -> bool:
+        """Whether its class asks for its step to be compiled, and not only a base of it."""
+        return vars(type(self)).get("compiled", False)
+
     def check(self, parameters: Parameters) -> None:
         """Refuse an aircraft that cannot do what is asked, from its parameters (1, ...).
 
@@ -168,6 +174,13 @@ class Task(abc.ABC):
     def update(self, before: Snapshot, now: Snapshot) -> TaskState:
         """What is remembered after a control step: a new record, or `now.task` itself."""
         return now.task
+
+    def duration(self, now: Snapshot) -> tuple[Array, Array] | None:
+        """Time limit and settle time of each row's episode [s], (N,) each, in whole control steps.
+
+        The limit stays what it is, at most `time_limit`. None where they are the options.
+        """
+        return None
 
     def goal(self, now: Snapshot) -> Array:
         """Where to be, (N, 3) [m], task frame."""
@@ -290,17 +303,38 @@ class Task(abc.ABC):
         """The task's own figures of an evaluation, with their units in their names."""
         return {}
 
-    def replace(self, **options: Any) -> Task:
+    def replace(self, **options: Any) -> Self:
         """A variant with other options.
 
         Raises:
             QuadrlError: An option that the task does not have; the message lists the choices.
         """
-        keys(f"{self.name} option", options, [f.name for f in dataclasses.fields(self)])
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return self.of(own, **options)
+
+    @classmethod
+    def of(cls, own: Mapping[str, Any], /, **options: Any) -> Self:
+        """A task of this class with some options; the others are its `own`, or the usual ones.
+
+        Raises:
+            QuadrlError: An option that the task does not have; the message lists the choices.
+        """
+        keys(f"{cls.name} option", options, [f.name for f in dataclasses.fields(cls)])
         try:
-            return dataclasses.replace(self, **options)
+            return cls(**{**own, **options})
         except (TypeError, ArithmeticError) as error:  # of a check that is the task's own
-            raise QuadrlError(f"{self.name} options {options}: {error}") from error
+            raise QuadrlError(f"{cls.name} options {options}: {error}") from error
+
+    @classmethod
+    def usual(cls) -> dict[str, Any]:
+        """Its options where none is given."""
+        made = ((field, field.default_factory) for field in dataclasses.fields(cls))
+        none = dataclasses.MISSING
+        return {field.name: field.default if of is none else of() for field, of in made}
+
+    def to_json(self) -> dict[str, Any]:
+        """Its options, as JSON can hold them."""
+        return as_json(self)
 
 
 def heads_east(now: Snapshot, tolerance: float) -> Array:

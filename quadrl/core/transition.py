@@ -24,7 +24,7 @@ class Clock:
     """The lengths of an episode."""
 
     control_timestep: float  # [s]
-    time_limit_steps: int
+    time_limit_steps: int  # of the longest episode
     settle_steps: int  # before the time limit, over which the final error is taken
 
     @classmethod
@@ -43,6 +43,13 @@ class Clock:
             )
         settle = min(max(1, round(task.settle_time / control_timestep)), limit)
         return cls(control_timestep, limit, settle)
+
+    def lengths(self, task: Task, now: Snapshot) -> tuple[Array | int, Array | int]:
+        """The same of each row's episode, (N,) each where the task has them by row."""
+        if (seconds := task.duration(now)) is None:
+            return self.time_limit_steps, self.settle_steps
+        limit, settle = (namespace(s).floor(s / self.control_timestep + 0.5) for s in seconds)
+        return limit, settle
 
 
 @dataclasses.dataclass(slots=True)
@@ -148,12 +155,13 @@ def finish(
     now = Snapshot(state, *given, sensed=sensed or {}, world=world)
     now.potentials = task.measure(now)
     terminated = task.terminated(now) | diverged
-    truncated = (steps >= clock.time_limit_steps) & ~terminated
+    limit, settle_steps = clock.lengths(task, now)
+    truncated = (steps >= limit) & ~terminated
     error = task.error(now)
     error_sum = episode.error_sum + error
-    settling = steps > clock.time_limit_steps - clock.settle_steps
+    settling = steps > limit - settle_steps
     final_sum = episode.final_sum + xp.where(settling, error, 0.0 * error)
-    end = EpisodeEnd(terminated, truncated, steps, error_sum, final_sum, clock.settle_steps)
+    end = EpisodeEnd(terminated, truncated, steps, error_sum, final_sum, settle_steps)
     end.succeeded = (terminated | truncated) & task.succeeded(now, end) & ~diverged
     terms = task.reward(before, now, end)
     task_state = task.update(before, now)

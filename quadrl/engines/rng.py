@@ -82,6 +82,10 @@ class Rng:
         self._drawn: Array = None  # (n, k) numbers of the stream from `_first` on
         self._first = self._end = self._used = 0
 
+    def stream(self, number: int) -> Rng:
+        """Another stream of the same episodes, or the same one again, from its first number on."""
+        return Rng(self._keys, self._episodes, number)
+
     def uniform(self, low: float, high: float, size: int | None = None) -> Array:
         """Uniform numbers in [low, high): (n,), or (n, size)."""
         count = 1 if size is None else size

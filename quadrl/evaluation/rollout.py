@@ -13,6 +13,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import roll_pitch_yaw
 from quadrl.base.validation import action
 from quadrl.core.environment import Environment
+from quadrl.core.one_of import OneOf
 from quadrl.core.record import warn_of_changes
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.snapshot import Rollout
@@ -224,9 +225,12 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
         episodes; success_rate and survival_rate (shares); position_error_m and
         position_error_std_m: mean and deviation over the flights [m]; where the heading matters
         heading_error_deg; `means_of_behaviour`; return_mean and return_std; length_mean_s; diverged
-        (count); and the task's own metrics. `flights` says what each of them is of one flight.
+        (count); the task's own metrics; and of each member of a `OneOf` the same, with its name in
+        front. `flights` says what each of them is of one flight.
     """
-    flown = flights(rollout)
+    flown, task, own = flights(rollout), rollout.task, dict[str, Any]()
+    for name, part in task.flown(rollout).items() if isinstance(task, OneOf) else ():
+        own |= {f"{name}_{metric}": value for metric, value in summarize(part).items()}
     heading = {k: float(v.mean()) for k, v in flown.items() if k == "heading_error_deg"}
     return {
         "episodes": len(flown["return"]),
@@ -240,7 +244,7 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
         "return_std": float(flown["return"].std()),
         "length_mean_s": float(flown["length_s"].mean()),
         "diverged": int(flown["diverged"].sum()),
-    } | rollout.task.metrics(rollout)
+    } | (task.metrics(rollout) | own)
 
 
 def _state(environment: Environment) -> dict[str, np.ndarray]:

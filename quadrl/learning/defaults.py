@@ -23,10 +23,10 @@ from typing import Any
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.validation import IN_A_FILE, choice, keys
 from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.core import catalogue
 from quadrl.core.scenario import GIVEN
 from quadrl.core.task import Task
 from quadrl.learning.settings import ALGORITHM_CONFIGS, PAIRED, USUAL
-from quadrl.tasks import TASKS
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
 """Settings that the other defaults depend on, or that have no better default than another."""
@@ -128,7 +128,7 @@ def training_defaults(
         QuadrlError: The task, the vehicle, the variant or a setting in `Task.training`,
             `Task.training_with` or `Task.variants` is unknown.
     """
-    kind = TASKS[choice("task", task, TASKS, IN_A_FILE)]
+    kind = catalogue.kind(task)
     shared = VARIANTS[choice("variant", variant, VARIANTS)]
     choice("vehicle", vehicle, VEHICLES, IN_A_FILE)
     check_stated(kind)

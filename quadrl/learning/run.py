@@ -208,7 +208,7 @@ def would_gain(config: TrainConfig) -> str:
     """What `compiled = True` would gain for a task of one's own, in a line; "" for nothing."""
     scenario, took = config.training_scenario, dict[bool, float]()
     task, kind = scenario.task, type(scenario.task)
-    if kind.__module__.startswith("quadrl.") or vars(kind).get("compiled"):
+    if kind.__module__.startswith("quadrl.") or task.asks_compiled:
         return ""
     own = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
     for asked in (False, True):

@@ -273,14 +273,14 @@ QUADRL_EXPORT int64_t quadrl_step(const Step* s, const int64_t* ids, int64_t fir
   return marked;
 }
 
-// Begins episodes of aircraft `ids` (n). `start` takes the first `numbers` random numbers of each
-// episode's `stream`, for keys and episodes of the aircraft in the list, and what is at `places`;
-// it gives a motion, numbers for `out`, and the observation; they go to `room`, for quadrl_place. Returns
-// how many of the motions a physics step does not resolve.
+// Begins episodes of aircraft `ids` (n). `start` takes the first random number of each episode's
+// stream `members` and the first `numbers` of its `stream`, for keys and episodes of the aircraft
+// in the list, and what is at `places`; it gives a motion, numbers for `out`, and the observation;
+// they go to `room`, for quadrl_place. Returns how many of the motions a physics step does not resolve.
 QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Function* start, const Place* places,
                                    int64_t reads, const int64_t* ids, int64_t n,
                                    const int64_t* keys, const int64_t* episodes, int64_t stream,
-                                   int64_t numbers, double* room) {
+                                   int64_t numbers, int64_t members, double* room) {
   const int rotors = (int)s->rows->rotors;
   const int64_t given = start->given;
   Lanes x[start->taken], y[given];
@@ -292,9 +292,11 @@ QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Function* start, const P
     for (int i = 0; i < LANES; ++i) {
       const int64_t at = first + (i < filled ? i : 0);
       uint32_t block[4];
+      words(block, 0, members, episodes[at], keys[at]);
+      x[0][i] = block[0] * 0x1p-32;
       for (int64_t k = 0; k < numbers; ++k) {
         if (k % 4 == 0) words(block, k / 4, stream, episodes[at], keys[at]);
-        x[k][i] = block[k % 4] * 0x1p-32;
+        x[1 + k][i] = block[k % 4] * 0x1p-32;
       }
       for (int64_t k = 0; k < reads; ++k) {
         x[places[k].number][i] = places[k].at[ids[at] * places[k].stride];
