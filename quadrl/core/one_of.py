@@ -236,7 +236,8 @@ class OneOf(Task):
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """Refuse controllers: they do not see which task they fly."""
-        raise self._refused("controller", reading, f"flown in {' or '.join(self.named)} alone")
+        allowed = f"one of {', '.join(self.named)} alone"
+        raise QuadrlError(name="task of a controller", value=self.name, allowed=allowed)
 
     def markers(self, now: Snapshot) -> Sequence[Marker | Primitive]:
         """What the member shows."""

@@ -180,7 +180,7 @@ class Rollout:
         ends = ("length", "terminated", "is_success", "diverged")
         changed |= {k: getattr(self, k)[rows] for k in ends}
         changed["remembered"] = {k: own(v) for k, v in remembered.items()}
-        return dataclasses.replace(self, **changed, task=task, markers=())
+        return dataclasses.replace(self, **changed, task=task, markers=(), events=())
 
     @property
     def success_time(self) -> np.ndarray:

@@ -10,6 +10,7 @@ from helpers import needs_dm_control
 from quadrl.base.rotation import Array, namespace
 from quadrl.control.modes import CONTROL_MODES
 from quadrl.control.reading import Reading
+from quadrl.core.one_of import OneOf
 from quadrl.core.task import Potentials, TaskState
 from quadrl.envs.gymnasium import QuadrotorEnv
 from quadrl.tasks import TASKS, make
@@ -55,6 +56,10 @@ def test_the_yardstick_is_guided_in_any_namespace(name):
 def test_a_route_keeps_it_too():
     # The first waypoint is reached at once, the second by the aircraft that climbs.
     check_task(StaticWaypoint(waypoints=WAYPOINTS, reach=0.35))
+
+
+def test_one_of_several_tasks_keeps_it_too():
+    check_task(OneOf(members=("hover", "straight_and_level"), time_limit=1.5))
 
 
 def check_identity(task, actions=ACTIONS, mode="rotor"):
