@@ -22,7 +22,6 @@ from quadrl.base.philox import MEMBERS, START
 from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import Array, namespace, stack
 from quadrl.base.validation import MAX_OPTION, number, numbers
-from quadrl.control.reading import Reading
 from quadrl.core.catalogue import make
 from quadrl.core.markers import Marker
 from quadrl.core.observation import ObservationTerm
@@ -233,11 +232,6 @@ class OneOf(Task):
         """The terms of the member, 0 in those of others."""
         terms: list[dict[str, Array]] = self.each("reward", before, now, end)
         return _terms(now.task.which, terms, _in_order(tuple(tuple(one) for one in terms)))
-
-    def guide(self, reading: Reading) -> tuple[Array, Array]:
-        """Refuse controllers: they do not see which task they fly."""
-        allowed = f"one of {', '.join(self.named)} alone"
-        raise QuadrlError(name="task of a controller", value=self.name, allowed=allowed)
 
     def markers(self, now: Snapshot) -> Sequence[Marker | Primitive]:
         """What the member shows."""

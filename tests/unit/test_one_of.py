@@ -15,7 +15,7 @@ from quadrl.core.scenario import Scenario
 from quadrl.core.snapshot import TaskState
 from quadrl.core.task import ObservationTerm
 from quadrl.evaluation.evaluate import evaluate
-from quadrl.evaluation.rollout import EVALUATION_SEED, flights, fly
+from quadrl.evaluation.rollout import flights
 from quadrl.learning.config import TrainConfig
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
@@ -110,17 +110,18 @@ def test_each_row_draws_its_task_for_each_episode_in_proportion():
 
 
 def test_an_evaluation_tells_of_each_member_what_it_reaches_alone():
-    task, given = OneOf(members=MEMBERS), {"episodes": 24, "engine": "free_flight"}
-    controller = lambda seen: np.full((len(seen), 4), [0.2, 0.2, 0.3, 0.1])  # noqa: E731
-    found = evaluate(controller, task, seed=1, **given)
+    task, given = OneOf(members=MEMBERS), {"episodes": 24, "engine": "free_flight", "seed": 1}
+    found = evaluate("geometric", task, **given)
     which, parts = found.rollout.remembered["which"][0], task.flown(found.rollout)
     for number, (name, part) in enumerate(parts.items()):
-        rows = np.flatnonzero(which == number)
-        alone = fly(controller, task.named[name], seed=EVALUATION_SEED + 1, **given)
-        for figure, values in flights(alone).items():
+        rows, alone = (
+            np.flatnonzero(which == number),
+            evaluate("geometric", task.named[name], **given),
+        )
+        for figure, values in flights(alone.rollout).items():
             np.testing.assert_allclose(flights(part)[figure], values[rows], rtol=1e-12)
-        assert found.metrics[f"{name}_success_rate"] == alone.is_success[rows].mean()
-    off = np.sqrt(np.nanmean(alone.position[1:, rows, 2] ** 2))
+        assert found.metrics[f"{name}_success_rate"] == alone.rollout.is_success[rows].mean()
+    off = np.sqrt(np.nanmean(alone.rollout.position[1:, rows, 2] ** 2))
     np.testing.assert_allclose(found.metrics["straight_and_level_altitude_rms_m"], off, rtol=1e-12)
     assert {target.metric for target in task.targets} <= found.metrics.keys()
 
