@@ -115,7 +115,7 @@ class EpisodeEnd:
     steps: Array  # control steps so far
     error_sum: Array  # [m], sum of the task's error over these steps
     final_sum: Array  # [m], sum over the last `settle_steps` before the time limit
-    settle_steps: Array | int  # or (N,), where it differs by row
+    settle_steps: Array | int  # a number, or (N,) where it differs by row
     succeeded: Array = None  # bool; only the reward sees it
 
     @property
