@@ -54,6 +54,7 @@ def make_rollout(**changes) -> Rollout:
         diverged=np.array([False, True, False]),
         remembered={},
         markers=(),
+        events=(),
         origin=np.array([0.0, 0.0, 3.0]),
         control_timestep=0.05,
         task=tasks.make("hover"),

@@ -71,7 +71,7 @@ def test_rollouts_and_trajectories_have_the_shapes_that_stand_behind_them():
 
     flown = fly(still, tasks.make("hover", time_limit=0.5), episodes=2)
     longest = int(flown.length.max())
-    assert check(flown, S=longest + 1, T=longest, N=2, R=4, k=4) == 18
+    assert check(flown, S=longest + 1, T=longest, N=2, R=4, k=4) == 19
     steps = int(flown.length[0])
     drawn = flown.trajectory(VEHICLES["paper"])
     assert check(drawn, T=steps, R=4) == 7
