@@ -265,6 +265,8 @@ class GustFront(Sudden):
 def resolve(given: Happens) -> dict[str, Event]:
     """Make events by name from a name, from names, or from a mapping of names to their options.
 
+    The name "none" alone is for no event.
+
     Raises:
         QuadrlError: The event or an option is unknown, or an option is out of range.
     """
@@ -275,6 +277,8 @@ def resolve(given: Happens) -> dict[str, Event]:
             allowed = "a name, a list of names, or a mapping of names to options"
             raise QuadrlError(name="events", value=given, allowed=allowed)
         named = dict.fromkeys(given)
+    if [*named] == ["none"]:
+        return {}
     return {name: _made(name, options) for name, options in named.items()}
 
 

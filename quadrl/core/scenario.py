@@ -64,7 +64,8 @@ class Conditions(TypedDict, total=False, extra_items=Any):
     [0.8, 1.2]}'; in Python also a Randomization, or some of its fields."""
     events: Happens
     """What happens in flight, with options: battery, rotor_failure, rotor_damage, payload or
-    gust_front, such as battery rotor_failure='{"at": 3}'; in Python also a name, or several."""
+    gust_front, such as battery rotor_failure='{"at": 3}'; or none. In Python also a name, or
+    several."""
     observe: Observed
     """Options of the observation: fields of `quadrl.Observing`, such as action_history=2."""
     control_mode: str | None
@@ -266,6 +267,8 @@ class Scenario:
 
 
 FIELDS = dataclasses.fields(Scenario)
+UNDISTURBED: Mapping[str, Any] = {"weather": "calm", "randomization": "none", "events": "none"}
+"""Conditions of a flight that nothing disturbs."""
 _OPTIONS: Mapping[str, Any] = {"given": "pairs", "usual": {}}
 GIVEN: dict[str, Mapping[str, Any]] = {field.name: field.metadata for field in FIELDS[1:]}
 GIVEN["task_options"] = GIVEN["vehicle_options"] = _OPTIONS

@@ -18,7 +18,7 @@ from quadrl.base.validation import number
 from quadrl.control import CONTROLLERS
 from quadrl.control.feasibility import warn_of_unreached
 from quadrl.core.catalogue import make
-from quadrl.core.scenario import Conditions, Scenario
+from quadrl.core.scenario import UNDISTURBED, Conditions, Scenario
 from quadrl.core.snapshot import Rollout
 from quadrl.core.task import Task
 from quadrl.core.trajectory import Trajectory
@@ -229,8 +229,8 @@ def beside(
     """Resolve several controllers for a view side by side: one episode of one task in one world.
 
     Each has the aircraft and the observation of its training. The task is that of the first; the
-    weather and the randomization are the first that differ from calm air and from none. Wind acts
-    on all as on the first that brings it.
+    weather, the randomization and the events are the first that disturb. Wind acts on all as on the
+    first that brings it.
 
     Args:
         controllers: Policies or controllers, each as `setting` takes it.
@@ -247,11 +247,12 @@ def beside(
         flown.append((flies, scenario))
     scenarios = [scenario for _, scenario in flown]
     same: Any = {"task": scenarios[0].task}
-    for name in ("weather", "randomization"):
-        usual = Scenario.__dataclass_fields__[name].default
+    calm = Scenario.of(scenarios[0].task, **UNDISTURBED)
+    for name in UNDISTURBED:
+        usual = getattr(calm, name)
         own = (getattr(scenario, name) for scenario in scenarios)
         same[name] = next((world for world in own if world != usual), usual)
-    air = next((one.aerodynamics for one in scenarios if not one.weather.calm), None)
+    air = next((one.aerodynamics for one in scenarios if not one.calm), None)
     return [
         (flies, dataclasses.replace(one, **same, aerodynamics=one.aerodynamics or air))
         for flies, one in flown

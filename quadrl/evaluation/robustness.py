@@ -20,7 +20,7 @@ from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Rand
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control.feasibility import limit
-from quadrl.core.scenario import Conditions, Scenario
+from quadrl.core.scenario import UNDISTURBED, Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.cache import ResultCache
 from quadrl.evaluation.card import QUARTILES, Card, half_level, wilson
@@ -38,7 +38,7 @@ from quadrl.evaluation.rollout import (
     means_of_behaviour,
 )
 
-WORLD = ("vehicle", "aerodynamics", "weather", "randomization", "engine")
+WORLD = ("vehicle", "aerodynamics", *UNDISTURBED, "engine")
 """Fields of the first one's scenario in which the others fly too, beside the task."""
 CELL_SHARE = 10  # a cell of a recovery map has this part of the flights of a level
 PUSHES_PER_SECOND = 0.5  # chosen: about five in a flight of 10 s
@@ -269,7 +269,7 @@ def _flown(
         raise QuadrlError(name="controller", value=controller, allowed="at least one that flies")
     given: dict[str, Any] = {name: x for name, x in conditions.items() if x is not None}
     if not isinstance(task, Scenario):
-        given = {"weather": Weather(), "randomization": Randomization()} | given
+        given = {**UNDISTURBED, **given}
     flown: dict[str, tuple[Controller, Scenario]] = {}
     asked = "aerodynamics" in given
     for name, one in pairs:

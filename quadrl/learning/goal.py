@@ -9,6 +9,7 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.core.environment import Environment
+from quadrl.core.scenario import UNDISTURBED
 from quadrl.learning.config import TrainConfig
 
 DRAWN = 16  # goal states that are compared
@@ -33,7 +34,7 @@ def goal_state(config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
     sensors = {**scenario.task.sensors, **scenario.observe.sensors}
     exact = {name: {**options, "noise": 0.0, "bias": 0.0} for name, options in sensors.items()}
     observe = dataclasses.replace(scenario.observe, sensors=exact)
-    calm: Any = {"weather": "calm", "randomization": "none", "observe": observe}
+    calm: Any = {**UNDISTURBED, "observe": observe}
     environment = Environment(scenario, num_envs=DRAWN, seed=0, **calm)
     task, vehicle = environment.task, environment.vehicle
     environment.reset()

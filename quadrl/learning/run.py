@@ -21,7 +21,7 @@ from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.units import percent
 from quadrl.control.feasibility import warn_of_unreached
 from quadrl.core.environment import Environment
-from quadrl.core.scenario import Scenario
+from quadrl.core.scenario import UNDISTURBED, Scenario
 from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
@@ -104,9 +104,10 @@ class Run:
         """The command that goes on where targets are missed."""
         config, run, flown = self.config, shlex.quote(str(self.folder)), self.config.scenario
         usual = TrainConfig(config.task, algo=config.algo).scenario
-        if (flown.weather, flown.randomization) != (usual.weather, usual.randomization):
-            calm = f"quadrl evaluate {run} --weather calm --randomization none"
-            return f"They count undisturbed: {calm}"
+        differ = [k for k in UNDISTURBED if getattr(flown, k) != getattr(usual, k)]
+        if differ:
+            calm = " ".join(f"--{name} {UNDISTURBED[name]}" for name in differ)
+            return f"They count undisturbed: quadrl evaluate {run} {calm}"
         if flown.task.trainings and flown == usual and not config.from_run:
             first, second = flown.task.trainings
             begun = config.algo == first.get("algo", flown.task.trained_by)

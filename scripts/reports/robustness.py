@@ -20,7 +20,7 @@ from quadrl.base.units import length, quantity
 from quadrl.conditions.randomization import RANDOMIZATIONS
 from quadrl.control import Gains, GeometricController
 from quadrl.control.reading import Reading
-from quadrl.core.scenario import Conditions, Scenario
+from quadrl.core.scenario import UNDISTURBED, Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import setting
 from quadrl.evaluation.policy import Policy
@@ -56,7 +56,7 @@ class Integrating(GeometricController):
         return super().action(reading, offset + self._sum, velocity)
 
 
-UNDISTURBED: Conditions = {"weather": "calm", "randomization": "none", "aerodynamics": "none"}
+IN_CALM: Any = {**UNDISTURBED, "aerodynamics": "none"}
 WIDER: Conditions = {"vehicle_options": {"action_scale": WIDE}}  # as the policies command
 UNCERTAIN: Conditions = {  # unknown mass, late commands, an estimate with noise
     "weather": "light",
@@ -91,7 +91,7 @@ def tuned(task: str, name: str, condition: Conditions) -> Integrating:
     """The controller with the gains that were found for a task in a condition; for one flight."""
     gains = report.load("tuning")["tasks"][task]
     bandwidth, integral = gains.get(name) or gains["all together"]  # where none were
-    scenario = Scenario.of(task, **UNDISTURBED | condition)
+    scenario = Scenario.of(task, **IN_CALM | condition)
     own = Gains(**{**scenario.task.gains, "level": bandwidth, "height": bandwidth})
     return Integrating(scenario.aircraft, scenario.task, own, integral)
 
@@ -100,7 +100,7 @@ def flown(flyer: Any, task: str, condition: Conditions, episodes: int) -> Result
     """What a policy, a known name or a tuned controller reaches in a condition."""
     made = tasks.make(task)
     engine = "mujoco" if made.contact else "free_flight"
-    given: Any = UNDISTURBED | condition | {"engine": engine}
+    given: Any = IN_CALM | condition | {"engine": engine}
     given |= SEEN if flyer == "geometric" or isinstance(flyer, Integrating) else {}
     _, controller, scenario = setting(flyer, made, **given)
     each = flights(fly(controller, scenario, episodes=episodes, seed=FRESH))

@@ -11,7 +11,7 @@ from typing import Any
 from quadrl import tasks
 from quadrl.base.files import write_json
 from quadrl.base.units import quantity
-from quadrl.core.scenario import Scenario
+from quadrl.core.scenario import UNDISTURBED, Scenario
 from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED, SHIPPED_AS, Policy
@@ -35,7 +35,6 @@ column lists the targets of the task that the policy misses in the same number o
 episodes. Rows "as flown" have one disturbance that real aircraft meet. {source}"""
 MADE = ("algo", "seed", "run", "variant", "steps", "rotors")
 """What a policy says of its training beside the scenario."""
-CALM: Any = {"weather": "calm", "randomization": "none"}
 AS_FLOWN: dict[str, Any] = {  # each alone, by the policies of tasks that have no robust one
     "as flown, 10 ms late": {"randomization": {"command_delay": 0.01}},
     "as flown, 20 ms late": {"randomization": {"command_delay": 0.02}},
@@ -84,7 +83,7 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES}"
     practised = usual["training_options"]
     practice = {k: x for k, x in config.training_options.items() if x != practised[k]}
-    still = summarize(fly(policy, episodes=EPISODES, **CALM))
+    still = summarize(fly(policy, episodes=EPISODES, **UNDISTURBED))
     if short := missed(tasks.TASKS[config.task].targets, still):
         for old in (file, file.with_suffix(".json")):
             old.unlink(missing_ok=True)
@@ -137,7 +136,7 @@ def shipped(episodes: int = EPISODES, only: tuple[str, ...] = ()) -> None:
     before = report.load("shipped") if only else {"rows": []}
     rows = {row["policy"]: {"commit": before["commit"]} | row for row in before["rows"]}
     for name in only or sorted(file.stem for file in SHIPPED.glob("*.safetensors")):
-        found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, CALM))
+        found, still = (evaluate(name, episodes=episodes, **x).metrics for x in ({}, UNDISTURBED))
         targets = tasks.TASKS[found["task"]].targets
         alone = {} if (SHIPPED / f"{found['task']}_robust.safetensors").exists() else AS_FLOWN
         late = {k: evaluate(name, episodes=episodes, **x).metrics for k, x in alone.items()}

@@ -13,7 +13,7 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.rotation import namespace
 from quadrl.conditions.event import EVENTS, SPEED_LIMIT, Event, register_event
 from quadrl.core.environment import Environment
-from quadrl.core.scenario import Scenario
+from quadrl.core.scenario import UNDISTURBED, Scenario
 from quadrl.engines.engine import ENGINES
 
 PAPER = VEHICLES["paper"]
@@ -282,3 +282,4 @@ def test_a_scenario_keeps_its_events():
     assert changed.events["payload"].at == (1, 2)
     assert Scenario.of("hover", events="battery").events == {"battery": given.events["battery"]}
     assert dataclasses.replace(given, events=None).events == {}
+    assert Scenario.of(given, **UNDISTURBED).events == {}
