@@ -358,9 +358,9 @@ class Environment(saving.Copied):
                 reward that is not finite.
             RuntimeError: There was no reset before.
         """
-        begun = self._begun
+        _ = self._begun  # refuse what has not begun; it may be made anew now
         self._accept(action)
-        if not self._parted and begun.fly():
+        if not self._parted and self._begun.fly():
             if self.observer:
                 self.observer.follow(self._inputs.command, self.vehicle.control_timestep)
             return self.finish()
