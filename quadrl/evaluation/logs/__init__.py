@@ -1,0 +1,1 @@
+"""Logs of flights, a reader for each format."""
