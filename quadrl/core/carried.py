@@ -1,0 +1,150 @@
+"""What a policy needs beside its network on an aircraft's own computer, as functions of a row.
+
+They are the traced functions of a control step (`core/program.py`) without what only a simulation
+knows: no errors are drawn, the air is calm, the aircraft is as specified, and rewards and ends are
+left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quadrl.aircraft.parameters import ROW_SIZE, numbers
+from quadrl.base import records
+from quadrl.base.errors import QuadrlError
+from quadrl.base.rotation import Array
+from quadrl.base.trace import NotCompilable
+from quadrl.core.environment import Environment
+from quadrl.core.program import AGED, Program
+from quadrl.core.senses import Look, arrays
+from quadrl.core.transition import begin
+from quadrl.engines.rowwise import RowFunction
+from quadrl.engines.state import Start, State
+
+
+class Carried(Program):
+    """The functions for the scenario of an environment.
+
+    A motion is position [m], from the origin of the task's frame, quaternion, velocity [m/s], world
+    frame, body rate [rad/s], body frame, and rotor speeds [rad/s]. A memory is what the task and
+    the sensors remember of an episode (`remembered`), its first numbers what the task does
+    (`task_memory`).
+    """
+
+    def __init__(self, environment: Environment) -> None:
+        """Trace the functions.
+
+        Args:
+            environment: Flies the scenario, undisturbed; it was reset.
+
+        Raises:
+            QuadrlError: The task or a sensor needs what no autopilot has.
+        """
+        task, observer = environment.task, environment.observer
+        if environment.snapshot.world is not None:
+            allowed = "one without solids, whose places an autopilot does not know"
+            raise QuadrlError(name="task", value=task.name, allowed=allowed)
+        if observer and observer.senses.loops and any(c.follows for c in observer.senses.early):
+            given = observer.kept.get("rotor_speed", {})
+            if "speed" in given:
+                allowed = "rotor_speed none, or a control mode without loops"
+                reason = "its rotor speeds follow commands of loops, which are the autopilot's own"
+                raise QuadrlError(reason, name="rotor_speed", value="estimated", allowed=allowed)
+        row = environment.engine.parameters[:1]
+        self._row = numbers(row).reshape(1, ROW_SIZE)
+        self.environment = environment
+        written = environment.written()
+        try:
+            super().__init__(written, environment.snapshot, environment.episode, row)
+            motion, actions = written.engine.motions.shape[-1], self.parts["action"]
+            size = len(records.leaves(environment.snapshot.task))
+            widths = [array.size for array in self._first_row()[:size]]
+            self.task_width = sum(widths)
+            """Numbers of a memory that are the task's own, which come first."""
+            mode = environment.control_mode
+            self.begun = RowFunction(self._begun, motion, self.task_width)
+            """Memory and observation as an episode begins, from motion and the task's memory."""
+            self.followed = 0 if written.loops else self.parts["command"]
+            """Rotor commands [rad/s] of the last control step that `sensed` takes."""
+            given = motion, motion, actions, self.followed, self.remembered.end
+            self.sensed = RowFunction(self._sensed, *given, sound=False)
+            """The same after a control step, from the motion, that before it, the action and the
+            commands of the step, and the memory."""
+            self.asked = RowFunction(mode.values, actions)
+            """What an action asks for, in the units of the control mode."""
+        except NotCompilable as error:
+            name = f"task {task.name}"
+            allowed = "functions of arithmetic alone, which C can be made of"
+            raise QuadrlError(str(error), name=name, value="Python", allowed=allowed) from error
+
+    def _first_row(self) -> list[np.ndarray]:
+        environment = self.environment
+        return [np.asarray(a)[0] for a in self.leaves(environment.snapshot, environment.episode)]
+
+    def task_memory(self) -> dict[str, np.ndarray]:
+        """What the task remembers in the environment's present episode, by name."""
+        named = records.named(self.environment.snapshot.task)
+        return {name: np.asarray(array)[0] for name, array in named.items()}
+
+    def _state(self, motion: Array) -> State:
+        parts = np.split(motion, [3, 7, 10, 13], axis=1)
+        height = float(self.written.engine.origin[2])
+        return State.of_coordinates(*parts, origin_height=height)
+
+    def _aged(self, motion: Array) -> Array:
+        origin = self.written.engine.origin
+        return np.concatenate([motion[:, :3] + origin, motion[:, 3:AGED]], axis=1)
+
+    def _calm(self) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+        """Wind, what sensors are given, and the errors that are drawn: nothing."""
+        if not (observer := self.written.observer):
+            return np.zeros((1, 0)), {}, {}
+        senses = observer.senses
+        given = {name: np.zeros((1, width)) for name, width in senses.given.items()}
+        errors = {name: np.zeros((1, width)) for name, (_, width) in senses.draws.items()}
+        return np.zeros((1, 3)), given, errors
+
+    def _begun(self, motion: Array, own: Array) -> Array:
+        state, aircraft = self._state(motion), self._parameters(self._row)
+        like = self._like.task
+        places = iter(records.Columns(0, records.leaves(like)).views(own.T))
+        parts = state.position, state.quaternion, state.velocity, state.body_rate, state.rotor_speed
+        remembered = self.task.remember(Start(*parts), records.filled(like, places))
+        actions, look = self.parts["action"], None
+        if observer := self.written.observer:
+            wind, given, errors = self._calm()
+            seen = np.zeros((1, actions)), wind, np.zeros(1), self._aged(motion), given, errors
+            look = Look(observer.senses, observer.senses.moment(state, None, *seen), None)
+        now, episode, seen = begin(self.task, state, remembered, aircraft, actions, None, look)
+        truth = self.task.observe(now).values() if look else ()
+        now.state = now.parameters = None  # type: ignore[assignment]
+        kept = [*records.leaves(now), *records.leaves(episode)]
+        sensors = arrays(look.after) if look else []
+        found = [*self._numbers(kept, sensors, [*seen.values(), *truth])]
+        return np.array(found[: self._known], dtype=object)[None]
+
+    @property
+    def _known(self) -> int:
+        """Numbers of a memory and an observation."""
+        return self.remembered.end + self.environment.size
+
+    def _sensed(
+        self, motion: Array, last: Array, action: Array, command: Array, was: Array
+    ) -> Array:
+        wind, given, errors = self._calm()
+        steps = self._steps(was) + 1.0
+        drawn = (np.concatenate([*part.values(), wind[:, :0]], axis=1) for part in (errors, given))
+        normal, lasting = drawn
+        nothing = np.zeros((1, 0))
+        command = command if self.followed else np.zeros((1, self.parts["command"]))
+        whole = self._finish(
+            *(motion, np.zeros((1, 1)), steps[:, None], self._aged(motion), normal, last),
+            *(action, command, was, nothing, nothing, self._row, wind, lasting),
+        )
+        return whole[:, : self._known]
+
+    def _steps(self, was: Array) -> Array:
+        """Control steps since the start, of a memory."""
+        places = iter(self.kept.views(was.T))
+        _, episode = (records.filled(like, places) for like in (self._like, self._episode))
+        return episode.steps

@@ -1,0 +1,213 @@
+"""A policy as one C99 header without dependencies: observation, network, commands, and their test.
+
+All is plain single precision (`single`): every compiler that does not contract or reorder the
+operations gives the same bits, and the header's own test asks for these.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from string import Template
+
+import numpy as np
+
+from quadrl.base.errors import QuadrlError
+from quadrl.core.carried import Carried
+from quadrl.core.environment import Environment
+from quadrl.core.scenario import UNDISTURBED
+from quadrl.deploy.c_cost import Cost, cost
+from quadrl.deploy.c_network import acted, network
+from quadrl.deploy.single import function, functions, in_single, is_exact, numbers
+from quadrl.evaluation.policy import Policy
+
+PARTS = "begun", "sensed", "asked"
+TEST_STEPS = 4
+TEMPLATE = Path(__file__).with_name("templates") / "policy.h.in"
+
+
+class Header:
+    """What the header of a policy says and does, beside its text."""
+
+    def __init__(self, policy: Policy) -> None:
+        """Trace what it flies.
+
+        Raises:
+            QuadrlError: The task or a sensor needs what no autopilot has.
+        """
+        self.policy = policy
+        self.environment = Environment(policy.scenario, seed=0, **UNDISTURBED)
+        self.environment.reset()
+        self.carried = Carried(self.environment)
+        self.functions = {name: getattr(self.carried, name) for name in PARTS}
+        """The traced functions, by name."""
+        self.exact = all(map(is_exact, self.functions.values()))
+        """Whether every compiler gives the same bits."""
+        variant = str(policy.metadata.get("variant") or "ideal")
+        stem = policy.task if variant == "ideal" else f"{policy.task}_{variant}"
+        self.name = re.sub(r"\W", "_", stem)
+        """What the names of its functions begin with."""
+        speeds = range(13, 13 + self.environment.vehicle.rotor_count)
+        self.reads_speeds = any(f"x[{k}][i]" in self.carried.sensed.body for k in speeds)
+        """Whether it has to be given measured rotor speeds, not only those of the start."""
+
+    def check_holds_a_place(self) -> None:
+        """Refuse a policy that does not hold a place by the commands of rotors.
+
+        Raises:
+            QuadrlError: The task asks for something else, or the control mode has loops.
+        """
+        task = self.environment.task
+        if task.contact or not task.keeps_place or {*self.carried.task_memory()} != {"goal"}:
+            allowed = "one that holds a place, such as hover; any other flies by --to c"
+            raise QuadrlError(name="task", value=task.name, allowed=allowed)
+        if self.environment.control_mode.has_loops:
+            reason, allowed = "the firmware has loops of its own", "rotor or share"
+            mode = self.policy.control_mode
+            raise QuadrlError(reason, name="control_mode", value=mode, allowed=allowed)
+
+    def check_speeds(self, board: str) -> None:
+        """Refuse a policy that looks at measured rotor speeds.
+
+        Raises:
+            QuadrlError: It does.
+        """
+        if self.reads_speeds:
+            allowed = f"estimated: {board} does not measure it. The variant robust learns so"
+            raise QuadrlError(name="rotor_speed", value="measured", allowed=allowed)
+
+    @property
+    def memory(self) -> int:
+        """Bytes of what is remembered of an episode."""
+        numbers = 13 + self.environment.vehicle.rotor_count + self.carried.remembered.end
+        numbers += self.environment.action_size + self.carried.asked.width
+        return 4 * (numbers + self.environment.size + self.policy.state_size + 1)
+
+    @property
+    def cost(self) -> Cost:
+        """What it costs on a board."""
+        motion, size = 13 + self.environment.vehicle.rotor_count, self.environment.size
+        test = TEST_STEPS * (motion + size + self.carried.asked.width)
+        # The next memory is made beside the last one, and the last motion is taken with this one.
+        return cost(self.policy, self.functions, test, 2 * self.memory // 4 - size)
+
+    def flown(self, motions: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Observation, action and command for motions (steps, 13 + R), in single precision.
+
+        The first one begins an episode. NumPy computes them, an operation at a time.
+        """
+        carried, width = self.carried, self.carried.remembered.end
+        own = [np.ravel(array) for array in carried.task_memory().values()]
+        found = in_single(carried.begun, np.concatenate([motions[0], *own]))
+        state = np.zeros(self.policy.state_size, np.float32)
+        action = command = np.zeros(0, np.float32)
+        for step, motion in enumerate(motions):
+            if step:
+                done = motion, motions[step - 1], action, command[: carried.followed], found[:width]
+                found = in_single(carried.sensed, np.concatenate(done))
+            observation = found[width:]
+            action, state = acted(self.policy, observation, state)
+            command = in_single(carried.asked, action)
+            yield observation, action, command
+
+
+def content(policy: Policy, metadata: Mapping[str, str]) -> bytes:
+    """The header of a policy.
+
+    Args:
+        policy: The policy.
+        metadata: As `quadrl.deploy.export.described` gives it.
+
+    Raises:
+        QuadrlError: The task or a sensor needs what no autopilot has.
+    """
+    return written(Header(policy), metadata)
+
+
+def written(header: Header, metadata: Mapping[str, str]) -> bytes:
+    """The text of a header; the metadata as for `content`."""
+    policy, environment = header.policy, header.environment
+    carried, name = header.carried, header.name
+    said = {name: json.loads(value) for name, value in metadata.items()}
+    task, vehicle = carried.task_memory(), environment.vehicle
+    motions = _motions(header)
+    flown = [np.concatenate([seen, asked]) for seen, _, asked in header.flown(motions)]
+    first, places = 0, list[str]()
+    for key, array in task.items():
+        label = f"{name.upper()}_{key.upper()}_AT"
+        places.append(f"  {label} = {first},  // {array.size} number{'s' * (array.size > 1)}")
+        first += array.size
+    sizes = (
+        f"  {name.upper()}_COMMANDS = {carried.asked.width},",
+        f"  {name.upper()}_FOLLOWED = {carried.followed},  // of these, by modelled rotor speeds",
+    )
+    seen = [
+        f"//   {x['first']}-{x['last']} {x['name']} [{x['unit']}]: {x['formula'] or x['meaning']}"
+        for x in said["observation"]
+    ]
+    asked = [
+        f"//   {k} {x['name']} [{x['unit']}], {x['least']:.6g} to {x['most']:.6g}: {x['meaning']}"
+        for k, x in enumerate(said["action"])
+    ]
+    spent = f"// {header.cost.said()};", f"// {header.memory} bytes of memory."
+    text = Template(TEMPLATE.read_text()).substitute(
+        name=name,
+        upper=name.upper(),
+        version=said["quadrl"],
+        task=policy.task,
+        vehicle=vehicle.name,
+        timestep=repr(float(vehicle.control_timestep)),
+        timestep_said=f"{vehicle.control_timestep:g}",
+        height=f"{environment.origin[2]:g}",
+        observation="\n".join(_wrapped(seen)),
+        commands="\n".join(_wrapped(asked)),
+        size=environment.size,
+        actions=environment.action_size,
+        rotors=vehicle.rotor_count,
+        cost="\n".join(_wrapped(spent)),
+        task_width=carried.task_width,
+        places="\n".join([*places, *sizes]),
+        kept=carried.remembered.end,
+        state_size=policy.state_size,
+        speeds="measured" if header.reads_speeds else "read at the start: hovering if unknown",
+        functions="\n".join(
+            [
+                functions(name, header.functions.values()),
+                *(function(name, *part) for part in header.functions.items()),
+            ]
+        ),
+        network=network(name, policy),
+        usual=numbers(x for array in task.values() for x in np.ravel(array)) or "0",
+        tolerance=", to the last bit" if header.exact else "",
+        steps=len(motions),
+        motions=", ".join(f"{{{numbers(row)}}}" for row in motions),
+        expected=", ".join(f"{{{numbers(row)}}}" for row in flown),
+        slack="0.0f" if header.exact else "1e-5f",
+    )
+    return text.encode()
+
+
+def _motions(header: Header) -> np.ndarray:
+    """Motions (steps, 13 + R) of a flight by the policy, single precision, task frame."""
+    environment, flight = header.environment, header.policy.flying(1)
+    observation, motions = environment.reset(seed=0), list[np.ndarray]()
+    for _ in range(TEST_STEPS):
+        now = environment.snapshot.state
+        parts = now.position, now.quaternion, now.velocity, now.body_rate, now.rotor_speed
+        motions.append(np.concatenate(parts, axis=1)[0].astype(np.float32))
+        done = environment.step(flight(environment.flatten(observation)))
+        observation = done.observation
+    environment.reset(seed=0)
+    return np.array(motions)
+
+
+def _wrapped(lines: Sequence[str]) -> Iterator[str]:
+    """Comments in lines of at most 100 characters."""
+    for line in lines:
+        while len(line) > 100:
+            at = line.rfind(" ", 0, 100)
+            yield line[:at]
+            line = f"//      {line[at:]}"
+        yield line
