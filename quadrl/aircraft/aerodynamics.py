@@ -1,7 +1,7 @@
 """Effects of the air on the rotors beyond equation 7, and which of them act on an aircraft.
 
 Without any, the paper's equations are left. `engines/native/aero.h` and `engines/dynamics.py` have
-the forces, docs/physics.md the equations with their sources.
+the forces, docs/lab/air.md the equations with their sources.
 """
 
 # pyright: reportUnnecessaryIsInstance=false

@@ -45,7 +45,7 @@ MARK = 1903518052.0
 """Marks the actuators and bodies of quadrl: "quad" in ASCII."""
 SETTINGS = (
     *("name", "rotors", "action_scale", "physics_timestep", "control_timestep", "aerodynamics"),
-    "dead_time",
+    *("dead_time", "command_map"),
 )
 """Fields of `Vehicle` that are not in a row."""
 DERIVED = ("foot", "hull", "ground_clearance", "rotor_height", "resolved_speed", "resolved_turn")

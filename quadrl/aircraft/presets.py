@@ -7,12 +7,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 from quadrl.aircraft.aerodynamics import EFFECTS, FULL, NONE, SWITCHES, Aerodynamics
+from quadrl.aircraft.command_map import CommandMap
 from quadrl.aircraft.rotors import Rotor, ring
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
+from quadrl.base.files import read_table
 from quadrl.base.validation import IN_A_FILE, choice, keys, record
 
 _ALL = Aerodynamics.full()
@@ -143,7 +146,9 @@ HEXA = Vehicle(
     physics_timestep=0.0025,  # chosen: a fifth of the lag
     control_timestep=0.02,  # chosen
 )
-OPTIONS = "mass inertia drag_coefficient moment_coefficient action_scale dead_time".split()
+OPTIONS = (
+    "mass inertia drag_coefficient moment_coefficient action_scale control_timestep dead_time"
+).split()
 """Fields that may differ from an aircraft's without making another one of it."""
 REAL_AIR = {
     "paper": (_ALL, 1.0),  # equation 8 is its drag beside the rotors' already
@@ -200,6 +205,35 @@ VEHICLES = {
     for vehicle in (Vehicle(), CRAZYFLIE, CRAZYFLIE_BRUSHLESS, CF21B_500, RACER, HEXA)
 }
 """The aircraft that are known by name."""
+FILE = ".json"
+"""What the name of a file of an aircraft ends in."""
+_READ: set[str] = set()
+
+
+def of_file(path: str | Path) -> str:
+    """Make the aircraft of a file known by its name, as `quadrl identify` writes it.
+
+    The file is JSON, a mapping with a field `vehicle`, and in it the fields of a Vehicle.
+
+    Returns:
+        The name.
+
+    Raises:
+        QuadrlError: There is no such file, it holds no aircraft, or another one has the name.
+    """
+    if not Path(path).is_file():
+        allowed = f"a name ({', '.join(VEHICLES)}) or a file that exists"
+        raise QuadrlError(name="vehicle", value=str(path), allowed=allowed)
+    fields = read_table(Path(path), "vehicle").get("vehicle")
+    if not isinstance(fields, dict):
+        raise QuadrlError(f"{path} holds no aircraft: it needs a field vehicle with its numbers")
+    made = _of_fields(cast(dict[str, Any], fields), whole=False)
+    if made.name not in _READ and VEHICLES.get(made.name, made) != made:
+        allowed = "one that no other aircraft has: change it in the file"
+        raise QuadrlError(name=f"name in {path}", value=made.name, allowed=allowed)
+    _READ.add(made.name)
+    VEHICLES[made.name] = made
+    return made.name
 
 
 def resolve(
@@ -211,13 +245,16 @@ def resolve(
     """Make a vehicle from a name, a mapping of fields or a vehicle; None is the paper's.
 
     Args:
-        vehicle: The vehicle; fields are changes to the known one of their `name`, else the paper's.
+        vehicle: The vehicle, its name, or that of its file (`of_file`); fields are changes to the
+            known one of their `name`, else the paper's.
         options: Numbers that differ from it, by their fields' names.
         whole: Whether a mapping is all of an aircraft: a field that it lacks has its default then.
 
     Raises:
         QuadrlError: It is something else, a name is unknown, or a number impossible.
     """
+    if isinstance(vehicle, str) and vehicle.endswith(FILE):
+        vehicle = of_file(vehicle)
     if isinstance(vehicle, str):
         vehicle = VEHICLES[choice("vehicle", vehicle, VEHICLES, IN_A_FILE)]
     if isinstance(vehicle, Mapping):
@@ -239,6 +276,8 @@ def _of_fields(given: Mapping[str, Any], whole: bool) -> Vehicle:
         changes["rotors"] = tuple(record("rotors", rotor, Rotor) for rotor in rotors)
     if "aerodynamics" in changes:
         changes["aerodynamics"] = record("aerodynamics", changes["aerodynamics"], Aerodynamics)
+    if "command_map" in changes:
+        changes["command_map"] = record("command_map", changes["command_map"], CommandMap)
     known = VEHICLES.get(str(changes.get("name")), VEHICLES["paper"])
     return dataclasses.replace(Vehicle() if whole else known, **changes)
 

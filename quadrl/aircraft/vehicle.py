@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from quadrl.aircraft.aerodynamics import Aerodynamics, check_air
+from quadrl.aircraft.command_map import CommandMap
 from quadrl.aircraft.rotors import (
     GRAVITY,
     LENGTHS,
@@ -77,6 +78,8 @@ class Vehicle:
     """What the air does to the rotors beside equation 7; nothing by default."""
     dead_time: float = 0.0
     """Time from a command to the first motion of a rotor [s], in whole physics steps."""
+    command_map: CommandMap | None = None
+    """What its motor commands mean, for a board; simulation commands rotor speeds."""
 
     def __repr__(self) -> str:
         return f"Vehicle({self.name!r}, {self.mass:g} kg, {len(self.rotors)} rotors)"
@@ -96,6 +99,9 @@ class Vehicle:
         if max(self.inertia) > (sum(self.inertia) - max(self.inertia)) * (1 + 1e-9):
             allowed = "three moments, each at most the sum of the other two"
             raise QuadrlError(name="inertia", value=self.inertia, allowed=allowed)
+        if not isinstance(self.command_map, CommandMap | None):
+            allowed = "a CommandMap or None"
+            raise QuadrlError(name="command_map", value=self.command_map, allowed=allowed)
         self._check_rotors()
         self._check_timesteps()
         mass, inertia, fastest = self.mass, self.inertia, self.max_speed
