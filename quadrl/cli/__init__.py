@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import sys
 import typing
@@ -24,11 +25,16 @@ from quadrl.base.version import __version__
 from quadrl.cli import choices, console, parsing, train
 from quadrl.cli.benchmark import Benchmark
 from quadrl.cli.check import Check
+from quadrl.cli.crosscheck import Crosscheck
 from quadrl.cli.evaluate import Evaluate
 from quadrl.cli.export import Export
+from quadrl.cli.identify import Identify
+from quadrl.cli.new import NewAircraft, NewTask
 from quadrl.cli.plot import Plot
 from quadrl.cli.render import Render
+from quadrl.cli.replay import Replay
 from quadrl.cli.robustness import Robustness
+from quadrl.cli.runs import Runs
 from quadrl.cli.study import Study
 from quadrl.cli.tasks import Tasks
 from quadrl.cli.train import Train
@@ -55,9 +61,17 @@ class Completion:
             parse(["--tyro-print-completion", shell])
 
 
-Command = (Tasks | Train | Study | Evaluate | Robustness | Render | View | Plot | Check | Export
+Command = (Tasks | Train | Study | Runs | Evaluate | Robustness | Render | View | Plot | Check
+           | Identify | Replay | Export | Crosscheck | NewTask | NewAircraft
            | Benchmark | Completion)  # fmt: skip
-COMMANDS = {kind.__name__.lower(): kind for kind in typing.get_args(Command)}
+
+
+def _spelt(kind: type) -> str:
+    """The name of a command: new-task of NewTask."""
+    return re.sub("(?<=.)(?=[A-Z])", "-", kind.__name__).lower()
+
+
+COMMANDS = {_spelt(kind): kind for kind in typing.get_args(Command)}
 
 
 @choices.command
@@ -92,7 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
             console.console.quiet = chosen.quiet
             for path in chosen.own:
                 import_own(path)
-            with needed(f"quadrl {type(chosen.command).__name__.lower()}"):
+            with needed(f"quadrl {_spelt(type(chosen.command))}"):
                 chosen.command.run()
     except (QuadrlError, OSError, MemoryError, RuntimeError) as error:
         said = console.reason(error)

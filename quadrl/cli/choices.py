@@ -16,11 +16,13 @@ from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.docstrings import docstrings
 from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import GIVEN, Conditions
-from quadrl.learning.config import ALGORITHMS, ALIASES, MEMORIES
+from quadrl.learning.config import ALGORITHMS, ALIASES, KEEPS, MEMORIES
 from quadrl.learning.defaults import VARIANTS
+from quadrl.learning.log import WRITERS
 from quadrl.learning.settings import PAIRED
 from quadrl.tasks import TASKS
 
@@ -45,11 +47,14 @@ def words(known: Iterable[str], *others: str) -> PrimitiveConstructorSpec[str]:
 TaskName = Annotated[str, words(TASKS)]
 Algorithm = Annotated[str, words((*ALGORITHMS, *ALIASES))]
 ControllerName = Annotated[str, words(CONTROLLERS)]
+VehicleName = Annotated[str, words(VEHICLES, "FILE.json")]
 Camera = Annotated[str, words(("follow", "track", "chase", "onboard", "fixed"))]
 SETTINGS = {
     "variant": Annotated[str, words(VARIANTS)],
     "algo": Algorithm,
     "memory": Annotated[str, words(MEMORIES)],
+    "keep": Annotated[str, words(KEEPS)],
+    "log": Annotated[str, words(WRITERS)],
 }
 """Of settings, by name."""
 FLAGS = {"from_run": "from"}
@@ -105,6 +110,8 @@ def _word(name: str) -> Any:
     """The type of an option that is a word, or a word or JSON; None for any other."""
     if name == "task":
         return Positional[TaskName]
+    if name == "vehicle":
+        return VehicleName
     how = GIVEN.get(name, {})
     if (given := how.get("given")) not in ("name", "json"):
         return SETTINGS.get(name)

@@ -19,6 +19,8 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.signals import Stopped, handling
 from quadrl.evaluation.controllers import comes_with_quadrl
 
+PADDING, NARROWEST = 2, 12
+"""Spaces behind a column of a table, and characters that a folded one has at least."""
 console = Console()
 own_files: list[Path] = []
 """The files named by `--import`."""
@@ -37,14 +39,22 @@ def print_json(data: Any) -> None:
 def make_table(rows: Sequence[Sequence[str]], numbers: int = 0) -> Table:
     """A table without lines, whose texts are no markup; the last columns hold `numbers`.
 
-    The first row is its head. Where the terminal is narrow, cells are broken between words and
-    never within one.
+    The first row is its head. Where the terminal is narrow, texts are broken between words; where
+    that is not enough, the column with the longest word is broken within it.
     """
-    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
+    table = Table(box=None, header_style="bold", padding=(0, PADDING, 0, 0))
+    texts = len(rows[0]) - numbers
+    least = [
+        max(len(word) for cell in column for word in ("", *(cell.split() if k < texts else [cell])))
+        for k, column in enumerate(zip(*rows, strict=True))
+    ]
+    if texts:
+        longest = max(range(texts), key=least.__getitem__)
+        over = sum(least) + PADDING * len(least) - console.width
+        least[longest] = min(least[longest], max(NARROWEST, least[longest] - over))
     for k, column in enumerate(rows[0]):
-        right = k >= len(rows[0]) - numbers
-        longest = max(len(word) for row in rows for word in ("", *row[k].split()))
-        table.add_column(column, min_width=longest, justify="right" if right else "left")
+        justify = "left" if k < texts else "right"
+        table.add_column(escape(column), min_width=least[k], justify=justify, overflow="fold")
     for row in rows[1:]:
         table.add_row(*(escape(cell) for cell in row))
     return table

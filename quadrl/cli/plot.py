@@ -15,11 +15,16 @@ from quadrl.learning.show import curve, curves
 
 @choices.command
 class Plot:
-    """Draw the learning curve of one run, or the curves of several runs in one picture."""
+    """Draw the learning curve of one run, or the curves of several runs in one picture.
+
+    A csv beside the runs is the curve of another program, labelled by its name: columns of steps
+    and of success or return, as in a progress.csv or monitor.csv of Stable-Baselines3 or an export
+    of W&B or TensorBoard.
+    """
 
     run_folders: Positional[tuple[Path, ...]]
-    """Run folders. Several are drawn together: a picture for each task, with a curve for each
-    algorithm and the spread over its runs."""
+    """Run folders, or csv files. Several are drawn together: a picture for each task, with a curve
+    for each algorithm and the spread over its runs."""
     out: Path | None = None
     """Output file; its extension (png, pdf, svg) sets the format. By default learning_curve.png in
     the run folder or, for several runs, learning_curves_TASK.png here."""
@@ -30,8 +35,8 @@ class Plot:
 
         if not self.run_folders:
             raise QuadrlError("give a run folder, or several: quadrl plot runs/*")
-        if len(self.run_folders) == 1:
-            (folder,) = self.run_folders
+        (folder, *more) = self.run_folders
+        if not more and folder.suffix != ".csv":
             figures = {self.out or folder / LEARNING_CURVE: curve(folder)}
         else:
             found = curves(self.run_folders, lambda error: say(f"left out: {error}"))

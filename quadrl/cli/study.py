@@ -13,6 +13,9 @@ from quadrl.base.errors import QuadrlError
 from quadrl.cli import choices
 from quadrl.cli.console import console, going_on, make_table, own_files, print_json, say
 
+LEFT_OUT = ("along the training", "turning", "circling")
+"""Columns of the table for which a narrow terminal has no place."""
+
 
 @choices.command
 class Study:
@@ -30,8 +33,7 @@ class Study:
 
     compare: str = ""
     """Compare all pairs of algorithms and variants by a figure of study.json, such as success_rate
-    or, with the setting evaluations, solved_after_steps: how often a seed of the one has the
-    smaller figure."""
+    or solved_after_steps: how often a seed of the one has the smaller figure."""
     json: bool = False
     """Print what study.json holds as one JSON object and nothing else."""
 
@@ -56,9 +58,9 @@ def carry_out(
     else:
         columns, said = [*zip(*found.table, strict=True)], "with their 95 % intervals in brackets"
         if sum(max(map(len, column)) + 2 for column in columns) > console.width:
-            kept = (column for column in columns if column[0] not in ("turning", "circling"))
+            kept = (column for column in columns if column[0] not in LEFT_OUT)
             columns = [[cell.partition(" (")[0] for cell in column] for column in kept]
-            said = "whose 95 % intervals, turning and circling are in table.csv"
+            said = "whose 95 % intervals and other figures are in table.csv"
         names = [*(column[0] for column in columns), "seeds"]  # a table may be empty
         numbers = max(0, len(columns) - names.index("seeds"))
         console.print("", make_table([*zip(*columns, strict=True)], numbers=numbers))

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import arg
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
+from quadrl.base.files import read_table
 from quadrl.base.progress import ProgressBar
 from quadrl.base.signals import heeded
-from quadrl.base.validation import seeds
+from quadrl.base.validation import seeds, tuples
 from quadrl.cli import choices
 from quadrl.cli.console import again, console, make_table, reason, say
 from quadrl.cli.flown import parsed
@@ -23,7 +24,8 @@ from quadrl.cli.study import carry_out
 from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
-from quadrl.learning.defaults import flat
+from quadrl.learning.defaults import flat, merged
+from quadrl.learning.settings import USUAL
 
 if TYPE_CHECKING:
     from quadrl.learning.run import Run
@@ -70,6 +72,11 @@ class Train:
     out: Path | None = None
     """Folder of the run; by default runs/TASK-ALGO-SEED, with a number added if that holds a run
     already. With --seeds the folder of the runs; by default runs/TASK-ALGO-seeds."""
+    name: str = ""
+    """Name of the run: its folder is runs/NAME."""
+    config: Path | None = None
+    """Begin with the settings of a run's config.json, or of a .toml or .json file with settings by
+    name; options given beside it come on top."""
     resume: Path | None = None
     """Continue the run in this folder, with its own settings; --steps may be larger than at its
     start."""
@@ -83,11 +90,9 @@ class Train:
 
     def run(self) -> None:
         """Train, sum up, draw."""
-        settings = parsed(dataclasses.asdict(self.settings))
-        given = dict.fromkeys(dict(flat(settings)), "given")
-        task = settings.pop("task", None)
         if self.dry_run:
-            config, _ = prepare(task, self.out, self.resume, settings)
+            given = dict.fromkeys(dict(flat(parsed(dataclasses.asdict(self.settings)))), "given")
+            config, _ = self.prepared()
             rows = [
                 (name, "-" if value in ("", {}) else str(value), given.get(name, origin))
                 for name, value, origin in config.sources()
@@ -95,16 +100,41 @@ class Train:
             console.print(make_table([("setting", "value", "from"), *rows]))
             return
         if self.seeds:
-            self._study(task, settings)
+            self._study()
             return
-        run = self._train(*prepare(task, self.out, self.resume, settings))
+        run = self._train(*self.prepared())
         _draw(run, video=self.video)
         _list_files(run)
         if run.misses:
-            say(f"\n{run.misses}")
+            say(f"\n{run.misses}\n{run.causes}")
 
-    def _study(self, task: str | None, settings: dict[str, Any]) -> None:
+    def _given(self) -> tuple[str | None, Path | None, dict[str, Any]]:
+        """The task, the folder and the other settings that are given.
+
+        Raises:
+            QuadrlError: They cannot be read, or do not go together.
+        """
+        settings = parsed(dataclasses.asdict(self.settings))
+        if self.config:
+            settings = merged(_of_file(self.config), settings)
+        if self.name and (self.out or self.resume):
+            allowed = "left out beside --out and --resume"
+            raise QuadrlError(name="--name", value=self.name, allowed=allowed)
+        out = Path("runs", self.name) if self.name else self.out
+        return settings.pop("task", None), out, settings
+
+    def prepared(self) -> tuple[TrainConfig, Path]:
+        """The settings of the training, and its folder.
+
+        Raises:
+            QuadrlError: A setting is unknown or out of range.
+        """
+        task, out, settings = self._given()
+        return prepare(task, out, self.resume, settings)
+
+    def _study(self) -> None:
         """Train the seeds as a study of one configuration."""
+        task, out, settings = self._given()
         for name, other in (("--seed", settings.get("seed")), ("--resume", self.resume)):
             if other is not None:
                 raise QuadrlError(name=name, value=str(other), allowed="left out beside --seeds")
@@ -112,7 +142,7 @@ class Train:
         settings = {k: v for k, v in settings.items() if k not in ("algo", "episodes")}
         what = {"tasks": [config.task], "algorithms": [config.algo], "seeds": given,
                 "episodes": config.episodes, "settings": settings}  # fmt: skip
-        carry_out(what, out=self.out or Path("runs", f"{config.task}-{config.algo}-seeds"))
+        carry_out(what, out=out or Path("runs", f"{config.task}-{config.algo}-seeds"))
 
     def _train(self, config: TrainConfig, folder: Path) -> Run:
         """Train and evaluate, and print the result."""
@@ -144,12 +174,25 @@ class Train:
             kept = (folder / names.CONFIG).exists()
             advice = f"the run is kept, {go_on}" if kept else "choose another --out"
             raise QuadrlError(f"{reason(error)}; {advice}") from error
-        say(f"\n{run.summary} (imports: {imports:.1f} s; engine: {config.base.engine})\n")
+        say(f"\n{run.summary} (imports: {imports:.1f} s; engine: {config.base.engine})")
+        say(f"{run.kept}\n")
         if run.lateness:
             say(f"{run.lateness}\n")
         if config.num_envs < FEW:
             say("Many aircraft train faster than few, with shorter rollouts: see --num-envs.\n")
         return run
+
+
+def _of_file(path: Path) -> dict[str, Any]:
+    """The settings in a run's config.json, or in a table.
+
+    Raises:
+        QuadrlError: It cannot be read, or is a configuration of another version.
+    """
+    if path.name != names.CONFIG:
+        return tuples(read_table(path, "file of settings"))
+    saved = names.read_config(path.parent)
+    return tuples({name: saved[name] for name in USUAL if name in saved})
 
 
 def _draw(run: Run, *, video: bool) -> None:
@@ -178,7 +221,9 @@ def _list_files(run: Run) -> None:
         names.TRAJECTORY: "flights of the evaluation",
         names.VIDEO: "one of them on video",
         names.EVALUATION: "the metrics",
+        names.EVALUATIONS: "what the mean action reached along the training",
         names.METRICS: f"the training, row by row; also: tensorboard --logdir {folder}",
+        names.WANDB: f"W&B's files; from offline: wandb sync {folder}/{names.WANDB}/offline-run-*",
         names.WARNINGS: "MuJoCo's warnings in the training",
         names.CONFIG: "the resolved configuration",
         "checkpoint.safetensors": f"to continue: {again('train --resume', folder)} --steps N",

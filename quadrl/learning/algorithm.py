@@ -19,6 +19,8 @@ class Algorithm(abc.ABC):
 
     whole: ClassVar[bool] = False
     """Whether it learns from batches (aircraft, time), with the networks that flew them."""
+    columns: ClassVar[tuple[str, ...]] = ()
+    """Names of its metrics that no other algorithm has."""
 
     def __init__(
         self, actor: ProbabilisticActor, critic: TensorDictModuleBase, config: Any

@@ -23,7 +23,7 @@ from quadrl.learning.folder import CHECKPOINT as CHECKPOINT
 AT_GOAL = ("at_goal", "looks")
 CHANGED = ("scenario.changed.task", "scenario.changed.vehicle")
 """Not what is flown, but how it differed from what its names meant when it was saved."""
-FORMAT = "quadrl-checkpoint-6"
+FORMAT = "quadrl-checkpoint-7"
 
 
 def save(path: Path, tensors: dict[str, Any], numbers: dict[str, Any]) -> None:
@@ -90,7 +90,8 @@ def check_same(path: Path, saved: dict[str, Any], present: dict[str, Any]) -> No
     """
     was, now = dict(flat(saved)), dict(flat(present))
     for name in was | now:
-        if was.get(name) != now.get(name) and name not in (*CHANGEABLE, *CHANGED):
+        free = name.partition(".")[0] in CHANGEABLE or name in CHANGED
+        if was.get(name) != now.get(name) and not free:
             reason = f"{path} was trained with it; restore that setting or start a new run"
             value = now.get(name, present.get(name))
             raise QuadrlError(reason, name=name, value=value, allowed=repr(was.get(name)))

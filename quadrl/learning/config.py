@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from quadrl.aircraft.aerodynamics import FULL
-from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.presets import FILE, VEHICLES, of_file
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import free_name
 from quadrl.base.records import as_json
-from quadrl.base.validation import choice, number, resolved, tuples
+from quadrl.base.validation import choice, keys, number, numbers, resolved, tuples
 from quadrl.base.version import __version__
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
@@ -28,8 +28,9 @@ from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning import foreign
-from quadrl.learning.defaults import flat, training_defaults
-from quadrl.learning.folder import CHANGEABLE, CONFIG, read_config
+from quadrl.learning.defaults import flat, training_defaults, usual_vehicle
+from quadrl.learning.folder import CHANGEABLE, CONFIG, FIGURES, read_config
+from quadrl.learning.log import WRITERS
 from quadrl.learning.origin import Origin, with_networks
 from quadrl.learning.settings import ALGORITHM_CONFIGS, PAIRED, USUAL, TrainSettings
 from quadrl.tasks import TASKS
@@ -40,7 +41,8 @@ ALIASES = {"gae": "vpg"}
 MAX_BATCH = 1 << 24
 """Most transitions in a batch, which are some GB."""
 MAX_WIDTH = 1 << 16
-MEMORIES = ("none", "gru")
+MEMORIES = ("none", "gru", "raptor")
+KEEPS = ("best", "last")
 
 
 @dataclasses.dataclass(frozen=True, init=False)
@@ -75,7 +77,10 @@ class TrainConfig(TrainSettings):
         foreign.refuse_unknown("setting", settings, USUAL, algo)
         settings = with_networks(settings)
         # An unknown task is refused with the defaults.
-        vehicle = settings.setdefault("vehicle", TASKS.get(task, Task).trained_on)
+        usual = usual_vehicle(TASKS.get(task, Task), settings.get("variant"))
+        vehicle = settings.setdefault("vehicle", usual)
+        if isinstance(vehicle, str) and vehicle.endswith(FILE):
+            vehicle = settings["vehicle"] = of_file(vehicle)
         variant = settings.get("variant", TrainConfig.variant)
         varied = self._known(vehicle), variant, settings.get("memory")
         values, _ = training_defaults(task, algo, *varied)
@@ -154,6 +159,7 @@ class TrainConfig(TrainSettings):
             ("num_threads", 0, MAX_THREADS, {"whole": True}),
             ("memory_width", 1, MAX_WIDTH, {"whole": True}),
             ("evaluations", 0, math.inf, {"whole": True}),
+            ("checkpoint_every", 0, self.steps, {"whole": True}),
             ("episodes", 1, MAX_EPISODES, {"whole": True}),
             ("gamma", 0, 1, {}),
             ("gae_lambda", 0, 1, {}),
@@ -175,12 +181,26 @@ class TrainConfig(TrainSettings):
             said = "gamma = 1: distant rewards count as much as near ones; usual are 0.9 to 0.99"
             warnings.warn(said, QuadrlWarning, stacklevel=4)
         choice("memory", self.memory, MEMORIES)
+        choice("keep", self.keep, KEEPS)
+        choice("log", self.log, WRITERS)
+        keys("until", self.until, FIGURES)
+        for name, value in self.until.items():
+            number(f"until {name}", value)
+        if self.evaluations > max(self.iterations, USUAL["evaluations"]):
+            allowed = f"at most {self.iterations}, one after each batch"
+            raise QuadrlError(name="evaluations", value=self.evaluations, allowed=allowed)
+        if self.until and not self.evaluations:
+            reason = "without evaluations nothing says when"
+            raise QuadrlError(reason, name="until", value=self.until, allowed="left out")
         if not isinstance(self.holds_goal, bool) or (self.holds_goal and self.memory != "none"):
             allowed = "True or False; False for a policy with a memory"
             raise QuadrlError(name="holds_goal", value=self.holds_goal, allowed=allowed)
         if not isinstance(self.device, str) or not self.device:
             raise QuadrlError(name="device", value=self.device, allowed="a device of torch")
         scenario, _ = self.training_scenario, self.scenario
+        if self.gammas:
+            given = numbers("gammas", self.gammas, len(scenario.task.parts), 0, 1)
+            object.__setattr__(self, "gammas", given)
         AircraftSampler(scenario.randomization, scenario.aircraft)
         getattr(self, self.algo).check(self)
 
@@ -262,6 +282,8 @@ def prepare(
                 reason = f"a run keeps its settings; only {', '.join(CHANGEABLE)} may change"
                 raise QuadrlError(reason, name=name, value=given[name], allowed="left out")
         number("steps", given.get("steps", config.steps), config.steps, whole=True)
+        if "steps" in given:  # it goes on to them, whatever ended it before
+            given = {"until": {}} | given
         return TrainConfig.of_saved(read_config(folder), **given), folder
     if isinstance(task, TrainConfig):
         config = dataclasses.replace(task, **settings)

@@ -9,7 +9,7 @@ A policy with a memory cannot have all of them: see `WITH_MEMORY`.
 
 Every layer states the settings of `PER_STEP` for the control rate of the paper's aircraft. An
 aircraft that is controlled more often looks as far ahead in seconds, collects as many seconds in a
-batch, and trains for as many: `at_rate` reads a layer for it.
+batch, and trains for as many: `at_rate` reads a layer for it. A variant may have a rate of its own.
 """
 
 from __future__ import annotations
@@ -30,8 +30,15 @@ from quadrl.learning.settings import ALGORITHM_CONFIGS, PAIRED, USUAL
 
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
 """Settings that the other defaults depend on, or that have no better default than another."""
+
+
+def _discount(gamma: float, often: float) -> float:
+    return round(gamma ** (1 / often), 4)
+
+
 PER_STEP: dict[str, Callable[[Any, float], Any]] = {
-    "gamma": lambda gamma, often: round(gamma ** (1 / often), 4),
+    "gamma": _discount,
+    "gammas": lambda gammas, often: tuple(_discount(gamma, often) for gamma in gammas),
     "rollout": lambda steps, often: max(1, round(steps * often)),
     "steps": lambda steps, often: round(steps * often),
 }
@@ -81,6 +88,70 @@ VARIANTS: dict[str, dict[str, Any]] = {
             "smoothness_weight": 10.0,
         },
     },
+    "raptor": {
+        "vehicle": "racer",  # motors as PX4 has them, which the paper's aircraft has not
+        "control_mode": "share",
+        "vehicle_options": {"control_timestep": 0.01},
+        "weather": {"wind_speed": 1.0},
+        "randomization": {
+            "mass": (0.8, 1.2),
+            "lag": (0.7, 1.5),
+            "command_delay": (0.0, 0.025),
+            "drag": (0.5, 1.5),
+            "noise": dataclasses.asdict(RANDOMIZATIONS["light"].noise),
+            "rotors": (0.99, 1.01),
+        },
+        "observe": {
+            "action_history": 1,
+            "rotation": True,
+            "rotor_speed": "none",
+            "privileged": True,
+            "sensors": {"offset": {}},
+        },
+        "memory": "raptor",
+        "memory_width": 16,
+        "hidden": (),
+        "initial_deviation": 0.2,
+        "num_envs": 512,
+        "rollout": 6.4,
+        "gae_lambda": 0.97,
+        "gamma": 0.95,
+        "ppo": {"learning_rate": 2e-3, "beta2": 0.999, "minibatch": 4096},
+        "steps": 1_000_000,
+        "task_options": {
+            "spin_weight": 10.0,
+            "attitude_weight": 75.0,
+            "progress_weight": 300.0,
+            "smoothness_weight": 10.0,
+        },
+    },
+    "any": {
+        "vehicle": "racer",  # its layout; all else is drawn
+        "control_mode": "share_of_x",
+        "vehicle_options": {"control_timestep": 0.02},
+        "weather": {"wind_speed": 1.0},
+        "randomization": {
+            "sizes": {
+                "mass": (0.025, 2.0),
+                "thrust_to_weight": (1.5, 5.0),
+                "angular_acceleration": (100.0, 900.0),
+                "lag": (0.02, 0.2),
+            },
+            "torque": (0.5, 1.6),  # yaw, beside roll and pitch
+            "inertia_axes": (0.85, 1.18),
+            "command_delay": (0.0, 0.03),  # 20 ms, and the dead time of the aircraft
+            "drag": (0.0, 2.0),
+            "inflow": (0.01, 1.2),
+            "flapping": (0.0, 1.5),
+            "rotors": (0.98, 1.02),
+            "noise": dataclasses.asdict(RANDOMIZATIONS["light"].noise),
+        },
+        "observe": {"action_history": 2, "rotor_speed": "none", "sensors": {"level": {}}},
+        "memory": "gru",
+        "holds_goal": False,  # where hover is, it has to find out
+        "hidden": (64,),
+        "steps": 1_638_400,
+    },
 }
 """Settings that go together."""
 WIDE = 90.0
@@ -98,7 +169,11 @@ _SMALL: dict[str, Any] = {
 OF_VEHICLE: dict[tuple[str, str], dict[str, Any]] = {
     ("robust", "paper"): {"vehicle_options": {"action_scale": WIDE}},
     ("robust", "crazyflie"): _SMALL,
-    ("robust", "crazyflie_brushless"): _SMALL,
+    # Other simulators leave the flapping out, and a policy that leans on it circles there.
+    ("robust", "crazyflie_brushless"): {
+        **_SMALL,
+        "randomization": {**_SMALL["randomization"], "flapping": (0.0, 1.2)},
+    },
 }
 """Settings of a variant for one aircraft."""
 WITH_MEMORY: dict[str, Any] = {
@@ -106,6 +181,11 @@ WITH_MEMORY: dict[str, Any] = {
     "ppo": {"fused": False},
 }
 """Settings of a policy with a memory, over all layers."""
+
+
+def usual_vehicle(task: type[Task], variant: str | None) -> str:
+    """The aircraft that a variant of a task is trained on if none is named."""
+    return VARIANTS.get(variant or "", {}).get("vehicle", task.trained_on)
 
 
 def training_defaults(
@@ -143,10 +223,12 @@ def training_defaults(
     }
     if (memory or merged(*layers.values())["memory"]) != "none":
         layers["memory"] = WITH_MEMORY
+    options = merged(*layers.values()).get("vehicle_options", {})
+    timestep = options.get("control_timestep", VEHICLES[vehicle].control_timestep)
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for label, layer in layers.items():
-        read = at_rate(layer, vehicle)
+        read = at_rate(layer, timestep)
         values = merged(values, read)
         sources |= {
             name: label if layer.get(name) == read.get(name) else f"{label}, at its control rate"
@@ -168,10 +250,9 @@ def check_stated(task: type[Task]) -> None:
     keys(f"training default of {task.name}", stated, known)
 
 
-def at_rate(layer: dict[str, Any], vehicle: str) -> dict[str, Any]:
-    """Convert a layer's settings to the control rate of an aircraft: the same times in seconds."""
-    timestep = VEHICLES["paper"].control_timestep
-    often = round(timestep / VEHICLES[vehicle].control_timestep, 9)
+def at_rate(layer: dict[str, Any], timestep: float) -> dict[str, Any]:
+    """Convert a layer's settings to a control timestep [s]: the same times in seconds."""
+    often = round(VEHICLES["paper"].control_timestep / timestep, 9)
     if often == 1:
         return layer
     return layer | {name: PER_STEP[name](layer[name], often) for name in PER_STEP if name in layer}
@@ -183,7 +264,8 @@ def own_settings(task: Task | type[Task]) -> dict[str, Any]:
     They are as `quadrl train` takes them, at the control rate of the aircraft that the task is
     trained on.
     """
-    return at_rate(_unusual(task, task.trained_by), task.trained_on)
+    timestep = VEHICLES[task.trained_on].control_timestep
+    return at_rate(_unusual(task, task.trained_by), timestep)
 
 
 def _unusual(task: Task | type[Task], algo: str) -> dict[str, Any]:

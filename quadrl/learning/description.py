@@ -46,7 +46,9 @@ def describe(task: Task) -> dict[str, Any]:
 
 def describe_observation(environment: Environment) -> list[dict[str, Any]]:
     """Describe each term of the flat observation: name, place, unit, meaning and formula."""
-    seen = environment.observer.terms if environment.observer else environment.task.observation
+    seen = (
+        environment.observer.senses.terms if environment.observer else environment.task.observation
+    )
     return [
         {"name": name, "first": where.start, "last": where.stop - 1, "unit": seen[name].unit,
          "meaning": seen[name].meaning, "formula": seen[name].formula}

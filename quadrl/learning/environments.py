@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import BehaviourPolicy
 from quadrl.learning.networks import STATE
+from quadrl.learning.teacher import Teacher
 from quadrl.learning.window import Moment, fly
 
 with warnings.catch_warnings():
@@ -31,7 +33,48 @@ SEED_STRIDE = 1 << 20
 """Distance between the seeds of two trainings: as many as there can be aircraft in one."""
 
 
-class RememberingEnv(QuadrotorEnv):
+class TrainingEnv(QuadrotorEnv):
+    """Environments that keep what their steps say of episodes, for the log."""
+
+    def __init__(self, *given: Any, **settings: Any) -> None:
+        """Make the environments."""
+        super().__init__(*given, **settings)
+        self._told: list[tuple[Transition, np.ndarray]] = []
+        self.teacher: Teacher | None = None
+        """Who says before each step what it would do."""
+        self._taught: list[np.ndarray] = []
+
+    def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the T steps since the last call say of N aircraft.
+
+        Returns:
+            Reward terms (T, terms, N), ends (T, ends, N), and the number of the task that is flown,
+            (N, T), 0 where there is one.
+        """
+        told, self._told = self._told, []
+        terms = [[*now.reward_terms.values()] for now, _ in told]
+        ends = [[*now.ended.values()] for now, _ in told]
+        which = np.array([of for _, of in told], dtype=int)
+        return np.array(terms), np.array(ends), which.reshape(-1, self.num_envs).T
+
+    def taught(self) -> np.ndarray:
+        """What the teacher would have done in the steps since the last call, (T, N, k)."""
+        taught, self._taught = self._taught, []
+        return np.array(taught)
+
+    def _fly(self, action: torch.Tensor) -> Transition:
+        if self.teacher:
+            self._taught.append(self.teacher.action())
+        return self._tell(super()._fly(action))
+
+    def _tell(self, now: Transition) -> Transition:
+        flown = self.environment.snapshot.task
+        which = getattr(flown, "which", np.zeros(self.num_envs))
+        self._told.append((now, which.astype(int)))
+        return now
+
+
+class RememberingEnv(TrainingEnv):
     """Environments with the states (N, width) of a recurrent policy; they are zero at a reset."""
 
     def __init__(self, width: int, *given: Any, **settings: Any) -> None:
@@ -55,7 +98,7 @@ class RememberingEnv(QuadrotorEnv):
         return fresh
 
 
-class RecordingEnv(QuadrotorEnv):
+class RecordingEnv(TrainingEnv):
     """Environments that record their steps, for the derivatives."""
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -75,7 +118,7 @@ class RecordingEnv(QuadrotorEnv):
     def _fly(self, action: torch.Tensor) -> Transition:
         moment, done = fly(self.environment, action.numpy())
         self._moments.append(moment)
-        return done
+        return self._tell(done)
 
 
 ENDED = ("return", "length")
@@ -83,51 +126,80 @@ OUTCOMES = ("over", "success", "survival")
 
 
 class EpisodeStatistics:
-    """Return and length of the episodes that end; success and survival of those that must be over.
+    """Return, length and reward terms of episodes that end; outcomes of those that must be over.
 
-    Success and survival are those of the episodes that began between one and two time limits ago,
-    all of which are over. The episodes that end in a batch are a biased sample: most of them have
-    failed, or none where all began together and reach the time limit together.
+    Success, survival and the shares of the ends are those of the episodes that began between one
+    and two time limits ago, all of which are over. The episodes that end in a batch are a biased
+    sample: most of them have failed, or none where all began together and reach the time limit
+    together.
     """
 
-    def __init__(self, num_envs: int, time_limit_steps: int, rollout: int) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        time_limit_steps: int,
+        rollout: int,
+        terms: Sequence[str] = (),
+        ends: Sequence[str] = (),
+    ) -> None:
         """Begin with every aircraft at the start of an episode.
 
         Args:
             num_envs: Aircraft, N.
             time_limit_steps: Control steps after which an episode is over at the latest.
             rollout: Control steps of a batch.
+            terms: Names of the terms of the reward.
+            ends: Names of the ends of an episode.
         """
         self._limit = time_limit_steps
+        self._terms = [f"reward/{name}" for name in terms]
+        self._ends = [f"end/{name}" for name in ends]
         self.running: dict[str, np.ndarray] = {name: np.zeros(num_envs) for name in ENDED}
+        self.running["terms"] = np.zeros((len(terms), num_envs))
         ages = 2 * time_limit_steps + rollout
-        self.running["outcomes"] = np.zeros((ages, len(OUTCOMES)))
-        """Numbers (steps, 3) of the `OUTCOMES` of episodes, by the steps since they began."""
+        self.running["outcomes"] = np.zeros((ages, len(OUTCOMES) + len(ends)))
+        """Numbers of the `OUTCOMES` and ends of episodes, by the steps since they began."""
 
-    def count(self, batch: Any) -> dict[str, float]:
-        """Include a batch, and return its metrics."""
+    @property
+    def columns(self) -> list[str]:
+        """Names of the metrics of terms and ends."""
+        return [*self._terms, *self._ends]
+
+    def count(self, batch: Any, terms: np.ndarray, ends: np.ndarray) -> dict[str, float]:
+        """Include a batch, and return its metrics.
+
+        Args:
+            batch: What a collector gives, (N, T).
+            terms: The terms of its rewards, (T, terms, N).
+            ends: How its episodes ended, (T, ends, N) bool.
+        """
         names = ("reward", "done", "terminated", "is_success", "error")
         columns = (batch["next", name][..., 0].cpu().numpy().T for name in names)
         reward, done, terminated, success, error = columns  # (time, aircraft)
-        ended: dict[str, list[np.ndarray]] = {name: [] for name in ENDED}
+        ended: dict[str, list[np.ndarray]] = {name: [] for name in (*ENDED, "terms")}
         outcomes, steps = self.running["outcomes"], len(reward)
         outcomes[steps:], outcomes[:steps] = outcomes[:-steps].copy(), 0.0
         judged = np.stack([done, success, ~terminated | success], axis=-1)
+        judged = np.concatenate([judged, ends.swapaxes(1, 2)], axis=-1)
         for step, (gained, over) in enumerate(zip(reward, done, strict=True)):
             self.running["return"] += gained
             self.running["length"] += 1
+            self.running["terms"] += terms[step]
             ages = self.running["length"][over].astype(int) + steps - 1 - step
             np.add.at(outcomes, ages, judged[step, over])
             for name, found in ended.items():
-                found.append(self.running[name][over])
-                self.running[name][over] = 0.0
+                found.append(self.running[name][..., over])
+                self.running[name][..., over] = 0.0
         metrics = {"episodes": float(done.sum()), "reward": float(reward.mean())}
         metrics["error"] = float(error.mean())
         if done.any():
-            metrics |= {name: float(np.concatenate(ended[name]).mean()) for name in ended}
-        over, succeeded, survived = outcomes[self._limit :].sum(axis=0)
+            metrics |= {name: float(np.concatenate(ended[name]).mean()) for name in ENDED}
+            means = np.concatenate(ended["terms"], axis=-1).mean(-1)
+            metrics |= dict(zip(self._terms, means.tolist(), strict=True))
+        over, *shares = outcomes[self._limit :].sum(axis=0).tolist()
         if over:
-            metrics |= {"success": succeeded / over, "survival": survived / over}
+            names = (*OUTCOMES[1:], *self._ends)
+            metrics |= {k: share / over for k, share in zip(names, shares, strict=True)}
         return metrics
 
 
@@ -147,7 +219,7 @@ def make_device(name: str) -> torch.device:
     return device
 
 
-def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
+def make_env(config: TrainConfig, device: torch.device) -> TrainingEnv:
     """Make the environments of a training."""
     scenario = config.training_scenario
     if config.algo == "apg" and (late := scenario.vehicle.dead_time):
@@ -158,9 +230,13 @@ def make_env(config: TrainConfig, device: torch.device) -> QuadrotorEnv:
     given: Any = scenario, config.num_envs, config.seed * SEED_STRIDE, device
     if config.algo == "apg":
         return RecordingEnv(*given, num_threads=config.num_threads)
-    if config.memory == "none":
-        return QuadrotorEnv(*given, num_threads=config.num_threads)
-    return RememberingEnv(config.memory_width, *given, num_threads=config.num_threads)
+    env = (
+        TrainingEnv(*given, num_threads=config.num_threads)
+        if config.memory == "none"
+        else RememberingEnv(config.memory_width, *given, num_threads=config.num_threads)
+    )
+    env.teacher = Teacher(env.environment) if config.algo == "dagger" else None
+    return env
 
 
 def make_collector(env: QuadrotorEnv, actor: ProbabilisticActor, frames: int) -> Collector:

@@ -1,4 +1,4 @@
-"""The folder of a run: making it, locking it, its configuration and its log; without torch."""
+"""The folder of a run: making it, locking it, its configuration and its tables; without torch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
-from quadrl.base.files import NO_LOCKS, lock, read_sealed_json, write_csv, write_sealed_json
+from quadrl.base.files import NO_LOCKS, lock, read_sealed_json, write_sealed_json
 from quadrl.base.machine import processor_kind
 from quadrl.core.record import sealed_imports
 from quadrl.evaluation.policy_file import RUN as CONFIG
@@ -26,8 +26,9 @@ from quadrl.evaluation.policy_file import RUN_FORMAT
 CHECKPOINT = "checkpoint.safetensors"
 METRICS = "metrics.csv"
 EVALUATIONS = "evaluations.csv"
-"""Evaluations of the policy during the training, if any were asked for."""
+"""Evaluations of the mean action during the training."""
 EVENTS = "events"
+WANDB = "wandb"
 EVALUATION = "evaluation.json"
 """A run with this file is trained and evaluated."""
 LEARNING_CURVE = "learning_curve.png"
@@ -37,9 +38,17 @@ WARNINGS = "warnings.txt"
 """MuJoCo's warnings during the training, if there were any."""
 LOCK = "training.lock"
 """Host and process of the training that works here, if the file system has no locks."""
-FREE = ("num_threads", "checkpoint_seconds", "evaluations", "episodes")
+FIGURES = {
+    "success": "success_rate",
+    "survival": "survival_rate",
+    "error": "position_error_m",
+    "return": "return_mean",
+}
+"""Columns of `EVALUATIONS`, means over the episodes, and the metric of `quadrl.evaluate`."""
+FREE = ("num_threads", "checkpoint_seconds", "evaluations", "keep", "log", "checkpoint_every",
+        "episodes")  # fmt: skip
 """Settings that do not change what is trained."""
-CHANGEABLE = (*FREE, "steps", "device")
+CHANGEABLE = (*FREE, "steps", "until", "device")
 """Settings that may have other values when a run is continued."""
 DRAWN = {"steps", "seconds", "return", "success", "error", "survival"}
 """Columns of the metrics that a plot needs."""
@@ -203,36 +212,3 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
     if missing := DRAWN - set(metrics):
         raise QuadrlError(f"{path} has no column {', '.join(sorted(missing))}")
     return metrics
-
-
-class Log:
-    """metrics.csv and TensorBoard events; rows after the checkpoint are replaced."""
-
-    COLUMNS = (
-        "iteration", "steps", "seconds", "episodes", "return", "length", "success", "survival",
-        "reward", "error", "deviation", "critic_loss", "kl", "clip_fraction",
-    )  # fmt: skip
-
-    def __init__(self, folder: Path, iteration: int) -> None:
-        """Open the files; keep the rows of the first `iteration` iterations."""
-        from torch.utils.tensorboard import SummaryWriter
-
-        path = folder / METRICS
-        write_csv(path, self.COLUMNS, read_rows(path, self.COLUMNS)[:iteration])
-        self._file = open(path, "a", newline="")  # noqa: SIM115 - closed by close
-        self._writer = csv.writer(self._file)
-        self._events = SummaryWriter(str(folder / EVENTS), purge_step=iteration + 1)
-
-    def write(self, iteration: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Add the row of an iteration."""
-        known = {"iteration": iteration, "steps": steps, "seconds": round(seconds, 3)} | metrics
-        row = (known.get(name, "") for name in self.COLUMNS)
-        self._writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in row])
-        self._file.flush()
-        for name, value in metrics.items():
-            self._events.add_scalar(name, value, iteration)
-
-    def close(self) -> None:
-        """Close the files."""
-        self._file.close()
-        self._events.close()

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
 
-from quadrl.base.errors import UnknownKeyword
+import numpy as np
+
+from quadrl.base.errors import QuadrlError, UnknownKeyword
 from quadrl.base.validation import keys
 from quadrl.learning.settings import ALGORITHM_CONFIGS, USUAL
 
 SB3 = "Stable-Baselines3 has it, and trains on quadrl.envs.sb3.QuadrotorVecEnv"
 ALGORITHMS = {"sac": SB3, "td3": SB3, "ddpg": SB3, "a2c": "vpg", "pg": "vpg"}
 COMMANDS = {
-    **{"list": "tasks", "eval": "evaluate", "test": "evaluate", "play": "view", "video": "render"},
+    **{
+        "list": "tasks",
+        "eval": "evaluate",
+        "test": "evaluate",
+        "ls": "runs",
+        "play": "view",
+        "video": "render",
+    },
     "compare": "quadrl study FILE --compare success_rate compares algorithms and settings",
-    "new-task": "a task is a Python file of your own that --import names: see docs/own_task.md",
+    "new": "new-task",
 }
 """Names here, or sentences that say what to do."""
 SETTINGS = {
@@ -39,17 +50,79 @@ SETTINGS = {
     "evaluations": "eval_every eval_freq eval_interval evaluate_every",
     "device": "gpu cuda accelerator",
     "num_threads": "n_jobs num_workers workers threads",
-    "out": "name run_name exp_name experiment_name save_dir output logdir log_dir folder",
+    "log": "logger wandb tensorboard track report_to",
+    "out": "run_name exp_name experiment_name save_dir output logdir log_dir folder",
+    "config": "cfg config_file yaml",
     "from_run": "init_from load pretrained checkpoint load_run",
 }
 """Names here, of which the first counts that the training has; and names elsewhere."""
 OTHERWISE = {
     "the task comes first, by its name alone: hover": "task env env_id",
-    "a file of quadrl study holds settings of trainings": "config cfg",
-    "a run folder holds TensorBoard's files, and quadrl.train(on_progress=...) hands over each row":
-        "tensorboard log logger wandb track",
 }  # fmt: skip
 """What to do instead, where there is no such setting."""
+
+COLUMNS = {
+    "steps": "steps step total_timesteps time/total_timesteps global_step timesteps",
+    "seconds": "seconds time/time_elapsed",
+    "success": "success success_rate eval/success_rate rollout/success_rate",
+    "return": "return return_mean eval/return_mean eval/mean_reward rollout/ep_rew_mean reward",
+}
+"""Columns of a learning curve, and what a csv calls them; the first that has numbers counts."""
+EPISODES = 100
+"""Episodes of a monitor.csv that make a point of its curve, as in Stable-Baselines3's own logs."""
+
+
+def read_curve(path: Path) -> dict[str, np.ndarray]:
+    """Read the learning curve that another program wrote.
+
+    Args:
+        path: A csv whose columns are named as COLUMNS has them, in any case, perhaps behind the
+            name of a run, as in W&B's exports (`NAME - eval/success_rate`). A column `value` is the
+            success where it stays within 0 and 1, else the return. Or a monitor.csv of
+            Stable-Baselines3, whose rows are episodes of one environment.
+
+    Returns:
+        Arrays (n,) by the names of COLUMNS: steps, and those of the others that it has; NaN where
+        a row has no number.
+
+    Raises:
+        QuadrlError: It has no such columns.
+    """
+    with open(path, newline="", errors="replace") as file:
+        rows = [*csv.DictReader(line for line in file if not line.startswith("#"))]
+    columns = {
+        head.rpartition(" - ")[2].strip().lower(): np.array([_number(row[head]) for row in rows])
+        for head in (rows[0] if rows else ())
+        if head  # None has the cells beyond the head
+    }
+    known = {name: column for name, column in columns.items() if np.isfinite(column).any()}
+    if {"r", "l", "t"} <= {*known}:
+        sums, count = np.cumsum(known["r"]), np.arange(1, len(rows) + 1)
+        sums[EPISODES:] -= sums[:-EPISODES].copy()
+        mean = sums / np.minimum(count, EPISODES)
+        return {"steps": np.cumsum(known["l"]), "seconds": known["t"], "return": mean}
+    if "value" in known:
+        share = 0 <= np.nanmin(known["value"]) and np.nanmax(known["value"]) <= 1
+        known["success" if share else "return"] = known["value"]
+    found = {
+        name: known[head]
+        for name, others in COLUMNS.items()
+        for head in [next((other for other in others.split() if other in known), None)]
+        if head
+    }
+    for needs in (("steps",), ("success", "return")):
+        if not {*needs} & {*found}:
+            names = " ".join(COLUMNS[name] for name in needs).split()
+            raise QuadrlError(f"{path} has no column of {' or '.join(needs)}: {', '.join(names)}")
+    order = np.argsort(found["steps"], kind="stable")[: np.isfinite(found["steps"]).sum()]
+    return {name: column[order] for name, column in found.items()}
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return np.nan
 
 
 def setting(name: str, algo: str, *, guess: bool = True) -> str:
@@ -60,7 +133,7 @@ def setting(name: str, algo: str, *, guess: bool = True) -> str:
     """
     word = name.lower().replace("-", "_").rpartition(".")[2]
     own = {one.name: f"{algo}.{one.name}" for one in dataclasses.fields(ALGORITHM_CONFIGS[algo])}
-    known = {one: one for one in USUAL} | {"out": "out"} | own
+    known = {one: one for one in USUAL} | {"out": "out", "config": "config"} | own
     known = {one: full for one, full in known.items() if one not in ("task", *ALGORITHM_CONFIGS)}
     for answer, elsewhere in SETTINGS.items():
         if word in elsewhere.split():

@@ -46,13 +46,18 @@ class Plain:
         The variance is not yet bounded. If the policy holds a goal, the layers read it as one more
         row, whose mean is subtracted.
         """
-        if self.goal is not None:
-            seen = torch.cat([seen, self.goal.seen(self.goal.at_goal)[None]])
-        values, output = forward(seen, weights)
+        goal, read = self.goal, seen
+        if goal is not None:
+            read = torch.cat([seen, goal.seen(goal.at_goal)[None]])
+        values, output = forward(read, weights)
         mean, log_variance = output.chunk(2, -1)
-        if self.goal is not None:
-            mean, log_variance = mean[:-1] - mean[-1], log_variance[:-1]
+        if goal is not None:
+            mean, log_variance = mean[:-1] - self.held(seen, mean[-1]), log_variance[:-1]
         return values, mean, log_variance
+
+    def held(self, seen: Tensor, at_goal: Tensor) -> Tensor:
+        """Of something of the goal (k,), what counts in rows that read (n, size)."""
+        return self.goal.share(seen) * at_goal if self.goal.others else at_goal
 
     def weights(self) -> list[Tensor]:
         """Weights and biases of the layers in turn."""
@@ -169,7 +174,8 @@ class PPOGradients:
         to_variance = 0.5 * (by_ratio * (square - 1) - share * self._config.entropy)
         to_output = torch.cat([to_mean, to_variance * (free == log_variance)], -1)
         if self._policy.goal is not None:
-            at_goal = torch.cat([-to_mean.sum(0), torch.zeros_like(to_mean[0])])
+            at_goal = -self._policy.held(part.get("policy"), to_mean).sum(0)
+            at_goal = torch.cat([at_goal, torch.zeros_like(at_goal)])
             to_output = torch.cat([to_output, at_goal[None]])
         # The critic: its squared error.
         critic_values, value = forward(part.get("critic"), critic_weights)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import math
 from typing import Any
 
 import numpy as np
@@ -18,11 +20,15 @@ from quadrl.evaluation.policy import LOG_VARIANCE, Policy
 from quadrl.evaluation.policy_file import CLIP
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import Plain
-from quadrl.learning.goal import goal_state
+from quadrl.learning.goal import GoalState, goal_state
 
 STATE, BEGINS = "recurrent_state", "is_init"
 """What a policy with a memory reads beside the observation, by TorchRL's names: its state before
 the observation, and whether an episode begins with it."""
+UNCLIPPED = 1024.0
+"""Deviation of what is clipped nowhere; a power of two, which rounds nothing."""
+SURE = 60.0
+"""Weight of a flag, less a half of it: tanh of that is -1 or 1."""
 PRIVILEGED = "privileged"
 """The observation for the critic alone, if the environment gives one."""
 
@@ -36,9 +42,10 @@ class Normaliser(nn.Module):
     shift: torch.Tensor  # (size,), the mean in single precision
     deviation: torch.Tensor  # (size,)
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, clip: float = CLIP) -> None:
         """Start with mean 0 and deviation 1."""
         super().__init__()
+        self.clip = clip
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("square_sum", torch.zeros(size, dtype=torch.float64))
@@ -46,8 +53,8 @@ class Normaliser(nn.Module):
         self.register_buffer("deviation", torch.ones(size))
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Observations (..., size) shifted and scaled to mean 0 and deviation 1, within +-CLIP."""
-        return ((observation - self.shift) / self.deviation).clamp(-CLIP, CLIP)
+        """Observations (..., size) shifted and scaled to mean 0 and deviation 1, within +-clip."""
+        return ((observation - self.shift) / self.deviation).clamp(-self.clip, self.clip)
 
     @torch.no_grad()
     def update(self, observation: torch.Tensor) -> None:
@@ -79,47 +86,58 @@ class MeanAndDeviation(nn.Module):
 
 
 class HoldsGoal(nn.Module):
-    """A network minus its output at the goal, where the mean action is then 0, which is hover."""
+    """A network minus its output at the goal, where the mean action is then 0, which is hover.
+
+    Of several tasks in one, nothing is subtracted in those without that goal.
+    """
 
     at_goal: torch.Tensor  # (size,), an observation
     looks: torch.Tensor  # (size,), 1 for numbers that the network sees, 0 for the others
 
-    def __init__(
-        self, normaliser: Normaliser, network: nn.Sequential, at_goal: np.ndarray, looks: np.ndarray
-    ) -> None:
-        """Keep normaliser and network, and what `quadrl.learning.goal.goal_state` returns."""
+    def __init__(self, normaliser: Normaliser, network: nn.Sequential, goal: GoalState) -> None:
+        """Keep normaliser, network and goal."""
         super().__init__()
-        self.normaliser, self.network = normaliser, network
+        self.normaliser, self.network, self.others = normaliser, network, [*goal.others]
         self.last = MeanAndDeviation()
-        self.register_buffer("at_goal", torch.from_numpy(at_goal).float())
-        self.register_buffer("looks", torch.from_numpy(looks).float())
+        self.register_buffer("at_goal", torch.from_numpy(goal.seen).float())
+        self.register_buffer("looks", torch.from_numpy(goal.looks).float())
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and standard deviation of the actions (..., k) for observations (..., size)."""
-        mean, deviation = self.last(self.network(self.seen(observation)))
-        return mean - self.mean_at_goal(), deviation
+        seen = self.seen(observation)
+        mean, deviation = self.last(self.network(seen))
+        return mean - self.share(seen) * self.mean_at_goal(), deviation
 
     def seen(self, observation: torch.Tensor) -> torch.Tensor:
         """Return what the network reads of observations (..., size)."""
         return self.looks * self.normaliser(observation)
 
+    def share(self, seen: torch.Tensor) -> torch.Tensor:
+        """Whether the mean at the goal counts, 1 or 0 (..., 1), where (..., size) is read."""
+        # The flag of another task, 0 or 1, is below or above 0 once its mean is subtracted.
+        return (seen[..., self.others] <= 0).all(-1, keepdim=True).to(seen)
+
     def mean_at_goal(self) -> torch.Tensor:
-        """Return the mean at the goal, which is subtracted, (k,)."""
+        """Return the mean at the goal, (k,)."""
         return self.last(self.network(self.seen(self.at_goal)))[0]
 
 
 class Memory(nn.Module):
     """A gated recurrent unit beside a network: its state joins the normalised observation.
 
-    It follows TorchRL's recurrent mode. TorchRL's GRUModule, which splits and packs sequences in
-    which an episode begins, takes twice as long as this loop.
+    It follows TorchRL's recurrent mode. With a layer before the unit, the network reads the state
+    alone.
     """
 
-    def __init__(self, normaliser: Normaliser, width: int, network: nn.Module) -> None:
+    def __init__(
+        self, normaliser: Normaliser, width: int, network: nn.Module, *, alone: bool = False
+    ) -> None:
         """Keep a network that reads (normalised observation, state), and make the unit."""
         super().__init__()
         self.normaliser, self.network = normaliser, network
-        self.cell = GRUCell(len(normaliser.mean), width)
+        size = len(normaliser.mean)
+        self.first = nn.Linear(size, width) if alone else None
+        self.cell = GRUCell(width if alone else size, width)
 
     def forward(
         self, observation: torch.Tensor, state: torch.Tensor, begins: torch.Tensor | None
@@ -135,15 +153,40 @@ class Memory(nn.Module):
             begins: For sequences, whether an episode begins with the observation, (N, T, 1).
         """
         seen = self.normaliser(observation)
+        if self.first is not None:
+            seen = self.first(seen).relu()
         if not recurrent_mode():
             state = self.cell(seen, state)
-            return *self.network(torch.cat([seen, state], -1)), state
+            return *self.network(self._read(seen, state)), state
         assert begins is not None
-        state, states = state[:, 0], []
-        for now, begin in zip(seen.unbind(1), begins.unbind(1), strict=True):
-            state = self.cell(now, state.masked_fill(begin, 0.0))
-            states.append(state)
-        return self.network(torch.cat([seen, torch.stack(states, 1)], -1))
+        return self.network(self._read(seen, self._states(seen, state[:, 0], begins[..., 0])))
+
+    def _states(
+        self, seen: torch.Tensor, state: torch.Tensor, begins: torch.Tensor
+    ) -> torch.Tensor:
+        """The states (N, T, width) after sequences (N, T, size), in one call of torch's unit.
+
+        What follows a begin (N, T) within a sequence is one more sequence, with a state of zero.
+        """
+        count, steps = begins.shape
+        rows, times = begins.nonzero(as_tuple=True)
+        place = torch.arange(steps, device=seen.device)
+        later = seen[rows[:, None], (times[:, None] + place).clamp(max=steps - 1)]
+        first = torch.cat([state, state.new_zeros(len(rows), state.shape[1])])[None]
+        cell = self.cell
+        weights = [cell.weight_ih, cell.weight_hh, cell.bias_ih, cell.bias_hh]
+        how = True, 1, 0.0, self.training, False, True  # biases, layers, ..., batch first
+        states, _ = torch.gru(torch.cat([seen, later]), first, weights, *how)
+        # Which sequence a state is of: the number of the last begin of its row, 0 for none.
+        begun = torch.zeros_like(begins, dtype=torch.long)
+        begun[rows, times] = torch.arange(1, len(rows) + 1, device=seen.device)
+        begun = begun.cummax(1).values
+        since = torch.cat([times.new_zeros(1), times])[begun]
+        own = torch.arange(count, device=seen.device)[:, None].expand_as(begun)
+        return states[torch.where(begun > 0, begun + count - 1, own), place - since]
+
+    def _read(self, seen: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        return state if self.first is not None else torch.cat([seen, state], -1)
 
 
 class Informed(nn.Module):
@@ -210,20 +253,23 @@ def make_actor_critic(
         config: Gives the widths of the layers and the deviation of the first actions.
         privileged: Numbers in the privileged observation; 0 for none.
     """
-    remembered = config.memory_width if config.memory == "gru" else 0
-    normaliser = Normaliser(size)
+    remembered = config.memory_width if config.memory != "none" else 0
+    alone = config.memory == "raptor"
+    normaliser = Normaliser(size, math.inf if alone else CLIP)  # mc_raptor clips no normalised one
     normalisers = {"observation": normaliser}
-    network = make_network(size + remembered, config.hidden, 2 * actions, gain=0.01)
+    inputs = remembered + size * (not alone)
+    network = make_network(inputs, config.hidden, 2 * actions, gain=0.01)
     bias: Any = network[-1].bias
     with torch.no_grad():
         bias[actions:] = 2 * torch.tensor(config.initial_deviation).log()
     layers = [*network][::2]
     if remembered:
-        policy = Memory(normaliser, remembered, network.append(MeanAndDeviation()))
+        network.append(MeanAndDeviation())
+        policy = Memory(normaliser, remembered, network, alone=alone)
         given = ["loc", "scale", ("next", STATE)]
         entries = Entries(policy, ["observation", STATE, BEGINS], given)
     else:
-        goal = HoldsGoal(normaliser, network, *goal_state(config)) if config.holds_goal else None
+        goal = HoldsGoal(normaliser, network, goal_state(config)) if config.holds_goal else None
         policy = goal or nn.Sequential(normaliser, *network, MeanAndDeviation())
         entries = Entries(policy, ["observation"], ["loc", "scale"])
         entries.plain = Plain({"observation": goal.seen if goal else normaliser}, layers, goal)
@@ -260,26 +306,60 @@ def check_fits(config: TrainConfig, size: int) -> None:
 
 def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Policy:
     """Convert an actor to a NumPy policy."""
-    layers = [module for module in actor.modules() if isinstance(module, nn.Linear)]
     (normaliser,) = (module for module in actor.modules() if isinstance(module, Normaliser))
+    mean, deviation = _array(normaliser.shift), _array(normaliser.deviation)
+    kept = [module for module in actor.modules() if isinstance(module, Memory)]
+    first = kept[0].first if kept else None
+    layers = [x for x in actor.modules() if isinstance(x, nn.Linear) and x is not first]
     cells = [module for module in actor.modules() if isinstance(module, GRUCell)]
     memory = [GRU(*map(_array, (c.weight_ih, c.weight_hh, c.bias_ih, c.bias_hh))) for c in cells]
+    if first is not None:  # the same function, without normalised observations that are clipped
+        weight, bias = _array(first.weight) / deviation, _array(first.bias)
+        bias = bias - weight @ mean
+        mean, deviation = np.zeros_like(mean), np.full_like(deviation, UNCLIPPED)
+        own = {"first_weight": weight * np.float32(UNCLIPPED), "first_bias": bias}
+        memory = [dataclasses.replace(memory[0], **own)]
     weights = [_array(layer.weight) for layer in layers]
     biases = [_array(layer.bias) for layer in layers]
     for module in actor.modules():
         if isinstance(module, HoldsGoal):  # the same function, as a plain network
             weights[0] *= _array(module.looks)
-            at_goal = _array(module.mean_at_goal())
-            biases[-1][: len(at_goal)] -= at_goal
+            _subtract(module, weights, biases)
     return Policy(
         weights=tuple(weights),
         biases=tuple(biases),
-        mean=_array(normaliser.shift),
-        deviation=_array(normaliser.deviation),
+        mean=mean,
+        deviation=deviation,
         task=task,
         metadata=metadata,
         memory=memory[0] if memory else None,
     )
+
+
+def _subtract(held: HoldsGoal, weights: list[np.ndarray], biases: list[np.ndarray]) -> None:
+    """Let plain layers subtract the mean at the goal, but where another task is flown.
+
+    The flag of each of those passes the hidden layers as -1 or 1, in a unit of its own.
+    """
+    mean, flags = _array(held.mean_at_goal()), held.others
+    biases[-1][: len(mean)] -= mean
+    if not (count := len(flags)):
+        return
+    sure = SURE * np.eye(count, dtype=np.float32)
+    for k, weight in enumerate(weights[:-1]):
+        if k:
+            told, below = np.pad(sure, ((0, 0), (weight.shape[1], 0))), np.zeros(count)
+        else:
+            told = np.zeros((count, weight.shape[1]), np.float32)
+            told[:, flags] = sure * _array(held.normaliser.deviation)[flags]
+            below = SURE * (_array(held.normaliser.shift)[flags] - 0.5)
+        wide = np.pad(weight, ((0, 0), (0, told.shape[1] - weight.shape[1])))
+        weights[k] = np.concatenate([wide, told])
+        biases[k] = np.concatenate([biases[k], below.astype(np.float32)])
+    half = np.zeros((len(biases[-1]), count), np.float32)
+    half[: len(mean)] = mean[:, None] / 2
+    weights[-1] = np.concatenate([weights[-1], half], axis=1)
+    biases[-1] += half.sum(1)
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from quadrl.base.errors import QuadrlWarning
-from quadrl.base.files import write_csv, write_json
+from quadrl.base.files import write_json
 from quadrl.base.progress import Progress, ProgressBar
-from quadrl.base.units import percent
+from quadrl.base.units import digits, percent
 from quadrl.control.feasibility import warn_of_unreached
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import UNDISTURBED, Scenario
@@ -27,28 +27,12 @@ from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import written
-from quadrl.learning.folder import (
-    EVALUATION,
-    EVALUATIONS,
-    LEARNING_CURVE,
-    TRAJECTORY,
-    VIDEO,
-    read_rows,
-)
+from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training
 from quadrl.rendering import write_video
 from quadrl.rendering.scenarios import comment
 
-EPISODES = 50
-"""Of each of the evaluations along a training."""
-COLUMNS = {
-    "success": "success_rate",
-    "survival": "survival_rate",
-    "error": "position_error_m",
-    "return": "return_mean",
-}
-"""Columns of evaluations.csv after steps and seconds, and the metric of each."""
 LATER = (0.01, 0.02)
 """How much later [s] commands also act, as by a radio, where the largest is a control step."""
 FEW, GAIN = 20, 0.95
@@ -76,7 +60,7 @@ class Run:
     where that is no whole control step."""
 
     def __repr__(self) -> str:
-        return f"{self.summary}\n{self.misses}".rstrip()
+        return "\n".join(filter(None, (self.summary, self.misses, self.causes)))
 
     @property
     def summary(self) -> str:
@@ -85,10 +69,39 @@ class Run:
         return f"{self.evaluation}; {trained}; in {self.folder}"
 
     @property
+    def kept(self) -> str:
+        """Which policy it is, in a line."""
+        after = f"kept: the policy after {self.policy.metadata['steps']:,} control steps"
+        if self.config.keep == "last" or not self.config.evaluations:
+            return f"{after}, the last"
+        return f"{after}, the best in the evaluations along the training"
+
+    @property
     def misses(self) -> str:
         """What it misses of what the task asks, and what to do next, in a line; "" if nothing."""
-        what = missed(self.evaluation.task.targets, self.evaluation.metrics)
+        what = missed(self.evaluation.task.asked, self.evaluation.metrics)
         return f"misses: {what}. {self._next()}" if what else ""
+
+    @property
+    def causes(self) -> str:
+        """How the episodes ended and what the reward was made of, in two lines; "" if all is well.
+
+        They are those of the evaluation.
+        """
+        if not self.misses:
+            return ""
+        ends, terms = (self._named(*marks) for marks in (("end_", "_rate"), ("reward_", "_mean")))
+        how = ", ".join(f"{name.replace('_', ' ')} {percent(x)}" for name, x in ends if x)
+        most, *rest = (f"{name} {digits(x)}" for name, x in terms)
+        others = f", then {', '.join(rest)}" * bool(rest)
+        return f"its episodes ended: {how}\nits reward an episode: mostly {most}{others}"
+
+    def _named(self, begin: str, end: str) -> list[tuple[str, float]]:
+        """Figures of the task's own names, the largest first, whatever their sign."""
+        found = self.evaluation.metrics.items()
+        own = [(k, x) for k, x in found if k.startswith(begin) and k.endswith(end)]
+        own = [(k.removeprefix(begin).removesuffix(end), x) for k, x in own]
+        return sorted(own, key=lambda one: -abs(one[1]))
 
     @property
     def lateness(self) -> str:
@@ -103,7 +116,9 @@ class Run:
     def _next(self) -> str:
         """The command that goes on where targets are missed."""
         config, run, flown = self.config, shlex.quote(str(self.folder)), self.config.scenario
-        usual = TrainConfig(config.task, algo=config.algo).scenario
+        # Some tasks cannot be made without; where trainings follow each other, options differ.
+        own = {} if flown.task.trainings else {"task_options": config.conditions["task_options"]}
+        usual = TrainConfig(config.task, algo=config.algo, **own).scenario
         differ = [k for k in UNDISTURBED if getattr(flown, k) != getattr(usual, k)]
         if differ:
             calm = " ".join(f"--{name} {UNDISTURBED[name]}" for name in differ)
@@ -120,7 +135,7 @@ class Run:
         aircraft = config.conditions["vehicle"]
         head = f"{config.task}, {config.algo.upper()}, seed {config.seed}, {aircraft}"
         rows = [("trained", head), ("folder", str(self.folder)), ("seconds", f"{self.seconds:.1f}")]
-        rows += [("", self.misses)] * bool(self.misses)
+        rows += [("", line) for line in f"{self.misses}\n{self.causes}".split("\n") if line]
         return html_table(rows) + self.evaluation._repr_html_()
 
     def draw(
@@ -194,7 +209,7 @@ def train_in(
     warn_of_unreached(scenario.aircraft, *asked)
     training = Training(config, folder, resume=resume)
     with heed(training.ask):
-        policy = training.run(_evaluating(training, show) if config.evaluations else show)
+        policy = training.run(show)
     found = evaluate(policy, scenario, episodes=config.episodes)
     seconds = round(training.seconds, 2)
     record = {"training_s": seconds, "scenario": scenario.to_json()}
@@ -241,28 +256,3 @@ def _later(policy: Policy, scenario: Scenario, episodes: int) -> dict[float, flo
         found = evaluate(policy, scenario, episodes=episodes, **flown)
         shares[later] = float(found.metrics["success_rate"])
     return shares
-
-
-def _evaluating(training: Training, show: Callable[[Progress], None]) -> Callable[[Progress], None]:
-    """Make a function that evaluates the policy when it is due, then shows the progress.
-
-    It counts the success of the mean action, in episodes of its own. metrics.csv has the success of
-    sampled actions, in episodes that began up to two time limits ago.
-    """
-    config, file = training.config, training.folder / EVALUATIONS
-    head = ("steps", "seconds", *COLUMNS)
-    times = range(1, config.evaluations + 1)
-    due = {max(1, round(time * config.iterations / config.evaluations)) for time in times}
-    # A row after the checkpoint is made again.
-    rows: list[Any] = [row for row in read_rows(file, head) if int(row[0]) <= training.steps]
-
-    def after(progress: Progress) -> None:
-        if progress.iteration in due:
-            policy = training.policy()
-            found = evaluate(policy, config.scenario, episodes=EPISODES, engine="free_flight")
-            reached = (found.metrics[of] for of in COLUMNS.values())
-            rows.append([progress.steps, round(progress.seconds, 3), *reached])
-            write_csv(file, head, rows)
-        show(progress)
-
-    return after

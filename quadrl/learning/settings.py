@@ -154,6 +154,7 @@ class APGConfig(AlgorithmConfig):
             ("engine", flown.engine, flown.engine != "free_flight", "'free_flight'"),
             ("memory", config.memory, config.memory != "none", "'none'"),
             ("device", config.device, config.device != "cpu", "'cpu'"),
+            ("gammas", config.gammas, bool(config.gammas), "left out, since gamma is for all"),
             ("task", task.name, task.contact, "a task without contact with the ground"),
             ("task", task.name, task.true_parameters, "a task that sees the specified parameters"),
             ("observe", given["observe"], observed, "left out"),
@@ -166,7 +167,27 @@ class APGConfig(AlgorithmConfig):
                 raise QuadrlError(reason, name=name, value=value, allowed=allowed)
 
 
-ALGORITHM_CONFIGS = {"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig, "apg": APGConfig}
+@dataclasses.dataclass(frozen=True)
+class DaggerConfig(AlgorithmConfig):
+    """Settings of the imitation of a teacher."""
+
+    # Seconds of flight in each batch, for the memory; exploration would only hide what it finds.
+    training = {"num_envs": 512, "rollout": 26, "initial_deviation": 0.03}
+
+    learning_rate: float = 3e-3
+    """Initial learning rate of Adam, which falls linearly to zero."""
+    epochs: int = 2
+    """Passes over each batch."""
+    minibatch: int = 4096
+    """Transitions in a gradient step, of whole aircraft."""
+    max_gradient: float = 1.0
+    """Norm to which the gradient is clipped."""
+
+
+ALGORITHM_CONFIGS = {
+    **{"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig},
+    **{"apg": APGConfig, "dagger": DaggerConfig},
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,12 +202,14 @@ class TrainSettings:
     """Name of the task."""
     algo: str = "ppo"
     """Algorithm: ppo, trpo, vpg (the plain policy gradient; gae, the paper's name for it, works
-    too), or apg (the analytic policy gradient through the physics; not in the paper)."""
+    too), apg (the analytic policy gradient through the physics; not in the paper), or dagger
+    (imitation of a regulator that is told what was drawn; of quadrotors that hold a place)."""
     seed: int = 0
     """Seed of the networks, the exploration and the episodes, between 0 and 2^32 - 1."""
     variant: str = "ideal"
-    """Group of settings: ideal (the paper's episodes), or robust (an uncertain aircraft in light
-    wind, and a policy that sees what it needs for that)."""
+    """Group of settings: ideal (the paper's episodes), robust (an uncertain aircraft in light wind,
+    and a policy that sees what it needs for that), or raptor (one of the shape that PX4's mc_raptor
+    flies)."""
     conditions: dict[str, Any] = dataclasses.field(
         default_factory=lambda: _CONDITIONS | {"engine": "free_flight"}
     )
@@ -204,6 +227,8 @@ class TrainSettings:
     gamma: float = 0.93
     """Discount per control step; 0.93 gives an effective horizon of 0.7 s. With a short horizon a
     lasting error costs more than one that is corrected."""
+    gammas: tuple[float, ...] = ()
+    """Of several tasks in one, the discount of each instead of gamma."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimation."""
     reward_scale: float = 0.01
@@ -213,7 +238,8 @@ class TrainSettings:
     critic_hidden: tuple[int, ...] = (64, 64)
     """Widths of the critic's hidden layers."""
     memory: str = "none"
-    """Memory of the policy: none (the paper's), or gru, a gated recurrent unit."""
+    """Memory of the policy: none (the paper's), gru, a gated recurrent unit, or raptor, a unit
+    behind a layer of as many neurons, whose state is all that is read: what mc_raptor flies."""
     memory_width: int = 64
     """Numbers that a policy with a memory remembers."""
     holds_goal: bool = False
@@ -235,16 +261,30 @@ class TrainSettings:
     """Settings of the plain policy gradient."""
     apg: APGConfig = dataclasses.field(default_factory=APGConfig)
     """Settings of the analytic policy gradient."""
+    dagger: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+    """Settings of the imitation of a teacher."""
     device: str = "cpu"
     """Device of the networks, such as cuda; the simulation stays on the CPU."""
     num_threads: int = 0
     """Threads of the simulation; 0 for one per core. The results do not depend on it."""
     checkpoint_seconds: float = 5.0
     """Shortest time between two checkpoints [s]."""
-    evaluations: int = 0
-    """Number of evaluations, evenly over the training: the policy of the moment flies 50 episodes
-    with its mean action, in free flight, for a row of evaluations.csv. They count in the seconds of
-    the training."""
+    evaluations: int = 10
+    """Number of evaluations, evenly over the training: the policy of the moment flies 10 to 50
+    episodes with its mean action, in the engine of the training, for a row of evaluations.csv. They
+    take some 2 % of the training, and change nothing of it."""
+    keep: str = "best"
+    """The policy that is kept: best (of the evaluations that with the highest success, then the
+    lowest error, then the latest) or last. The checkpoint is always the last."""
+    log: str = "tensorboard"
+    """Where the figures of metrics.csv and evaluations.csv are shown: tensorboard, or wandb for W&B
+    as well (offline with WANDB_MODE=offline; its project is WANDB_PROJECT, by default quadrl)."""
+    until: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Figures of an evaluation that end the training early, such as success=0.99: success,
+    survival and return from there on up, error [m] from there on down."""
+    checkpoint_every: int = 0
+    """Control steps between two policies that are kept beside the last, as in
+    policy_000100000.safetensors; 0 for none."""
     episodes: int = 100
     """Episodes of the evaluation at the end."""
 
@@ -258,5 +298,5 @@ class TrainSettings:
 
 USUAL = TrainSettings().named()
 """The defaults of all settings, by name."""
-PAIRED = ("training_options", *(name for name in GIVEN if GIVEN[name]["given"] == "pairs"))
+PAIRED = ("training_options", "until", *(name for name in GIVEN if GIVEN[name]["given"] == "pairs"))
 """Settings that are dicts: given entries are added to the default ones."""

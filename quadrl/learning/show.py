@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.extras import needed
@@ -16,7 +18,8 @@ from quadrl.base.validation import choice
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import Evaluation, beside, evaluate
-from quadrl.learning.folder import METRICS, read_config, read_metrics
+from quadrl.learning.folder import EVALUATIONS, METRICS, read_config, read_metrics
+from quadrl.learning.foreign import read_curve
 from quadrl.rendering.scenarios import comment
 from quadrl.rendering.sheet import SHEETS, write_contact_sheet
 from quadrl.rendering.video import VIDEOS, write_video
@@ -98,7 +101,8 @@ def plot(*what: Any, kind: str = "png") -> Media:
     Args:
         *what: What `quadrl.train` returned, or run folders; or one thing that `quadrl.evaluate`
             returned. Several runs must be of one task; there is a curve for each algorithm, with
-            the spread over its runs.
+            the spread over its runs. A csv is the curve of another program beside them
+            (`quadrl.learning.foreign.read_curve`).
         kind: Kind of the picture: "png", "pdf", "svg" or another that matplotlib knows.
 
     Raises:
@@ -115,7 +119,10 @@ def plot(*what: Any, kind: str = "png") -> Media:
         raise QuadrlError("give one evaluation at a time")
     figures = {repr(one): plotting.trajectory(one.rollout, repr(one)) for one in flown}
     folders = [Path(getattr(one, "folder", one)) for one in what if not flown]
-    figures |= curves(folders) if len(folders) > 1 else {str(one): curve(one) for one in folders}
+    if len(folders) == 1 and folders[0].suffix != ".csv":
+        figures |= {str(one): curve(one) for one in folders}
+    elif folders:
+        figures |= curves(folders)
     if len(figures) > 1:
         allowed = "one for all runs of a picture"
         raise QuadrlError(name="task", value=sorted(figures), allowed=allowed)
@@ -138,26 +145,40 @@ def curve(folder: Path) -> Figure:
 
     config, metrics = read_config(folder), read_metrics(folder / METRICS)
     title = f"{config['task']}, {str(config['algo']).upper()}, seed {config['seed']}"
-    return plotting.learning_curve(metrics, title)
+    return plotting.learning_curve(metrics, title, _evaluated(folder))
+
+
+def _evaluated(folder: Path) -> dict[str, np.ndarray] | None:
+    """The evaluations of the mean action along a training; None where there was none."""
+    file = folder / EVALUATIONS
+    return read_metrics(file) if file.exists() else None
 
 
 def curves(
     folders: Iterable[Path] | Mapping[Path, str],
     on_missing: Callable[[QuadrlError], None] | None = None,
+    clocks: Sequence[str] = ("steps", "seconds"),
 ) -> dict[str, Figure]:
     """Draw the learning curves of several runs: a figure for each task, a curve for each label.
 
+    They are of the mean action where all runs of a task were evaluated along the training, else of
+    the sampled actions. Curves of other programs are drawn beside those of each task.
+
     Args:
         folders: Folders of the runs, perhaps with a label each; by default that is the algorithm.
+            A csv is a curve of another program (`quadrl.learning.foreign.read_curve`), labelled by
+            its name without the ending.
         on_missing: Called with the error about a folder without metrics, or about a task of which
             no episode has ended; they are then left out.
+        clocks: Names of `plotting.CLOCKS`, a row of each figure for each.
 
     Raises:
         QuadrlError: There is such a folder or task, and `on_missing` is None.
     """
     from quadrl.evaluation import plotting
 
-    runs: dict[str, dict[str, list[plotting.Metrics]]] = {}
+    runs: dict[str, dict[str, list[tuple[Any, Any]]]] = {}
+    others: dict[str, list[Any]] = {}
     figures: dict[str, Figure] = {}
 
     @contextlib.contextmanager
@@ -171,10 +192,21 @@ def curves(
 
     for folder in folders:
         with told():
+            if folder.suffix == ".csv":
+                read = read_curve(folder)
+                others.setdefault(folder.stem, []).append(read)
+                continue
             config, metrics = read_config(folder), read_metrics(folder / METRICS)
             label = folders[folder] if isinstance(folders, Mapping) else config["algo"]
-            runs.setdefault(config["task"], {}).setdefault(label, []).append(metrics)
-    for task, groups in runs.items():
+            both = metrics, _evaluated(folder)
+            runs.setdefault(config["task"], {}).setdefault(label, []).append(both)
+    for task, found in runs.items():
+        mean = all(evaluated for pairs in found.values() for _, evaluated in pairs)
+        groups = {label: [pair[mean] for pair in pairs] for label, pairs in found.items()}
         with told():
-            figures[task] = plotting.learning_curves(groups, task)
+            flown = "mean action" if mean else "sampled actions"
+            title = f"{task}, {flown}{' of the runs' * bool(others)}"
+            figures[task] = plotting.learning_curves(groups | others, title, clocks)
+    if others and not runs:
+        figures["others"] = plotting.learning_curves(others, "learning curves", clocks)
     return figures

@@ -33,6 +33,7 @@ from quadrl.learning.show import curves
 MAX_JOBS = 4096
 FIGURES = {
     "success_rate": 1.0,
+    "success_area": 1.0,
     "position_error_m": math.inf,
     "yaw_rate_rad_s": math.inf,
     "circling_m_s": math.inf,
@@ -55,9 +56,10 @@ class StudyResult:
     runs: tuple[dict[str, Any], ...]
     """A row a training: name, task, algo, variant, seed, scenario, metrics and settings."""
     rows: tuple[dict[str, Any], ...]
-    """A row for each task, algorithm and variant: seeds, and of `success_rate`, `position_error_m`
-    over the last 2 s, `yaw_rate_rad_s`, `circling_m_s` and `training_s` the mean over the seeds,
-    with its 95 % interval `_low`, `_high` (None with one seed, or where there is no figure)."""
+    """A row for each task, algorithm and variant: seeds, and of `success_rate`, `success_area`
+    (its mean along the training), `position_error_m` over the last 2 s, `yaw_rate_rad_s`,
+    `circling_m_s` and `training_s` the mean over the seeds, with its 95 % interval `_low`, `_high`
+    (None with one seed, or where there is no figure)."""
     failed: dict[str, str]
     """Why trainings failed, by name."""
 
@@ -65,7 +67,8 @@ class StudyResult:
     def table(self) -> list[tuple[str, ...]]:
         """The rows as text, the head first."""
         known = [name for name in (*GROUP, "seeds") if any(row[name] for row in self.rows)]
-        head = (*known, "successful", "error over the last 2 s", "turning", "circling", "training")
+        head = (*known, "successful", "along the training", "error over the last 2 s", "turning",
+                "circling", "training")  # fmt: skip
         figures = ([_text(row, name) for name in FIGURES] for row in self.rows)
         named = ([str(row[name]) for name in known] for row in self.rows)
         return [head, *((*one, *other) for one, other in zip(named, figures, strict=True))]

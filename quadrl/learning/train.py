@@ -20,24 +20,26 @@ from typing import Any
 import numpy as np
 import torch
 from torchrl.modules import set_recurrent_mode
-from torchrl.objectives.value import GAE
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import PART
 from quadrl.base.machine import processor_kind
 from quadrl.base.progress import Progress
+from quadrl.core.transition import TIME_LIMIT
 from quadrl.engines import native
-from quadrl.envs.torchrl import QuadrotorEnv
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE as POLICY_FILE
-from quadrl.learning import checkpoint, environments, networks
+from quadrl.evaluation.policy_file import arrays_of, parts_of
+from quadrl.learning import checkpoint, environments, log, networks
+from quadrl.learning.advantages import Advantages
 from quadrl.learning.algorithm import Algorithm, generators, one_thread, set_generators
 from quadrl.learning.apg import APG
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.dagger import Dagger
+from quadrl.learning.evaluations import Evaluations, Kept
 from quadrl.learning.folder import (
     EVALUATION,
     WARNINGS,
-    Log,
     lock_folder,
     new_folder,
     read_config,
@@ -47,6 +49,7 @@ from quadrl.learning.folder import (
 from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE
 from quadrl.learning.origin import Origin
 from quadrl.learning.ppo import PPO
+from quadrl.learning.settings import DaggerConfig
 from quadrl.learning.trpo import TRPO
 from quadrl.learning.vpg import VPG
 
@@ -55,11 +58,15 @@ LEARNED_FROM = ("action", "action_log_prob", "loc", "scale", "advantage", "value
 ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "vpg": VPG}
 
 
-def make_algorithm(config: TrainConfig, env: QuadrotorEnv, actor: Any, critic: Any) -> Algorithm:
+def make_algorithm(
+    config: TrainConfig, env: environments.TrainingEnv, actor: Any, critic: Any
+) -> Algorithm:
     """Make the algorithm of a training."""
     own = getattr(config, config.algo)
     if isinstance(env, environments.RecordingEnv):
         return APG(actor, critic, own, env, config.gamma, config.reward_scale)
+    if isinstance(own, DaggerConfig):
+        return Dagger(actor, critic, own, env)
     return ALGORITHMS[config.algo](actor, critic, own)
 
 
@@ -93,17 +100,19 @@ class Training:
                 Origin.of(config.from_run).checkpoint(size, actions), self.actor, self.critic
             )
         self.algorithm = make_algorithm(config, self.env, self.actor, self.critic)
-        self.advantages = GAE(
-            gamma=config.gamma, lmbda=config.gae_lambda, value_network=None, average_gae=True
-        )
+        self.advantages = Advantages(config, device)
         self.iteration = 0
         self.seconds = 0.0  # of training, in all processes that worked on it
+        self._evaluations = Evaluations(config, folder) if config.evaluations else None
+        flown = self.env.environment
         self._episodes = environments.EpisodeStatistics(
-            config.num_envs, self.env.environment.time_limit_steps, config.rollout
+            *(config.num_envs, flown.time_limit_steps, config.rollout),
+            *(flown.term_names, ("diverged", *flown.end_names, TIME_LIMIT)),
         )
         self._generators: dict[str, torch.Tensor] = {}
         self._remembered: dict[str, np.ndarray] = {}  # the states of a recurrent policy
         self._asked = self._stopping = False
+        log.check(config.log)
         if not resume:
             new_folder(folder)
         self._unlock = weakref.finalize(self, lock_folder(folder))
@@ -128,6 +137,8 @@ class Training:
             write_config(folder, resolved, before)
         if self.iteration < config.iterations:
             (folder / EVALUATION).unlink(missing_ok=True)
+        if self._evaluations:
+            self._evaluations.begin(self.steps)
 
     @property
     def steps(self) -> int:
@@ -147,7 +158,7 @@ class Training:
         config = self.config
         with contextlib.ExitStack() as stack:
             stack.callback(self._unlock)
-            if self.iteration >= config.iterations:
+            if self.iteration >= config.iterations or self._reached:
                 policy = self.policy()  # it may have been killed between checkpoint and policy
                 policy.save(self.folder / POLICY_FILE)
                 return policy
@@ -156,8 +167,14 @@ class Training:
             )
             stack.callback(collector.shutdown, close_env=False)
             set_generators(self._generators, self.env.device)
-            log = Log(self.folder, self.iteration)
-            stack.callback(log.close)
+            self.env.told()  # what the collector asked of it before
+            settings = {name: value for name, value, _ in config.sources()}
+            columns = [*self._episodes.columns, *self.algorithm.columns]
+            logged = self.folder, self.iteration, columns, settings, config.log
+            rows = log.Log(*logged)
+            stack.callback(rows.close)
+            if self._evaluations:
+                self._evaluations.on_row = rows.evaluated
             stack.enter_context(native.warnings_in(self.folder / WARNINGS))
             # What the imports made is no garbage, and searching it would take 5 % of the time.
             gc.freeze()
@@ -174,10 +191,16 @@ class Training:
                         f"the training diverged after {self.steps} steps: a weight is no longer "
                         "finite; lower the learning rate and start a new run"
                     )
-                log.write(self.iteration, self.steps, self.seconds, metrics)
+                rows.write(self.iteration, self.steps, self.seconds, metrics)
+                if self._evaluations and self.iteration in self._evaluations.due:
+                    moment = self.iteration, self.steps, self.seconds
+                    self._evaluations.add(*moment, self._present())
+                if config.checkpoint_every and self._passes(config.checkpoint_every):
+                    numbered = POLICY_FILE.replace(".", f"_{self.steps:09}.")
+                    self._present(described=True).save(self.folder / numbered)
                 progress = (self.iteration, config.iterations, self.steps, self.seconds, metrics)
                 on_progress(Progress(*progress))
-                over = self.iteration == config.iterations or self._stopping
+                over = self.iteration == config.iterations or self._reached or self._stopping
                 if over or self._asked or now - saved > config.checkpoint_seconds:
                     self._asked = False  # requests from here on are for the next iteration
                     self.save()
@@ -195,25 +218,44 @@ class Training:
         self._stopping |= stop
         self._asked = True
 
+    @property
+    def _reached(self) -> bool:
+        return bool(self._evaluations) and self._evaluations.reached
+
+    def _passes(self, every: int) -> bool:
+        """Whether the last iteration passed a multiple of some control steps."""
+        return self.steps % every < self.config.num_envs * self.config.rollout
+
     def policy(self) -> Policy:
-        """Export the present policy."""
+        """Export the policy that is kept so far: the best, or the present one."""
+        best = self._evaluations.best if self._evaluations else None
+        if best is None or self.config.keep == "last":
+            return self._present(described=True)
+        return dataclasses.replace(best.policy, metadata=self._described(best.steps))
+
+    def _present(self, *, described: bool = False) -> Policy:
+        metadata = self._described(self.steps) if described else {}
+        return networks.export(self.actor, self.config.task, metadata)
+
+    def _described(self, steps: int) -> dict[str, Any]:
+        """The metadata of a policy after some control steps."""
         config = self.config
-        metadata = {
+        return {
             "algo": config.algo,
             "seed": config.seed,
             "run": self._known_as,
             "variant": config.variant,
-            "steps": self.steps,
+            "steps": steps,
             "rotors": config.scenario.vehicle.rotor_count,
             **config.resolved()["scenario"],
             "engine": "mujoco",
             "observe": dataclasses.asdict(config.scenario.observe),
         }
-        return networks.export(self.actor, config.task, metadata)
 
     def _learn(self, batch: Any) -> dict[str, float]:
         """Do one iteration with a batch (aircraft, time)."""
-        metrics = self._episodes.count(batch)
+        terms, ends, which = self.env.told()
+        metrics = self._episodes.count(batch, terms, ends)
         with torch.no_grad():
             if self.config.memory != "none":
                 done, state = (batch["next", name] for name in ("done", STATE))
@@ -229,7 +271,7 @@ class Training:
                 batch["action_log_prob"] = present.log_prob(batch["action"])
             batch["next", "reward"] *= self.config.reward_scale
             self._evaluate(batch)
-            self.advantages(batch)
+            self.advantages(batch, which)
         flat = batch.select(*self.actor.in_keys, *self.critic.in_keys, *LEARNED_FROM)
         if self.config.memory == "none" and not self.algorithm.whole:
             flat = flat.reshape(-1)
@@ -251,19 +293,28 @@ class Training:
         batch["next", "state_value"] = after
 
     def save(self) -> None:
-        """Write the checkpoint and the present policy."""
+        """Write the checkpoint and the policy."""
+        if self._evaluations:
+            self._evaluations.fly()
         tensors = {
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
+            "returns": self.advantages.returns,
             "optimisers": self.algorithm.save(),
             "environment": self.env.environment.save() | self._remembered,
             "running": self._episodes.running,
             "generators": generators(self.env.device),
         }
+        best = self._evaluations.best if self._evaluations else None
+        if best:
+            tensors["best"] = arrays_of(best.policy)
         numbers = {
             "iteration": self.iteration,
             "seconds": self.seconds,
             "config": self.config.resolved(),
+            "best": [best.steps, best.success, best.error, len(best.policy.weights)]
+            if best
+            else [],
         }
         checkpoint.save(self.folder / checkpoint.CHECKPOINT, tensors, numbers)
         self.policy().save(self.folder / POLICY_FILE)
@@ -277,10 +328,17 @@ class Training:
             checkpoint.check_same(path, was, self.config.resolved())
             self.actor.load_state_dict(tensors["actor"])
             self.critic.load_state_dict(tensors["critic"])
+            for name, values in tensors.get("returns", {}).items():  # older trainings have none
+                self.advantages.returns[name].copy_(values)
             self.algorithm.restore(tensors.get("optimisers", {}))
             self.env.restore({k: v.numpy() for k, v in tensors["environment"].items()})
             self._episodes.running |= {k: v.numpy().copy() for k, v in tensors["running"].items()}
             self._generators = tensors["generators"]
+            if self._evaluations and numbers["best"]:
+                steps, success, error, layers = numbers["best"]
+                arrays = {k: v.numpy() for k, v in tensors["best"].items()}
+                kept = Policy(**parts_of(arrays, layers), task=self.config.task)
+                self._evaluations.best = Kept(steps, kept, success, error)
             self.iteration, self.seconds = int(numbers["iteration"]), float(numbers["seconds"])
         except QuadrlError:
             raise
