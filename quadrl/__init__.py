@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from quadrl import envs, tasks
 from quadrl.aircraft.aerodynamics import Aerodynamics
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.rotors import Rotor, ring
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.extras import needed
 from quadrl.base.shield import shield_triton
@@ -42,9 +43,9 @@ if TYPE_CHECKING:
     from quadrl.learning.study import study
 
 __all__ = [
-    "RANDOMIZATIONS", "VEHICLES", "Aerodynamics", "Observing", "Policy", "Randomization", "Task",
-    "Vehicle", "check", "envs", "evaluate", "export", "load", "plot", "register", "render",
-    "rendering", "robustness", "study", "suite", "tasks", "testing", "train",
+    "RANDOMIZATIONS", "VEHICLES", "Aerodynamics", "Observing", "Policy", "Randomization", "Rotor",
+    "Task", "Vehicle", "check", "envs", "evaluate", "export", "load", "plot", "register", "render",
+    "rendering", "ring", "robustness", "study", "suite", "tasks", "testing", "train",
 ]  # fmt: skip
 LAZY = {
     "train": "quadrl.learning.run",

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import GRAVITY
-from quadrl.base.rotation import Array, namespace, norm, stack
+from quadrl.base.rotation import Array, namespace, norm, stack, zeros
 from quadrl.control.reading import Reading
 from quadrl.engines.rng import Rng, hovering
 from quadrl.engines.state import Start
@@ -30,7 +30,7 @@ class Way(NamedTuple):
 
     def start(self, parameters: Parameters) -> Start:
         """The same with the rotors at hover speed."""
-        xp, none = namespace(self.pitch), 0.0 * self.pitch
+        xp, none = namespace(self.pitch), zeros(self.pitch)
         return Start(
             position=self.position,
             quaternion=stack(xp.cos(self.pitch / 2), none, -xp.sin(self.pitch / 2), none),
@@ -67,7 +67,7 @@ def on_the_way(rng: Rng, incline: Array, into: tuple[float, float]) -> Way:
         incline: (N,) [rad], of the surface, and the pitch of the touch.
         into: Smallest and largest speed of the touch into the surface [m/s].
     """
-    xp, none = namespace(incline), 0.0 * incline
+    xp, none = namespace(incline), zeros(incline)
     rate, thrust = rng.uniform(*RATE), GRAVITY * rng.uniform(*THRUST)
     speed = rng.uniform(*into)
     time = rng.uniform(0.1, 1.0) * (incline + DIVE) / rate

@@ -8,7 +8,7 @@ import functools
 import numpy as np
 
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, cross, dot, namespace, norm, stack, to_body
+from quadrl.base.rotation import Array, cross, dot, filled, namespace, norm, stack, to_body, zeros
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import State
 from quadrl.tasks.boxes import gap
@@ -116,7 +116,7 @@ class Arena(Course):
         gaps.append(gap([*off[:2], off[2] + outer + STAND[2]], turn, half, STAND))
         for k in (1, 2):  # of a frame's four sides the box can reach the two nearer ones
             beside, size = [*off], [DEPTH, outer, outer]
-            size[k], middle = wide, outer - wide + 0.0 * off[k]
+            size[k], middle = wide, filled(outer - wide, off[k])
             beside[k] = off[k] - xp.where(off[k] < 0, -middle, middle)
             gaps.append(gap(beside, turn, half, size))
         return xp.min(xp.concat(gaps, axis=-1), axis=-1)
@@ -148,8 +148,8 @@ def furnished(rng: Rng, track: Track, off: float, boxes: tuple[float, float]) ->
         rows += [x + by[0], y + by[1], z + by[2], *_leaning(east, north, *by[3:])]
     aside = ASIDE_POLE * (len(poles) // 3)
     stand = [poles[k] + aside[k] * shift[..., 6 * count + k] for k in range(len(poles))]
-    one = 0.0 * shift[..., 0]
-    three, seen = stack(one, one, one), 0.0 * shift[..., : count + len(poles) // 3]
+    one = zeros(shift[..., 0])
+    three, seen = stack(one, one, one), zeros(shift[..., : count + len(poles) // 3])
     course = Course(three, one, three, three, one, one, three, one)
     return Arena(**vars(course), gates=stack(*rows), poles=stack(*stand), size=size, seen=seen)
 

@@ -12,7 +12,7 @@ import numpy as np
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, dot, namespace, norm, stack, to_body, to_world
+from quadrl.base.rotation import Array, dot, namespace, norm, stack, to_body, to_world, zeros
 from quadrl.base.validation import number
 from quadrl.conditions.solids import Pose, Solid
 from quadrl.control.reading import Reading
@@ -122,7 +122,7 @@ class DeckLanding(Landing):
         height = rng.uniform(self.lowest_waves, self.highest_waves)
         waves = sea.draw(rng, height, (self.boat_length, self.boat_beam))
         touchdown = ("down", "speed", "upright", "miss", "rest")
-        return start, Sea(**vars(waves), **dict.fromkeys(touchdown, 0.0 * height))
+        return start, Sea(**vars(waves), **dict.fromkeys(touchdown, zeros(height)))
 
     def remember(self, start: Start, drawn: Any) -> TaskState:
         """Nothing of the start: the speed is that of the touchdown."""
@@ -144,12 +144,13 @@ class DeckLanding(Landing):
         normal = sea.deck(now.task, now.time).normal
         return {**terms, "normal": to_body(now.state.rotation, normal)}
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Crashed, in its own wash, in the water, away, or at rest for long enough."""
         sinks = (now.state.body_velocity[..., 2] < -self.max_sink) & ~now.landed
         away = now.potentials.distance > self.max_distance
         wet = now.potentials.to_goal[..., 2] > sea.FREEBOARD
-        return self._crashed(now) | sinks | away | wet | self._rested(now)
+        failed = {"crashed": self._crashed(now), "own_wash": sinks, "away": away, "water": wet}
+        return failed | {"at_rest": self._rested(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """At rest on the pad for long enough, and heading east."""

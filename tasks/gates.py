@@ -8,14 +8,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from quadrl.base.rotation import Array, namespace, norm, to_body
+from quadrl.base.rotation import Array, namespace, norm, to_body, zeros
 from quadrl.base.validation import number
 from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.observation import MOTION, ROTATION, ObservationTerm, observed_motion
 from quadrl.core.snapshot import Rollout, statistic
-from quadrl.core.task import EpisodeEnd, Snapshot, Task, TaskState
+from quadrl.core.task import EpisodeEnd, Snapshot, Task, TaskState, either
 from quadrl.engines.state import Start
 from quadrl.tasks.tracks import Track, crossing
 
@@ -159,13 +159,13 @@ class GateRace(Task):
             "crash": rewards.once(-self.crash_weight, end.failed, now),
         }
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Through the last gate or a frame, on the ground, or astray."""
-        return self._failed(now) | self._finished(now)
+        return self._failures(now) | {"finished": self._finished(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Through every gate, and nothing else."""
-        return end.terminated & self._finished(now) & ~self._failed(now)
+        return end.terminated & self._finished(now) & ~either(self._failures(now))
 
     def guide(self, reading: Reading) -> tuple[Array, Array]:
         """Through the gate: straight to a place behind it."""
@@ -192,7 +192,7 @@ class GateRace(Task):
     def _following(self, gate: Array) -> Array:
         """Numbers (N,) of the gates after some."""
         last = float(len(self.course.gates) - 1)
-        return namespace(gate).where(gate == last, 0.0 * gate, gate + 1)
+        return namespace(gate).where(gate == last, zeros(gate), gate + 1)
 
     def _crossed(self, now: Snapshot) -> tuple[Array, Array, Array, Array]:
         """Whether this control step passes, hits or misses the next gate, (N,).
@@ -206,14 +206,15 @@ class GateRace(Task):
         forwards, backwards, aside, share = crossing(task.position, now.state.position, *gate)
         beside = aside - (self.course.opening / 2 - self.margin)
         struck = (beside > 0) & (aside < self.course.frame / 2 + self.margin)
-        missed = xp.where(forwards, xp.clip(beside, 0.0, FARTHEST_MISS), 0.0 * beside)
+        missed = xp.where(forwards, xp.clip(beside, 0.0, FARTHEST_MISS), zeros(beside))
         return forwards & (beside <= 0), (forwards | backwards) & struck, missed, share
 
-    def _failed(self, now: Snapshot) -> Array:
-        """Through a frame, on the ground, or astray, (N,) bool."""
+    def _failures(self, now: Snapshot) -> dict[str, Array]:
+        """Through a frame, on the ground, or astray, (N,) bool each."""
         astray = now.potentials.distance > now.task.leg + ASTRAY
         begun = (now.time > self.on_ground) | (now.task.passed > 0)
-        return self._crossed(now)[1] | astray | (touches_ground(now, bounces=self.contact) & begun)
+        ground = touches_ground(now, bounces=self.contact) & begun
+        return {"frame": self._crossed(now)[1], "astray": astray, "ground": ground}
 
     def _finished(self, now: Snapshot) -> Array:
         """Whether this control step passes the last gate of the last lap, (N,) bool."""

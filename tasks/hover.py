@@ -21,7 +21,7 @@ IN_GUSTS: dict[str, Any] = {
 }
 """Settings of the variant `robust` of this task and of random_waypoint, whose place gusts move the
 aircraft from: enough neurons and steps to learn how to answer them. static_waypoint gains nothing
-by these: docs/robustness.md."""
+by these: docs/lab/robustness.md."""
 # Flights from the edge of what was trained on fail more often. With the task's own attitude weight,
 # aircraft that begin heading nearly west sometimes turn too late.
 FARTHER = {"tilt": 0.3, "spin": 0.6, "radius": 0.75, "speed": 0.5, "attitude_weight": 60.0}
@@ -82,9 +82,11 @@ class Hover(Task):
             "apg": {"step": 0.5},
         },
     }
-    variants = {"robust": {"training_options": AS_ASKED, **IN_GUSTS}}
-    heading_matters = True
-
+    variants = {
+        "robust": {"training_options": AS_ASKED, **IN_GUSTS},
+        "raptor": {"training_options": AS_ASKED},
+        "any": {"task_options": {"any_heading": True}},
+    }
     radius: float = 0.5
     """Largest distance from the waypoint at the start [m]."""
     tilt: float = 0.2
@@ -99,6 +101,20 @@ class Hover(Task):
     """Largest final error that counts as success [m]."""
     heading_tolerance: float = math.radians(10.0)
     """Largest angle off east at the end that counts as success [rad]."""
+    any_heading: bool = False
+    """Whether no heading is asked: only level then, at any heading."""
+
+    @property
+    def heading_matters(  # pyright: ignore[reportIncompatibleVariableOverride] - of its options
+        self,
+    ) -> bool:
+        """Whether east is asked."""
+        return not self.any_heading
+
+    @property
+    def asked(self) -> tuple[Target, ...]:
+        """All, but for the heading if any will do."""
+        return tuple(x for x in self.targets if x.metric != "heading_error_deg" * self.any_heading)
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
         """Near the waypoint, nearly level and slow; the rotors at hover speed."""
@@ -117,12 +133,13 @@ class Hover(Task):
         terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
         return rewards.weighted(self, terms, before, now)
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Away, on the ground or on its back."""
         away = now.potentials.distance > self.max_distance
-        return away | touches_ground(now) | (now.state.cos_tilt < 0)
+        return {"away": away, "ground": touches_ground(now), "on_back": now.state.cos_tilt < 0}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Still flying at the end, close, and heading east."""
         close = end.final_error < self.tolerance
-        return end.truncated & close & heads_east(now, self.heading_tolerance)
+        held = end.truncated & close
+        return held if self.any_heading else held & heads_east(now, self.heading_tolerance)

@@ -11,7 +11,7 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, namespace, norm, square_norm, stack
+from quadrl.base.rotation import Array, namespace, norm, square_norm, stack, zeros
 from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import stands, strikes_ground
@@ -139,7 +139,7 @@ class Landing(Task):
         """The speed with which it begins."""
         return dataclasses.replace(drawn, speed=norm(start.velocity))
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Crashed, in its own wash, away, or at rest for long enough."""
         state, down = now.state, stands(now)
         tilted = state.cos_tilt < math.cos(self.max_tilt)
@@ -148,7 +148,7 @@ class Landing(Task):
         sinks = state.body_velocity[..., 2] < -self.max_sink
         away = now.potentials.distance > self.max_distance
         crashed = strikes_ground(now) | (down & (tilted | hard))
-        return crashed | sinks | away | self._rested(now)
+        return {"crashed": crashed, "own_wash": sinks, "away": away, "at_rest": self._rested(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """At rest on the pad for long enough, upright, on its feet alone, and heading east."""
@@ -178,7 +178,7 @@ class Landing(Task):
         terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
         return {
             **rewards.weighted(self, terms, before, now),
-            "haste": -cost * namespace(haste).where(haste > 0, haste, 0.0 * height),
+            "haste": -cost * namespace(haste).where(haste > 0, haste, zeros(height)),
             "success": rewards.once(self.success_weight, end.succeeded, now),
             "failure": rewards.once(-self.failure_weight, end.failed, now),
         }

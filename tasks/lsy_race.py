@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -12,10 +13,12 @@ from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import (
     Array,
     dot,
+    filled,
     namespace,
     norm,
     quaternion_from_heading_and_tilt,
     stack,
+    zeros,
 )
 from quadrl.base.validation import number
 from quadrl.core import rewards
@@ -154,16 +157,16 @@ class LsyRace(GateRace):
         rest = self.radius * u[0], self.radius * u[1], 0.02 * abs(u[2])
         rest = (at + aside for at, aside in zip(self.course.start, rest, strict=True))
         position = where.where(flies[..., None], centre, stack(*rest))
-        speed = where.where(flies, rng.uniform(0.0, SPEED), 0.0 * last)
-        bearing = self.tilt * u[3] + where.where(flies, FULL_TURN * u[4], 0.0 * last)
+        speed = where.where(flies, rng.uniform(0.0, SPEED), zeros(last))
+        bearing = self.tilt * u[3] + where.where(flies, FULL_TURN * u[4], zeros(last))
         turning = hovering(position, parameters)
         tilt = rng.uniform(0.0, self.tilt), rng.uniform(0.0, FULL_TURN)
         start = Start(
             position=position,
             quaternion=quaternion_from_heading_and_tilt(bearing, *tilt),
             velocity=speed[..., None] * through,
-            body_rate=0.0 * position,
-            rotor_speed=where.where(flies[..., None], turning, 0.0 * turning),
+            body_rate=zeros(position),
+            rotor_speed=where.where(flies[..., None], turning, zeros(turning)),
         )
         begun: dict[str, Array] = {"goal": goal, "through": ahead, "left": left, "gate": gate}
         return start, dataclasses.replace(arena, passed=gate, **begun)
@@ -197,7 +200,7 @@ class LsyRace(GateRace):
             "progress": self.progress_weight * nearer,
             **self.passage(before, now, end),
             "room": -self.room_weight * time * close,
-            "time": 0.0 * close - self.time_weight * time,
+            "time": filled(-self.time_weight * time, close),
         }
 
     def gate(self, task: Any, number: Array) -> tuple[Array, Array, Array]:
@@ -208,12 +211,12 @@ class LsyRace(GateRace):
         """The gates with their stands and the poles, where they stand."""
         return now.task.drawn(self.course)
 
-    def _failed(self, now: Snapshot) -> Array:
-        """Against something, on the ground, or beyond the limits, (N,) bool."""
-        out = cast(Distances, now.potentials).clearance < 0
-        for k, limit in enumerate(LIMITS):
-            out = out | (abs(now.state.position[..., k]) > limit)
-        return out | super()._failed(now)
+    def _failures(self, now: Snapshot) -> dict[str, Array]:
+        """Against something, on the ground, or beyond the limits, (N,) bool each."""
+        struck = cast(Distances, now.potentials).clearance < 0
+        outside = (abs(now.state.position[..., k]) > limit for k, limit in enumerate(LIMITS))
+        beyond = functools.reduce(operator.or_, outside)
+        return {"struck": struck, "beyond_limits": beyond, **super()._failures(now)}
 
     def _way_left(self, task: Any, place: Array) -> Array:
         """Way to the next gate [m], (N,); from aside or behind by a place before it."""

@@ -13,13 +13,13 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import Array, namespace, norm, stack, to_body
+from quadrl.base.rotation import Array, namespace, norm, stack, to_body, zeros
 from quadrl.base.validation import number
 from quadrl.conditions.solids import Box, Pose, Solid
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.observation import MOTION, ROTATION, ObservationTerm, observed_motion
-from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState
+from quadrl.core.task import EpisodeEnd, Potentials, Snapshot, Target, Task, TaskState, either
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
 from quadrl.tasks.approach import Way, on_the_way
@@ -151,14 +151,14 @@ class Perching(Task):
         """Its middle at the origin, facing up and west."""
         normal = cast(Perch, state).normal
         incline = np.arctan2(-normal[..., 0], normal[..., 2])
-        none = 0.0 * incline
+        none = zeros(incline)
         turn = stack(np.cos(incline / 2), none, -np.sin(incline / 2), none)
         return {"wall": Pose(-WALL.height / 2 * normal, turn)}
 
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, Perch]:
         """At rest before the surface, facing it, or on the way; from above where it is level."""
         incline = rng.uniform(self.least_incline, self.most_incline)
-        xp, none = namespace(incline), 0.0 * incline
+        xp, none = namespace(incline), zeros(incline)
         normal = stack(-xp.sin(incline), none, xp.cos(incline))
         goal = -parameters.foot[..., 2:] * normal
         above = (math.pi / 2 - incline) / 2
@@ -170,7 +170,7 @@ class Perching(Task):
         way = on_the_way(rng, incline, (self.least_touch, self.most_touch))
         begun = Way(
             xp.where(comes, goal + way.position + SPREAD * away, before + away),
-            xp.where(comes, way.velocity, 0.0 * way.velocity),
+            xp.where(comes, way.velocity, zeros(way.velocity)),
             xp.where(comes[..., 0], way.pitch, none),
             xp.where(comes[..., 0], way.rate, none),
         )
@@ -203,7 +203,7 @@ class Perching(Task):
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """To the surface and aligned with it; and what the touch is worth."""
-        xp, none = namespace(now.time), 0.0 * now.time
+        xp, none = namespace(now.time), zeros(now.time)
         shares = (xp.clip(share - 1, 0, WORST) for share in self._shares(now))
         excess = xp.where(now.held & ~before.held, functools.reduce(operator.add, shares), none)
         excess = xp.where(self._struck(now), xp.clip(now.touch_speed, 0, WORST), excess)
@@ -217,27 +217,29 @@ class Perching(Task):
             "failure": rewards.once(-self.failure_weight, end.failed, now),
         }
 
-    def terminated(self, now: Snapshot) -> Array:
-        """On the surface for long enough, or failed."""
-        return self._rested(now) | self._failed(now)
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
+        """Failed, or on the surface for long enough."""
+        return self._failures(now) | {"perched": self._rested(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """At rest on the surface for long enough, after a good touch."""
-        return end.terminated & self._rested(now) & now.state.at_rest & ~self._failed(now)
+        rested = end.terminated & self._rested(now) & now.state.at_rest
+        return rested & ~either(self._failures(now))
 
     def _rested(self, now: Snapshot) -> Array:
         """Whether the aircraft has been on the surface for long enough, (N,) bool."""
         steps = now.task.rest + 1
         return now.held & (steps * now.parameters.control_timestep >= self.rest_time)
 
-    def _failed(self, now: Snapshot) -> Array:
-        """Touched otherwise than asked, off again, on the ground, or away, (N,) bool."""
+    def _failures(self, now: Snapshot) -> dict[str, Array]:
+        """Touched otherwise than asked, off again, on the ground, or away, (N,) bool each."""
         xp = namespace(now.time)
         most = functools.reduce(xp.maximum, self._shares(now))
         off = now.held & (now.potentials.distance > OFF)
         away = now.potentials.distance > self.max_distance
         low = touches_ground(now, bounces=True)
-        return (now.held & (most > 1)) | self._struck(now) | off | away | low
+        touch = {"bad_touch": now.held & (most > 1), "struck": self._struck(now)}
+        return touch | {"off_again": off, "away": away, "ground": low}
 
     def _struck(self, now: Snapshot) -> Array:
         """Whether anything but the feet touches the surface first, (N,) bool."""

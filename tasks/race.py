@@ -11,7 +11,7 @@ import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, namespace, norm
+from quadrl.base.rotation import Array, namespace, norm, zeros
 from quadrl.base.trace import look_up
 from quadrl.core import rewards
 from quadrl.core.snapshot import Rollout
@@ -85,24 +85,24 @@ class Race(GateRace):
         xp = namespace(gate)
         gate, flies = xp.floor(gate), rng.uniform(0.0, 1.0) < self.flying
         rest, away = rng.vector(self.radius), rng.vector(track.opening / 2)
-        gate = xp.where(flies, gate, 0.0 * gate)
+        gate = xp.where(flies, gate, zeros(gate))
         goal = look_up(track.centre, gate)
         last = look_up(np.roll(track.centre, 1, axis=0), gate)
-        first = look_up(np.array([track.start]), 0.0 * gate) + rest
+        first = look_up(np.array([track.start]), zeros(gate)) + rest
         between = last + rng.uniform(0.0, 1.0)[..., None] * (goal - last) + away
         position = xp.where(flies[..., None], between, first)
         leg = norm(goal - position)
-        speed = xp.where(flies, rng.uniform(0.0, self.flying_speed), 0.0 * leg)
+        speed = xp.where(flies, rng.uniform(0.0, self.flying_speed), zeros(leg))
         start = Start(
             position=position,
             quaternion=rng.attitude(self.tilt),
             velocity=(speed / leg)[..., None] * (goal - position),
-            body_rate=0.0 * position,
+            body_rate=zeros(position),
             rotor_speed=hovering(position, parameters),
         )
-        none = 0.0 * gate
+        none = zeros(gate)
         through, left = (look_up(track.axes[:, k], gate) for k in range(2))
-        return start, Course(goal, gate, through, left, none, none, 0.0 * position, none)
+        return start, Course(goal, gate, through, left, none, none, zeros(position), none)
 
     def reward(self, before: Snapshot, now: Snapshot, end: EpisodeEnd) -> dict[str, Array]:
         """Nearer to the next gate, and what its passage is worth."""

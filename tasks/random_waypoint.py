@@ -91,9 +91,10 @@ class RandomWaypoint(Task):
         terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
         return rewards.weighted(self, terms, before, now)
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Far away or on the ground."""
-        return (now.potentials.distance > self.max_distance) | touches_ground(now)
+        away = now.potentials.distance > self.max_distance
+        return {"away": away, "ground": touches_ground(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Still flying at the end, and close."""

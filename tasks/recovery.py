@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.base.rotation import Array, namespace, norm, stack
+from quadrl.base.rotation import Array, namespace, norm, stack, zeros
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.observation import MOTION, ROTATION, observed_motion
@@ -82,7 +82,7 @@ class Recovery(Task):
     def begin(self, rng: Rng, parameters: Parameters) -> tuple[Start, TaskState]:
         """Over or under the origin, in any attitude, in motion; the rotors at hover speed."""
         height = rng.uniform(self.lowest, self.highest) - self.altitude
-        position = stack(0.0 * height, 0.0 * height, height)
+        position = stack(zeros(height), zeros(height), height)
         start = Start(
             position=position,
             quaternion=rng.attitude(self.tilt),
@@ -114,9 +114,10 @@ class Recovery(Task):
         terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
         return rewards.weighted(self, terms, before, now)
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Far away or on the ground."""
-        return (now.potentials.distance > self.max_distance) | touches_ground(now)
+        away = now.potentials.distance > self.max_distance
+        return {"away": away, "ground": touches_ground(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Flying at the end, level and slow."""

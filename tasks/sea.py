@@ -12,7 +12,14 @@ import numpy as np
 
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import Array, namespace, norm, quaternion_from_heading_and_tilt, stack
+from quadrl.base.rotation import (
+    Array,
+    namespace,
+    norm,
+    quaternion_from_heading_and_tilt,
+    stack,
+    zeros,
+)
 from quadrl.conditions.solids import Box
 from quadrl.core.task import TaskState
 from quadrl.engines.rng import FULL_TURN, Rng
@@ -72,7 +79,7 @@ def draw(rng: Rng, height: Array, size: tuple[float, float]) -> Waves:
     )
     amplitude = (height / 4)[..., None] * math.sqrt(2 / WAVES) * ahead * aside
     return Waves(
-        goal=stack(*3 * (0.0 * height,)),
+        goal=stack(*3 * (zeros(height),)),
         amplitude=amplitude,
         steepness=amplitude * wave_number,
         frequency=frequency,
@@ -86,7 +93,7 @@ def deck(waves: Waves, time: Array) -> Motion:
 
     Water at the surface of a deep sea goes around in circles, which are tilted as the wave is.
     """
-    xp, none = namespace(time), 0.0 * time
+    xp, none = namespace(time), zeros(time)
     angle = waves.frequency * time[..., None] + waves.phase
     sine, cosine = xp.sin(angle), xp.cos(angle)
     up, ahead = waves.amplitude * cosine, waves.amplitude * sine

@@ -103,10 +103,11 @@ class StraightAndLevel(Task):
         terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
         return rewards.weighted(self, terms, before, now)
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Off the altitude, off the line or on the ground."""
         high = abs(now.state.position[..., 2]) > self.max_altitude_error
-        return high | (now.potentials.distance > self.max_offset) | touches_ground(now)
+        off = now.potentials.distance > self.max_offset
+        return {"off_altitude": high, "off_line": off, "ground": touches_ground(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Whether it flew to the end."""

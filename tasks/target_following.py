@@ -136,10 +136,10 @@ class TargetFollowing(Task):
         terms = "progress", "attitude", "speed", "spin", "control", "survival", "smoothness"
         return rewards.weighted(self, terms, before, now)
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Too far from the target, or on the ground."""
         lost = now.potentials.distance > self.max_distance - self.keep
-        return lost | touches_ground(now)
+        return {"lost": lost, "ground": touches_ground(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Whether it flew to the end, near the distance on average."""

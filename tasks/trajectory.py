@@ -174,9 +174,10 @@ class Trajectory(Task):
             **rewards.weighted(self, terms, before, now),
         }
 
-    def terminated(self, now: Snapshot) -> Array:
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Too far from the reference, or on the ground."""
-        return (now.potentials.distance > self.max_distance) | touches_ground(now)
+        away = now.potentials.distance > self.max_distance
+        return {"away": away, "ground": touches_ground(now)}
 
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
         """Whether it flew to the end, and was near in the end."""

@@ -13,6 +13,8 @@ _BROUGHT = {
     "'quadrl[video]'": "matplotlib PIL mediapy imageio_ffmpeg",
     "'quadrl[view]'": "viser trimesh msgspec websockets",
     "'quadrl[export]'": "onnx onnxruntime",
+    "'quadrl[logs]'": "pyulog orangebox rosbags",
+    "'quadrl[wandb]'": "wandb",
     "'quadrl[ray]'": "ray",
     "'quadrl[rsl_rl]'": "rsl_rl",
     "stable-baselines3": "stable_baselines3",

@@ -172,6 +172,12 @@ def write_sealed_json(path: Path, content: Mapping[str, Any], form: str) -> None
     write_sealed(path, json.dumps(sealed, indent=2).encode())
 
 
+def another_format(path: Path, written: Any, *read: str) -> QuadrlError:
+    """The error about a file of another format than those that can be read."""
+    reason = "another version of quadrl wrote it" if written else "quadrl did not write it"
+    return QuadrlError(reason, name=f"format of {path}", value=written, allowed=" or ".join(read))
+
+
 def read_sealed_json(path: Path, form: str) -> dict[str, Any]:
     """Read what `write_sealed_json` wrote.
 
@@ -188,7 +194,7 @@ def read_sealed_json(path: Path, form: str) -> dict[str, Any]:
         raise QuadrlError(f"{path} must hold a table")
     table = cast(dict[str, Any], found)
     if (written := table.get("format")) != form:
-        raise QuadrlError(name=f"format of {path}", value=written, allowed=form)
+        raise another_format(path, written, form)
     check_seal(path, content)
     return {name: value for name, value in table.items() if name not in ("digest", "format")}
 
@@ -230,8 +236,7 @@ def read_safetensors(
         check_texts(header)
         written = header.get("format")
         if written not in wanted:
-            allowed = " or ".join(wanted)
-            raise QuadrlError(name=f"format of {path}", value=written, allowed=allowed)
+            raise another_format(path, written, *wanted)
         check_seal(path, content)
         return of_bytes(content), header
     except QuadrlError:

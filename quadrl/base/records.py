@@ -131,5 +131,5 @@ class Columns:
 
     def views(self, table: np.ndarray) -> list[np.ndarray]:
         """The arrays as views of a table."""
-        parts = (table[place].reshape(*tail, -1) for place, tail in self._places)
+        parts = (table[place].reshape(*tail, *table.shape[1:]) for place, tail in self._places)
         return [np.moveaxis(part, -1, 0) for part in parts]

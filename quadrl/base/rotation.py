@@ -24,6 +24,16 @@ def namespace(array: Array) -> Any:
     return array_namespace(array)
 
 
+def filled(value: Array | float, like: Array) -> Array:
+    """A value in the shape, the namespace and on the device of an array, traced ones among them."""
+    return 0.0 * like + value
+
+
+def zeros(like: Array) -> Array:
+    """Zeros like an array, each of the sign of its number, as `filled` makes them."""
+    return 0.0 * like
+
+
 def stack(*parts: Array) -> Array:
     """Components (...) of vectors as one array (..., k)."""
     first: Any = parts[0]

@@ -74,7 +74,7 @@ REVERSE: dict[str, Callable[..., tuple[Any, ...]]] = {
     "look_up": lambda by, result, index: (None,),
 }
 """Derivatives by the operands, from the derivative by the result, the result and the operands."""
-MAX_OPERATIONS = 5000  # more would take the C compiler longer than they save
+MAX_OPERATIONS = 8000  # more would take the C compiler longer than they save
 MAX_TABLES = 1_000_000
 """Largest number of entries of all tables in which a function looks up values."""
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 UNITS = {"_rad_s": "rad/s", "_m_s": "m/s", "_deg": "°", "_s": "s"}
 """Units by the end of a metric's name; lengths (`_m`) and shares have their own functions."""
 
-SHARES = ("_rate", "_share")
+SHARES = ("_rate", "_share", "success_area")
 """Ends of the names of metrics that are shown in percent."""
 
 LENGTHS = (("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("µm", 1e-6))

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, number, resolved
+from quadrl.conditions import ranging as ranging  # registers its sensors
 from quadrl.conditions import sensors
 from quadrl.conditions.sensors import LONGEST_HISTORY, Sensor
 

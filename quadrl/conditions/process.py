@@ -40,6 +40,10 @@ class Process(abc.ABC):
     def save(self) -> dict[str, np.ndarray]:
         """Copies of all arrays that the next steps depend on, by name."""
 
+    def fitted(self, saved: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """A saved environment with what `save` did not give when it was saved."""
+        return saved
+
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
         """Refuse arrays of a saved environment, by their whole names, that no flight leads to.
 

@@ -38,6 +38,12 @@ AFFECTS: dict[str, tuple[str, ...]] = {
     "inertia_axes": ("inertia",),
     "force": ("steady_force",),
     "moment": ("steady_moment",),
+    "flapping": ("flapping_moment",),
+    "sizes": (
+        *("mass", "inertia", "rotor.thrust_coefficient", "rotor.torque_coefficient"),
+        *("rotor.disc_radius", "rotor.lag_up", "rotor.lag_down", "drag_coefficient"),
+        *("moment_coefficient", "rotor_drag", "flapping_moment", "rotor_inertia"),
+    ),
 }
 """Numbers that a field of `Randomization` changes in a row of parameters
 (`aircraft/parameters.py`)."""
@@ -88,6 +94,34 @@ class Pushes:
             object.__setattr__(self, name, number(f"pushes {name}", value, 0, MAX))
 
 
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """Sizes of whole quadrotors, drawn evenly in their logarithm in place of the specified ones.
+
+    0 stands for the specified size. The layout, the largest rotor speed and the shape of the
+    inertia stay; what the air does goes with the thrust, the area or the inertia that it acts on.
+    """
+
+    mass: Range = (0.0, 0.0)
+    """[kg]."""
+    thrust_to_weight: Range = (0.0, 0.0)
+    """Largest thrust over the weight."""
+    angular_acceleration: Range = (0.0, 0.0)
+    """Angular acceleration with the two rotors on one side of the X at their largest speeds and the
+    others at rest [rad/s^2], the geometric mean of roll and pitch; yaw keeps its share of it."""
+    lag: Range = (0.0, 0.0)
+    """Time constant of the rotors [s], the geometric mean of rising and falling."""
+
+    def __post_init__(self) -> None:
+        """Validate the ranges."""
+        for name, value in vars(self).items():
+            pair = _pair(f"sizes {name}", value, 0, MAX)
+            if pair[0] == 0 < pair[1]:
+                allowed = "(0, 0) or two positive numbers"
+                raise QuadrlError(name=f"sizes {name}", value=value, allowed=allowed)
+            object.__setattr__(self, name, pair)
+
+
 def _pair(name: str, given: Any, low: float, high: float) -> Range:
     """A range, from two numbers or from one number for both ends."""
     whole = isinstance(given, (list, tuple, np.ndarray))
@@ -95,6 +129,10 @@ def _pair(name: str, given: Any, low: float, high: float) -> Range:
     if first > last:
         raise QuadrlError(name=name, value=given, allowed="(low, high) with low at most high")
     return first, last
+
+
+RECORDS: dict[str, type] = {"noise": Errors, "bias": Errors, "pushes": Pushes, "sizes": Sizes}
+"""Fields of `Randomization` that are records of their own."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +196,18 @@ class Randomization:
     corners: float = 0.0
     """Share of the episodes in which lag and command_delay are both drawn from the upper quarter
     of their ranges, since slow rotors are hardest to fly where commands are late."""
+    flapping: Range = (1.0, 1.0)
+    """Further factor of the rotors' flapping moment; 0 is without, as other simulators are."""
+    sizes: Sizes = Sizes()
+    """Sizes that take the place of the specified ones, before any factor."""
+    command_jitter: Range = (0.0, 0.0)
+    """Probability that the commands of a control step arrive one control step later, so that those
+    of the step before stay in force."""
+    command_loss: Range = (0.0, 0.0)
+    """Outages of the link in a second, on average. In an outage no command arrives, and the last
+    one stays in force."""
+    loss_time: Range = (0.2, 0.2)
+    """Length of each outage [s], in whole control steps; by default 0.2 s."""
 
     def __post_init__(self) -> None:
         """Validate as far as that needs no aircraft."""
@@ -165,14 +215,21 @@ class Randomization:
             name, given = field.name, getattr(self, field.name)
             if name in ("centre_of_mass", "corners", "force", "moment"):
                 value: Any = number(name, given, 0, 1)  # [m], shares
-            elif name in ("noise", "bias", "pushes"):
-                value = resolved(name, given, Pushes if name == "pushes" else Errors)
-            elif name in DELAYS:
+            elif name in RECORDS:
+                value = resolved(name, given, RECORDS[name])
+            elif name in (*DELAYS, "loss_time"):
                 value = _pair(name, given, 0, LONGEST_DELAY)
+            elif name in ("command_jitter", "command_loss"):
+                value = _pair(name, given, 0, 1.0 if name == "command_jitter" else MAX)
             else:
-                least = 0.0 if name in ("drag", "wind") else LEAST
+                least = 0.0 if name in ("drag", "wind", "flapping") else LEAST
                 value = _pair(name, given, least, 1.0 if name == "max_speed" else MOST)
             object.__setattr__(self, name, value)
+        often, lasts = self.command_loss[1], self.loss_time[1]
+        if often * lasts > 1:
+            reason = f"with outages of {lasts:g} s the link would never be there"
+            allowed = f"at most {1 / lasts:.3g} a second"
+            raise QuadrlError(reason, name="command_loss", value=often, allowed=allowed)
 
     def __repr__(self) -> str:
         return f"Randomization({', '.join(f'{k}={v!r}' for k, v in self.given().items())})"

@@ -1,4 +1,4 @@
-"""Apply a randomization to rows of aircraft: their parameters, late commands, and pushes.
+"""Apply a randomization to rows of aircraft: their parameters, late and lost commands, and pushes.
 
 All that the next steps depend on is in arrays that are saved and restored, and every random number
 follows from the seed of its row, the episode and the control step.
@@ -13,7 +13,7 @@ import numpy as np
 
 from quadrl.aircraft.parameters import numbers
 from quadrl.base.errors import QuadrlError
-from quadrl.base.philox import PARAMETERS, PUSHES
+from quadrl.base.philox import LINK, PARAMETERS, PUSHES
 from quadrl.base.rotation import Array
 from quadrl.conditions.process import Process
 from quadrl.conditions.randomization import AGES, OFF
@@ -22,7 +22,7 @@ from quadrl.engines import native
 from quadrl.engines.engine import Engine
 from quadrl.engines.rng import uniform
 
-SAVED = ("drawn", "place", "steps", "queue", "past", "newest")
+SAVED = ("drawn", "place", "steps", "queue", "past", "newest", "last", "left")
 
 
 class Randomizer(Process):
@@ -37,7 +37,7 @@ class Randomizer(Process):
             sampler: The sampler of the randomization.
             engine: The engine that flies the aircraft.
             active: Whether anything depends on the drawn numbers; otherwise they are drawn only if
-                commands are late.
+                commands are late or get lost.
         """
         self.sampler, self._engine = sampler, engine
         count, rotors = engine.ctrl.shape
@@ -55,7 +55,9 @@ class Randomizer(Process):
         self._dead = round(vehicle.dead_time / vehicle.physics_timestep)  # physics steps
         fewest, most = (self._dead + steps for steps in sampler.delays["command_delay"])
         self._aged = max(sampler.delays[name][1] for name in AGES)
-        self.late = most + self._aged > 0
+        jitter = vehicle.substeps * (given.command_jitter[1] > 0)  # physics steps
+        self._links = jitter + sampler.outage[1] > 0
+        self.late = self._links or most + self._aged > 0
         """Whether commands pass a queue, or earlier motions are remembered."""
         each = range(vehicle.substeps)
         late = each if self._aged else {k % vehicle.substeps for k in range(fewest, most + 1)}
@@ -65,14 +67,19 @@ class Randomizer(Process):
         command changes or a motion has to be remembered."""
         self.active = active or self.late
         # Long enough that a control step can be flown twice: see native/free_flight.c.
-        length = max(most, self._aged) + vehicle.substeps
+        length = max(most + jitter, self._aged) + vehicle.substeps
         self.queue = np.zeros((length, count, rotors))  # [rad/s]
         self.past = np.zeros((length if self._aged else 0, count, 13))  # qpos, qvel before it
         self.newest = np.zeros(1, np.int64)  # where in both
-        self._delay = np.zeros(count, np.int64)  # [physics steps]
-        self._ages = np.zeros((len(AGES), count), np.int64)  # [physics steps]
-        late = self.queue, self.past if self._aged else None, self._delay, self.newest
-        self.rows = native.struct(*late, length, count)
+        self.last = np.zeros((count, rotors))  # commands that arrived last [rad/s]
+        self.left = np.zeros(count, np.int64)  # control steps without a link, this one counted
+        # Delays without jitter and in this control step [physics steps]; outages [control steps].
+        self._usual, self._delay, self._outage = np.zeros((3, count), np.int64)
+        self._jitter, self._loss = np.zeros((2, count))  # their chances in a control step
+        self.ages = np.zeros((len(AGES), count), np.int64)
+        """Ages of the motion and of the body rate that are seen [physics steps]."""
+        kept = self.queue, self.past if self._aged else None, self.last
+        self.rows = native.struct(*kept, self._delay, self.newest, self.left, length, count)
         """What is late, as `Late` in native/free_flight.c; the arrays stay where they are."""
 
     def sample(self, keys: np.ndarray, episodes: np.ndarray) -> Drawn:
@@ -100,7 +107,8 @@ class Randomizer(Process):
         self.drawn[rows] = drawn.numbers
         self._set_delay()
         if self.late:
-            self.queue[:, rows] = self._engine.act[rows]
+            self.queue[:, rows] = self.last[rows] = self._engine.act[rows]
+            self.left[rows] = 0
             self.forget(rows)
 
     def forget(self, rows: np.ndarray) -> None:
@@ -109,8 +117,8 @@ class Randomizer(Process):
         Queued commands that are not finite become the present rotor speeds.
         """
         self.past[:, rows] = self._coordinates[rows]
-        late = self.queue[:, rows]
-        self.queue[:, rows] = np.where(np.isfinite(late), late, self._engine.act[rows])
+        for sent in (*self.queue, self.last):
+            sent[rows] = np.where(np.isfinite(sent[rows]), sent[rows], self._engine.act[rows])
 
     @property
     def _coordinates(self) -> Array:
@@ -132,7 +140,15 @@ class Randomizer(Process):
         step = self._engine.vehicle.physics_timestep
         names = "command_delay", *AGES
         steps = [np.rint(self.column(name) / step).astype(np.int64) for name in names]
-        self._delay[:], self._ages[:] = self._dead + steps[0], steps[1:]
+        self._usual[:], self.ages[:] = self._dead + steps[0], steps[1:]
+        self._delay[:] = self._usual
+        if self._links:
+            control = self._engine.vehicle.control_timestep
+            often = control * self.column("command_loss")  # outages in a control step
+            self._outage[:] = np.rint(self.column("loss_time") / control)
+            # So that outages, and the gaps between them, make as many as are asked for.
+            self._loss[:] = often / (1 + often - often * self._outage)
+            self._jitter[:] = self.column("command_jitter")
 
     def delayed(self, command: Array, steps: int) -> Array:
         """Queue a command (N, R) [rad/s] for some physics steps; return the one that arrives."""
@@ -142,6 +158,8 @@ class Randomizer(Process):
         first = int(self.newest[0]) + 1
         self.queue[first % length] = command
         arrived = self.queue[(first - self._delay) % length, self._rows]
+        arrived = np.where(self.left[:, None] > 0, self.last, arrived)
+        self.last[:] = arrived
         for k in range(1, min(steps, length)):  # this may overwrite the one that arrives
             self.queue[(first + k) % length] = command
         if self._aged:
@@ -150,31 +168,39 @@ class Randomizer(Process):
         return arrived
 
     def passed(self) -> None:
-        """Count a control step whose commands were queued in C."""
+        """Count a control step whose commands are queued in C."""
         self.newest[0] = (self.newest[0] + self._engine.vehicle.substeps) % len(self.queue)
 
-    def aged(self) -> tuple[Array, Array]:
-        """Coordinates of the drawn ages: as old as the motion, and as the body rate, (N, 13) each.
+    def aged(self, rows: np.ndarray | slice) -> Array:
+        """Coordinates of aircraft, of the drawn ages: of the motion, and of the body rate.
 
         Returns:
-            Position [m], world frame, quaternion, velocity [m/s], world frame, body rate [rad/s],
-            body frame.
+            (n, 13): position [m], world frame, quaternion, velocity [m/s], world frame, body rate
+            [rad/s], body frame.
         """
-        now = self._coordinates
+        now = self._coordinates[rows]
         if not self._aged:
-            return now, now
+            return now
         # Each physics step remembers the coordinates before it.
-        past = self.past[(self.newest - self._ages + 1) % len(self.past), self._rows]
-        motion, rate = np.where(self._ages[..., None], past, now)
-        return motion, rate
+        ages = self.ages[:, rows]
+        past = self.past[(self.newest - ages + 1) % len(self.past), self._rows[rows]]
+        motion, rate = np.where(ages[..., None], past, now)
+        return np.concatenate([motion[:, :10], rate[:, 10:]], axis=1)
 
     def act(self) -> None:
-        """Count a control step that begins, and push the aircraft that are drawn for it."""
+        """Count a control step that begins: push aircraft and draw what their links do in it."""
         if not self.active:
             return
+        keys, episodes = (array.ctypes.data for array in self.place)
+        place = keys, episodes, self.steps.ctypes.data
+        if self._links:
+            chances = self._jitter, self._loss, self._outage, self._usual
+            given = (array.ctypes.data for array in chances)
+            found = self._delay.ctypes.data, self.left.ctypes.data
+            substeps = self._engine.vehicle.substeps
+            native.library().quadrl_link(len(self.steps), *place, LINK, *given, substeps, *found)
         if self._chance > 0:
-            keys, episodes = (array.ctypes.data for array in self.place)
-            place = keys, episodes, self.steps.ctypes.data, PUSHES
+            place = *place, PUSHES
             hit = self._chance, self._pushes.velocity, self._pushes.body_rate
             qvel = self._engine.qvel
             rows = qvel.ctypes.data, qvel.strides[0] // 8
@@ -184,6 +210,17 @@ class Randomizer(Process):
     def save(self) -> dict[str, np.ndarray]:
         """Copies of the arrays; none where nothing depends on what is drawn."""
         return {name: np.array(getattr(self, name)) for name in SAVED if self.active}
+
+    def fitted(self, saved: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """What was saved, with the last numbers if they were not drawn then: at their low ends."""
+        drawn = saved.get("randomizer.drawn")
+        if drawn is None or not self.active or drawn.ndim != 2:
+            return saved
+        if drawn.shape[1] >= self.drawn.shape[1]:
+            return saved
+        rest = np.tile(self.sampler.low[drawn.shape[1] :], (len(drawn), 1))
+        link = {f"randomizer.{k}": 0 * getattr(self, k) for k in ("last", "left")}
+        return {**link, **saved, "randomizer.drawn": np.concatenate([drawn, rest], axis=1)}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
         """Refuse aircraft and numbers that this randomization does not draw.
@@ -198,10 +235,11 @@ class Randomizer(Process):
             raise QuadrlError(reason, name="engine.begun", value=table, allowed="this aircraft's")
         if not self.active:
             return
-        drawn, newest = saved["randomizer.drawn"], saved["randomizer.newest"]
+        drawn, newest, left = (saved[f"randomizer.{k}"] for k in ("drawn", "newest", "left"))
         for name, value, within in (
             ("drawn", drawn, self.sampler.contains(drawn)),
             ("newest", newest, ((newest >= 0) & (newest < len(self.queue))).all()),
+            ("left", left, ((left >= 0) & (left <= self.sampler.outage[1])).all()),
         ):
             if not within:
                 allowed = "of an environment with the same randomization"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.aircraft import parameters
+from quadrl.aircraft.quadrotor import authority
 from quadrl.aircraft.rotors import GRAVITY, hover_squares
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
@@ -70,6 +71,10 @@ class AircraftSampler:
             for name in DELAYS
         }
         """Fewest and most physics steps by the names of DELAYS."""
+        given, control = randomization, vehicle.control_timestep
+        lasts = given.loss_time if given.command_loss[1] > 0 else (0.0, 0.0)
+        self.outage = whole_steps("loss_time", lasts, control, "control")
+        """Fewest and most control steps of an outage; 0 where the link is never lost."""
         early = *FACTORS, "command_delay", "observation_delay", "wind"
         ends = {name: getattr(randomization, name) for name in early}
         shift = randomization.centre_of_mass
@@ -86,12 +91,19 @@ class AircraftSampler:
         for name in STEADY:
             size = getattr(randomization, name)
             ends |= {f"{name}_{axis}": (-size, size) for axis in "xyz"}
-        ends[CORNER] = (0, randomization.corners > 0)
+        ends |= {CORNER: (0, randomization.corners > 0), "flapping": randomization.flapping}
+        sized = randomization.sizes != NONE.sizes
+        self._usual = sizes_of(vehicle) if sized else dict.fromkeys(vars(NONE.sizes), 1.0)
+        for name, usual in self._usual.items():
+            drawn = getattr(randomization.sizes, name)
+            ends[f"log_{name}"] = tuple(math.log(size or usual) for size in drawn)
+        ends |= {name: getattr(given, name) for name in ("command_jitter", "command_loss")}
+        ends["loss_time"] = lasts
         ends["torque"] = (self._least_torque(), ends["torque"][1])
         self.names = tuple(ends)
         """Names of the drawn numbers. All are drawn, so that no range affects the other numbers."""
         whole = {name: (steps, step) for name, steps in self.delays.items()}
-        whole[DAMAGED] = (0, last), 1.0
+        whole |= {DAMAGED: ((0, last), 1.0), "loss_time": (self.outage, control)}
         self._whole = [(self.names.index(name), *given) for name, given in whole.items()]
         self.low, self._high = np.array([*ends.values()]).T
         self._width = self._high - self.low
@@ -140,7 +152,9 @@ class AircraftSampler:
         """Rows of parameters (n,) of the aircraft with drawn numbers (n, k)."""
         count = self._vehicle.rotor_count
         table = np.repeat(self._specified, len(drawn))
-        for name in (*FACTORS, "rotor_inertia", "inertia_axes", "one_rotor"):
+        if self.randomization.sizes != NONE.sizes:
+            self._size(table, drawn)
+        for name in (*FACTORS, "rotor_inertia", "inertia_axes", "one_rotor", "flapping"):
             first, width = ("inertia_axes_x", 3) if name == "inertia_axes" else (name, 1)
             factor = self.columns(drawn, first, width)
             if name in EACH_ROTOR:
@@ -162,6 +176,26 @@ class AircraftSampler:
             parameters.field(table, *AFFECTS[name])[:] = unit * self.columns(drawn, f"{name}_x", 3)
         parameters.refresh(table, self._vehicle.physics_timestep)
         return table
+
+    def _size(self, table: np.ndarray, drawn: Array) -> None:
+        """Give rows of parameters (n,), in place, the sizes in drawn numbers (n, k)."""
+        mass, thrust, turn, lag = (
+            np.exp(self.columns(drawn, f"log_{name}") - math.log(usual))
+            for name, usual in self._usual.items()
+        )  # (n, 1) each over the specified one
+        force = mass * thrust  # and the moments with it, since the arms stay
+        inertia = force / turn
+        ratios = {
+            **{"mass": mass, "inertia": inertia, "moment_coefficient": inertia},
+            **{"rotor.thrust_coefficient": force, "rotor.torque_coefficient": force},
+            "rotor.disc_radius": np.sqrt(force),  # the same flow through the discs at full speed
+            **{"rotor.lag_up": 1 / lag, "rotor.lag_down": 1 / lag},
+            "drag_coefficient": np.cbrt(mass) ** 2,  # an area, at one density
+            **{"rotor_drag": force, "flapping_moment": force, "rotor_inertia": inertia},
+        }
+        for name in AFFECTS["sizes"]:
+            numbers = parameters.field(table, name)
+            np.multiply(numbers, ratios[name], out=numbers)
 
     def explains(self, saved: np.ndarray) -> bool:
         """Whether rows of parameters differ from the specified ones only in what may be drawn."""
@@ -215,7 +249,11 @@ class AircraftSampler:
             columns |= {f"{name}_1": [given.rotors[ends[name]]] * count for name in EACH_ROTOR}
             columns["inertia_axes_x"] = [given.inertia_axes[inertia]] * 3
             columns |= {"force_x": (0.0, 0.0, 0.0), "moment_x": (0.0, 0.0, 0.0)}
-            columns |= {"one_rotor": 1.0, "centre_of_mass_x": (0.0, 0.0, 0.0)}
+            columns |= {
+                "one_rotor": 1.0,
+                "flapping": given.flapping[1],
+                "centre_of_mass_x": (0.0, 0.0, 0.0),
+            }
             try:
                 made = vehicle_of(self._vehicle, self.table(self._at(1, **columns))[0])
                 number("pushes velocity", given.pushes.velocity, 0, made.resolved_speed)
@@ -285,6 +323,24 @@ class AircraftSampler:
             names = ("thrust_coefficient", "torque_coefficient")
             worst = {name: rotor[name][unable][0].tolist() for name in names}
             raise QuadrlError(reason, name="rotors", value=worst, allowed="a narrower range")
+
+
+def sizes_of(vehicle: Vehicle) -> dict[str, float]:
+    """The sizes of a quadrotor by the names and in the units of `randomization.Sizes`.
+
+    Raises:
+        QuadrlError: Its rotors are no X and no plus.
+    """
+    table = parameters.rows(vehicle)
+    lift, roll, pitch, _ = np.exp(authority(table)).reshape(4, 4).mean(0).tolist()
+    rotor = table["rotor"][0, : vehicle.rotor_count]
+    rates = np.log([rotor["lag_up"], rotor["lag_down"]])
+    return {
+        "mass": vehicle.mass,
+        "thrust_to_weight": 4 * lift,
+        "angular_acceleration": 2 * math.sqrt(roll * pitch),
+        "lag": math.exp(-rates.mean()),
+    }
 
 
 def vehicle_of(vehicle: Vehicle, row: np.void) -> Vehicle:

@@ -9,6 +9,7 @@ near one to MuJoCo. `Scene.world` measures clearances and hits.
 # What users give is checked, whatever its annotation promises.
 from __future__ import annotations
 
+import dataclasses
 import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -24,6 +25,7 @@ from quadrl.base.validation import MAX_OPTION
 from quadrl.conditions.solids import MIN_LENGTH, Pose, Solid
 from quadrl.conditions.world import FAR, World
 from quadrl.engines.engine import Engine
+from quadrl.engines.rays import Rays
 from quadrl.engines.solids import KINDS, MOTION
 from quadrl.engines.state import Start
 
@@ -31,6 +33,8 @@ FASTEST, WIDEST = 100.0, 0.5
 """The fastest that a solid may move [m/s], and how far it may turn in a physics step [rad]."""
 HIDDEN = 3
 """Geom group that pictures do not show: they draw the solids where they are in the episode."""
+BEAM, BEAM_RGBA = 0.004, (0.95, 0.45, 0.25, 0.35)
+"""Half the width [m] and the colour of rays in pictures."""
 UPRIGHT = 1.0, 0.0, 0.0, 0.0
 ELSEWHERE = (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5)
 """Pose with which the geoms are compiled: MuJoCo would assume that geoms at the origin, upright,
@@ -40,8 +44,12 @@ stay there."""
 class Scene:
     """The solids of a task, in the order of their geoms."""
 
-    def __init__(self, solids: Sequence[Solid]) -> None:
+    def __init__(self, solids: Sequence[Solid], rays: Mapping[str, Rays | None] = {}) -> None:
         """Check the names.
+
+        Args:
+            solids: The solids.
+            rays: Rays that are measured, by the names of their sensors; None where one has none.
 
         Raises:
             QuadrlError: Two solids have the same name, or something is not a solid.
@@ -50,7 +58,7 @@ class Scene:
         if not all(isinstance(solid, Solid) for solid in given):
             allowed = "a list of Sphere, Cylinder, Box and Gate of quadrl.conditions.solids"
             raise QuadrlError(name="solids", value=solids, allowed=allowed)
-        self.solids = tuple(solids)
+        self.solids, self.rays = tuple(solids), {k: own for k, own in rays.items() if own}
         self.names = tuple(solid.name for solid in self.solids)
         """Names of the solids, in order."""
         if len(set(self.names)) < len(self.names):
@@ -60,6 +68,8 @@ class Scene:
             solid.name: slice(*ends[k : k + 2]) if solid.count else ends[k]
             for k, solid in enumerate(self.solids)
         }
+        ends = np.cumsum([0, *(own.count for own in self.rays.values())]).tolist()
+        self._beams = {k: slice(*pair) for k, *pair in zip(self.rays, ends, ends[1:], strict=False)}
         self._parts = [(s, part) for s in self.solids for part in (s.count or 1) * s.parts]
         """The geoms: the solid that each is of, and its part."""
         self._first = np.cumsum([0, *((s.count or 1) * len(s.parts) for s in self.solids)]).tolist()
@@ -183,27 +193,41 @@ class Scene:
         touched = np.zeros(position.shape[:2], dtype=bool)
         far, never = np.full(count, FAR), np.zeros(count, dtype=bool)
         touch = np.zeros((count, HELD - 1))
-        measured = position, far, touched, 0.0 * far, never, touch, never
-        return World(self._places, *measured)
+        reaches = [np.full(own.count, own.reach) for own in self.rays.values()]
+        rays = np.tile(np.concatenate([np.zeros(0), *reaches]), (count, 1))
+        measured = position, far, touched, 0.0 * far, never, touch, never, rays
+        return World(self._places, self._beams, *measured)
 
     def primitives(self, engine: Engine, row: int) -> tuple[Primitive, ...]:
-        """The solids as pictures show them, at their poses in a row."""
+        """The solids of a row as pictures show them, and the rays that meet something."""
         poses = engine.solids.poses[row].copy()
         sizes = engine.solids.table["size"][row].copy()
-        return tuple(
+        shown = [
             Primitive(KINDS[part.kind], size, pose[:3], pose[3:7], solid.rgba, glow=0.0)
             for (solid, part), pose, size in zip(self._parts, poses, sizes, strict=True)
-        )
+        ]
+        for own in self.rays.values():
+            (distance,), qpos = own.measured(engine, np.array([row])), engine.qpos[row]
+            ends = own.ends(qpos[:3], qpos[3:], distance)
+            for k in np.flatnonzero(distance < own.reach):
+                shown.append(Primitive("line", BEAM, points=ends[k], rgba=BEAM_RGBA))
+        return tuple(shown)
 
     def world(self, engine: Engine, rows: np.ndarray | None = None) -> World | None:
-        """The present world about some aircraft (n,) of an engine, or of all; None without solids.
+        """The present world about some aircraft (n,) of an engine, or of all.
+
+        None where there is nothing to measure: neither solids nor rays.
 
         Its arrays are copies, except for the positions of all aircraft's solids: if no solid moves,
         these are live, since they then change only with an episode.
         """
-        if not self.solids:
+        if not (self.solids or self.rays):
             return None
         chosen = slice(None) if rows is None else rows
+        measured = [own.measured(engine, rows) for own in self.rays.values()]
+        rays = np.concatenate([np.zeros((len(engine.hits[chosen]), 0)), *measured], axis=1)
+        if not self.solids:
+            return dataclasses.replace(self.nothing_near(len(rays)), rays=rays)
         which, speed = engine.hits[chosen].T
         touched = np.zeros((len(which), engine.solids.centres.shape[1]), dtype=bool)
         hitting = np.flatnonzero(which)
@@ -212,8 +236,8 @@ class Scene:
         centres = centres.copy() if engine.solids.moves else centres
         feet = engine.feet[chosen].copy()
         landed, held = feet[:, 0] > 0, feet[:, HELD] > 0
-        measured = centres, clear, touched, speed.copy(), landed, feet[:, 1:HELD], held
-        return World(self._places, *measured)
+        measured = centres, clear, touched, speed.copy(), landed, feet[:, 1:HELD], held, rays
+        return World(self._places, self._beams, *measured)
 
 
 def _checked(

@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 import zlib
 from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar, cast, dataclass_transform
 
-import numpy as np
-
-from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
 from quadrl.aircraft.rotors import MAX
 from quadrl.base.errors import QuadrlError
 from quadrl.base.philox import SENSORS as STREAMS
-from quadrl.base.rotation import Array
+from quadrl.base.rotation import Array, namespace
 from quadrl.base.validation import IN_A_FILE, choice, number, record, registered, whole_steps
-from quadrl.conditions.event_process import Events
 from quadrl.conditions.randomization import LONGEST_DELAY
-from quadrl.conditions.randomizer import Randomizer
 from quadrl.conditions.world import World, above_ground
-from quadrl.engines import native
-from quadrl.engines.engine import Engine
-from quadrl.engines.rng import normal, uniform
-from quadrl.engines.state import Frame, State
+from quadrl.engines.rays import Rays
+from quadrl.engines.state import State
 
+ROUNDING = 1e-6  # of the time between two samples, as a share
 SYMBOLS = {
     "R": "rotation matrix from body to world, R^T its transpose; of the estimated attitude",
     "T": "control_timestep [s]",
@@ -35,6 +30,8 @@ SYMBOLS = {
 }
 """What the letters in the formulas of exports mean."""
 Memory = dict[str, Array]
+VALUES = "values"
+"""Where the output of a sensor keeps its samples, beside what the sensor remembers."""
 Kind = TypeVar("Kind", bound=type)
 
 
@@ -43,14 +40,23 @@ class Moment:
     """All that a sensor may read at the end of a control step; arrays (n, ...)."""
 
     true: State
+    action: Array  # (n, k), as it was given; zero at the start
+    wind: Array  # (n, 3) [m/s], world frame
+    parameters: Parameters  # of the specified aircraft
+    world: World  # far from everything where the task declares no solids
+    origin: Array  # (3,) [m], world frame, of the task's frame
+    tasks: tuple[str, ...]  # names of what is flown: of the task, or of those that are drawn
+    steps: Array  # (n,) control steps since the start
+    aged: Array  # (n, 13) coordinates as old as is drawn: position [m], world frame, quaternion,
+    # velocity [m/s], world frame, body rate [rad/s], body frame
+    errors: Array  # (n, 12) of the estimate: position, attitude, velocity, body rate
+    drawn: Array  # (n, d) what was drawn, from -1 to 1
+    happening: Array  # (n, h) what events do, as `Events.seen` gives it
+    airframe: Array  # (n, 16) of `quadrotor.authority`; (n, 0) where no sensor reads it
+    bias: Mapping[str, Array]  # (n, size) errors that last for the episode, by sensor
+    normal: Mapping[str, Array]  # (n, size) normal numbers of this step, by sensor
     state: State  # estimated on board; the true one where nothing disturbs the estimate
     rotor_speed: Array  # (n, R) [rad/s], for the estimate
-    wind: Array  # (n, 3) [m/s], world frame
-    action: Array  # (n, k), as it was given; zero at the start
-    parameters: Parameters  # of the specified aircraft
-    randomizer: Randomizer
-    rows: np.ndarray | None  # (n,) which aircraft; None for all
-    frame: EstimatedState | None  # keeps the estimate; None where it is the true state
     entries: Array = None  # (n, e), the task's entries that are seen, of the estimated state
     estimated: Mapping[str, Array] = dataclasses.field(default_factory=dict[str, Array])
     """All the task's entries, (n, k) by name, of the estimated state."""
@@ -58,8 +64,7 @@ class Moment:
     """The same, of the true state."""
     observed: Array = None  # (n, m), all measured entries as they are seen, with their delays
     memory: Memory = dataclasses.field(default_factory=Memory)  # what the sensor itself remembers
-    events: Events | None = None  # what happens in flight, where something does
-    world: World = None  # type: ignore[assignment] - of this moment; far from all without solids
+    last: Array = None  # (n, size), the sensor's newest sample; None as an episode begins
 
     @property
     def above_ground(self) -> Array:
@@ -95,9 +100,15 @@ class Sensor(abc.ABC):
     """Whether it is an entry of the observation."""
     last: ClassVar[bool] = False
     """Whether it reads the task's entries or what is observed; a task cannot see such a sensor."""
+    compiled: ClassVar[bool] = False
+    """Whether a control step with it may be compiled: what its functions read besides their
+    arguments then stays as it is. quadrl's own are; a class says it for itself alone."""
     formula: ClassVar[str] = ""
     """How a sample follows, step by step, for those who fly without quadrl: exports say it beside
     the sensor's options. `SYMBOLS` has its letters."""
+
+    exact: ClassVar[Mapping[str, float]] = {"noise": 0.0, "bias": 0.0}
+    """Options with which its samples have no errors."""
 
     noise: float = 0.0
     """Standard deviation of the error of each sample, in the sensor's unit."""
@@ -106,7 +117,8 @@ class Sensor(abc.ABC):
     delay: float = 0.0
     """Age of what is seen [s], in whole control steps."""
     rate: float = 0.0
-    """Samples in a second, each held until the next one; 0 for one at each control step."""
+    """Samples in a second, each taken in the control step in which it is due and held until the
+    next one; 0 for one at each control step."""
 
     def __post_init__(self) -> None:
         """Validate the options."""
@@ -119,10 +131,28 @@ class Sensor(abc.ABC):
         """Numbers in a sample on an aircraft."""
         return self.size
 
+    @functools.cached_property
+    def rays(self) -> Rays | None:
+        """Rays whose readings `now.world.ranges` of its name gives."""
+        return None
+
     @property
     def hides(self) -> tuple[str, ...]:
         """Entries of the task that it hides."""
         return ()
+
+    def check(self, tasks: tuple[str, ...]) -> None:
+        """Refuse tasks, by their names, in which it has nothing to sense.
+
+        Raises:
+            QuadrlError: There is such a task.
+        """
+        return
+
+    @property
+    def asks_compiled(self) -> bool:
+        """Whether its class asks for its functions to be compiled, and not only a base of it."""
+        return vars(type(self)).get("compiled", False)
 
     def begin(self, now: Moment) -> Memory:
         """Its memory at the start of episodes, arrays (n, ...) by name."""
@@ -138,12 +168,28 @@ class Sensor(abc.ABC):
         """Its memory after a control step, which replaces `now.memory`."""
         return now.memory
 
+    def drawn(self, width: int) -> int:
+        """How many normal numbers `sample` takes, for a sample of some width."""
+        return width if self.noise else 0
+
     @abc.abstractmethod
     def sense(self, now: Moment) -> Array:
         """A sample without errors, (n, size)."""
 
+    def sample(self, now: Moment, width: int) -> Array:
+        """A sample with its errors, (n, width)."""
+        sample, expected = self.sense(now), (len(now.steps), width)
+        if getattr(sample, "shape", None) != expected:
+            allowed = f"an array {expected}"
+            raise QuadrlError(name=f"sense of {self.name}", value=sample, allowed=allowed)
+        if self.bias:
+            sample = sample + now.bias[self.name]
+        if self.noise:
+            sample = sample + self.noise * now.normal[self.name]
+        return sample
+
     def tell(self, now: Moment, seen: Array) -> None:
-        """Write what is seen of all aircraft (N, size) into `now`, for the sensors after it."""
+        """Write what is seen of all aircraft (n, size) into `now`, for the sensors after it."""
         return
 
 
@@ -176,114 +222,54 @@ def make(name: str, options: Any) -> Sensor:
 
 
 class Channel:
-    """The output of a sensor for N aircraft: its samples with errors, rate and delay."""
+    """The output of a sensor: its samples with errors, rate and delay.
 
-    def __init__(
-        self, sensor: Sensor, sizes: Sizes, randomizer: Randomizer, timestep: float
-    ) -> None:
-        """Set up the arrays.
+    Its memory holds VALUES (n, 1 + delay, width), the samples that are seen or will be, the newest
+    first, and what the sensor remembers.
+    """
+
+    def __init__(self, sensor: Sensor, sizes: Sizes, timestep: float) -> None:
+        """Lay it out.
 
         Raises:
-            QuadrlError: The delay or the time between two samples is not a multiple of the time
-                step [s].
+            QuadrlError: The delay is not a multiple of the time step [s], or there are more samples
+                than steps.
         """
-        self.sensor, self.width, self._randomizer = sensor, sensor.width(sizes), randomizer
-        times = sensor.delay, 1 / sensor.rate if sensor.rate else timestep
-        names = f"{sensor.name} delay and time of a sample [s]"
-        self._delay, self._period = whole_steps(names, times, timestep, "control")
-        self._stream = STREAMS + 2 * (zlib.crc32(sensor.name.encode()) >> 3)
-        self._rows = np.arange(len(randomizer.steps))
-        shape = 1 + self._delay, len(self._rows), self.width
-        self._values = np.zeros(shape)  # the newest first
-        self._bias = np.zeros(shape[1:])
-        self._memory: Memory = {}
+        self.sensor, self.width = sensor, sensor.width(sizes)
+        name = f"{sensor.name} delay [s]"
+        (self._delay,) = whole_steps(name, [sensor.delay], timestep, "control")
+        period = 1 / (sensor.rate * timestep) if sensor.rate else 1.0
+        if period < 1 - ROUNDING:
+            often = 1 / timestep
+            allowed = f"at most {often:g}, one in each of the control steps of {timestep:g} s"
+            raise QuadrlError(name=f"{sensor.name} rate", value=sensor.rate, allowed=allowed)
+        whole = round(period)
+        # As a number of steps where it is nearly one, so that no sample comes a step too late.
+        self._period = float(whole) if abs(period - whole) < ROUNDING * period else period
+        self.stream = STREAMS + 2 * (zlib.crc32(sensor.name.encode()) >> 3)
+        """Stream of the errors of samples; that of the lasting errors is the next one."""
+        self.follows = type(sensor).follow is not Sensor.follow
+        """Whether it follows the commands to the rotors."""
 
-    @property
-    def seen(self) -> Array:
-        """What is seen now, (N, width)."""
-        return self._values[self._delay]
+    def seen(self, memory: Memory) -> Array:
+        """What is seen, (n, width)."""
+        return memory[VALUES][:, self._delay]
 
-    def begin(self, now: Moment) -> None:
+    def begin(self, now: Moment) -> Memory:
         """Begin episodes, whose first sample is seen until the next one arrives."""
-        rows = self._rows if now.rows is None else now.rows
-        now.memory = self.sensor.begin(now)
-        kept = {name: np.array(array) for name, array in self._memory.items()}
-        for name, array in now.memory.items():
-            kept.setdefault(name, np.zeros((len(self._bias), *array.shape[1:])))[rows] = array
-        if self.sensor.bias:
-            keys, episodes = self._randomizer.place[:, rows]
-            shares = uniform(keys, episodes, self._stream + 1, 0, self.width)
-            self._bias[rows] = self.sensor.bias * (2 * shares - 1)
-        values = self._values.copy()
-        values[:, rows] = self._sample(rows, now)
-        self._memory, self._values = kept, values
-        self.sensor.tell(now, self.seen)
+        now.memory, now.last = self.sensor.begin(now), None
+        sample = self.sensor.sample(now, self.width)
+        values = namespace(sample).stack([sample] * (1 + self._delay), axis=1)
+        return {VALUES: values, **now.memory}
 
-    def follow(self, specified: Parameters, command: Array, seconds: float) -> None:
-        """Update the memory by commands (N, R) [rad/s] to the rotors for a time [s]."""
-        self._memory = self.sensor.follow(self._memory, specified, command, seconds)
-
-    def step(self, now: Moment) -> None:
-        """Take samples of all aircraft after a control step."""
-        now.memory = self._memory
-        self._memory = now.memory = self.sensor.update(now)
-        sample = self._sample(self._rows, now)
+    def step(self, memory: Memory, now: Moment) -> Memory:
+        """Take a sample after a control step."""
+        last = memory[VALUES]
+        now.memory = {name: array for name, array in memory.items() if name != VALUES}
+        now.memory, now.last = self.sensor.update(now), last[:, 0]
+        sample, xp = self.sensor.sample(now, self.width), namespace(last)
         if self._period > 1:
-            fresh = self._randomizer.steps % self._period == 0
-            sample = cast(Array, np.where(fresh[:, None], sample, self._values[0]))
-        self._values = np.concatenate([sample[None], self._values[:-1]])
-        self.sensor.tell(now, self.seen)
-
-    def _sample(self, rows: np.ndarray, now: Moment) -> Array:
-        """A sample of some aircraft (n,) with its errors."""
-        sample, sensor, source = self.sensor.sense(now), self.sensor, self._randomizer
-        if np.shape(sample) != (len(rows), self.width):
-            allowed = f"an array {(len(rows), self.width)}"
-            raise QuadrlError(name=f"sense of {sensor.name}", value=sample, allowed=allowed)
-        if sensor.bias:
-            sample = sample + self._bias[rows]
-        if sensor.noise:
-            (keys, episodes), steps = source.place[:, rows], source.steps[rows]
-            errors = normal(keys, episodes, steps, self._stream, self.width)
-            sample = sample + sensor.noise * errors
-        return sample
-
-    def save(self) -> dict[str, np.ndarray]:
-        """Copies of the arrays that the next steps depend on, under the sensor's name."""
-        own = {"values": self._values, "bias": self._bias, **self._memory}
-        return {f"{self.sensor.name}.{name}": np.array(array) for name, array in own.items()}
-
-    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
-        """Restore what `save` returned."""
-        start = f"{self.sensor.name}."
-        own = {k.removeprefix(start): np.array(v) for k, v in saved.items() if k.startswith(start)}
-        self._values, self._bias, self._memory = own.pop("values"), own.pop("bias"), own
-
-
-class EstimatedState(Frame):
-    """A table of states from other coordinates than the engine's."""
-
-    def __init__(self, engine: Engine) -> None:
-        """Make the table for the aircraft of an engine."""
-        count, rotors = engine.ctrl.shape
-        super().__init__(count, rotors)
-        self.coordinates = np.zeros((count, 13 + rotors))
-        """What it was filled from."""
-        self._limits = parameters.limits(parameters.rows(engine.vehicle))
-        motion = np.split(self.coordinates, [7, 13], axis=1)
-        arrays = (*motion, engine.origin, self._limits, engine.air)
-        # As `Rows` in native/state.c.
-        self._rows = native.struct(*arrays, 13 + rotors, 0, self.columns, rotors)
-
-    def fill(self, coordinates: np.ndarray, rows: np.ndarray | None) -> State:
-        """Fill the table, and return the state of some aircraft (n,), or of all.
-
-        Args:
-            coordinates: Coordinates of all, (N, 13 + R): position [m], world frame, quaternion,
-                velocity [m/s], world frame, body rate [rad/s], body frame, rotor speeds [rad/s].
-            rows: Which aircraft; None for all.
-        """
-        self.coordinates[:] = coordinates
-        ids, count = (None, len(coordinates)) if rows is None else (rows.ctypes.data, len(rows))
-        native.library().quadrl_state(self._rows.ctypes.data, count, ids, self.address)
-        return self.state if rows is None else State.of_table(self.table[:, rows])
+            due = xp.floor(now.steps / self._period) != xp.floor((now.steps - 1) / self._period)
+            sample = xp.where(due[:, None], sample, last[:, 0])
+        values = xp.concatenate([sample[:, None], last[:, :-1]], axis=1)
+        return {VALUES: values, **now.memory}

@@ -15,27 +15,27 @@ from typing import Any, Literal
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
+from quadrl.aircraft.quadrotor import as_x, turned
 from quadrl.aircraft.rotors import GRAVITY, MAX
 from quadrl.base.errors import QuadrlError
-from quadrl.base.philox import NOISE
-from quadrl.base.rotation import Array, norm, to_body, to_world
+from quadrl.base.rotation import Array, namespace, norm, stack, to_body, to_world
 from quadrl.base.validation import choice, number
-from quadrl.conditions.randomization import NONE
 from quadrl.conditions.sensor import SENSORS as SENSORS
 from quadrl.conditions.sensor import Memory, Moment, Sensor, Sizes, register_sensor
 from quadrl.conditions.sensor import make as make
-from quadrl.engines import native
 from quadrl.engines.dynamics import thrust_wrench
 from quadrl.engines.state import State
 
 LONGEST_HISTORY = 1000
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
+MOTION = 3  # numbers of `Standard` before its flags
 
 
 @register_sensor
 class RotorSpeed(Sensor):
     """Rotor speeds, for the estimate."""
 
+    compiled = True
     name, unit, measured, shown = "rotor_speed", "rad/s", False, False
     formula = (
         "source true: speed as measured. estimated: speed = hover_speed as an episode begins, and "
@@ -65,7 +65,7 @@ class RotorSpeed(Sensor):
 
     def begin(self, now: Moment) -> Memory:
         """A model starts from hover: no aircraft knows its true speeds."""
-        hover, shape = now.parameters.rotor.hover_speed, np.shape(now.true.rotor_speed)
+        hover, shape = now.parameters.rotor.hover_speed, now.true.rotor_speed.shape
         return {} if self.source == "true" else {"speed": np.broadcast_to(hover, shape)}
 
     def follow(
@@ -85,7 +85,7 @@ class RotorSpeed(Sensor):
 
     def tell(self, now: Moment, seen: Array) -> None:
         """Give the speeds to the estimate."""
-        now.rotor_speed = seen if now.rows is None else seen[now.rows]
+        now.rotor_speed = seen
 
 
 @register_sensor
@@ -96,6 +96,7 @@ class StateEstimate(Sensor):
     velocity and body rate. Its age is `observation_delay`, that of the body rate `rate_delay`.
     """
 
+    compiled = True
     name, unit, measured, shown = "estimate", "", False, False
     formula = (
         "position, attitude, velocity and body rate as estimated on board; their errors and ages "
@@ -115,33 +116,38 @@ class StateEstimate(Sensor):
         return 13 + sizes.rotors
 
     def sense(self, now: Moment) -> Array:
-        """The coordinates of the drawn ages with the drawn bias and with noise."""
-        source, rows = now.randomizer, slice(None) if now.rows is None else now.rows
-        motion, rate = source.aged()
-        aged = np.concatenate([motion[:, :10], rate[:, 10:]], axis=1)[rows]
-        bias = source.sampler.columns(source.drawn[rows], "position_bias_x", 12)
-        noise = source.sampler.randomization.noise
-        rotor_speed = np.ascontiguousarray(now.rotor_speed)
-        count, rotors = rotor_speed.shape
-        found = np.empty((count, 13 + rotors))
-        place = (part[rows] for part in (*source.place, source.steps))
-        arrays = *place, aged, aged[:, 7:], rotor_speed, noise.sizes, bias, found
-        strides = (array.strides[0] // 8 for array in (aged, rotor_speed, bias, found))
-        # As `Rows` in native/disturbances.c.
-        where = native.struct(*arrays, *strides, rotors, noise != NONE.noise, NOISE)
-        native.library().quadrl_estimate(where.ctypes.data, count)
-        return found
+        """The coordinates of the drawn ages with errors; the attitude is turned by small angles."""
+        xp, aged, errors = namespace(now.aged), now.aged, now.errors
+        a, b, c = (errors[:, k] / 2 for k in (3, 4, 5))  # about the axes of the body
+        w, x, y, z = (aged[:, k] for k in (3, 4, 5, 6))
+        turned = stack(
+            w - x * a - y * b - z * c,
+            x + w * a + y * c - z * b,
+            y + w * b + z * a - x * c,
+            z + w * c + x * b - y * a,
+        )
+        turned = turned / norm(turned)[:, None]
+        turns = (a != 0) | (b != 0) | (c != 0)  # else it keeps every bit
+        attitude = xp.where(turns[:, None], turned, aged[:, 3:7])
+        parts = aged[:, :3] + errors[:, :3], attitude, aged[:, 7:] + errors[:, 6:], now.rotor_speed
+        return xp.concatenate(parts, axis=1)
 
     def tell(self, now: Moment, seen: Array) -> None:
         """Make the estimate the state that the other sensors and the task see."""
-        if now.frame is not None:
-            now.state = now.frame.fill(seen, now.rows)
+        now.state = self.state(seen, now.origin)
+
+    @staticmethod
+    def state(seen: Array, origin: Array) -> State:
+        """The state of what is seen (n, 13 + R), in a frame with an origin (3,) [m]."""
+        parts = (seen[:, first:last] for first, last in ((3, 7), (7, 10), (10, 13), (13, None)))
+        return State.of_coordinates(seen[:, :3] - origin, *parts, origin_height=float(origin[2]))
 
 
 @register_sensor
 class Entries(Sensor):
     """The task's own entries of the observation."""
 
+    compiled = True
     name, unit, last = "state", "", True
     formula = "the task's entries of the estimated state, side by side"
 
@@ -158,6 +164,7 @@ class Entries(Sensor):
 class RelativeRotorSpeed(Sensor):
     """Rotor speeds less that of hover, over that of hover; in the place of the task's own entry."""
 
+    compiled = True
     name = "relative_rotor_speed"
     formula = "speed / hover_speed - 1, speed of the sensor rotor_speed"
 
@@ -179,6 +186,7 @@ class RelativeRotorSpeed(Sensor):
 class Rotation(Sensor):
     """Rotation matrix from body to world, row by row."""
 
+    compiled = True
     name, size, formula = "rotation", 9, "R, row by row"
 
     def sense(self, now: Moment) -> Array:
@@ -190,6 +198,7 @@ class Rotation(Sensor):
 class Airspeed(Sensor):
     """Velocity through the air, body frame."""
 
+    compiled = True
     name, size, unit, formula = "airspeed", 3, "m/s", "R^T (v - wind)"
 
     def sense(self, now: Moment) -> Array:
@@ -201,6 +210,7 @@ class Airspeed(Sensor):
 class Clearance(Sensor):
     """Free distance to the nearest solid or to the ground, whichever is nearer."""
 
+    compiled = True
     name, unit = "clearance", "m"
     formula = "least of: distance to the nearest solid, height of the lowest part, reach"
 
@@ -222,6 +232,7 @@ class Clearance(Sensor):
 class Disturbance(Sensor):
     """Acceleration that weight and specified thrust do not explain, body frame."""
 
+    compiled = True
     name, size, unit = "disturbance", 3, "m/s^2"
     formula = (
         "R^T felt; felt = 0 as an episode begins, and after each control step felt += share "
@@ -267,6 +278,7 @@ class Aim(Sensor):
     rest at the goal itself under any constant force, since the place moves on until then.
     """
 
+    compiled = True
     name, size, unit, last = "aim", 3, "m", True
     formula = (
         "R^T (goal - p + sum); sum = 0 as an episode begins, and after each control step, where "
@@ -315,6 +327,170 @@ class Aim(Sensor):
         return now.estimated["goal"] + to_body(now.state.rotation, now.memory["sum"])
 
 
+@register_sensor
+class Offset(Sensor):
+    """Position from the goal and velocity, world frame, clipped: how PX4's mc_raptor sees them."""
+
+    compiled = True
+    name, size, unit, last = "offset", 6, "m, m/s", True
+    formula = "p - goal, each number clipped to [-near, near]; v, to [-slow, slow]"
+
+    near: float = 0.5
+    """Largest distance along each axis that is seen [m]."""
+    slow: float = 1.0
+    """Largest speed along each axis that is seen [m/s]."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        super().__post_init__()
+        for name in ("near", "slow"):
+            number(f"offset {name}", getattr(self, name), 0, MAX)
+
+    @property
+    def hides(self) -> tuple[str, ...]:
+        """The entries that tell the same and more."""
+        return "position", "sin_attitude", "cos_attitude", "velocity", "goal"
+
+    def sense(self, now: Moment) -> Array:
+        """Both as they are estimated."""
+        way = to_world(now.state.rotation, now.estimated["goal"])
+        parts = (
+            np.clip(-way, -self.near, self.near),
+            np.clip(now.state.velocity, -self.slow, self.slow),
+        )
+        return np.concatenate(parts, axis=-1)
+
+
+@register_sensor
+class Level(Sensor):
+    """What a quadrotor sees without a heading, in the frame in which its rotors are an X.
+
+    The goal moves on by the sum of past offsets, as in `Aim`, and the yaw rate by that of the turns
+    so far: then a policy comes to rest at the goal without knowing how strong its rotors are.
+    """
+
+    compiled = True
+    name, size, unit, last = "level", 12, "1, m, m/s, rad/s", True
+    formula = (
+        "side by side, each turned into the frame of the X: R^T (0, 0, 1); R^T (goal - p + sum), "
+        "each number clipped to [-near, near]; R^T v; body rate + (0, 0, gain turn). sum and turn "
+        "are 0 as an episode begins; after each control step turn += T (body rate about z), and "
+        "sum += gain T (goal - p) where |goal - p| < near; then each number of both is clipped to "
+        "[-most, most]"
+    )
+
+    near: float = 0.6
+    """Largest distance along each axis that is seen, and longest offset that is summed up [m]."""
+    gain: float = 0.5
+    """What a second adds to the sum, of the offset [1/s]; the weight of the turns, too."""
+    most: float = 1.0
+    """Largest number of the sum [m] and of the turn [rad]."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        super().__post_init__()
+        for name in ("near", "gain", "most"):
+            number(f"level {name}", getattr(self, name), 0, MAX)
+
+    @property
+    def hides(self) -> tuple[str, ...]:
+        """The entries that tell the same, or a heading."""
+        return "position", "sin_attitude", "cos_attitude", "velocity", "body_rate", "goal"
+
+    def begin(self, now: Moment) -> Memory:
+        """Both are zero."""
+        return {"sum": np.zeros((len(now.wind), 3)), "turn": np.zeros((len(now.wind), 1))}
+
+    def update(self, now: Moment) -> Memory:
+        """Add the offset to the sum if it is short, and the yaw rate to the turn."""
+        offset = to_world(now.state.rotation, now.estimated["goal"])
+        added = np.where(norm(offset)[:, None] < self.near, offset, 0.0)
+        seconds = float(now.parameters.control_timestep)
+        summed = now.memory["sum"] + self.gain * seconds * added
+        turn = now.memory["turn"] + seconds * now.state.body_rate[:, 2:]
+        return {
+            "sum": np.clip(summed, -self.most, self.most),
+            "turn": np.clip(turn, -self.most, self.most),
+        }
+
+    def sense(self, now: Moment) -> Array:
+        """From the estimated state, in the frame of the X of the specified aircraft."""
+        rotor, state = now.parameters.rotor, now.state
+        _, turn = as_x(rotor.position[0], rotor.spin[0])
+        aim = now.estimated["goal"] + to_body(state.rotation, now.memory["sum"])
+        rate = state.body_rate
+        rate = np.concatenate([rate[:, :2], rate[:, 2:] + self.gain * now.memory["turn"]], axis=-1)
+        seen = state.rotation[..., 2, :], np.clip(aim, -self.near, self.near), state.body_velocity
+        return np.concatenate([turned(part, turn) for part in (*seen, rate)], axis=-1)
+
+
+@register_sensor
+class Airframe(Sensor):
+    """What its rotors can do, as a quadrotor in an X: the normalised allocation matrix."""
+
+    name, size, unit, measured = "airframe", 16, "log(g), log(rad/s^2)", False
+    formula = (
+        "ln of what each rotor gives at its largest speed: acceleration [g] along z, and the sizes "
+        "of the angular accelerations [rad/s^2] about x, y, z of the X"
+    )
+    compiled = True
+
+    def sense(self, now: Moment) -> Array:
+        """Of the aircraft as it was drawn."""
+        return now.airframe
+
+
+@register_sensor
+class Standard(Sensor):
+    """What is asked, in the same numbers for several tasks: how a target moves, and which task.
+
+    One policy can then fly each of them by its own name, and the same numbers where they are drawn.
+    """
+
+    compiled = True
+    name, last = "standard", True
+    formula = (
+        "the task's entry target_velocity, zeros without one; then for each name of tasks 1 where "
+        "it is the task's, else 0"
+    )
+
+    tasks: tuple[str, ...] = (
+        "hover",
+        "static_waypoint",
+        "random_waypoint",
+        "straight_and_level",
+        "landing",
+        "target_following",
+    )
+    """Names of the tasks that it knows."""
+
+    @property
+    def hides(self) -> tuple[str, ...]:
+        """The entries in whose place it stands."""
+        return "target_velocity", "task"
+
+    def check(self, tasks: tuple[str, ...]) -> None:
+        """Refuse a task that is not among those that it knows."""
+        for task in tasks:
+            if task not in self.tasks:
+                raise QuadrlError(name="standard tasks", value=self.tasks, allowed=f"with {task}")
+
+    def width(self, sizes: Sizes) -> int:
+        """A velocity, and a flag for each task."""
+        return MOTION + len(self.tasks)
+
+    def sense(self, now: Moment) -> Array:
+        """From the entries that it hides."""
+        xp, seen = namespace(now.wind), now.estimated
+        zeros, one = 0.0 * now.wind, 0.0 * now.wind[:, :1] + 1.0
+        drawn = seen.get("task", one)
+        flags = (
+            sum((drawn[:, k, None] for k, name in enumerate(now.tasks) if name == known), 0.0 * one)
+            for known in self.tasks
+        )
+        return xp.concatenate([seen.get("target_velocity", zeros), *flags], axis=-1)
+
+
 @dataclasses.dataclass(frozen=True)
 class History(Sensor):
     """The last of something, the newest first."""
@@ -334,6 +510,7 @@ class History(Sensor):
 class ActionHistory(History):
     """The last actions, the newest first."""
 
+    compiled = True
     name = "action_history"
     formula = "the last `length` actions, clipped to [-1, 1], the newest first; zeros before them"
 
@@ -358,6 +535,7 @@ class ActionHistory(History):
 class ObservationHistory(History):
     """The observations before, the newest first; the first one stands for those before it."""
 
+    compiled = True
     name, unit, last = "observation_history", "", True
     formula = (
         "the `length` observations before the present one, without histories, the newest first; "
@@ -389,6 +567,7 @@ class Privileged(Sensor):
     `Events.seen` gives it; the wind [m/s] is in the body frame.
     """
 
+    compiled = True
     name, unit, measured, shown, last = "privileged", "", False, False, True
 
     def width(self, sizes: Sizes) -> int:
@@ -397,9 +576,8 @@ class Privileged(Sensor):
 
     def sense(self, now: Moment) -> Array:
         """The true entries, what was drawn, what happens and the wind, side by side."""
-        wind, drawn = to_body(now.true.rotation, now.wind), now.randomizer.scaled(now.rows)
-        happening = [now.events.seen(now.rows)] if now.events else []
-        return np.concatenate([*now.truth.values(), drawn, *happening, wind], axis=-1)
+        wind = to_body(now.true.rotation, now.wind)
+        return np.concatenate([*now.truth.values(), now.drawn, now.happening, wind], axis=-1)
 
 
 def pushed(past: Array, newest: Array) -> Array:

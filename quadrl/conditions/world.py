@@ -21,6 +21,7 @@ class World:
     """
 
     places: Mapping[str, int | slice]  # of solids among the K; a slice for one with a `count`
+    beams: Mapping[str, slice]  # of sensors among the B rays
     position: Array  # (N, K, 3) [m] of their centres, task frame
     clearance: Array  # (N,) [m], free at least between the aircraft and the nearest solid
     touched: Array  # (N, K) bool, which one was touched fastest in this control step
@@ -28,10 +29,15 @@ class World:
     landed: Array  # (N,) bool, whether a foot has touched a solid
     touch: Array  # (N, 4) of that moment: speed into it and along it [m/s], cosine, rate [rad/s]
     held: Array  # (N,) bool, whether a foot has touched a solid that grips
+    rays: Array  # (N, B) what is read along the rays of sensors: distances [m], or logarithms
 
     def solid(self, name: str) -> Array:
         """Centre of a solid, (N, 3) [m], task frame; (N, count, 3) of one with a `count`."""
         return self.position[..., self.places[choice("solid", name, self.places)], :]
+
+    def ranges(self, name: str) -> Array:
+        """What is read along the rays of a sensor, (N, B): how far a solid or the ground is."""
+        return self.rays[..., self.beams[choice("sensor with rays", name, self.beams)]]
 
 
 def above_ground(state: State, parameters: Parameters) -> Array:

@@ -1,10 +1,10 @@
 """Control modes, the meaning of an action: rotor speeds, thrust and body rates, velocity, position.
 
 An action is k numbers in [-1, 1]; each has a unit, a value at 0 and a scale that follow from the
-vehicle. `rotor` is the paper's, whose commands hold for a control step. The others are flown by
-inner loops (`quadrl.control.loops`) that see the true state and command the rotors at every physics
-step, as an autopilot does. `thrust_body_rate` spans all that the rotors can do; the others command
-speeds within hover plus and minus `Vehicle.action_scale`, as `rotor` does.
+vehicle. `rotor` is the paper's; its commands and those of `share` hold for a control step. The
+others are flown by inner loops (`quadrl.control.loops`) that see the true state and command the
+rotors at every physics step, as an autopilot does. `share` and `thrust_body_rate` span all that the
+rotors can do; the others command speeds within hover plus and minus `Vehicle.action_scale`.
 
 Velocities and offsets are along the level heading: forward, left, up, as in the Crazyflie's hover
 setpoint and MAVLink's SET_POSITION_TARGET_LOCAL_NED with MAV_FRAME_BODY_OFFSET_NED (forward,
@@ -19,9 +19,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from quadrl.aircraft.quadrotor import PLACES, as_x
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.rotation import Array, heading_of
+from quadrl.base.rotation import Array, heading_of, stack
 from quadrl.base.validation import choice
 from quadrl.control.allocation import columns, within
 from quadrl.control.loops import MAX_HEADING_ERROR, Controlled, Loops, turned
@@ -52,6 +53,10 @@ class ControlMode(abc.ABC):
     """The name in CONTROL_MODES."""
     has_loops: ClassVar[bool] = True
     """Whether the rotor commands depend on the state at every physics step."""
+    any_layout: ClassVar[bool] = True
+    """Whether an action means the same with rotors that stand otherwise."""
+    quadrotors_alone: ClassVar[bool] = False
+    """Whether it needs four rotors in an X or a plus."""
     terms: tuple[ActionTerm, ...]
     """The k numbers of an action."""
     centre: Array
@@ -93,7 +98,7 @@ class Rotor(ControlMode):
     """The paper's: each number changes the speed command of a rotor from hover."""
 
     name = "rotor"
-    has_loops = False
+    has_loops = any_layout = False
 
     def __init__(self, vehicle: Vehicle) -> None:
         """Hover, plus and minus the vehicle's action scale."""
@@ -123,6 +128,59 @@ class Rotor(ControlMode):
     def rotor_command(self, state: State, setpoint: Array) -> Array:
         """The setpoint itself."""
         return setpoint
+
+
+class Share(Rotor):
+    """Each number commands the speed of a rotor as a share of the largest: -1 stands, 1 is all."""
+
+    name = "share"
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Half the largest speed, plus and minus as much."""
+        super().__init__(vehicle)
+        self.centre = self.scale = self.scale_down = vehicle.max_speed / 2
+
+    @classmethod
+    def reach(cls, vehicle: Vehicle) -> Vehicle:
+        """Span all speeds of the rotors."""
+        return dataclasses.replace(vehicle, action_scale=float(np.max(vehicle.max_speed)))
+
+    def values(self, action: Array) -> Array:
+        """The commands."""
+        return self.centre + self.scale * within(np.asanyarray(action, order="F"), -1.0, 1.0)
+
+
+class ShareOfX(Share):
+    """Shares of the largest speeds in the order of an X, in whatever order the rotors stand.
+
+    The same action lifts, rolls, pitches and yaws every quadrotor the same way, about the axes that
+    the sensor `level` sees: a policy for one of them commands them all.
+    """
+
+    name = "share_of_x"
+    any_layout = quadrotors_alone = True
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Find the X in the layout.
+
+        Raises:
+            QuadrlError: There is none.
+        """
+        super().__init__(vehicle)
+        rotors = vehicle.rotors
+        position = np.array([rotor.position for rotor in rotors])
+        self.order, _ = as_x(position, np.array([rotor.spin for rotor in rotors]))
+        """Indices of the rotors in the order of the action."""
+        self._places = [self.order.index(k) for k in range(len(self.order))]
+        said = "speed command of the rotor {}, as an X sees it"
+        self.terms = tuple(
+            ActionTerm(f"rotor_{k + 1}", "rad/s", said.format(place))
+            for k, place in zip(self.order, PLACES, strict=True)
+        )
+
+    def values(self, action: Array) -> Array:
+        """The commands, in the order of the aircraft's rotors."""
+        return super().values(stack(*(action[..., k] for k in self._places)))
 
 
 class _Looped(ControlMode):
@@ -236,9 +294,15 @@ class Position(_Looped):
 
 
 CONTROL_MODES: dict[str, type[ControlMode]] = {
-    mode.name: mode for mode in (Rotor, ThrustBodyRate, Velocity, Position)
+    mode.name: mode for mode in (Rotor, Share, ShareOfX, ThrustBodyRate, Velocity, Position)
 }
 """Every control mode by name."""
+
+
+def modes_of(vehicle: Vehicle) -> list[str]:
+    """The names of the control modes that fit an aircraft."""
+    four = vehicle.rotor_count == len(PLACES)
+    return [name for name, mode in CONTROL_MODES.items() if four or not mode.quadrotors_alone]
 
 
 def named(given: Any) -> str:

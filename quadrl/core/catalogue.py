@@ -10,7 +10,8 @@ from quadrl.core.task import Task
 TASKS: dict[str, type[Task]] = {}
 """Every registered task by name, but for those in `COMPOSED`."""
 COMPOSED: dict[str, type[Task]] = {}
-"""Tasks that are made of others: no name alone says what to fly, so that no list has them."""
+"""Tasks that are made of others, by name: no API lists them, since an environment of theirs flies
+several."""
 
 
 def register(task: type[Task]) -> type[Task]:

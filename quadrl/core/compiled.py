@@ -14,7 +14,8 @@ import contextlib
 import functools
 import warnings
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from typing import cast
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from quadrl.conditions.world import World
 from quadrl.control.autopilot import Laws
 from quadrl.control.modes import ControlMode
 from quadrl.core.program import FLAGS, Program
+from quadrl.core.senses import arrays
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.step import Step, WrittenStep
 from quadrl.core.tables import Page, Tables
@@ -63,6 +65,9 @@ def compiled(
     if not step.task.asks_compiled:
         step.not_compiled = "its class does not say `compiled = True`"
         return step
+    if step.observer and (reason := step.observer.not_compilable):
+        step.not_compiled = reason
+        return step
     try:
         return CompiledStep(step, now, episode, parameters, mode)
     except NotCompilable as error:
@@ -97,8 +102,9 @@ class CompiledStep(Step):
     """A control step of N rows, in C.
 
     The snapshot, the episode and the observation stand in two tables in turn, as the engine's
-    motions do. The rest of a transition has a table of its own: a row for each term of the reward,
-    for their sum, for the error, and one for the flags, a byte each.
+    motions do. The rest of a transition has a table of its own: a row for each term of the reward
+    and each end of the task, for the sum of the terms, for the error, and one for the flags, a byte
+    each.
     """
 
     def __init__(
@@ -122,19 +128,17 @@ class CompiledStep(Step):
             NotCompilable: The functions of the task do more than arithmetic, or there is no
                 compiler.
         """
-        flown = written.engine, written.inputs, written.estimate, written.loops
+        flown = written.engine, written.inputs, written.observer, written.loops
         super().__init__(written.task, written.clock, *flown, written.randomizer)
         self._parameters, engine = now.parameters, self.engine
         self._program = program = Program(written, now, episode, parameters)
-        functions, estimate = Laws(mode, engine).functions(), self.estimate
-        seen = estimate.coordinates if estimate else None
+        functions = Laws(mode, engine).functions()
         try:
-            self._tables = Tables(program, functions, engine, self.inputs, seen, parameters)
+            self._tables = Tables(program, functions, engine, self.inputs, parameters)
         except NativeError as error:
             raise NotCompilable(str(error).partition("\n")[0]) from error
-        # Where it needs no other room in between, the task's part follows at once.
-        alone = not (estimate or program.sensed.end)
-        self._ends = ENDS | (FINISHES if alone else 0)
+        # Where nobody has to measure solids in between, the task's part follows at once.
+        self._ends = ENDS | (0 if program.world.end else FINISHES)
         self._substeps = engine.vehicle.substeps
         self._into = 0  # the page that the present step fills
         self._flown = False
@@ -146,7 +150,10 @@ class CompiledStep(Step):
         page = self._tables.pages[self.engine.turn]
         for into, array in zip(page.kept, self._program.leaves(now, episode), strict=True):
             into[:] = array
-        self._show(page, now.sensed, now.world)
+        if observer := self.observer:
+            for into, array in zip(*map(arrays, (page.memory, observer.kept)), strict=True):
+                into[:] = array
+        self._show(page, now.world)
 
     def start(self, rows: np.ndarray, keys: np.ndarray, episodes: np.ndarray) -> Observation | None:
         """Begin episodes (n,) of aircraft as they are specified, in air that is at rest.
@@ -157,11 +164,11 @@ class CompiledStep(Step):
         """
         if (starts := self._starts) is None:
             return None
-        function, (struct, places), count = self._program.start, starts, len(rows)
+        function, places, count = self._program.start, starts, len(rows)
         words, room = np.array((rows, keys, episodes)), np.empty((count, function.width))
         ids, keyed, numbered = (native.address(words) + k * words.strides[0] for k in range(3))
         step, into, library = self._tables.address, native.address(room), native.library()
-        given = struct.ctypes.data, places.ctypes.data, len(places), ids, count
+        given = places.ctypes.data, len(places), ids, count
         drawn = keyed, numbered, START, self._program.drawn, MEMBERS
         if library.quadrl_begin(step, *given, *drawn, into):
             return None
@@ -172,14 +179,12 @@ class CompiledStep(Step):
         return dict(zip(self._program.observed, seen, strict=False))
 
     @functools.cached_property
-    def _starts(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """The function of starts and the places that it reads; None where it cannot be compiled."""
+    def _starts(self) -> np.ndarray | None:
+        """The places that starts read; None where they cannot be compiled."""
         try:
-            function = self._program.start
-            struct = function.struct()
+            return self._tables.begin_by(self._program.start)
         except (NotCompilable, NativeError):
             return None
-        return struct, self._tables.places_of(function)
 
     def fly(self) -> bool:
         """Command and fly the aircraft through a control step; False where that is not its part."""
@@ -187,6 +192,7 @@ class CompiledStep(Step):
         if engine.name != "free_flight":
             return False
         self._turn()
+        self.randomizer.passed()
         if self._call(None, self._ends, 0, self._substeps):
             marked = np.flatnonzero(engine.near)
             kinds = engine.near[marked]
@@ -194,7 +200,6 @@ class CompiledStep(Step):
         else:
             for first, end in self._pieces():
                 engine.passed(end - first)
-        self.randomizer.passed()
         self._flown = True
         engine.take_turn()
         return True
@@ -235,6 +240,7 @@ class CompiledStep(Step):
         self._broken = np.zeros(self.engine.num_envs, bool)
         self._broken[broken] = True
         self.note_diverged(broken)
+        self.randomizer.forget(broken)
         if self._ends & FINISHES:
             self._call(broken, FINISHES)
 
@@ -248,31 +254,37 @@ class CompiledStep(Step):
         self._flown, (broken, self._broken) = False, (self._broken, None)
         return broken
 
-    def finish(self, sensed: Mapping[str, np.ndarray], world: World | None) -> Transition:
+    def finish(self, world: World | None) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
         tables, count = self._tables, self.engine.num_envs
         page, last = tables.pages[self._into], tables.pages[1 - self._into]
         if not self._ends & FINISHES:
-            # A reset since the last step has given its rows what the sensors show then.
-            tables.take(self._present.sensed, self._present.world, last)
-            tables.take(sensed, world, page)
+            # A reset since the last step has given its rows what is about them then.
+            for about, into in ((self._present.world, last), (world, page)):
+                tables.take(cast(World, about), into)
             self._call(None, FINISHES)
-        self._show(page, sensed, world)
+        self._show(page, world)
         self._observation = page.observation.copy()
-        *terms, reward, error = self._rest[:-1, :count]
+        *named, reward, error = self._rest[:-1, :count]
+        terms = named[: len(self._program.rewarded)]
+        ends = self._rest[len(terms) : -3, :count] != 0.0
         flags = self._rest[-1].view(np.bool_).reshape(-1, tables.columns)[:, :count]
         return Transition(
             observation=self._observation,
             reward=reward,
             reward_terms=dict(zip(self._program.rewarded, terms, strict=True)),
+            ends=dict(zip(self._program.ended, ends, strict=True)),
             error=error,
             truth=page.truth or self._observation,
             **dict(zip(FLAGS, flags, strict=False)),
         )
 
-    def _show(self, page: Page, sensed: Mapping[str, np.ndarray], world: World | None) -> None:
+    def _show(self, page: Page, world: World | None) -> None:
         """Make a table the present one."""
-        page.now.sensed, page.now.world = sensed, world
+        if observer := self.observer:
+            observer.kept = page.memory
+            page.now.sensed = observer.sensed
+        page.now.world = world
         page.now.parameters = self._parameters
         self._present, self.episode = page.now, page.episode
 

@@ -15,7 +15,11 @@ def touches_ground(now: Snapshot, *, bounces: bool = False) -> Array:
     Args:
         now: The snapshot.
         bounces: Whether the ground stops aircraft, which then may have left it again.
+
+    Where there are solids, the ground is one, too: whatever part is on it has touched it.
     """
+    if not bounces and now.world is not None and now.world.places:
+        return stands(now) | strikes_ground(now)
     lowest = _lowest(now) if bounces else now.state.height
     return lowest < now.parameters.ground_clearance
 

@@ -28,6 +28,7 @@ from quadrl.conditions.randomizer import Randomizer
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.scene import Scene
 from quadrl.conditions.weather import WeatherProcess
+from quadrl.conditions.world import World
 from quadrl.control import modes
 from quadrl.control.autopilot import Autopilot
 from quadrl.control.trim import trimmed
@@ -37,6 +38,7 @@ from quadrl.core.markers import Marker
 from quadrl.core.observation import layout
 from quadrl.core.observer import Observer
 from quadrl.core.scenario import KEYWORDS, Conditions, Scenario
+from quadrl.core.senses import Senses
 from quadrl.core.step import Inputs, Step, WrittenStep
 from quadrl.core.task import Snapshot, Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
@@ -99,8 +101,6 @@ class Environment(saving.Copied):
         elif per_row and len(engine.parameters) < engine.num_envs:
             allowed = "made with per_row=True, since aircraft differ"
             raise QuadrlError(name="engine", value=engine, allowed=allowed)
-        self.scene = Scene(self.task.solids())
-        self.scene.check(engine)
         self.engine, self.num_envs, self.origin = engine, engine.num_envs, engine.origin
         self.control_mode = modes.kind(self.scenario.control_mode)(self.vehicle)
         self.action_size = self.control_mode.size
@@ -112,8 +112,9 @@ class Environment(saving.Copied):
         nominal = parameters.rows(self.vehicle)
         self._rows = engine.parameters if self._true else nominal  # those that the task sees
         self._parameters, seen = (Parameters.of(k, timestep) for k in (self._rows, nominal))
-        self.term_names = rules.check_values(self.task, seen, self.action_size, self.origin[2])
-        """Names of the reward's terms, in their order."""
+        checked = rules.check_values(self.task, seen, self.action_size, self.origin[2])
+        self.term_names, self.end_names = checked
+        """Names of the reward's terms, and of what ends episodes, in their order."""
         senses = self.observing != Observing() or bool(self.task.sensors)
         active = senses or self.randomization != NONE
         self.randomizer = Randomizer(sampler, engine, active=active)
@@ -124,9 +125,14 @@ class Environment(saving.Copied):
             self.events = Events(happening, *given, calm=self.blowing is None)
         self.observer: Observer | None = None  # the task then observes the true state
         if senses or self.randomization.uncertain:
-            given = self.observing, self.task, engine, self.action_size, self.randomizer
-            self.observer = Observer(*given, self.events)
-        terms = self.observer.terms if self.observer else self.task.observation
+            happening = self.events.width if self.events else 0
+            flown = self.observing, self.task, self.vehicle, self.action_size, sampler, happening
+            senses = Senses(*flown, self.origin, loops=self.control_mode.has_loops)
+            self.observer = Observer(senses, engine, self.randomizer, self.events)
+        rays = self.observer.senses.rays if self.observer else {}
+        self.scene = Scene(self.task.solids(), rays)
+        self.scene.check(engine)
+        terms = self.observer.senses.terms if self.observer else self.task.observation
         self.layout = layout(terms, self.vehicle.rotor_count)
         """Where each named term of the observation stands in the flat vector."""
         self.size = max(part.stop for part in self.layout.values())
@@ -149,7 +155,7 @@ class Environment(saving.Copied):
         self.seeds = saving.Seeds(*np.zeros((2, self.num_envs), np.int64))
         """Which episode each row flies."""
         self._step: Step | None = None  # from the first reset on
-        taken = np.zeros((self.num_envs, self.action_size))
+        taken, self._still = np.zeros((2, self.num_envs, self.action_size))
         self._inputs = Inputs(taken, np.zeros(engine.ctrl.shape), np.zeros(self.num_envs, bool))
         self.transition: Transition | None = None  # what the last step gave
         loops, given = self.control_mode.has_loops, (self.control_mode, engine, self._inputs.action)
@@ -282,10 +288,12 @@ class Environment(saving.Copied):
         self.seeds = seeds
         for process in self._processes:
             process.begin(rows, *place, drawn)
-        world = self.scene.world(self.engine, rows)
-        given = task_state, seen, self.action_size, world
-        now, episode = transition.begin(self.task, state, *given)
-        observation = self.observer.first(rows, now) if self.observer else self.task.observe(now)
+        world, observer, still = self._world(rows), self.observer, self._still
+        look = observer.look(state, still[: len(rows)], world, rows) if observer else None
+        given = task_state, seen, self.action_size, world, look
+        now, episode, observation = transition.begin(self.task, state, *given)
+        if observer and look:
+            observer.keep(look.after, rows)
         self.seeds.episodes[rows] += 1
         if len(rows) == self.num_envs:
             self._take(now, episode)
@@ -328,6 +336,11 @@ class Environment(saving.Copied):
         """Why the task's step is not compiled; empty where it is, from the first reset on."""
         return self._begun.not_compiled
 
+    def written(self) -> WrittenStep:
+        """Its control step as it is written, before a reset begins it."""
+        flown = self.engine, self._inputs, self.observer, self.control_mode.has_loops
+        return WrittenStep(self.task, self._clock, *flown, self.randomizer)
+
     def sources(self) -> list[str]:
         """The C of its control step, while that runs as it is written."""
         return sources(cast(WrittenStep, self._begun), self._rows, self.control_mode)
@@ -338,10 +351,7 @@ class Environment(saving.Copied):
         now.task, now.parameters = records.owned(now.task), self._parameters
         now.sensed = self.sensed
         if self._step is None:
-            estimate = self.observer.frame if self.observer else None
-            flown = self.engine, self._inputs, estimate, self.control_mode.has_loops
-            written = WrittenStep(self.task, self._clock, *flown, self.randomizer)
-            self._step = compiled(written, now, episode, self._rows, self.control_mode)
+            self._step = compiled(self.written(), now, episode, self._rows, self.control_mode)
         self._step.begin(now, episode)
 
     def step(self, action: Array) -> Transition:
@@ -361,8 +371,6 @@ class Environment(saving.Copied):
         _ = self._begun  # refuse what has not begun; it may be made anew now
         self._accept(action)
         if not self._parted and self._begun.fly():
-            if self.observer:
-                self.observer.follow(self._inputs.command, self.vehicle.control_timestep)
             return self.finish()
         self._command()
         for steps in self.commands():
@@ -408,8 +416,6 @@ class Environment(saving.Copied):
         else:
             command[:] = self.control_mode.values(taken)
             self.engine.command(command)
-            if self.observer:
-                self.observer.follow(command, self.vehicle.control_timestep)
 
     def control(self, most: int) -> int:
         """Command the rotors and move the solids, where that happens within a control step.
@@ -444,15 +450,15 @@ class Environment(saving.Copied):
     def finish(self) -> Transition:
         """Do the second half of a step, after the engine has advanced."""
         self._read()
-        world = self.scene.world(self.engine)
-        if self.observer:
-            self.observer.sense(self._inputs.action, world)
-        done = self._begun.finish(self.sensed, world)
+        done = self._begun.finish(self._world())
         rules.check_reward(self.task, done)
-        if self.observer:
-            done.observation = self.observer.observe(done)
         self.transition = done
         return done
+
+    def _world(self, rows: np.ndarray | None = None) -> World | None:
+        """The world about some aircraft (n,), or all; None where there is nothing to measure."""
+        world = self.scene.world(self.engine, rows)
+        return self.observer.ranged(world, rows) if self.observer and self.scene.rays else world
 
     def _read(self) -> None:
         """Compute the state, and note which aircraft have diverged."""
@@ -461,8 +467,6 @@ class Environment(saving.Copied):
 
     def flatten(self, observation: Observation) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""
-        if self.observer and observation is self.observer.observation:
-            return self.observer.flat.astype(np.float32)
         return self._begun.flatten(observation)
 
     @property
@@ -514,7 +518,7 @@ class Environment(saving.Copied):
             raise
         now, episode = self._memory().restore(saved)
         now.sensed = self.sensed
-        now.world = self.scene.world(self.engine)
+        now.world = self._world()
         now.potentials = self.task.measure(now)
         self._take(now, episode)
         return self.observer.again() if self.observer else self.task.observe(now)
@@ -526,6 +530,7 @@ def row_memory(
     """Least memory that one more aircraft takes [bytes], as measured, plus that of histories."""
     rotors, (command, *ages) = vehicle.rotor_count, (most for _, most in sampler.delays.values())
     aged, late = max(ages), command + round(vehicle.dead_time / vehicle.physics_timestep)
+    late += vehicle.substeps * (sampler.randomization.command_jitter[1] > 0)
     single = sum(term.width(rotors) for term in task.observation.values())
     sensors = seen.made(task.sensors)
     names = "observation_history", "action_history"

@@ -1,7 +1,8 @@
 """One of several tasks, drawn for each episode: rows of one environment fly different tasks.
 
 Each member's functions are called for all rows, with what it remembers itself; a row takes the
-numbers of its own member, which are bit for bit those of that task alone.
+numbers of its own member, which are bit for bit those of that task alone. The frame of the lowest
+member is that of all; others see heights above their own.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from quadrl.core.catalogue import make
 from quadrl.core.markers import Marker
 from quadrl.core.observation import ObservationTerm
 from quadrl.core.snapshot import EpisodeEnd, Rollout, Snapshot, TaskState
-from quadrl.core.task import Task
+from quadrl.core.task import Task, ends_of
 from quadrl.core.transition import Clock
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
 
-WORLD = ("altitude", "contact", "true_parameters")
+WORLD = ("true_parameters",)
 """What members have alike, since there is one world for all rows."""
 EXAMPLE = '["hover", {"task": "random_waypoint", "farthest": 2.0}]'
 
@@ -43,17 +44,10 @@ class Chosen(TaskState):
     which: Array  # (N,) number of the member, from 0 on
     own: tuple[TaskState, ...]  # of each member; of a row, that of its own member counts
 
-    @classmethod
-    def of(cls, which: Array, own: tuple[Any, ...]) -> Chosen:
-        """The record with the goal of each row's member."""
-        return cls(_select(which, [state.goal for state in own]), which, own)
 
-
-def _seen(given: Any, number: int) -> Any:
-    """A snapshot as a member sees it; other arguments as they are."""
-    if not isinstance(given, Snapshot):
-        return given
-    return dataclasses.replace(given, task=given.task.own[number])
+def _raised(position: Array, by: float) -> Array:
+    """Places (..., 3) [m] by so much higher [m]; the same array without that."""
+    return stack(position[..., 0], position[..., 1], position[..., 2] + by) if by else position
 
 
 def _select(which: Array, values: Sequence[Any]) -> Any:
@@ -142,6 +136,8 @@ class OneOf(Task):
             if others:
                 said = ", ".join(f"{k} {getattr(one, name)!r}" for k, one in self.named.items())
                 raise self._refused("members", said, f"with one {name}, since they share a world")
+        known["altitude"] = min(member.altitude for member in members)
+        known["contact"] = any(member.contact for member in members)
         for name, member in self.named.items():
             if member.solids() or type(member).scene is not Task.scene or isinstance(member, OneOf):
                 allowed = "tasks without solids, which stand in the way of others, none a one_of"
@@ -173,6 +169,11 @@ class OneOf(Task):
         return found
 
     @property
+    def parts(self) -> tuple[Task, ...]:
+        """Its members."""
+        return self.members
+
+    @property
     def asks_compiled(self) -> bool:
         """Whether all its members ask for it, too."""
         return super().asks_compiled and all(member.asks_compiled for member in self.members)
@@ -196,18 +197,20 @@ class OneOf(Task):
         xp, which = namespace(drawn), 0.0 * drawn
         for edge in itertools.accumulate(self._weights[:-1]):
             which = xp.where(drawn >= edge, which + 1.0, which)
-        return _select(which, starts), Chosen.of(which, own)
+        moved = [self._moved(*pair) for pair in zip(starts, self._heights, strict=True)]
+        return _select(which, moved), self._chosen(which, own)
 
     def remember(self, start: Start, drawn: Any) -> Chosen:
         """What each member remembers of the start."""
-        pairs = zip(self.members, drawn.own, strict=True)
-        return Chosen.of(drawn.which, tuple(member.remember(start, own) for member, own in pairs))
+        each = zip(self.members, drawn.own, self._heights, strict=True)
+        own = tuple(member.remember(self._moved(start, -h), kept) for member, kept, h in each)
+        return self._chosen(drawn.which, own)
 
     def update(self, before: Snapshot, now: Snapshot) -> Chosen:
         """What each member remembers."""
         own = self.each("update", before, now)
         kept = all(one is was for one, was in zip(own, now.task.own, strict=True))
-        return now.task if kept else Chosen.of(now.task.which, tuple(own))
+        return now.task if kept else self._chosen(now.task.which, tuple(own))
 
     def duration(self, now: Snapshot) -> tuple[Array, Array]:
         """Those of the member, rounded to control steps as alone."""
@@ -217,8 +220,22 @@ class OneOf(Task):
         settles = [0.0 * now.time + clock.settle_steps * timestep for clock in clocks]
         return _select(now.task.which, limits), _select(now.task.which, settles)
 
-    goal, target_velocity, error = map(_by_row, ("goal", "target_velocity", "error"))
-    measure, terminated, succeeded = map(_by_row, ("measure", "terminated", "succeeded"))
+    target_velocity, error = map(_by_row, ("target_velocity", "error"))
+    measure, succeeded = map(_by_row, ("measure", "succeeded"))
+
+    def goal(self, now: Snapshot) -> Array:
+        """Where the member wants to be."""
+        pairs = zip(self.each("goal", now), self._heights, strict=True)
+        return _select(now.task.which, [_raised(*pair) for pair in pairs])
+
+    def terminated(self, now: Snapshot) -> dict[str, Array]:
+        """The ends of the member, none of others."""
+        ends = dict[str, Array]()
+        for k, member in enumerate(self.members):
+            for name, holds in ends_of(member, self._seen(now, k)).items():
+                own = (now.task.which == k) & holds
+                ends[name] = ends[name] | own if name in ends else own
+        return ends
 
     def observe(self, now: Snapshot) -> dict[str, Array]:
         """Which member it is, and what that sees, 0 in the entries of others."""
@@ -236,7 +253,8 @@ class OneOf(Task):
     def markers(self, now: Snapshot) -> Sequence[Marker | Primitive]:
         """What the member shows."""
         number = int(now.task.which[0])
-        return self.members[number].markers(_seen(now, number))
+        up = np.array([0.0, 0.0, self._heights[number]])
+        return [one.moved(up) for one in self.members[number].markers(self._seen(now, number))]
 
     def flown(self, rollout: Rollout) -> dict[str, Rollout]:
         """The flights of each member that was drawn, as a rollout of its own, by its name."""
@@ -244,15 +262,37 @@ class OneOf(Task):
         for k, (name, member) in enumerate(self.named.items()):
             own = {of.removeprefix(f"own.{k}."): values for of, values in kept.items()}
             if (rows := np.flatnonzero(kept["which"][0] == k)).size:
-                found[name] = rollout.part(rows, member, own)
+                found[name] = rollout.part(rows, member, own, self._heights[k])
         return found
 
     def each(self, function: str, *given: Any) -> list[Any]:
         """What a function of each member gives, for snapshots and what else it takes."""
         return [
-            getattr(member, function)(*(_seen(one, k) for one in given))
+            getattr(member, function)(*(self._seen(one, k) for one in given))
             for k, member in enumerate(self.members)
         ]
+
+    @functools.cached_property
+    def _heights(self) -> tuple[float, ...]:
+        """Of the frames of the members above that of all [m]."""
+        return tuple(member.altitude - self.altitude for member in self.members)
+
+    def _seen(self, given: Any, number: int) -> Any:
+        """A snapshot as a member sees it; other arguments as they are."""
+        if not isinstance(given, Snapshot):
+            return given
+        state = self._moved(given.state, -self._heights[number])
+        return dataclasses.replace(given, state=state, task=given.task.own[number])
+
+    def _chosen(self, which: Array, own: tuple[Any, ...]) -> Chosen:
+        """What is remembered, with the goal of each row's member."""
+        pairs = zip(own, self._heights, strict=True)
+        return Chosen(_select(which, [_raised(one.goal, h) for one, h in pairs]), which, own)
+
+    @staticmethod
+    def _moved(at: Any, by: float) -> Any:
+        """A start or a state so much higher [m]."""
+        return dataclasses.replace(at, position=_raised(at.position, by)) if by else at
 
     @property
     def _weights(self) -> tuple[float, ...]:

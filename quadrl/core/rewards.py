@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.base.rotation import Array, namespace, square_norm
+from quadrl.base.rotation import Array, filled, namespace, square_norm, zeros
 from quadrl.core.snapshot import Snapshot
 
 REWARD_TIME = 0.05  # [s], the control step of the paper's aircraft
@@ -37,7 +37,7 @@ def weighted(task: Any, names: Iterable[Name], before: Snapshot, now: Snapshot) 
         "speed": lambda: task.speed_weight * (was.speed - is_.speed),
         "spin": lambda: task.spin_weight * (was.angular_speed - is_.angular_speed),
         "control": lambda: cost(task.control_weight, command - rotor.hover_speed),
-        "survival": lambda: 0.0 * now.time + task.survival_weight * share,
+        "survival": lambda: filled(task.survival_weight * share, now.time),
         "smoothness": lambda: cost(task.smoothness_weight, command - before.rotor_command),
     }
     asked = (name for name in names if name != "smoothness" or task.smoothness_weight != 0)
@@ -46,7 +46,7 @@ def weighted(task: Any, names: Iterable[Name], before: Snapshot, now: Snapshot) 
 
 def once(weight: float, happens: Array, now: Snapshot) -> Array:
     """The worth of what happens (N,) bool in this control step, such as the end of an episode."""
-    zero = 0.0 * now.time
+    zero = zeros(now.time)
     return namespace(zero).where(happens, zero + weight, zero)
 
 

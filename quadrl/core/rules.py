@@ -28,7 +28,7 @@ from quadrl.conditions.sensor import Sizes
 from quadrl.core.catalogue import make
 from quadrl.core.scenario import Scenario
 from quadrl.core.snapshot import EpisodeEnd, Snapshot
-from quadrl.core.task import Task
+from quadrl.core.task import Task, either, ends_of
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import SIZES, Start, State
 
@@ -117,35 +117,39 @@ def begun(
     if not (abs(square_norm(start.quaternion) - 1) < 1e-6).all():
         name = f"{task.name} quaternion of begin"
         raise QuadrlError(name=name, value=start.quaternion, allowed="of norm 1")
-    scene = Scene(task.solids())
+    sensors = {name: sensor.make(name, options) for name, options in task.sensors.items()}
+    scene = Scene(task.solids(), {name: made.rays for name, made in sensors.items()})
     scene.poses(task.place(Rng(keys, 0 * keys, SOLIDS), start, task_state), rows, np.zeros(3))
-    world = scene.nothing_near(rows) if scene.solids else None
+    world = scene.nothing_near(rows) if scene.solids or scene.rays else None
     state = State.of_coordinates(**coordinates, origin_height=height)
     acts = more + np.zeros(actions), start.rotor_speed + 0.0, more[:, 0]
     now = Snapshot(state, task_state, own, *acts, world=world)
     now.potentials = task.measure(now)
-    for name, options in task.sensors.items():
-        made = sensor.make(name, options)
+    for name, made in sensors.items():
         if made.shown and not made.last:
             now.sensed = {**now.sensed, name: np.zeros((rows, made.width(Sizes(rotors, actions))))}
     return now
 
 
-def check_values(task: Task, own: Parameters, actions: int, height: float) -> tuple[str, ...]:
+def check_values(
+    task: Task, own: Parameters, actions: int, height: float
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Begin a few episodes, and refuse a task whose functions return what no task may return.
 
     The arguments are those of `begun`.
 
     Returns:
-        Names of the reward's terms, in their order.
+        Names of the reward's terms, in their order, and of the ends.
 
     Raises:
         QuadrlError: The message names the function.
     """
     now = begun(task, own, actions, height, rows := SAMPLE)
-    terminated = task.terminated(now)
-    _check_array(task, "terminated", terminated, (rows,), "b")
-    if terminated.any():
+    if not (ends := ends_of(task, now)):
+        raise QuadrlError(name=f"{task.name} terminated", value=ends, allowed="at least one end")
+    for name, holds in ends.items():
+        _check_array(task, f"terminated {name!r}", holds, (rows,), "b")
+    if (terminated := either(ends)).any():
         changed = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
         changed = {k: v for k, v in changed.items() if str(v) != str(getattr(type(task), k, ""))}
         reason = f"{terminated.sum()} of {rows} episodes would end where they begin"
@@ -171,7 +175,7 @@ def check_values(task: Task, own: Parameters, actions: int, height: float) -> tu
         shape = (rows, term.width(own.rotor.hover_speed.shape[-1]))
         _check_array(task, f"observation {name!r}", observation[name], shape, "f")
     task.update(now, now)  # so that a fault of any function shows before symbols call it
-    return tuple(terms)
+    return tuple(terms), tuple(ends)
 
 
 def check_reward(task: Task, done: Any) -> None:
@@ -230,14 +234,15 @@ def check_functions(task: Task) -> None:
 
 def check_start(task: Task) -> None:
     """What it remembers of every step, it remembers of a start that `reset` is given, too."""
-    with blame(task, "a given start"):
-        now, later = (begun(task, *seen_by(task), moved=moved) for moved in (0.1, 0.2))
-        first, later.task = _remembered(now), task.update(now, later)
-        later.potentials = task.measure(later)
-    for name, (own, value) in _remembered(later).items():
-        if np.array_equal(own, value) and np.ptp(value, axis=0).any():
-            message = f"{name} after every step, but not at a start that reset was given"
-            require(np.allclose(*first[name]), f"{task.name}: {message}: make it in `remember`")
+    for part in task.parts:  # of several, only the rows of a part remember what is its own
+        with blame(part, "a given start"):
+            now, later = (begun(part, *seen_by(part), moved=moved) for moved in (0.1, 0.2))
+            first, later.task = _remembered(now), part.update(now, later)
+            later.potentials = part.measure(later)
+        for name, (own, value) in _remembered(later).items():
+            if np.array_equal(own, value) and np.ptp(value, axis=0).any():
+                message = f"{name} after every step, but not at a start that reset was given"
+                require(np.allclose(*first[name]), f"{part.name}: {message}: make it in `remember`")
 
 
 def _remembered(now: Snapshot) -> dict[str, tuple[Array, Array]]:
@@ -252,7 +257,7 @@ def outputs(task: Task, before: Snapshot, now: Snapshot) -> dict[str, Array]:
     rows = f"{len(now.time)} rows of {type(now.time).__module__} arrays"
     with blame(task, f"a function of {rows}"):
         now = dataclasses.replace(now, potentials=task.measure(now))
-        terminated, error = task.terminated(now), task.error(now)
+        terminated, error = either(ends_of(task, now)), task.error(now)
         end = EpisodeEnd(terminated, ~terminated, 0 * error + 1, error, error, 1)
         end.succeeded = succeeded = task.succeeded(now, end)
         terms, seen = task.reward(before, now, end), task.observe(now)

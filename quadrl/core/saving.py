@@ -93,17 +93,21 @@ class Memory:
         saved = {f.name: getattr(self.seeds, f.name).copy() for f in dataclasses.fields(Seeds)}
         saved |= records.arrays("task", self.snapshot.task)
         saved |= records.arrays("episode", self.episode)
-        saved |= {name: np.array(getattr(self.snapshot, name)) for name in MOMENT}
+        # In C's order, as every file format wants them: compiled steps keep columns.
+        moment = {name: getattr(self.snapshot, name) for name in MOMENT}
+        saved |= {name: np.array(array, order="C") for name, array in moment.items()}
         for name, part in self._parts().items():
             saved |= {f"{name}.{k}": value for k, value in part.save().items()}
         return saved
 
     def fitted(self, saved: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        """What was saved, with the numbers that an aircraft's row did not have then.
+        """What was saved, with the numbers that an aircraft's row or a process did not have then.
 
         Raises:
             QuadrlError: The row has a number that is not known here.
         """
+        for process in self.processes:
+            saved = process.fitted(saved)
         layout, own = saved.get("engine.layout"), self.engine.begun
         if layout is None or not saved.keys() >= {*TABLES} or np.array_equal(layout, LAYOUT):
             return saved

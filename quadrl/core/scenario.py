@@ -48,8 +48,8 @@ class Conditions(TypedDict, total=False, extra_items=Any):
     task_options: Mapping[str, Any] | None
     """Options of the task, such as time_limit=5."""
     vehicle: str | Vehicle | Mapping[str, Any] | None
-    """The aircraft: a name of `quadrl.VEHICLES`; in Python also a Vehicle, or changed fields of
-    one."""
+    """The aircraft: a name of `quadrl.VEHICLES`, or a .json file that quadrl identify wrote; in
+    Python also a Vehicle, or changed fields of one."""
     vehicle_options: Mapping[str, Any] | None
     """Changed numbers of the aircraft, such as mass=0.7 action_scale=90."""
     aerodynamics: str | Aerodynamics | Mapping[str, Any] | None
@@ -69,7 +69,7 @@ class Conditions(TypedDict, total=False, extra_items=Any):
     observe: Observed
     """Options of the observation: fields of `quadrl.Observing`, such as action_history=2."""
     control_mode: str | None
-    """Meaning of the actions: rotor, thrust_body_rate, velocity or position."""
+    """Meaning of the actions: rotor, share, thrust_body_rate, velocity or position."""
     engine: EngineName | Engine | None
     """The engine: mujoco, or free_flight (which uses MuJoCo only near the ground and solids);
     `Environment` also accepts an engine object."""

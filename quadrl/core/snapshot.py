@@ -159,6 +159,8 @@ class Rollout:
     terminated: np.ndarray  # (N,) bool
     is_success: np.ndarray  # (N,) bool
     diverged: np.ndarray  # (N,) bool
+    ended: Mapping[str, np.ndarray]  # (N,) bool by name: how each ended, as `Transition.ended`
+    reward_terms: Mapping[str, np.ndarray]  # (N,) by name, summed over each flight
     markers: tuple[Any, ...]  # (T,) of what the task shows of the first aircraft, world frame
     events: tuple[str, ...]  # (T,) of what is said of the events of its flight
     origin: np.ndarray  # (3,) [m], of the task frame in the world frame
@@ -169,8 +171,13 @@ class Rollout:
         steps, flights = self.error.shape
         return f"Rollout of {self.task.name}: {flights} flights, {steps} control steps at most"
 
-    def part(self, rows: np.ndarray, task: Any, remembered: Mapping[str, np.ndarray]) -> Rollout:
-        """Some of the flights, by their numbers (n,), with the task of theirs and its memory."""
+    def part(
+        self, rows: np.ndarray, task: Any, remembered: Mapping[str, np.ndarray], height: float = 0.0
+    ) -> Rollout:
+        """Some of the flights, by their numbers (n,), with the task of theirs and its memory.
+
+        Its frame is `height` above the one here [m].
+        """
         steps, times = int(self.length[rows].max()), len(self.error)
 
         def own(values: Array) -> Array:  # (T, N, ...), or (S, N, ...)
@@ -180,6 +187,12 @@ class Rollout:
         ends = ("length", "terminated", "is_success", "diverged")
         changed |= {k: getattr(self, k)[rows] for k in ends}
         changed["remembered"] = {k: own(v) for k, v in remembered.items()}
+        for name in ("ended", "reward_terms"):
+            changed[name] = {k: v[rows] for k, v in getattr(self, name).items()}
+        if height:
+            up = np.array([0.0, 0.0, height])
+            changed |= {k: changed[k] - up for k in ("position", "goal")}
+            changed["origin"] = self.origin + up
         return dataclasses.replace(self, **changed, task=task, markers=(), events=())
 
     @property

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Mapping
 
 import numpy as np
 
 from quadrl.base import records
 from quadrl.conditions.randomizer import Randomizer
-from quadrl.conditions.sensor import EstimatedState
 from quadrl.conditions.world import World
 from quadrl.core import transition
+from quadrl.core.observer import Observer
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
@@ -39,7 +38,7 @@ class Step(abc.ABC):
     clock: Clock  # of its episodes
     engine: Engine  # of the aircraft
     inputs: Inputs  # read live
-    estimate: EstimatedState | None  # the state that is observed, live; None for the true one
+    observer: Observer | None  # what policies see; None where that is the true state
     loops: bool  # whether commands change with each physics step
     randomizer: Randomizer  # says which of them are late
     snapshot: Snapshot = dataclasses.field(init=False)
@@ -77,11 +76,10 @@ class Step(abc.ABC):
         """Make a snapshot of all rows the present one."""
 
     @abc.abstractmethod
-    def finish(self, sensed: Mapping[str, np.ndarray], world: World | None) -> Transition:
+    def finish(self, world: World | None) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does.
 
         Args:
-            sensed: What the sensors give now, (N, size) by name.
             world: The world about the aircraft; None where the task declares no solids.
         """
 
@@ -103,16 +101,16 @@ class WrittenStep(Step):
             self.note_diverged(diverged)
         return diverged
 
-    def finish(self, sensed: Mapping[str, np.ndarray], world: World | None) -> Transition:
+    def finish(self, world: World | None) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
-        inputs, estimate = records.copied(self.inputs), self.estimate
+        inputs, state, observer = records.copied(self.inputs), self.engine.state, self.observer
+        look = observer.look(state, inputs.action, world) if observer else None
         self.snapshot, self.episode, done = transition.finish(
-            *(self.task, self.clock, self.episode, self.snapshot, self.engine.state),
-            *(inputs.action, inputs.command, inputs.diverged),
-            estimate.state if estimate else None,
-            world,
-            sensed,
+            *(self.task, self.clock, self.episode, self.snapshot, state),
+            *(inputs.action, inputs.command, inputs.diverged, world, look),
         )
         # What a task remembers must not be a view of buffers that the next steps write.
         self.snapshot.task = records.owned(self.snapshot.task)
+        if observer and look:
+            observer.keep(look.after)
         return done

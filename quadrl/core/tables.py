@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from quadrl.aircraft.parameters import ROW_SIZE
-from quadrl.base.rotation import Array
+from quadrl.base import records
 from quadrl.conditions.world import World
 from quadrl.core.program import MAX_DRAWN, Program
 from quadrl.core.step import Inputs
@@ -16,8 +16,8 @@ from quadrl.engines.engine import Engine
 from quadrl.engines.rowwise import RowFunction
 from quadrl.engines.state import padded
 
-REST = 14
-"""Index of `rest` in `Step` of native/free_flight.c; `flags` follows."""
+START, REST = 7, 16
+"""Indices of `start` and of `rest` in `Step` of native/free_flight.c; `flags` follows."""
 Place = tuple[int, int, int]
 """Address of a number of the first row, stride between rows, and which one it is."""
 
@@ -29,15 +29,15 @@ class Page:
         """Lay out a table for N rows."""
         self.whole, columns = whole, whole.shape[1]
         table = self.whole[:, :count]
-        sensed = np.empty((program.sensed.end + 1, columns))  # at least a row has an address
-        self.sensed = sensed[:, :count]
+        self.world = np.empty((program.world.end + 1, columns))  # at least a row has an address
         self.kept = program.kept.views(table)
+        self.memory = program.memory(table)
         self.now, self.episode = program.records(table)
         seen, names = program.seen.views(table), program.observed
         self.observation = dict(zip(names, seen, strict=False))
-        self.truth = dict(zip(names, seen[len(names) :], strict=False))
+        self.truth = dict(zip(program.entries, seen[len(names) :], strict=False))
         size = sum(array.shape[1] for array in self.observation.values())
-        self.vectors = table[program.kept.end : program.kept.end + size].T
+        self.vectors = table[program.remembered.end : program.remembered.end + size].T
 
 
 class Tables:
@@ -49,7 +49,6 @@ class Tables:
         functions: Sequence[RowFunction],
         engine: Engine,
         inputs: Inputs,
-        estimate: np.ndarray | None,
         parameters: np.ndarray,
     ) -> None:
         """Lay out the tables.
@@ -59,7 +58,6 @@ class Tables:
             functions: Setpoint and rotor commands of the control mode, to compile.
             engine: The engine.
             inputs: What a control step is flown with.
-            estimate: Coordinates (N, 13 + R) of the state that is observed; None for the true one.
             parameters: Rows that the task sees, (N,) or (1,), read live.
 
         Raises:
@@ -74,23 +72,26 @@ class Tables:
         made, limits = [*functions, program.function], engine.limits
         structs = [function.struct() for function in made]
         sizes = inputs.action.shape[1], limits.shape[1] if len(limits) > 1 else 0
-        sizes = *sizes, program.seen.end, len(program.rewarded), self.columns
+        named = len(program.rewarded) + len(program.ended)
+        sizes = *sizes, program.seen.end, named, self.columns
         loops, randomizer = program.written.loops, program.written.randomizer
         more, late = (loops, engine.vehicle.substeps), randomizer.rows if randomizer.late else None
         self.held = np.array([1] * len(randomizer.held) if loops else randomizer.held)
         """For each physics step of a control step, how many are flown at once from there on."""
         self.steps: list[np.ndarray] = []
         """A `Step` of native/free_flight.c for each page."""
-        self._alive: list[object] = [made, structs, setpoint, engine.rows]  # C has the addresses
+        senses = _senses(program, engine)
+        # C has the addresses.
+        self._alive: list[object] = [made, structs, setpoint, engine.rows, *senses]
         for turn, page in enumerate(self.pages):
-            places = self._places(turn, inputs, estimate)
+            places = self._places(turn, inputs)
             flown = inputs.action, limits, engine.motions[turn], setpoint, inputs.command
             filled = inputs.diverged, places, page.whole, None, None, len(places)
-            about = engine.rows, late, self.held
-            step = native.struct(*about, *structs, *flown, *filled, *sizes, *more)
+            about = engine.rows, late, senses[0] if senses else None, self.held
+            step = native.struct(*about, *structs, None, *flown, *filled, *sizes, *more)
             self.steps.append(step)
             self._alive.append(places)
-        self._wanted = self._read_of_sensed()
+        self._wanted = self._read_of_world()
 
     @property
     def address(self) -> int:
@@ -98,14 +99,25 @@ class Tables:
         return self.steps[self._engine.turn].ctypes.data
 
     def fresh(self, turn: int) -> np.ndarray:
-        """A table for what else a step gives, that fills a page: terms, reward, error and flags."""
-        rest = np.empty((len(self._program.rewarded) + 3, self.columns))
+        """A table for what else a step of a page gives: terms, ends, reward, error and flags."""
+        named = len(self._program.rewarded) + len(self._program.ended)
+        rest = np.empty((named + 3, self.columns))
         first = native.address(rest)
         self.steps[turn][REST : REST + 2] = first, first + 8 * self.columns * (len(rest) - 1)
         return rest
 
-    def places_of(self, start: RowFunction) -> np.ndarray:
-        """The places of the parameters that a function of a start reads, which come last in it."""
+    def begin_by(self, start: RowFunction) -> np.ndarray:
+        """Let episodes begin by a function; return the places that it reads.
+
+        These are of parameters, which come last in it.
+
+        Raises:
+            NativeError: There is no compiler, or it refused the source.
+        """
+        struct = start.struct()
+        for step in self.steps:
+            step[START] = struct.ctypes.data
+        self._alive += [start, struct]
         row, stride = self._parameters.ctypes.data, self._stride
         return _read([(row + 8 * k, stride, 1 + MAX_DRAWN + k) for k in range(ROW_SIZE)], start)
 
@@ -114,49 +126,74 @@ class Tables:
         table = self._parameters
         return table.strides[0] // 8 if len(table) > 1 else 0
 
-    def _places(self, turn: int, inputs: Inputs, estimate: np.ndarray | None) -> np.ndarray:
+    def _places(self, turn: int, inputs: Inputs) -> np.ndarray:
         """The places of what the task's part reads in a step that fills a page."""
         motions, page, other = self._engine.motions, self.pages[turn], self.pages[1 - turn]
-        motion, columns, parts = motions.shape[-1], self.columns, self._program.parts
+        columns, parts, wind = self.columns, self._program.parts, self._engine.wind
+        observer = self._program.written.observer
+        given = [*observer.given.values()] if observer else []
         tables: dict[str, tuple[np.ndarray, int, int]] = {  # strides between rows and numbers
-            "last_motion": (motions[1 - turn], motion, 1),
+            "last_motion": (motions[1 - turn], motions.shape[-1], 1),
             "action": (inputs.action, inputs.action.shape[1], 1),
             "command": (inputs.command, inputs.command.shape[1], 1),
             "was": (other.whole, 1, columns),
-            "last_sensed": (other.sensed, 1, columns),
-            "sensed": (page.sensed, 1, columns),
-            "estimate": (motions[turn] if estimate is None else estimate, motion, 1),
+            "last_world": (other.world, 1, columns),
+            "world": (page.world, 1, columns),
             "parameters": (self._parameters, self._stride, 1),
+            "wind": (wind, wind.strides[0] // 8, 1),
         }
-        number, places = motion + 1, list[Place]()
+        number, places = self._first, list[Place]()
         for name, count in parts.items():
-            array, across, along = tables[name]
-            first = array.ctypes.data
-            places += [(first + 8 * k * along, across, number + k) for k in range(count)]
-            number += count
+            arrays = [(*tables[name], count)] if name in tables else []
+            arrays = arrays or [(a, a.shape[1], 1, a.shape[1]) for a in given]
+            for array, across, along, width in arrays:
+                first = array.ctypes.data
+                places += [(first + 8 * k * along, across, number + k) for k in range(width)]
+                number += width
         return _read(places, self._program.function)
 
-    def _read_of_sensed(self) -> list[tuple[int, np.ndarray]]:
-        """Where each array begins in the tables of what is sensed, and which places are read."""
-        first, found = self._engine.motions.shape[-1] + 1, set[int]()
+    @property
+    def _first(self) -> int:
+        """Which number of the task's part is the first one that has a place."""
+        return self._engine.motions.shape[-1] + 1 + sum(self._program.sensed.values())
+
+    def _read_of_world(self) -> list[tuple[int, np.ndarray]]:
+        """Where each array of the world begins in its table, and which places are read."""
+        first, found = self._first, set[int]()
         for name, count in self._program.parts.items():
-            if name in ("sensed", "last_sensed"):
+            if name in ("world", "last_world"):
                 read = (k - first for k in self._program.function.places)
                 found |= {k for k in read if 0 <= k < count}
             first += count
-        numbers = np.arange(self._program.sensed.end)[:, None]
-        places = [array.ravel().tolist() for array in self._program.sensed.views(numbers)]
-        return [(own[0], np.array([k for k in own if k in found], int)) for own in places]
+        numbers = np.arange(self._program.world.end)[:, None]
+        places = [array.ravel().tolist() for array in self._program.world.views(numbers)]
+        read = ([k for k in own if k in found] for own in places)
+        firsts = (own[0] if own else 0 for own in places)
+        return [(k, np.array(own, int)) for k, own in zip(firsts, read, strict=True)]
 
-    def take(self, sensed: Mapping[str, Array], world: World | None, page: Page) -> None:
-        """Write what the task's part reads of sensors and solids into a page.
+    def take(self, world: World, page: Page) -> None:
+        """Write what the task's part reads of solids into a page.
 
         Only that is copied: of a hundred solids a task may look at one.
         """
-        given = self._program.sources(sensed, world)
-        for array, (first, places) in zip(given, self._wanted, strict=True):
+        for array, (first, places) in zip(records.leaves(world), self._wanted, strict=True):
             if places.size:
-                page.sensed[places] = array.reshape(self.count, -1)[:, places - first].T
+                numbers = array.reshape(self.count, -1)[:, places - first]
+                page.world[places, : self.count] = numbers.T
+
+
+def _senses(program: Program, engine: Engine) -> list[np.ndarray]:
+    """What sensors are given, as `Senses` of native/free_flight.c; then arrays that it points to.
+
+    Empty where nobody observes.
+    """
+    if not (observer := program.written.observer):
+        return []
+    source = program.written.randomizer
+    draws = np.array([*observer.senses.draws.values()], np.int64).reshape(-1, 2)
+    ages = source.ages if len(source.past) else None
+    given = *source.place, source.steps, ages, draws
+    return [native.struct(*given, len(draws), engine.num_envs), draws]
 
 
 def _read(places: list[Place], function: RowFunction) -> np.ndarray:

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import mujoco
 
@@ -38,6 +39,11 @@ from quadrl.core.solved import TURNING as TURNING
 from quadrl.core.solved import Target
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
+
+
+def camel(name: str) -> str:
+    """The name of a task as classes and Gymnasium's ids have it: MyTask of my_task."""
+    return "".join(word.capitalize() for word in name.split("_"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,8 +128,7 @@ class Task(abc.ABC):
     @classmethod
     def gymnasium_id(cls) -> str:
         """Its id in Gymnasium: quadrl/<CamelCase>-vN."""
-        camel = "".join(word.capitalize() for word in cls.name.split("_"))
-        return f"quadrl/{camel}-v{cls.version}"
+        return f"quadrl/{camel(cls.name)}-v{cls.version}"
 
     def __post_init__(self) -> None:
         """Validate options."""
@@ -145,6 +150,11 @@ class Task(abc.ABC):
     def asks_compiled(self) -> bool:
         """Whether its class asks for its step to be compiled, and not only a base of it."""
         return vars(type(self)).get("compiled", False)
+
+    @property
+    def parts(self) -> tuple[Task, ...]:
+        """The tasks that its episodes are of: itself."""
+        return (self,)
 
     def check(self, parameters: Parameters) -> None:
         """Refuse an aircraft that cannot do what is asked, from its parameters (1, ...).
@@ -201,6 +211,11 @@ class Task(abc.ABC):
         """How far the task is from being done, (N,) [m]."""
         return now.potentials.distance
 
+    @property
+    def asked(self) -> tuple[Target, ...]:
+        """The targets that the task asks for with its options."""
+        return self.targets
+
     def measure(self, now: Snapshot) -> Potentials:
         """The distances that the reward is made of; `now` has no potentials yet."""
         state, target_velocity = now.state, self.target_velocity(now)
@@ -241,8 +256,12 @@ class Task(abc.ABC):
         return rewards.weighted(self, terms, before, now)
 
     @abc.abstractmethod
-    def terminated(self, now: Snapshot) -> Array:
-        """Whether the episode is over before its time, (N,) bool."""
+    def terminated(self, now: Snapshot) -> dict[str, Array] | Array:
+        """Whether the episode is over before its time, (N,) bool by the name of each such end.
+
+        Trainings and evaluations say how often each was the first that held. One array, without a
+        name, will do, too.
+        """
 
     @abc.abstractmethod
     def succeeded(self, now: Snapshot, end: EpisodeEnd) -> Array:
@@ -340,3 +359,14 @@ class Task(abc.ABC):
 def heads_east(now: Snapshot, tolerance: float) -> Array:
     """Whether the heading is at most `tolerance` [rad] off east, (N,) bool."""
     return now.state.cos_attitude[..., 2] >= math.cos(min(tolerance, math.pi))
+
+
+def ends_of(task: Task, now: Snapshot) -> dict[str, Array]:
+    """What ends the episodes of a task before their time, (N,) bool by name."""
+    found = task.terminated(now)
+    return cast(dict[str, Array], found) if isinstance(found, dict) else {"terminated": found}
+
+
+def either(flags: Mapping[str, Array]) -> Array:
+    """Whether any of some named flags holds, (N,) bool."""
+    return functools.reduce(lambda one, other: one | other, flags.values())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 from quadrl.aircraft.parameters import Parameters
@@ -11,10 +10,13 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace
 from quadrl.conditions.world import World
 from quadrl.core.rewards import total
-from quadrl.core.task import EpisodeEnd, Snapshot, Task
+from quadrl.core.senses import Look
+from quadrl.core.task import EpisodeEnd, Snapshot, Task, either, ends_of
 from quadrl.engines.state import State
 
 Observation = dict[str, Array]
+TIME_LIMIT = "time_limit"
+"""What the clock's end is called, beside the ends that tasks name."""
 OFF = 0.05
 """Share of a time limit by which whole control steps may differ from it."""
 
@@ -74,6 +76,8 @@ class Transition:
     """The sum of the terms."""
     reward_terms: dict[str, Array]
     """Named terms of the reward."""
+    ends: dict[str, Array]
+    """bool: what ends an episode before its time, by the task's names."""
     terminated: Array
     """bool: over by failure, or by success where the task says so."""
     truncated: Array
@@ -89,6 +93,16 @@ class Transition:
     """The task's entries of the true state: the observation itself, unless that has errors, is late
     or has other entries."""
 
+    @property
+    def ended(self) -> dict[str, Array]:
+        """How the episodes that are over ended, (N,) bool by name: each in one way, the first."""
+        going, found = self.terminated | self.truncated, dict[str, Array]()
+        own = {"diverged": self.diverged, **self.ends, TIME_LIMIT: self.truncated}
+        for name, holds in own.items():
+            found[name] = going & holds
+            going = going & ~holds
+        return found
+
 
 def begin(
     task: Task,
@@ -97,8 +111,9 @@ def begin(
     parameters: Parameters,
     actions: int,
     world: World | None = None,
-) -> tuple[Snapshot, Episode]:
-    """The snapshot with which episodes begin.
+    look: Look | None = None,
+) -> tuple[Snapshot, Episode, Observation]:
+    """The snapshot with which episodes begin, and the first observation.
 
     Args:
         task: The task.
@@ -107,14 +122,16 @@ def begin(
         parameters: Parameters of the aircraft.
         actions: Numbers in an action.
         world: The world about the aircraft; None where the task declares no solids.
+        look: What sensors see of it; None where the true state is observed.
     """
     xp = namespace(state.speed)
     time, *none = (0.0 * state.speed for _ in range(4))
     action = xp.stack([time] * actions, axis=-1)
     given = task_state, parameters, action, state.rotor_speed + 0.0, time
-    now = Snapshot(state, *given, world=world)
+    estimate, sensed = look.sense() if look else (None, {})
+    now = Snapshot(state, *given, sensed=sensed, world=world)
     now.potentials = task.measure(now)
-    return now, Episode(*none)
+    return now, Episode(*none), _observed(task, now, estimate, look)[0]
 
 
 def finish(
@@ -126,9 +143,8 @@ def finish(
     action: Array,
     rotor_command: Array,
     diverged: Array,
-    estimate: State | None = None,
     world: World | None = None,
-    sensed: Mapping[str, Array] | None = None,
+    look: Look | None = None,
 ) -> tuple[Snapshot, Episode, Transition]:
     """The transition to a new state.
 
@@ -141,9 +157,8 @@ def finish(
         action: (N, k) that was taken.
         rotor_command: (N, R) [rad/s], mean over the control step.
         diverged: (N,) bool, where the simulation broke down.
-        estimate: The state that is observed; None for the true one, which all else looks at.
         world: The world about the aircraft; None where the task declares no solids.
-        sensed: What the sensors give now, (N, size) by name.
+        look: What sensors see of it; None where the true state is observed.
 
     Returns:
         The snapshot after it, how far the episodes are, and the transition.
@@ -152,9 +167,11 @@ def finish(
     steps = episode.steps + 1.0
     time = steps * clock.control_timestep
     given = before.task, before.parameters, action, rotor_command, time
-    now = Snapshot(state, *given, sensed=sensed or {}, world=world)
+    estimate, sensed = look.sense(rotor_command) if look else (None, {})
+    now = Snapshot(state, *given, sensed=sensed, world=world)
     now.potentials = task.measure(now)
-    terminated = task.terminated(now) | diverged
+    ends = ends_of(task, now)
+    terminated = either(ends) | diverged
     limit, settle_steps = clock.lengths(task, now)
     truncated = (steps >= limit) & ~terminated
     error = task.error(now)
@@ -168,11 +185,12 @@ def finish(
     if task_state is not now.task:  # a goal may have moved on
         now = dataclasses.replace(now, task=task_state)
         now.potentials = task.measure(now)
-    truth = task.observe(now)
+    observation, truth = _observed(task, now, estimate, look)
     transition = Transition(
-        observation=truth if estimate is None else observe(task, now, estimate),
+        observation=observation,
         reward=total(terms),
         reward_terms=terms,
+        ends=ends,
         terminated=terminated,
         truncated=truncated,
         is_success=end.succeeded,
@@ -183,8 +201,13 @@ def finish(
     return now, Episode(steps, error_sum, final_sum), transition
 
 
-def observe(task: Task, now: Snapshot, estimate: State) -> Observation:
-    """The task's observation of a moment, of another state than the true one."""
-    seen = dataclasses.replace(now, state=estimate)
-    seen.potentials = task.measure(seen)
-    return task.observe(seen)
+def _observed(
+    task: Task, now: Snapshot, estimate: State | None, look: Look | None
+) -> tuple[Observation, Observation]:
+    """What policies observe, and the task's entries of the true state."""
+    seen = truth = task.observe(now)
+    if estimate is not None:
+        guessed = dataclasses.replace(now, state=estimate)
+        guessed.potentials = task.measure(guessed)
+        seen = task.observe(guessed)
+    return look.observe(seen, truth) if look else seen, truth

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.presets import FILE, VEHICLES, resolve
 from quadrl.aircraft.rotors import Rotor
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
@@ -29,11 +30,16 @@ from quadrl.rendering.video import checked
 from quadrl.tasks import TASKS
 
 TARGETS = {
+    "c": ("h", "quadrl.deploy.c"),
+    "crazyflie": ("", "quadrl.deploy.crazyflie"),
+    "hub": ("", "quadrl.deploy.hub"),
     "mjcf": ("xml", "quadrl.deploy.mjcf"),
+    "px4": ("", "quadrl.deploy.px4"),
+    "raptor": ("tar", "quadrl.deploy.raptor"),
     "onnx": ("onnx", "quadrl.deploy.onnx"),
     "torch": ("pt2", "quadrl.evaluation.module"),
 }
-"""By name: the ending of its file, and the module that makes it."""
+"""By name: the ending of its file, empty for a folder, and the module that makes it."""
 
 
 def export(what: Any, to: str, out: str | Path | None = None) -> Path:
@@ -42,9 +48,11 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
     Args:
         what: A `Policy`, what `quadrl.train` returned, a run folder, a .safetensors file, or the
             name of a policy that comes with quadrl; for "mjcf" also a Vehicle, or its name.
-        to: "mjcf" for the aircraft as a model of MuJoCo, "onnx" or "torch" for the policy.
-        out: The file; one that exists is overwritten. By default, in this folder, NAME.xml of an
-            aircraft, NAME.onnx or .pt2 of a policy; where that exists, NAME-2.xml and so on.
+        to: "mjcf" for the aircraft as a model of MuJoCo; "onnx", "torch", "c", "crazyflie",
+            "px4", "raptor" or "hub" for the policy.
+        out: The file, or the folder of "crazyflie", "px4" or "hub"; one that exists is overwritten.
+            By default, in this folder, NAME.xml of an aircraft, NAME.onnx, .pt2, .h or .tar of a
+            policy, or NAME_crazyflie; where that exists, NAME-2.xml and so on.
 
     Returns:
         The path of the file.
@@ -67,8 +75,18 @@ def export(what: Any, to: str, out: str | Path | None = None) -> Path:
         raise QuadrlError(reason, name="to", value=to, allowed=f"mjcf for {found.name}")
     with needed("quadrl.export"):
         module = importlib.import_module(name)
+    if not ending:
+        return _folder(Path(out or free_name(Path(f"{stem}_{to}"))), module.files(*given))
     path, _ = checked(out or free_name(Path(f"{stem}.{ending}")), (ending,))
     write_whole(path, module.content(*given))
+    return path
+
+
+def _folder(path: Path, files: Mapping[str, bytes]) -> Path:
+    """Write files into a folder, by their paths in it."""
+    for name, content in files.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path / name, content)
     return path
 
 
@@ -80,8 +98,8 @@ def _found(what: Any) -> Vehicle | Policy:
     """
     if isinstance(what, Vehicle):
         return what
-    if isinstance(what, str) and what in VEHICLES:
-        return VEHICLES[what]
+    if isinstance(what, str) and (what in VEHICLES or what.endswith(FILE)):
+        return resolve(what)
     found = getattr(what, "policy", what)  # of what `quadrl.train` returned
     if isinstance(found, str) and not (comes_with_quadrl(found) or Path(found).exists()):
         known = *VEHICLES, *TASKS, *(file.stem for file in shipped())
@@ -116,7 +134,7 @@ def described(policy: Policy) -> dict[str, str]:
         dataclasses.asdict(term) | dict(zip(names, numbers, strict=True))
         for term, numbers in zip(mode.terms, reach, strict=True)
     ]
-    sensors = environment.observer.sensors if environment.observer else []
+    sensors = environment.observer.senses.sensors if environment.observer else []
     whole = {
         "scenario": scenario.to_json(),
         "observation": describe_observation(environment),

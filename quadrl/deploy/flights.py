@@ -22,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ from quadrl.control.geometric import GeometricController
 from quadrl.control.reading import Reading
 from quadrl.core.environment import Environment
 from quadrl.core.program import Draws
+from quadrl.core.senses import Look
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.transition import Clock, Episode, Observation, Transition, begin, finish
 from quadrl.engines.state import FIRST, State
@@ -123,10 +124,11 @@ class _Memory:
     def aim(self, now: Snapshot, seen: Observation, *, begins: bool) -> dict[str, Any]:
         """What the sensor "aim" remembers and gives with an observation."""
         state, sensor = now.state, Aim()
-        nothing: Any = None  # of a batch
-        given = state.rotor_speed, self.read("wind", 3), now.action, now.parameters
-        moment = Moment(state, state, *given, nothing, nothing, nothing, estimated=seen)
-        moment.memory = {"sum": self.read("aim_sum", 3)}
+        # Of all that sensors may read, this one reads these.
+        given = {"state": state, "wind": self.read("wind", 3), "parameters": now.parameters}
+        given |= {"estimated": seen, "memory": {"sum": self.read("aim_sum", 3)}}
+        rest: Any = dict.fromkeys(field.name for field in dataclasses.fields(Moment))
+        moment = Moment(**rest | given)
         moment.memory = sensor.begin(moment) if begins else sensor.update(moment)
         return {"aim_sum": moment.memory["sum"], "aim": sensor.sense(moment)}
 
@@ -137,6 +139,19 @@ class _Memory:
         placed = [records.filled(record, places) for record in like]
         found = [records.mapped(lambda numbers: self.read("kept", numbers), one) for one in placed]
         return [*found, self.read("kept", np.array([columns.end]))]
+
+
+class _Modelled(Look):
+    """A look at a state that is estimated already."""
+
+    def __init__(self, estimate: State) -> None:
+        self._estimate = estimate
+
+    def sense(self, command: Array | None = None) -> tuple[State, dict[str, Array]]:
+        return self._estimate, {}
+
+    def observe(self, entries: Mapping[str, Array], truth: Mapping[str, Array]) -> Observation:
+        return {**entries}
 
 
 def write(environment: Environment) -> tuple[str, int]:
@@ -186,7 +201,7 @@ def write(environment: Environment) -> tuple[str, int]:
     memory = _Memory(environment)
     parameters, state = memory.parameters(), memory.estimate()
     remembered, _ = memory.kept(task_state)
-    now, episode = begin(task, state, remembered, parameters, environment.action_size)
+    now, episode, _ = begin(task, state, remembered, parameters, environment.action_size)
     emit("first", memory, **given(now, episode))
 
     memory = _Memory(environment)
@@ -196,7 +211,7 @@ def write(environment: Environment) -> tuple[str, int]:
     action, command = memory.read("action", rotors), memory.read("ctrl", rotors)
     flag = np.array([f"m[{LAYOUT['diverged']}] != 0"], object)
     diverged = memory.trace.inputs(flag, is_flag=True)
-    taken = action, command, diverged, memory.estimate()
+    taken = action, command, diverged, None, _Modelled(memory.estimate())
     emit("step", memory, **given(*finish(task, clock, episode, before, state, *taken)))
 
     memory = _Memory(environment)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import checker, helper, numpy_helper, parser
 
+from quadrl.evaluation.memory import PREFIX
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import CLIP
 
@@ -17,8 +18,11 @@ SEEN = """
   from_mean = Sub (observation, mean)
   normalised = Div (from_mean, deviation)
   seen = Clip (normalised, nearest, farthest)"""
+FIRST = """
+  sum_first = Gemm <transB = 1> (seen, first_weight, first_bias)
+  first = Relu (sum_first)"""
 MEMORY = """
-  new = Gemm <transB = 1> (seen, input_weight, input_bias)
+  new = Gemm <transB = 1> ({below}, input_weight, input_bias)
   old = Gemm <transB = 1> (state, state_weight, state_bias)
   new_reset, new_update, new_candidate = Split <axis = 1> (new)
   old_reset, old_update, old_candidate = Split <axis = 1> (old)
@@ -31,7 +35,8 @@ MEMORY = """
   candidate = Tanh (both_candidate)
   change = Sub (state, candidate)
   part = Mul (update, change)
-  next_state = Add (candidate, part)
+  next_state = Add (candidate, part)"""
+BESIDE = """
   remembered = Concat <axis = 1> (seen, next_state)"""
 LAYER = """
   sum_{k} = Gemm <transB = 1> ({below}, weight_{k}, bias_{k})"""
@@ -57,10 +62,13 @@ def content(policy: Policy, metadata: Mapping[str, str]) -> bytes:
     arrays |= {name: np.array(bound, np.float32) for name, bound in bounds.items()}
     inputs, outputs = {"observation": policy.size}, {"action": policy.action_size}
     nodes, below = SEEN, "seen"
-    if policy.memory:
+    if unit := policy.memory:
         inputs["state"] = outputs["next_state"] = policy.state_size
-        nodes, below = nodes + MEMORY, "remembered"
-        arrays |= vars(policy.memory)
+        if unit.alone:
+            nodes, below = nodes + FIRST + MEMORY.format(below="first"), "next_state"
+        else:
+            nodes, below = nodes + MEMORY.format(below="seen") + BESIDE, "remembered"
+        arrays |= {name.removeprefix(PREFIX): array for name, array in unit.arrays().items()}
     for k, (weight, bias) in enumerate(policy.mean_layers):
         nodes += BETWEEN.format(k=k - 1) * (k > 0) + LAYER.format(k=k, below=below)
         arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}

@@ -26,7 +26,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
 from quadrl.base.philox import START
 from quadrl.base.primitives import Primitive
-from quadrl.conditions.sensors import Aim, Disturbance
+from quadrl.conditions.sensors import Aim, Disturbance, Standard
 from quadrl.core.environment import Environment
 from quadrl.core.markers import Marker
 from quadrl.core.task import Task
@@ -98,8 +98,7 @@ def make_book() -> tuple[dict[str, Any], str]:
             sources.append(source)
             pairs[f"{task.name}_{vehicle.name}"] = {
                 "drawn": drawn,
-                "size": environment.size,
-                "besideAim": [beside_aim(environment, Aim(beside_goal=x)) for x in (False, True)],
+                "layout": {k: [part.start, part.stop] for k, part in environment.layout.items()},
                 "origin": environment.origin.tolist(),
                 # JSON knows no infinity, which is where the floor of these tasks is.
                 "world": np.nan_to_num(about).tolist(),
@@ -118,6 +117,11 @@ def make_book() -> tuple[dict[str, Any], str]:
         "massPlace": int(parameters.PLACES["mass"][0]),
         "gustTime": GUST_TIME,
         "smoothing": Disturbance.smoothing,
+        "hides": {
+            "aim": [Aim(beside_goal=beside).hides for beside in (False, True)],
+            "standard": [Standard().hides],
+        },
+        "standard": Standard.tasks,
         "policy": {"format": FORMAT, "header": HEADER, "clip": CLIP},
         "tasks": {
             name: {
@@ -132,7 +136,9 @@ def make_book() -> tuple[dict[str, Any], str]:
         "policies": {
             file.stem: {"task": policy.task, "file": _encoded(file.read_bytes())}
             for file in shipped()
-            if (policy := Policy.load(file)).task in tasks
+            # None with a memory, which the page has not.
+            if not (policy := Policy.load(file)).memory
+            and any(part.name in tasks for part in policy.scenario.task.parts)
         },
     }
     return book, "\n".join(sources)
@@ -146,12 +152,6 @@ def surroundings(task: Task) -> dict[str, Any]:
     stands = (one.moved(environment.origin) for one in asked if isinstance(one, Primitive))
     world = drawing.world(mjcf.compile_model(FLYING["paper"], scene=task.scene))
     return shapes([*world, *stands])
-
-
-def beside_aim(environment: Environment, aim: Aim) -> list[int]:
-    """Places of the numbers of an observation that stay visible beside the sensor `aim`."""
-    shown = (part for name, part in environment.layout.items() if name not in aim.hides)
-    return [place for part in shown for place in range(part.start, part.stop)]
 
 
 def describe(vehicle: Vehicle) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from quadrl.aircraft.aerodynamics import GROUND_EFFECT, ROTOR_EFFECTS, STILL_AIR
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.control.autopilot import Reversed
-from quadrl.control.modes import CONTROL_MODES
+from quadrl.control.modes import modes_of
 from quadrl.core.environment import Environment
 from quadrl.engines import adjoint
 from quadrl.engines.native import compiling
@@ -53,8 +53,9 @@ def steps(tasks: Iterable[str]) -> list[str]:
     routes = [{"waypoints": [[1.0, 1.0, 0.5]] * count} for count in many]
     with compiling.noted() as found, warnings.catch_warnings():
         warnings.simplefilter("ignore", QuadrlWarning)
-        for task, vehicle, mode, randomization, weight in itertools.product(
-            tasks, ROTORS.values(), CONTROL_MODES, ("none", "full"), (0.0, 0.1)
+        flown = [(name, mode) for name in ROTORS.values() for mode in modes_of(VEHICLES[name])]
+        for task, (vehicle, mode), randomization, weight in itertools.product(
+            tasks, flown, ("none", "full"), (0.0, 0.1)
         ):
             for options in routes if task == "static_waypoint" else [{}]:
                 environment = Environment(

@@ -85,16 +85,16 @@ def compile_model(
     passive callback overwrites.
 
     Raises:
-        NativeError: The callbacks cannot be built or installed.
+        NativeError: The callbacks cannot be built or installed, or one of other code fails here.
     """
     native.install()
     whole = spec(vehicle, contact=contact, drawn=drawn, scene=scene)
     if drawn:
         whole.body("aircraft").gravcomp = 1.0  # else MuJoCo does not compute it
-        model = whole.compile()
+        model = _compiled(whole)
         model.body_gravcomp[model.body("aircraft").id] = math.nan
         return model
-    model = whole.compile()
+    model = _compiled(whole)
     disable = mujoco.mjtDisableBit
     contact |= _has_solids(whole)
     # No automatic reset: a simulation that diverged must not look like a fresh one.
@@ -103,6 +103,14 @@ def compile_model(
         unused |= disable.mjDSBL_CONSTRAINT | disable.mjDSBL_CONTACT
     model.opt.disableflags |= int(unused)
     return model
+
+
+def _compiled(whole: mujoco.MjSpec) -> mujoco.MjModel:
+    try:
+        return whole.compile()
+    except ValueError:
+        native.check_installed()  # Python's callbacks of other code fail while a model is compiled
+        raise
 
 
 def _has_solids(whole: mujoco.MjSpec) -> bool:

@@ -23,6 +23,23 @@ from quadrl.base.trace import Trace, symbolic, symbols
 from quadrl.engines import native
 from quadrl.engines.native import compiling
 
+FUNCTION = """
+static inline __attribute__((always_inline)) void {name}_one(
+    const double* restrict c, const Lanes* restrict x, Lanes* restrict y, int i) {{
+    {body}
+}}
+
+// One row needs no vectors, and sines of one row only.
+{linkage} VECTORISED void {name}(const double* constants, const Lanes* restrict x,
+                                 Lanes* restrict y, int rows) {{
+  {constants}
+  if (rows == 1) {{
+    {name}_one(c, x, y, 0);
+  }} else {{
+    for (int i = 0; i < LANES; ++i) {name}_one(c, x, y, i);
+  }}
+}}
+"""
 SOURCE = """#include <math.h>
 #include <stdint.h>
 #include <string.h>
@@ -35,23 +52,7 @@ typedef struct {{
   double* at;
   int64_t stride, width;
 }} Rows;
-
-static inline __attribute__((always_inline)) void compute_one(
-    const double* restrict c, const Lanes* restrict x, Lanes* restrict y, int i) {{
-    {body}
-}}
-
-// One row needs no vectors, and sines of one row only.
-QUADRL_EXPORT VECTORISED void compute(const double* constants, const Lanes* restrict x,
-                                      Lanes* restrict y, int rows) {{
-  {constants}
-  if (rows == 1) {{
-    compute_one(c, x, y, 0);
-  }} else {{
-    for (int i = 0; i < LANES; ++i) compute_one(c, x, y, i);
-  }}
-}}
-
+{function}
 // Computes n rows, those of a list or the first ones.
 QUADRL_EXPORT void run(const double* constants, const Rows* in, const Rows* out, int64_t n,
                        const int64_t* ids) {{
@@ -79,6 +80,7 @@ QUADRL_EXPORT void run(const double* constants, const Rows* in, const Rows* out,
   }}
 }}
 """
+WITHOUT_HEX = {"inf": "INFINITY", "-inf": "-INFINITY", "nan": "NAN"}
 COPIED = 512
 """Most constants that a function copies, so that it may read them on either side of a choice."""
 
@@ -112,6 +114,8 @@ class RowFunction:
         ends = np.cumsum([0, *widths])
         with symbolic():
             result = function(*(whole[:, a:b] for a, b in zip(ends, ends[1:], strict=False)))[0]
+        self.trace, self.result = trace, result
+        """The recorded operations, and the symbols or numbers (j,) that they give."""
         self.width = len(result)
         """Numbers j in a row of its result."""
         body = trace.body({f"y[{k}][i]": value for k, value in enumerate(result)})
@@ -119,17 +123,31 @@ class RowFunction:
         kept = range(taken) if fixed is None else sorted(read.union(range(fixed)))
         self.places = {number: place for place, number in enumerate(kept)}
         """Where the C takes each of the numbers."""
-        body = re.sub(r"\bx\[(\d+)\]", lambda found: f"x[{self.places[int(found[1])]}]", body)
+        self.body = re.sub(r"\bx\[(\d+)\]", lambda found: f"x[{self.places[int(found[1])]}]", body)
+        """C of its operations, from x[k][i] to y[k][i], with its constants in c."""
         self.taken = len(self.places)
         """How many numbers the C takes."""
-        export = (Path(compiling.__file__).parent / "export.h").read_text()
         self.constants = np.array([*trace.constants, 0.0])
         count, kept = len(self.constants), "const double* c = constants;"
         if count <= COPIED:
             kept = f"double c[{count}];\n  memcpy(c, constants, sizeof c);"
-        sizes = {"taken": self.taken, "given": self.width, "constants": kept}
-        self.source = SOURCE.format(export=export, body=body, **sizes)
+        export = (Path(compiling.__file__).parent / "export.h").read_text()
+        whole = self._function("compute", "QUADRL_EXPORT", kept)
+        sizes = {"taken": self.taken, "given": self.width}
+        self.source = SOURCE.format(export=export, function=whole, **sizes)
         """Its C, without the constants."""
+
+    def _function(self, name: str, linkage: str, constants: str) -> str:
+        names = {"name": name, "linkage": linkage, "constants": constants}
+        return FUNCTION.format(body=self.body, **names)
+
+    def text(self, name: str) -> str:
+        """Its C as the function of a name, with the constants, for LANES rows."""
+        constants: list[float] = self.constants.tolist()
+        numbers = ", ".join(k.hex() if math.isfinite(k) else WITHOUT_HEX[str(k)] for k in constants)
+        known = f"static const double {name}_constants[] = {{{numbers}}};"
+        given = f"(void)constants;\n  const double* c = {name}_constants;"
+        return known + self._function(name, "static", given)
 
     def load(self) -> Any:
         """The C function, compiled unless it is in the cache.

@@ -65,7 +65,7 @@ class Solids:
             threads: Threads for the measurement of clearances.
         """
         self.geoms, self._origin, self._field = geoms_of_solids(model), origin, field
-        self._threads, self._kernel = threads, native.library().quadrl_clearance
+        self.threads, self._kernel = threads, native.library().quadrl_clearance
         self._outline, self._middles = _outline(model), _middles(model)
         _, which, *offset = model.geom_user[self.geoms].T[:5] if len(self.geoms) else [[]] * 5
         self._first = np.unique(which, return_index=True)[1]  # geom of each solid, (S,)
@@ -192,7 +192,7 @@ class Solids:
             where = native.struct(*arrays, qpos.strides[0] // 8, len(self.geoms), len(balls))
             measure, about, into = self._kernel, where.ctypes.data, out.ctypes.data
             if rows is None:
-                self._threads.call(lambda first, end: measure(about, first, end, None, into))
+                self.threads.call(lambda first, end: measure(about, first, end, None, into))
             else:
                 measure(about, 0, len(rows), rows.ctypes.data, into)
         return out

@@ -12,7 +12,7 @@ from typing import Any
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.extras import needed
-from quadrl.base.files import check_texts, csv_content, write_whole
+from quadrl.base.files import another_format, check_texts, csv_content, write_whole
 from quadrl.base.media import Media
 from quadrl.base.units import quantity
 from quadrl.evaluation.cache import ResultCache
@@ -167,7 +167,7 @@ class Card:
         except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise QuadrlError(f"{file} holds no robustness card: {error}") from error
         if written != FORMAT:
-            raise QuadrlError(name=f"format of {file}", value=written, allowed=FORMAT)
+            raise another_format(file, written, FORMAT)
         return cls(found)
 
     def _picture(self, name: str) -> Media:

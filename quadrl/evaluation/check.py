@@ -170,6 +170,7 @@ def _steps(vehicle: Vehicle, sampler: AircraftSampler, control_mode: str) -> Ite
     given = sampler.randomization
     seen = 0.0 if looped else max(given.observation_delay[1], given.rate_delay[1])
     late = vehicle.dead_time + given.command_delay[1] + seen
+    late += control * (given.command_jitter[1] > 0)
     held = held_command(vehicle, control_mode)
     lag = float(1 / rates.min())
     slow = f"over the lag of the rotors: control_timestep={lag:.2g} or less"

@@ -17,6 +17,7 @@ from quadrl.base.units import length, percent, quantity
 from quadrl.base.validation import number
 from quadrl.control import CONTROLLERS
 from quadrl.control.feasibility import warn_of_unreached
+from quadrl.control.modes import kind
 from quadrl.core.catalogue import make
 from quadrl.core.scenario import UNDISTURBED, Conditions, Scenario
 from quadrl.core.snapshot import Rollout
@@ -86,9 +87,11 @@ class Evaluation:
         return dataclasses.replace(flight, scenario=self.scenario.to_json())
 
     def yardstick(self) -> Evaluation:
-        """The geometric controller in the same episodes; it commands rotors."""
-        seen = self.scenario.observe.for_controller()
-        other = dataclasses.replace(self.scenario, control_mode="rotor", observe=seen)
+        """The geometric controller in the same episodes; it commands rotors, as far as the mode."""
+        flown = self.scenario
+        vehicle = kind(flown.control_mode).reach(flown.vehicle)
+        rotors: Any = {"control_mode": "rotor", "observe": flown.observe.for_controller()}
+        other = dataclasses.replace(flown, vehicle=vehicle, **rotors)
         return evaluate("geometric", other, episodes=self.metrics["episodes"], seed=self.seed)
 
     def save_csv(self, path: str | Path) -> Path:

@@ -15,21 +15,31 @@ PREFIX = "memory_"
 class GRU:
     """A gated recurrent unit (Cho et al. 2014), with the equations of `torch.nn.GRUCell`.
 
-    Rows of the weights: of the reset gate, then of the update gate, then of the candidate.
+    Rows of the weights: of the reset gate, then of the update gate, then of the candidate. With a
+    layer before it, the actions follow from its state alone: the network of PX4's mc_raptor.
     """
 
     input_weight: np.ndarray  # (3 width, size)
     state_weight: np.ndarray  # (3 width, width)
     input_bias: np.ndarray  # (3 width,)
     state_bias: np.ndarray  # (3 width,)
+    first_weight: np.ndarray | None = None  # (size, observation), rectified linear neurons before
+    first_bias: np.ndarray | None = None  # (size,)
 
     @property
     def width(self) -> int:
         """Numbers in a state."""
         return self.state_bias.size // 3
 
+    @property
+    def alone(self) -> bool:
+        """Whether what follows reads the state alone, without the observation beside it."""
+        return self.first_weight is not None
+
     def step(self, inputs: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """The next state (..., width), from inputs (..., size) and the present one."""
+        """The next state (..., width), from the observation and the present one."""
+        if self.first_weight is not None:
+            inputs = np.maximum(inputs @ self.first_weight.T + self.first_bias, 0.0)
         seen = np.split(inputs @ self.input_weight.T + self.input_bias, 3, axis=-1)
         kept = np.split(state @ self.state_weight.T + self.state_bias, 3, axis=-1)
         reset, update = (_sigmoid(a + b) for a, b in zip(seen[:2], kept[:2], strict=True))
@@ -38,12 +48,15 @@ class GRU:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays by their names in a file."""
-        return {PREFIX + name: array for name, array in vars(self).items()}
+        return {PREFIX + name: array for name, array in vars(self).items() if array is not None}
 
     def fits(self, size: int) -> bool:
-        """Whether the arrays are those of one unit with some numbers in an input."""
-        rows, width = 3 * self.width, self.width
-        shapes = [(rows, size), (rows, width), (rows,), (rows,)]
+        """Whether the arrays are those of one unit with some numbers in an observation."""
+        rows, width, first = 3 * self.width, self.width, list[tuple[int, ...]]()
+        if self.first_bias is not None:
+            first = [(self.first_bias.size, size), self.first_bias.shape]
+            size = self.first_bias.size
+        shapes = [(rows, size), (rows, width), (rows,), (rows,), *first]
         return width > 0 and [array.shape for array in self.arrays().values()] == shapes
 
 

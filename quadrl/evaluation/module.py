@@ -24,11 +24,16 @@ class PolicyModule(nn.Module):
         super().__init__()
         self.register_buffer("mean", torch.tensor(policy.mean))
         self.register_buffer("deviation", torch.tensor(policy.deviation))
-        self.memory, layers = None, []
+        self.first, self.memory, layers = None, None, []
         # Without first weights, so that torch's random numbers stay where they are.
         if unit := policy.memory:
-            self.memory = nn.utils.skip_init(nn.GRUCell, policy.size, policy.state_size)
-            _fill(self.memory, unit.arrays().values())
+            inputs = unit.input_weight.shape[1]
+            self.memory = nn.utils.skip_init(nn.GRUCell, inputs, policy.state_size)
+            own = [*unit.arrays().values()]
+            _fill(self.memory, own[:4])
+            if unit.alone:
+                self.first = nn.utils.skip_init(nn.Linear, policy.size, inputs)
+                _fill(self.first, own[4:])
         for weight, bias in policy.mean_layers:
             layer = nn.utils.skip_init(nn.Linear, *reversed(weight.shape))
             _fill(layer, (weight, bias))
@@ -47,6 +52,9 @@ class PolicyModule(nn.Module):
         seen = ((observation - self.mean) / self.deviation).clamp(-CLIP, CLIP)
         if self.memory is None:
             return self.network(seen).clamp(-1.0, 1.0)
+        if self.first is not None:
+            after = self.memory(self.first(seen).relu(), state)
+            return self.network(after).clamp(-1.0, 1.0), after
         after = self.memory(seen, state)
         return self.network(torch.cat([seen, after], -1)).clamp(-1.0, 1.0), after
 

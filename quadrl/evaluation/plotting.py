@@ -102,26 +102,39 @@ def head(figure: Figure, title: str) -> None:
 
 
 @styled
-def learning_curve(metrics: Metrics, title: str) -> Figure:
-    """Return, success and error over the steps of a run; figure 3 of the paper."""
+def learning_curve(metrics: Metrics, title: str, evaluated: Metrics | None = None) -> Figure:
+    """Return, success and error over the steps of a run; figure 3 of the paper.
+
+    The main line is the mean action, as it was evaluated along the training; beside it, or alone
+    where there was no evaluation, are the sampled actions of the training itself.
+    """
     figure = Figure(figsize=(8.0, 7.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)
-    steps, survived = metrics["steps"] / 1e3, metrics["survival"]
     for axis, (name, (label, colour)) in zip(axes, PANELS.items(), strict=True):
-        ended = np.isfinite(metrics[name])  # in some batches no episode ends
-        axis.plot(steps[ended], metrics[name][ended], color=colour, lw=2, label=name)
+        if evaluated is not None:
+            _curve(axis, metrics, name, color=colour, lw=1.0, alpha=0.4)
+            _curve(axis, evaluated, name, color=colour, lw=2, marker="o", ms=4, label=name)
+        else:
+            _curve(axis, metrics, name, color=colour, lw=2, label=name)
         axis.set_ylabel(label)
         axis.set_ylim(bottom=0 if name != "return" else None)
         tidy(axis)
-    ended = np.isfinite(survived)
-    axes[1].plot(steps[ended], survived[ended], color=GREY, lw=1.5, label="survival")
+    _curve(axes[1], evaluated or metrics, "survival", color=GREY, lw=1.5, label="survival")
     axes[1].set_ylim(-0.03, 1.03)
     axes[1].legend(frameon=False, loc="best")
-    axes[-1].set_xlabel("control steps [thousands], actions sampled from the policy")
-    top = axes[0].secondary_xaxis("top", functions=_steps_to_seconds(steps, metrics["seconds"]))
+    flown = "sampled actions" if evaluated is None else "mean action; thin: sampled actions"
+    axes[-1].set_xlabel(f"control steps [thousands], {flown}")
+    seconds = _steps_to_seconds(metrics["steps"] / 1e3, metrics["seconds"])
+    top = axes[0].secondary_xaxis("top", functions=seconds)
     top.set_xlabel("wall clock [s]")
     head(figure, title)
     return figure
+
+
+def _curve(axis: Any, metrics: Metrics, name: str, **style: Any) -> None:
+    """Draw a column over the steps; in some batches of a training no episode ends."""
+    ended = np.isfinite(metrics[name])
+    axis.plot(metrics["steps"][ended] / 1e3, metrics[name][ended], **style)
 
 
 def _steps_to_seconds(steps: np.ndarray, seconds: np.ndarray) -> tuple:
@@ -144,19 +157,23 @@ def learning_curves(
     Of each algorithm it shows the median over its runs, and the band from the worst to the best.
 
     Args:
-        groups: The metrics of the runs of each algorithm.
+        groups: The metrics of the runs of each algorithm, or their evaluations; any column but the
+            steps may be missing.
         title: Title of the figure.
         clocks: Names of CLOCKS, a row each.
 
     Raises:
         QuadrlError: No episode has ended in any of the runs.
     """
+    every = [*itertools.chain(*groups.values())]
+    clocks = [clock for clock in clocks if any(clock in run for run in every)]
     figure = Figure(figsize=(9.2, 0.6 + 2.6 * len(clocks)), layout="constrained")
     axes: Any = figure.subplots(len(clocks), len(OVER_RUNS), squeeze=False)
     spare = itertools.cycle(c for c in COLOURS if c not in ALGORITHM_COLOURS.values())
     for algo, runs in groups.items():
         colour = ALGORITHM_COLOURS.get(algo) or next(spare)
-        label = f"{algo.upper()}, {len(runs)} seed{'s' * (len(runs) > 1)}"
+        known = algo.partition(" ")[0] in ALGORITHM_COLOURS
+        label = f"{algo.upper() if known else algo}, {len(runs)} seed{'s' * (len(runs) > 1)}"
         for (clock, panel), axis in zip(
             itertools.product(clocks, OVER_RUNS), axes.flat, strict=True
         ):
@@ -172,9 +189,10 @@ def learning_curves(
             axis.set_xlim(left=0)
             if panel == "success":
                 axis.set_ylim(-0.03, 1.03)
-    if not axes[0, 0].lines:
+    if not (drawn := [axis for axis in axes.flat if axis.lines]):
         raise QuadrlError(f"nothing to plot yet for {title}: no episode has ended")
-    axes[0, 0].legend(frameon=False, loc="best")
+    most = max(drawn, key=lambda axis: len(axis.lines))
+    most.legend(frameon=False, loc="best")
     head(figure, title)
     return figure
 
@@ -187,7 +205,9 @@ def spread(runs: Sequence[Metrics], name: str, clock: str) -> tuple[np.ndarray, 
     """
     curves = []
     for run in runs:
-        ended = np.isfinite(run[name])
+        if not {name, clock} <= {*run}:
+            continue
+        ended = np.isfinite(run[name]) & np.isfinite(run[clock])
         if ended.any():
             curves.append((run[clock][ended], run[name][ended]))
     if not curves:

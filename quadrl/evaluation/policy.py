@@ -22,6 +22,9 @@ from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import read_sealed_json
 from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
+from quadrl.conditions.randomization import NONE
+from quadrl.conditions.randomization import resolve as resolve_randomization
+from quadrl.conditions.sampler import sizes_of
 from quadrl.control.modes import named
 from quadrl.core.record import import_again, warn_of_changes
 from quadrl.core.scenario import RECORDED, Scenario
@@ -94,10 +97,13 @@ class Policy:
 
         They are the aircraft, the control mode, the observation and the options of the task of its
         training: `gymnasium.make("quadrl/Hover-v0", **policy.keywords)`. The weather and the
-        randomization of its training are in `scenario`.
+        randomization of its training are in `scenario`. Those of a policy for several tasks make
+        each of these tasks, with its usual options.
         """
         own = self.scenario
         needed = {"vehicle": own.aircraft, "control_mode": own.control_mode, "observe": own.observe}
+        if own.task.parts != (own.task,):
+            return needed
         return needed | {x.name: getattr(own.task, x.name) for x in dataclasses.fields(own.task)}
 
     @property
@@ -217,18 +223,36 @@ class Policy:
         if (mode := environment.control_mode.name) != self.control_mode:
             allowed = f"{self.control_mode!r}, {as_trained}"
             raise QuadrlError(name="control_mode", value=mode, allowed=allowed)
-        rotors = self.control_mode == "rotor"
-        if rotors and not np.array_equal(trained.layout, vehicle.layout):
+        if not environment.control_mode.any_layout and not np.array_equal(
+            trained.layout, vehicle.layout
+        ):
             allowed = f"one with the rotor layout of {trained.name}, which the policy has learned"
             raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
-        if rotors and trained.action_scale != vehicle.action_scale:
+        if mode == "rotor" and trained.action_scale != vehicle.action_scale:
             reason = "make the environment with **policy.keywords, or its aircraft with that scale"
             scale, allowed = vehicle.action_scale, f"{trained.action_scale:g}, {as_trained}"
             raise QuadrlError(reason, name="action_scale", value=scale, allowed=allowed)
+        self._check_size(environment)
         if trained.control_timestep != (timestep := vehicle.control_timestep):
             said = f"control_timestep = {timestep:g}: the policy for {self.task} was trained with"
             warnings.warn(f"{said} {trained.control_timestep:g}", QuadrlWarning, stacklevel=4)
         warn_of_changes(self.conditions, environment.scenario, "policy", kept=False)
+
+    def _check_size(self, environment: Environment) -> None:
+        """Refuse an aircraft outside of the sizes that were drawn in its training.
+
+        Raises:
+            QuadrlError: The message has the size, and those of the training.
+        """
+        drawn = resolve_randomization(self.metadata.get("randomization")).sizes
+        if drawn == NONE.sizes or environment.randomization.sizes != NONE.sizes:
+            return
+        for name, size in sizes_of(environment.vehicle).items():
+            low, high = getattr(drawn, name)
+            if high and not low <= size <= high:
+                what = f"{name} of the vehicle {environment.vehicle.name}"
+                allowed = f"{low:g} to {high:g}, as in the training of the policy for {self.task}"
+                raise QuadrlError(name=what, value=round(size, 4), allowed=allowed)
 
     def _without_memory(self) -> np.ndarray:
         """The state of a policy that has none.
@@ -255,7 +279,7 @@ class Policy:
         hidden = np.clip((observation - self.mean) / self.deviation, -CLIP, CLIP)
         if self.memory:
             state = self.memory.step(hidden, state)
-            hidden = np.concatenate([hidden, state], axis=-1)
+            hidden = state if self.memory.alone else np.concatenate([hidden, state], axis=-1)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = np.tanh(hidden @ weight.T + bias)
         output = hidden @ self.weights[-1].T + self.biases[-1]
@@ -298,7 +322,8 @@ class Policy:
             task: The task that it was trained for, or the name of its file, such as hover_robust.
             algo: The algorithm that it was trained with: ppo, trpo, vpg (or gae, its alias) or apg;
                 by default that of the task's trainings.
-            variant: The variant of the training: ideal, or robust, for an uncertain aircraft.
+            variant: The variant of the training: ideal; robust, for an uncertain aircraft; raptor,
+                for PX4's module; any, for any quadrotor.
 
         Raises:
             QuadrlError: There is no such policy; the message lists those that there are.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,26 @@ LARGEST = 1e30
 PARTS = ("weight", "bias")
 
 
-def write(path: Path, policy: Any) -> None:
-    """Write the file of a policy, whole or not at all."""
+def arrays_of(policy: Any) -> dict[str, np.ndarray]:
+    """The arrays of a policy by their names in its file."""
     arrays = {"mean": policy.mean, "deviation": policy.deviation}
     for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         arrays |= {f"weight_{k}": weight, f"bias_{k}": bias}
     arrays |= policy.memory.arrays() if policy.memory else {}
-    arrays = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
+    return {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in arrays.items()}
+
+
+def parts_of(arrays: Mapping[str, np.ndarray], layers: int) -> dict[str, Any]:
+    """The fields of a policy that `arrays_of` took apart."""
+    weights, biases = (tuple(arrays[f"{p}_{k}"] for k in range(layers)) for p in PARTS)
+    own = {k.removeprefix(PREFIX): arrays[k] for k in NAMES if k in arrays}
+    parts = {"weights": weights, "biases": biases, "memory": GRU(**own) if own else None}
+    return parts | {name: arrays[name] for name in ("mean", "deviation")}
+
+
+def write(path: Path, policy: Any) -> None:
+    """Write the file of a policy, whole or not at all."""
+    arrays = arrays_of(policy)
     header = {"format": RECURRENT_FORMAT if policy.memory else FORMAT}
     header |= {"task": policy.task, "metadata": policy.metadata}
     write_safetensors(path, arrays, header, to_bytes)
@@ -64,14 +78,13 @@ def read(path: Path) -> dict[str, Any]:
     if not (isinstance(task, str) and isinstance(metadata, dict) and isinstance(options, dict)):
         raise QuadrlError(f"{file} does not say what its policy was trained for")
     own = NAMES if header["format"] == RECURRENT_FORMAT else ()
+    if not {*NAMES[4:]} & {*arrays}:  # a unit without a layer before it
+        own = own[:4]
     layers = max(1, (len(arrays) - len(own)) // 2 - 1)
     names = ("mean", "deviation", *(f"{p}_{k}" for k in range(layers) for p in PARTS), *own)
     if set(arrays) != set(names):
         raise QuadrlError(f"{file} is damaged: its arrays are {', '.join(sorted(arrays))}")
-    weights, biases = (tuple(arrays[f"{p}_{k}"] for k in range(layers)) for p in PARTS)
-    memory = GRU(**{k.removeprefix(PREFIX): arrays[k] for k in own}) if own else None
-    parts = {"weights": weights, "biases": biases, "memory": memory}
-    parts |= {name: arrays[name] for name in ("mean", "deviation")}
+    parts = parts_of(arrays, layers)
     if not _is_network(**parts):
         raise QuadrlError(f"{file} is damaged: its arrays do not make a policy network")
     return {**parts, "task": task, "metadata": metadata}
@@ -104,7 +117,7 @@ def _is_network(
     if memory:
         if not memory.fits(width):
             return False
-        width += memory.width
+        width = memory.width + width * (not memory.alone)
     for weight, bias in zip(weights, biases, strict=True):
         if bias.ndim != 1 or weight.shape != (bias.size, width):
             return False

@@ -78,6 +78,15 @@ def _delay(milliseconds: float) -> Randomization:
     return _exactly("command_delay", milliseconds / 1000)
 
 
+def _jitter(percent: float) -> Randomization:
+    return _exactly("command_jitter", percent / 100)
+
+
+def _outages(milliseconds: float) -> Randomization:
+    given: dict[str, Any] = {"command_loss": 1.0, "loss_time": milliseconds / 1000}
+    return Randomization(**given) if milliseconds else Randomization()
+
+
 def _weather(name: str) -> Callable[[float], Weather]:
     return lambda level: Weather(**{name: level})
 
@@ -96,6 +105,8 @@ MASSES = (0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2, 1.3)
 INERTIAS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
 LOSSES = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 15.0, 20.0)
 DELAYS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 70.0, 100.0)
+JITTERS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 75.0, 100.0)
+OUTAGES = (0.0, 100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 800.0)
 LAGS = (0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 NOISES = (0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0)
 PUSHES = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
@@ -113,6 +124,8 @@ DISTURBANCES = {
         Disturbance("lag", "rotor lag", SPECIFIED, LAGS, _factor("lag"), 1.0),
         Disturbance("noise", "noise of the estimate", "of 'full'", NOISES, _noise),
         Disturbance("pushes", "pushes, 0.5 per second", "m/s", PUSHES, _pushes),
+        Disturbance("jitter", "commands one step late", "%", JITTERS, _jitter),
+        Disturbance("outages", "outages, 1 per second", "ms", OUTAGES, _outages),
     )
 }
 """By name."""

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any, Unpack
 
 import numpy as np
 
 from quadrl.base import machine, records
-from quadrl.base.errors import QuadrlError
+from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.rotation import roll_pitch_yaw
 from quadrl.base.validation import action
+from quadrl.conditions.randomization import Sizes
 from quadrl.core.environment import Environment
 from quadrl.core.one_of import OneOf
 from quadrl.core.record import warn_of_changes
@@ -76,6 +78,8 @@ def fly(
     shape = episodes, environment.action_size
     length = np.zeros(episodes, dtype=int)
     ends = {name: np.zeros(episodes, bool) for name in ("terminated", "is_success", "diverged")}
+    terms = {name: np.zeros(episodes) for name in environment.term_names}
+    ended: dict[str, np.ndarray] = {}
     while alive.any():
         taken = np.clip(action(controller(observation), shape), -1.0, 1.0)
         now = environment.step(taken)
@@ -96,6 +100,10 @@ def fly(
         length += alive
         for name, flag in ends.items():
             flag |= alive & getattr(now, name)
+        for name, term in now.reward_terms.items():
+            terms[name] += np.where(alive, term, 0.0)
+        for name, holds in now.ended.items():
+            ended[name] = ended.get(name, False) | (alive & holds)
         alive &= ~(now.terminated | now.truncated)
     return Rollout(
         **_stacked(states),
@@ -103,6 +111,8 @@ def fly(
         remembered=_stacked(remembered),
         length=length,
         **ends,
+        ended=ended,
+        reward_terms=terms,
         markers=tuple(markers),
         events=tuple(events),
         origin=np.array(environment.origin),
@@ -134,6 +144,10 @@ def scenario_of(
             raise QuadrlError(name="task", value=None, allowed="given, for a function")
         scenario = Scenario.of(trained, task=task, **conditions)
         warn_of_changes(trained, scenario, "policy")
+    asked = conditions.get("vehicle") and not conditions.get("randomization")
+    if asked and scenario.randomization.sizes != Sizes():
+        said = f"the training draws sizes in place of those of the vehicle {scenario.vehicle.name}"
+        warnings.warn(f"{said}; with randomization none that one flies", QuadrlWarning, 2)
     if own not in (None, mode := scenario.control_mode):
         allowed = f"{own!r}, the mode of this policy or controller"
         raise QuadrlError(name="control_mode", value=mode, allowed=allowed)
@@ -180,12 +194,10 @@ def flights(rollout: Rollout) -> dict[str, np.ndarray]:
         over the whole flight command_change_rate: mean change of a rotor's command from one control
         step to the next, as a share of its largest speed; saturated_rate: share of the entries of
         the actions that are -1 or 1; least_height_m: of the aircraft's centre above the ground [m];
-        return; length_s.
+        return; length_s; for each end of the task end_NAME, whether it ended so (bool), with
+        end_diverged and end_time_limit; for each term of the reward reward_NAME, its sum.
     """
-    steps = max(1, round(FINAL_STRETCH / rollout.control_timestep))
-    index = np.arange(len(rollout.error))[:, None]
-    flown = index < rollout.length
-    last = flown & (index >= rollout.length - steps)
+    flown, last = _while_flying(rollout.error, rollout.length, rollout.control_timestep)
     yaw = np.degrees(roll_pitch_yaw(rollout.quaternion[1:])[..., 2])
     heading = {"heading_error_deg": _means(np.abs(yaw), last)}
     relative = np.linalg.norm((rollout.velocity - rollout.target_velocity)[1:], axis=-1)
@@ -205,7 +217,22 @@ def flights(rollout: Rollout) -> dict[str, np.ndarray]:
         "least_height_m": np.where(flown, height, np.inf).min(0),
         "return": np.nansum(rollout.reward, 0),
         "length_s": rollout.length * rollout.control_timestep,
+        **{f"end_{name}": holds for name, holds in rollout.ended.items()},
+        **{f"reward_{name}": term for name, term in rollout.reward_terms.items()},
     }
+
+
+def final_error(error: np.ndarray, length: np.ndarray, control_timestep: float) -> np.ndarray:
+    """Mean error of each flight over its last 2 s, (N,) [m], from errors (T, N) and lengths."""
+    return _means(error, _while_flying(error, length, control_timestep)[1])
+
+
+def _while_flying(
+    values: np.ndarray, length: np.ndarray, control_timestep: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which of values (T, N) are of a flight, and which of its last 2 s; masks (T, N)."""
+    steps, index = max(1, round(FINAL_STRETCH / control_timestep)), np.arange(len(values))[:, None]
+    return index < length, (index < length) & (index >= length - steps)
 
 
 def means_of_behaviour(flown: dict[str, np.ndarray]) -> dict[str, float]:
@@ -225,8 +252,9 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
         episodes; success_rate and survival_rate (shares); position_error_m and
         position_error_std_m: mean and deviation over the flights [m]; where the heading matters
         heading_error_deg; `means_of_behaviour`; return_mean and return_std; length_mean_s; diverged
-        (count); the task's own metrics; and of each member of a `OneOf` the same, with its name in
-        front. `flights` says what each of them is of one flight.
+        (count); end_NAME_rate (share) and reward_NAME_mean; the task's own metrics; and of each
+        member of a `OneOf` the same, with its name in front. `flights` says what each of them is of
+        one flight.
     """
     flown, task, own = flights(rollout), rollout.task, dict[str, Any]()
     for name, part in task.flown(rollout).items() if isinstance(task, OneOf) else ():
@@ -244,6 +272,8 @@ def summarize(rollout: Rollout) -> dict[str, Any]:
         "return_std": float(flown["return"].std()),
         "length_mean_s": float(flown["length_s"].mean()),
         "diverged": int(flown["diverged"].sum()),
+        **{f"end_{name}_rate": float(holds.mean()) for name, holds in rollout.ended.items()},
+        **{f"reward_{name}_mean": float(x.mean()) for name, x in rollout.reward_terms.items()},
     } | (task.metrics(rollout) | own)
 
 

@@ -42,7 +42,7 @@ from quadrl.engines.air import c_weather
 from quadrl.engines.state import c_state
 
 SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
-           "disturbances.c", "solids.c", "warnings.c")  # fmt: skip
+           "disturbances.c", "solids.c", "rays.c", "warnings.c")  # fmt: skip
 HEADERS = ("aero.h", "contacts.h", "export.h", "flight.h", "philox.h", "runge_kutta.h", "solids.h")
 # No contraction, since a fused multiply-add rounds differently from NumPy.
 FLAGS = (

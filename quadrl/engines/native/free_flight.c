@@ -29,6 +29,14 @@ typedef struct {
   int64_t taken, given;
 } Function;
 
+// Calls a function of a Step, and tells how many numbers it has (`taken`, `given`). A program that is
+// one text defines both before, so that its functions are called by their names.
+#ifndef RUN
+#define RUN(step, function, x, y, rows) \
+  (step)->function->run((step)->function->constants, x, y, rows)
+#define NUMBERS(step, function, numbers) ((step)->function->numbers)
+#endif
+
 // A number that each row has, at i * stride for row i, and which one it is for a function.
 typedef struct {
   const double* at;
@@ -37,19 +45,32 @@ typedef struct {
 
 // Commands that arrive late, and motions that are remembered. queue: commands of the last `length`
 // physics steps, one per rotor of each of `rows` aircraft, the newest at `newest`; past: as many
-// motions (qpos, qvel), each of before its step, or NULL. delay: of each aircraft, in physics steps;
-// less than `length` by the physics steps of a control step. Filled by quadrl/conditions.
+// motions (qpos, qvel), each of before its step, or NULL; `newest` is where the control step that is
+// flown ends. delay: of each aircraft, in physics steps; less than `length` by the physics steps of a
+// control step. left: for how many control steps the link of each aircraft is lost, this one
+// counted. last: its commands that arrived last, one per rotor. Filled by quadrl/conditions.
 typedef struct {
-  double *queue, *past;
-  const int64_t *delay, *newest;
+  double *queue, *past, *last;
+  const int64_t *delay, *newest, *left;
   int64_t length, rows;
 } Late;
 
+// What sensors are given: the control steps since the start of each episode; then, unless age is
+// NULL, AGED coordinates, ten as many physics steps old as age[row] says and three as age[rows + row]
+// does; then normal numbers, for each of `drawn` sensors a stream and how many. They follow from
+// keys, episodes and steps. Filled by quadrl/core/tables.py.
+typedef struct {
+  const int64_t *keys, *episodes, *steps, *age, *draws;
+  int64_t drawn, rows;
+} Senses;
+enum { AGED = SPEED, MOTION_AGED = BODY_RATE };
+
 // What a control step reads and fills. motion: 7 of qpos, 6 of qvel and one per rotor of each
 // aircraft, at the end of this control step. setpoint, mean: as many numbers a row as the first
-// function gives, and one per rotor [rad/s], the mean of the commands over the control step. limits: largest speed [m/s] and body rate [rad/s] of aircraft i at i * limit_stride.
-// diverged: a byte a row. `finish` takes the motion, whether it has diverged, and what is at
-// `reads` places; it gives `kept` numbers for the table `out`, then as many as go to the table
+// function gives, and one per rotor [rad/s], the mean of the commands over the control step. limits:
+// largest speed [m/s] and body rate [rad/s] of aircraft i at i * limit_stride. diverged: a byte a row.
+// `finish` takes the motion, whether it has diverged, what `senses` give (NULL: nothing), and what is
+// at `reads` places; it gives `kept` numbers for the table `out`, then as many as go to the table
 // `rest`, both with `columns` columns, and as the last ones BYTES flags. `reward` is the one in
 // `rest` that must be finite. late: NULL where commands arrive at once. loops: whether commands
 // change with each of the `substeps` physics steps; held: from each of these, for how many they
@@ -57,8 +78,9 @@ typedef struct {
 typedef struct {
   const Rows* rows;
   const Late* late;
+  const Senses* senses;
   const int64_t* held;
-  const Function *begin, *command, *finish;
+  const Function *begin, *command, *finish, *start;
   const double *action, *limits;
   double *motion, *setpoint, *mean;
   const uint8_t* diverged;
@@ -86,25 +108,28 @@ VECTORISED static void resolve(const Lanes* m, int rotors, const Lanes limits[2]
   }
 }
 
-// Calls a function; spare lanes get what the first one has.
-static void call(const Function* f, const Lanes* x, Lanes* y, int filled) {
-  f->run(f->constants, x, y, filled);
-  for (int64_t k = 0; filled == 1 && k < f->given; ++k) {
+// Gives spare lanes what the first one has, where a function has computed that alone.
+static void twin(Lanes* y, int64_t numbers, int filled) {
+  for (int64_t k = 0; filled == 1 && k < numbers; ++k) {
     for (int i = 1; i < LANES; ++i) y[k][i] = y[k][0];
   }
 }
 
 // Queues the commands of a block for some physics steps, and takes those that arrive in the first.
-static void arrive(const Late* late, Block* b, int rotors, int64_t first, int64_t steps) {
+static void arrive(const Late* late, Block* b, int rotors, int64_t first, int64_t steps,
+                   int64_t substeps) {
   for (int i = 0; i < b->filled; ++i) {  // spare lanes may fly another aircraft
-    const int64_t row = b->row[i], newest = *late->newest + 1 + first;
+    const int64_t row = b->row[i], newest = *late->newest + late->length - substeps + 1 + first;
     for (int64_t step = 0; step < steps; ++step) {
       double* to = late->queue + ((newest + step) % late->length * late->rows + row) * rotors;
       for (int k = 0; k < rotors; ++k) to[k] = b->s.command[k][i];
     }
     const int64_t then = (newest + late->length - late->delay[row]) % late->length;
     const double* from = late->queue + (then * late->rows + row) * rotors;
-    for (int k = 0; k < rotors; ++k) b->s.command[k][i] = from[k];
+    if (late->left[row]) from = late->last + row * rotors;
+    for (int k = 0; k < rotors; ++k) {
+      b->s.command[k][i] = late->last[row * rotors + k] = from[k];
+    }
     if (late->past) {
       double* kept = late->past + (newest % late->length * late->rows + row) * SPEED;
       for (int k = 0; k < SPEED; ++k) kept[k] = b->m[k][i];
@@ -119,8 +144,9 @@ static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean,
   const int rotors = (int)s->rows->rotors, motion = SPEED + rotors;
   if (s->loops) {
     memcpy(x, b->m, motion * sizeof(Lanes));
-    memcpy(x + motion, setpoint, s->begin->given * sizeof(Lanes));
-    call(s->command, (const Lanes*)x, b->s.command, b->filled);
+    memcpy(x + motion, setpoint, NUMBERS(s, begin, given) * sizeof(Lanes));
+    RUN(s, command, (const Lanes*)x, b->s.command, b->filled);
+    twin(b->s.command, rotors, b->filled);
   }
   for (int k = 0; k < rotors; ++k) {
     for (int i = 0; i < LANES; ++i) {
@@ -129,7 +155,7 @@ static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean,
       b->s.command[k][i] = wanted;
     }
   }
-  if (s->late) arrive(s->late, b, rotors, first, steps);
+  if (s->late) arrive(s->late, b, rotors, first, steps, s->substeps);
   for (int k = 0; k < rotors; ++k) {
     for (int i = 0; i < LANES; ++i) {
       const double ceiling = s->rows->ceiling[b->row[i] * rotors + k], given = b->s.command[k][i];
@@ -144,14 +170,15 @@ static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean,
 static void fly_on(const Step* s, Block* b, int64_t first, int64_t end, Lanes* x) {
   const Rows* r = s->rows;
   const int rotors = (int)r->rotors, motion = SPEED + rotors;
-  const int64_t numbers = s->begin->given;
-  Lanes setpoint[numbers], mean[MAX_ROTORS];
+  const int64_t numbers = NUMBERS(s, begin, given);
+  Lanes setpoint[NUMBERS(s, begin, given)], mean[MAX_ROTORS];
   if (first == 0) {
     memcpy(x, b->m, motion * sizeof(Lanes));
     for (int64_t k = 0; k < s->actions; ++k) {
       for (int i = 0; i < LANES; ++i) x[motion + k][i] = s->action[b->row[i] * s->actions + k];
     }
-    call(s->begin, (const Lanes*)x, setpoint, b->filled);
+    RUN(s, begin, (const Lanes*)x, setpoint, b->filled);
+    twin(setpoint, numbers, b->filled);
     memset(mean, 0, sizeof mean);
   } else {
     for (int i = 0; i < LANES; ++i) {
@@ -183,14 +210,39 @@ static int is_whole(const Rows* r, const Block* b) {
   return whole;
 }
 
+// Writes what the sensors of a block are given.
+static void sense(const Senses* s, const Late* late, const Block* b, Lanes* x) {
+  for (int i = 0; i < LANES; ++i) {
+    const int64_t row = b->row[i];
+    int64_t at = 0;
+    x[at++][i] = (double)s->steps[row];
+    for (int k = 0; s->age && k < AGED; ++k, ++at) {
+      // The motion before each physics step is remembered.
+      const int64_t age = s->age[(k < MOTION_AGED ? 0 : s->rows) + row];
+      const int64_t then = (*late->newest + late->length - age + 1) % late->length;
+      x[at][i] = age ? late->past[(then * late->rows + row) * SPEED + k] : b->m[k][i];
+    }
+    for (int64_t d = 0; d < s->drawn; ++d) {
+      const int64_t stream = s->draws[2 * d], count = s->draws[2 * d + 1];
+      uint32_t w[4];
+      for (int64_t k = 0; k < count; ++k, ++at) {
+        const int64_t block = s->steps[row] * ((count + 1) / 2) + k / 2;
+        if (k % 2 == 0) words(w, block, stream, s->episodes[row], s->keys[row]);
+        x[at][i] = normal(w[2 * (k % 2)], w[2 * (k % 2) + 1]);
+      }
+    }
+  }
+}
+
 // Lets the task judge the aircraft of a block that are not marked. Returns how many have a reward
 // that is not finite.
 VECTORISED static int64_t finish(const Step* s, const Block* b, Lanes* x) {
   const int motion = SPEED + (int)s->rows->rotors, whole = is_whole(s->rows, b);
-  const int64_t first = b->row[0], flags = s->finish->given - BYTES;
-  Lanes y[s->finish->given];
+  const int64_t first = b->row[0], flags = NUMBERS(s, finish, given) - BYTES;
+  Lanes y[NUMBERS(s, finish, given)];
   memcpy(x, b->m, motion * sizeof(Lanes));
   for (int i = 0; i < LANES; ++i) x[motion][i] = s->diverged[b->row[i]];
+  if (s->senses) sense(s->senses, s->late, b, x + motion + 1);
   for (const Place* place = s->places; place < s->places + s->reads; ++place) {
     if (whole && place->stride == 1) {
       memcpy(x[place->number], place->at + first, sizeof(Lanes));
@@ -201,7 +253,7 @@ VECTORISED static int64_t finish(const Step* s, const Block* b, Lanes* x) {
       }
     }
   }
-  s->finish->run(s->finish->constants, (const Lanes*)x, y, b->filled);
+  RUN(s, finish, (const Lanes*)x, y, b->filled);
   int64_t unsound = 0;
   for (int64_t k = 0; k < flags; ++k) {
     double* to = k < s->kept ? s->out + k * s->columns : s->rest + (k - s->kept) * s->columns;
@@ -233,9 +285,8 @@ QUADRL_EXPORT int64_t quadrl_step(const Step* s, const int64_t* ids, int64_t fir
   const int rotors = (int)r->rotors, motion = SPEED + rotors;
   Block b;
   Aircraft own;
-  int64_t room = motion + (s->actions > s->begin->given ? s->actions : s->begin->given);
-  if (s->finish->taken > room) room = s->finish->taken;
-  Lanes x[room];
+  // For the motion and an action or a setpoint, or for what the task's part takes.
+  Lanes x[NUMBERS(s, begin, taken) + NUMBERS(s, begin, given) + NUMBERS(s, finish, taken)];
   int64_t marked = 0;
   if (!r->block) spread(r->parameters, &own);
   for (int64_t row = first; row < last; row += LANES) {
@@ -273,17 +324,18 @@ QUADRL_EXPORT int64_t quadrl_step(const Step* s, const int64_t* ids, int64_t fir
   return marked;
 }
 
-// Begins episodes of aircraft `ids` (n). `start` takes the first random number of each episode's
+#ifndef WITHOUT_STARTS
+// Begins episodes of aircraft `ids` (n). Their `start` takes the first random number of each episode's
 // stream `members` and the first `numbers` of its `stream`, for keys and episodes of the aircraft
 // in the list, and what is at `places`; it gives a motion, numbers for `out`, and the observation;
 // they go to `room`, for quadrl_place. Returns how many of the motions a physics step does not resolve.
-QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Function* start, const Place* places,
-                                   int64_t reads, const int64_t* ids, int64_t n,
-                                   const int64_t* keys, const int64_t* episodes, int64_t stream,
-                                   int64_t numbers, int64_t members, double* room) {
+QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Place* places, int64_t reads,
+                                   const int64_t* ids, int64_t n, const int64_t* keys,
+                                   const int64_t* episodes, int64_t stream, int64_t numbers,
+                                   int64_t members, double* room) {
   const int rotors = (int)s->rows->rotors;
-  const int64_t given = start->given;
-  Lanes x[start->taken], y[given];
+  const int64_t given = NUMBERS(s, start, given);
+  Lanes x[NUMBERS(s, start, taken)], y[NUMBERS(s, start, given)];
   int64_t unsound = 0;
   for (int64_t first = 0; first < n; first += LANES) {
     const int filled = n - first < LANES ? (int)(n - first) : LANES;
@@ -303,7 +355,8 @@ QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Function* start, const P
       }
       for (int k = 0; k < 2; ++k) limits[k][i] = s->limits[ids[at] * s->limit_stride + k];
     }
-    call(start, (const Lanes*)x, y, filled);
+    RUN(s, start, (const Lanes*)x, y, filled);
+    twin(y, given, filled);
     resolve((const Lanes*)y, rotors, (const Lanes*)limits, sound);
     for (int i = 0; i < filled; ++i) {
       unsound += !sound[i];
@@ -312,6 +365,7 @@ QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Function* start, const P
   }
   return unsound;
 }
+#endif
 
 // Puts aircraft `ids` (n) where quadrl_begin lets their episodes begin. The first `kept` numbers
 // after the motion go to `out`; an observation there is that of the last control step.

@@ -8,7 +8,9 @@
 #include "aero.h"
 
 // Keeps the compiler from joining what is before it with what comes after.
+#ifndef KEPT_APART
 #define KEPT_APART __asm__("" ::: "memory")
+#endif
 #define INLINE static inline __attribute__((always_inline))
 
 // Rows of a motion, with a column for each aircraft. Rates of change are in the same rows.

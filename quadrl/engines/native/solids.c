@@ -40,14 +40,6 @@ typedef struct {
 
 enum { AHEAD = 4, CACHE_LINE = 64 };  // aircraft, bytes
 
-// Rotation matrix to the world of a unit quaternion.
-static void rotation(const double q[4], double r[9]) {
-  const double w = q[0], x = q[1], y = q[2], z = q[3];
-  r[0] = 1 - 2 * (y * y + z * z), r[1] = 2 * (x * y - w * z), r[2] = 2 * (x * z + w * y);
-  r[3] = 2 * (x * y + w * z), r[4] = 1 - 2 * (x * x + z * z), r[5] = 2 * (y * z - w * x);
-  r[6] = 2 * (x * z - w * y), r[7] = 2 * (y * z + w * x), r[8] = 1 - 2 * (x * x + y * y);
-}
-
 // Writes poses of the solids of n aircraft.
 QUADRL_EXPORT void quadrl_stand(const Placing* to, int64_t n) {
   const int64_t width = to->width, size = to->count * width;
@@ -65,7 +57,7 @@ QUADRL_EXPORT void quadrl_stand(const Placing* to, int64_t n) {
       memcpy(solid->position, pose, sizeof(solid->position));
       memcpy(to->position + 3 * geom, pose, sizeof(solid->position));
       if (!own || memcmp(own + k * width + 3, pose + 3, 4 * sizeof(*pose))) {
-        rotation(pose + 3, solid->turn);
+        rotation_of(pose + 3, solid->turn);
         memcpy(to->quaternion + 4 * geom, pose + 3, 4 * sizeof(*pose));
       }
       if (to->size) {
@@ -105,7 +97,7 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
     const int64_t i = ids ? ids[row] : row;
     const double* p = rows->qpos + i * rows->stride;
     double r[9], least = HUGE_VAL;
-    rotation(p + 3, r);
+    rotation_of(p + 3, r);
     const Solid* solids = rows->solids + i * rows->count;
     Nearby* list = rows->nearby + i;
     // The list of an aircraft ahead is not in the cache: fetch it as far as its two nearest solids.

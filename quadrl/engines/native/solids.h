@@ -11,6 +11,14 @@ typedef struct {
   double kind, size[3], position[3], turn[9];
 } Solid;
 
+// Rotation matrix to the world of a unit quaternion.
+static inline void rotation_of(const double q[4], double r[9]) {
+  const double w = q[0], x = q[1], y = q[2], z = q[3];
+  r[0] = 1 - 2 * (y * y + z * z), r[1] = 2 * (x * y - w * z), r[2] = 2 * (x * z + w * y);
+  r[3] = 2 * (x * y + w * z), r[4] = 1 - 2 * (x * x + z * z), r[5] = 2 * (y * z - w * x);
+  r[6] = 2 * (x * z - w * y), r[7] = 2 * (y * z + w * x), r[8] = 1 - 2 * (x * x + y * y);
+}
+
 // A point in a solid's own frame.
 static inline void to_solid(const Solid* s, const double point[3], double local[3]) {
   double away[3];

@@ -77,7 +77,9 @@ def others(scenario: Scenario) -> dict[str, Callable[[], Controller]]:
     for file in shipped():
         policy = Policy.load(file)
         # The aircraft stays the same, so a policy's actions must mean what they did in training.
-        scale = policy.scenario.aircraft.action_scale
-        if policy.task == task.name and scale == vehicle.action_scale:
+        own = policy.scenario.aircraft
+        alike = own.action_scale == vehicle.action_scale
+        alike &= own.control_timestep == vehicle.control_timestep
+        if policy.task == task.name and alike:
             policies[file.stem] = lambda policy=policy: policy
     return policies | {name: partial(make_controller, name, task, vehicle) for name in CONTROLLERS}
