@@ -97,6 +97,18 @@ ensure_web() {
     say "not here: ${missing[*]}; the page is built, and its tests are skipped"
 }
 
+# ensure_board: compilers for boards and emulated ones, on which the slow tests run policies in C.
+ensure_board() {
+    local tool missing=""
+    for tool in arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64; do
+        command -v "$tool" >/dev/null || missing="$missing $tool"
+    done
+    [ -z "$missing" ] ||
+        install_packages gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm \
+            gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user ||
+        say "there is no$missing here: the tests on emulated boards are skipped"
+}
+
 make_venv() {
     local python
     python="$(find_python)"

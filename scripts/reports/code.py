@@ -15,14 +15,17 @@ from quadrl.aircraft.rotors import GRAVITY, Rotor
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
 from quadrl.cli.flown import Conditioned
+from quadrl.cli.new import content
 from quadrl.cli.tasks import observation_rows, reward_rows
 from quadrl.conditions.observing import Observing
-from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization, Sizes
 from quadrl.control import CONTROL_MODES
+from quadrl.control.modes import modes_of
 from quadrl.core import snapshot
 from quadrl.core.scenario import Conditions
 from quadrl.engines import state
 from quadrl.learning.description import describe, describe_action
+from quadrl.learning.foreign import COLUMNS
 from scripts.reports.report import Parts, table
 
 FIRST_SOURCE = "gym-aero"
@@ -49,13 +52,17 @@ def control_modes() -> str:
     """What the control modes ask for, and how much of it on each aircraft."""
     rows = []
     for name, kind in CONTROL_MODES.items():
-        modes = [kind(vehicle) for vehicle in VEHICLES.values()]
+        modes = [kind(x) for x in VEHICLES.values() if name in modes_of(x)]
         terms = [(f"{term.name}: {term.meaning}", term.unit) for term in modes[0].terms]
         if not kind.has_loops:  # as many terms as rotors, and all alike
-            terms = [("one number per rotor: its speed command, from hover", terms[0][1])]
+            at_0 = "half the largest" if name.startswith("share") else "hover"
+            order = ", clockwise from ahead on the right" if kind.quadrotors_alone else ""
+            said = f"one number per rotor{order}: its speed command, from {at_0}"
+            terms = [(said, terms[0][1])]
         for k, term in enumerate(terms):
             ends = ((f"{mode.scale[k]:.3g}", f"{mode.scale_down[k]:.3g}") for mode in modes)
             scales = (up if up == down else f"{up} up, {down} down" for up, down in ends)
+            scales = [*scales, *[""] * (len(VEHICLES) - len(modes))]
             rows.append((f"`{name}`" if k == 0 else "", *term, *scales))
     scales = (f"scale, {name}" for name in VEHICLES)
     return table(("`control_mode=`", "what it asks for", "unit", *scales), rows)
@@ -128,6 +135,11 @@ def written_sources(name: str) -> dict[str, str]:
     return found
 
 
+def new(what: str, name: str) -> str:
+    """The file that `quadrl new-task` or `quadrl new-aircraft` writes."""
+    return f"```python\n{content(what, name)}```"
+
+
 def command(name: str) -> str:
     """What a command does, and its options."""
     kind, rows, meanings = cli.COMMANDS[name], [], docstrings(cli.COMMANDS[name])
@@ -179,7 +191,8 @@ def randomization() -> str:
         usual = getattr(Randomization(), field)
         cells = ("" if value == usual else drawn(value) for value in values)
         rows.append((f"`{field}`", f"{meaning}.", *cells))
-    for kind, name in ((Errors, "`noise`, `bias`"), (Pushes, "`pushes`")):
+    records = (Errors, "`noise`, `bias`"), (Pushes, "`pushes`"), (Sizes, "`sizes`")
+    for kind, name in records:
         rows += [(f"{name}: `{k}`", f"{text}.", "", "") for k, text in docstrings(kind).items()]
     return table(("field", "meaning and unit", "`light`", "`full`"), rows)
 
@@ -198,7 +211,16 @@ OBSERVATION = ("observation", "numbers", "unit", "meaning and frame")
 REWARD = ("reward", "meaning", "weight", "where it differs")
 RECORDS = {"state": state.State, "snapshot": snapshot.Snapshot,
            "potentials": snapshot.Potentials, "end": snapshot.EpisodeEnd}  # fmt: skip
+NEW = {"task": "my_task", "aircraft": "small"}
+"""Names in the files that the pages show."""
 PARTS: Parts = {
+    "curve-columns": lambda: table(
+        ("here", "in a csv"),
+        [
+            (name, ", ".join(f"`{one}`" for one in others.split()))
+            for name, others in COLUMNS.items()
+        ],
+    ),
     "task-list": lambda: task_table(SHORT),
     "tasks": lambda: task_table(LONG),
     "action": lambda: f"{describe_action(Vehicle())}.",
@@ -208,6 +230,7 @@ PARTS: Parts = {
     "vehicles": vehicles,
     **{f"aircraft-{name}": functools.partial(aircraft, name) for name in VEHICLES},
     **{f"command-{name}": functools.partial(command, name) for name in cli.COMMANDS},
+    **{f"new-{what}": functools.partial(new, what, name) for what, name in NEW.items()},
     **{f"fields-{name}": functools.partial(fields, kind) for name, kind in RECORDS.items()},
     "conditions": conditions,
     "randomization": randomization,

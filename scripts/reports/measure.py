@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import statistics
 from pathlib import Path
-from typing import Any
 
 from quadrl import VEHICLES, tasks
 from quadrl.base.units import length, quantity
 from quadrl.evaluation.evaluate import evaluate
-from quadrl.evaluation.plotting import learning_curves, save
+from quadrl.evaluation.plotting import save
 from quadrl.evaluation.rollout import BEHAVIOUR, summarize
 from quadrl.learning import benchmark
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.folder import EVALUATION, METRICS, read_metrics
+from quadrl.learning.folder import EVALUATION
+from quadrl.learning.show import curves
 from scripts.reports import report
 from scripts.reports.report import FIGURES, Result, Runs, table
 
@@ -36,7 +36,7 @@ def training(runs: Runs) -> None:
     configs = {run: TrainConfig.of_folder(run) for run in runs if (run / EVALUATION).is_file()}
     found: list[Result] = []
     yardstick: dict[tuple[str, str], Result] = {}
-    curves: dict[str, list[Any]] = {}
+    drawn: list[Path] = []
     for run, config in configs.items():
         whole = config.named()
         known = {name: whole[name] for name in ("task", "vehicle", "engine", "algo", "seed")}
@@ -48,11 +48,9 @@ def training(runs: Runs) -> None:
             metrics = flown("geometric", config)
             yardstick[task, vehicle] = {"task": task, "vehicle": vehicle, "metrics": metrics}
         if (vehicle, whole["engine"]) == (tasks.TASKS[task].trained_on, "free_flight"):
-            curves.setdefault(task, []).append(read_metrics(run / METRICS))
-    for task, metrics in curves.items():
-        by = {tasks.TASKS[task].trained_by: metrics}
-        picture = report.IMAGES / "curves" / f"{task}.png"
-        save(learning_curves(by, task, clocks=("steps",)), picture)
+            drawn.append(run)
+    for task, figure in curves(drawn, clocks=("steps",)).items():
+        save(figure, report.IMAGES / "curves" / f"{task}.png")
     found.sort(key=lambda row: ([*VEHICLES].index(row["vehicle"]), row["engine"], row["seed"]))
     rows = {"yardstick": [*yardstick.values()], "runs": found}
     only = {config.task for config in configs.values()}
@@ -137,16 +135,6 @@ def speed_table() -> str:
     return f"{table(head, rows)}\n\n{report.source(result)}"
 
 
-def figures() -> str:
-    """The figures of the README besides that of `claim`."""
-    measured, rows = report.load("speed"), []
-    for row in measured["rates"]:
-        if row["target"] and row["of"] in (benchmark.ALL_CORES, benchmark.ONE_CORE):
-            share = f"{row['share']:.2f} times bare `mj_step` on {row['of']}"
-            rows.append((row["what"], f"{row['rate']:,.0f} control steps/s; {share}"))
-    return f"{table(('`quadrl benchmark`', 'figure'), rows)}\n\n{report.source(measured)}"
-
-
 def claim() -> str:
     """What hover takes and reaches, beside the command that shows it."""
     result = report.load("training")
@@ -167,6 +155,5 @@ def claim() -> str:
     return f"{table(head, [cells])}\n\n{words}"
 
 
-PARTS: report.Parts = {"claim": claim, "figures": figures,
-                       "training-hover": hover_table, "training-suite": suite_table,
-                       "speed": speed_table}  # fmt: skip
+PARTS: report.Parts = {"claim": claim, "training-hover": hover_table,
+                       "training-suite": suite_table, "speed": speed_table}  # fmt: skip

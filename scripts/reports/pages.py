@@ -7,7 +7,19 @@ import re
 import sys
 from pathlib import Path
 
-from scripts.reports import code, measure, robustness, shipping, task_pages
+from scripts.reports import (
+    any_aircraft,
+    code,
+    crosscheck,
+    flights,
+    forest,
+    measure,
+    one_policy,
+    robustness,
+    shipping,
+    task_pages,
+    world,
+)
 from scripts.reports.report import DOCS, REPOSITORY, Parts
 
 
@@ -17,7 +29,8 @@ def pages(check: bool = False) -> None:
     Args:
         check: Write nothing; exit with 1 and a message if a page would change.
     """
-    modules = code, measure, robustness, shipping, task_pages
+    modules = (any_aircraft, code, crosscheck, flights, forest, measure, one_policy, robustness,
+               shipping, task_pages, world)  # fmt: skip
     parts = {name: part for module in modules for name, part in module.PARTS.items()}
     stale = [page for page in all_pages() if written(page, parts) != page.read_text()]
     if check and stale:

@@ -66,7 +66,8 @@ def pictures(only: tuple[str, ...] = (*tasks.TASKS, "learning")) -> None:
 
 def learning() -> Iterator[Image.Image]:
     """Frames of four policies of one training of hover, from the same start, side by side."""
-    config, scenario = TrainConfig("hover", seed=SEED), Scenario.of("hover", **RELEASED)
+    config = TrainConfig("hover", seed=SEED, evaluations=0)
+    scenario = Scenario.of("hover", **RELEASED)
     wanted = [max(1, round(share * config.iterations)) for share in SHARES]
     panels: list[list[np.ndarray]] = []
 

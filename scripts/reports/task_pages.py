@@ -34,7 +34,7 @@ print(info["error"], info["reward_terms"])
 
 {action}. Actions outside of [-1, 1] are clipped. With `control_mode=` the same task takes thrust
 and body rates, velocities or positions, and with `vehicle=` another aircraft: see
-[actions](tasks.md#actions) and [aircraft](aircraft.md).
+[actions](actions.md) and [aircraft](aircraft.md).
 
 ## Observation
 
@@ -141,19 +141,19 @@ def page(name: str) -> str:
 
 
 def observations(task: Task, known: dict[str, Any]) -> str:
-    """Every entry of the observation."""
+    """Every term of the observation, with the numbers of its entries."""
     rows = []
     for term in known["observation"]:
-        name, count = term["name"], term["last"] - term["first"] + 1
-        entries: Any = range(1, count + 1)
-        if task.observation[name].per_rotor:
-            entries = (f"rotor {k}" for k in entries)
+        first, last, name = term["first"], term["last"], term["name"]
+        count = last - first + 1
+        entries = f"1 to {count}" if count > 1 else ""
+        if name in task.observation and task.observation[name].per_rotor:  # else of a sensor
+            entries = f"rotors {entries}"
         elif count == 3:
-            entries = ("roll", "pitch", "yaw") if name.endswith("attitude") else "xyz"
-        for k, entry in enumerate(entries):
-            meaning = term["meaning"] if k == 0 else ""
-            rows.append((term["first"] + k, f"`{name}`", entry, term["unit"], meaning))
-    return table(("number", "term", "entry", "unit", "meaning and frame"), rows)
+            entries = "roll, pitch, yaw" if name.endswith("attitude") else "x, y, z"
+        numbers = f"{first} to {last}" if count > 1 else first
+        rows.append((numbers, f"`{name}`", entries, term["unit"], term["meaning"]))
+    return table(("numbers", "term", "entries", "unit", "meaning and frame"), rows)
 
 
 def line(text: str) -> str:
