@@ -1,8 +1,8 @@
 // An episode as the page shows it: a flight, who flies it, and what happens to it from outside.
 //
 // What happens from outside is a list of events { step, kind, values }, by the control step that
-// they come before. A push changes the velocity (world frame) and the body rates (body frame); a
-// wind event sets the mean wind (world frame) and the standard deviation of the gusts; a rotor
+// they come before. A task, by its number in the book, is what is flown from then on. A push changes
+// the velocity (world frame) and the body rates (body frame); a wind event sets the mean wind (world frame) and the standard deviation of the gusts; a rotor
 // event leaves a rotor, numbered from 1 on, a share of its largest speed; a payload is a share of
 // the aircraft's mass, and 0 drops it.
 
@@ -56,13 +56,21 @@ export class Episode {
     const action = this.controller?.act(this.#see());
     if (action) this.past[0].action = action;
     for (const { kind, values } of this.events.filter((event) => event.step === this.steps)) {
-      if (kind === "push") values.forEach((value, k) => (flight.qvel[k] += value));
+      if (kind === "task") this.#turn(Object.keys(flight.kernel.book.tasks)[values[0]]);
+      else if (kind === "push") values.forEach((value, k) => (flight.qvel[k] += value));
       else if (kind === "rotor") flight.weaken(...values);
       else if (kind === "payload") flight.load(...values);
       else this.air = { mean: values.slice(0, 3), deviation: values[3] };
     }
     this.#blow();
     flight.command(action);
+  }
+
+  // Flies another task from here on, if there is one, whose time begins now.
+  #turn(taskName) {
+    if (!taskName) return;
+    this.flight.turn(taskName);
+    this.solved = null;
   }
 
   // What the controller sees now: as the options of its observation say (quadrl/core/observer.py).

@@ -11,9 +11,11 @@ export function decoded(text) {
   return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 }
 
-// Which numbers of the observation of a pair of the book are seen beside an aim.
-export function besideAim(pair, aim) {
-  return pair.besideAim[Number(aim.beside_goal ?? false)];
+// Which numbers of a task's observation, of a pair of the book, are seen beside sensors.
+export function visible(book, pair, sensors) {
+  const hidden = Object.entries(sensors).flatMap(([name, { beside_goal: beside = false }]) => book.hides[name]?.[Number(beside)] ?? []);
+  const shown = Object.entries(pair.layout).filter(([name]) => !hidden.includes(name));
+  return shown.flatMap(([, [from, to]]) => Array.from({ length: to - from }, (_, k) => from + k));
 }
 
 // The compiled C, and where the parts of a flight stand in its memory.
@@ -44,11 +46,8 @@ export class Kernel {
 export class Flight {
   constructor(kernel, slot, taskName, vehicleName) {
     const { book } = kernel;
-    Object.assign(this, { kernel, slot });
-    this.task = book.tasks[taskName];
+    Object.assign(this, { kernel, slot, vehicleName });
     this.vehicle = book.vehicles[vehicleName];
-    this.pair = book.pairs[`${taskName}_${vehicleName}`];
-    this.call = (name) => kernel.functions[`${taskName}_${vehicleName}_${name}`](this.memory);
     this.memory = kernel.functions.flight_memory(slot);
     new Float64Array(kernel.functions.memory.buffer, this.memory, book.flightSize).fill(0);
     const motion = ["qpos", "qvel", "act", "ctrl", "wind"];
@@ -61,14 +60,33 @@ export class Flight {
     this.diverged = kernel.view(slot, "diverged");
     kernel.view(slot, "parameters").set(this.vehicle.row);
     kernel.view(slot, "limits").set(this.vehicle.limits);
-    kernel.view(slot, "world").set(this.pair.world);
-    kernel.view(slot, "origin").set(this.pair.origin);
+    this.#take(taskName);
     const { rotors } = this.vehicle;
     this.scale[0] = this.vehicle.actionScale;
     this.estimates = false; // whether the rotor speeds that are seen follow from the commands
     const flown = "qpos qvel act ctrl warm wind ceiling flown world near solids nearby";
     this.#point("flight_rows", flown, [0, 0, rotors, 0]);
     this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, rotors]);
+  }
+
+  // Takes a task up: its functions, its words, and the world it is in.
+  #take(taskName) {
+    const { kernel, slot, vehicleName } = this, { book, functions } = kernel;
+    Object.assign(this, { taskName, task: book.tasks[taskName], pair: book.pairs[`${taskName}_${vehicleName}`] });
+    this.call = (name) => functions[`${taskName}_${vehicleName}_${name}`](this.memory);
+    kernel.view(slot, "world").set(this.pair.world);
+    kernel.view(slot, "origin").set(this.pair.origin);
+  }
+
+  // Goes on with a task as its episode begins, but from where the aircraft is and as it moves.
+  turn(taskName) {
+    const motion = [this.qpos, this.qvel, this.act].map((part) => [part, part.slice()]);
+    this.#take(taskName);
+    this.uniform(this.kernel.book.startStream, 0, this.pair.drawn);
+    this.call("begin");
+    for (const [part, values] of motion) part.set(values);
+    this.#read();
+    this.call("first");
   }
 
   // Fills a struct of pointers, then of int64, for the kernels of C.
@@ -163,11 +181,18 @@ export class Flight {
 
   // What is measured: what the task shows, and what else the options of an observation ask for.
   seen({ disturbance = false, sensors = {} } = {}) {
-    const { observation, pair } = this;
-    const { aim } = sensors;
+    const { observation, pair, kernel: { book } } = this;
     const felt = disturbance || "disturbance" in sensors;
-    const own = aim ? besideAim(pair, aim).map((k) => observation[k]) : observation.subarray(0, pair.size);
-    return [...own, ...(felt ? this.felt : []), ...(aim ? this.aim : [])];
+    const own = visible(book, pair, sensors).map((k) => observation[k]);
+    const late = Object.keys(sensors).map((name) => ({ aim: this.aim, standard: this.standard })[name] ?? []);
+    return [...own, ...(felt ? this.felt : []), ...late.flatMap((values) => [...values])];
+  }
+
+  // As quadrl.conditions.sensors.Standard gives it: how a target moves, and which task this is.
+  get standard() {
+    const { book } = this.kernel, [from, to] = this.pair.layout.target_velocity ?? [0, 0];
+    const velocity = to ? this.observation.subarray(from, to) : [0, 0, 0];
+    return [...velocity, ...book.standard.map((name) => Number(name === this.taskName))];
   }
 
   get error() { return this.given[0]; } // [m]

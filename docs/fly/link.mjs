@@ -2,7 +2,7 @@
 
 const DIGITS = 4;
 // How many numbers an event of a kind has, and the least and largest of them.
-const KINDS = { push: [6, -100, 100], wind: [4, -100, 100], rotor: [2, 0, 8], payload: [1, 0, 1] };
+const KINDS = { task: [1, 0, 100], push: [6, -100, 100], wind: [4, -100, 100], rotor: [2, 0, 8], payload: [1, 0, 1] };
 export const DEFAULTS = { task: "hover", aircraft: "paper", left: "", right: "geometric", seed: 0, at: 0, events: [] };
 
 export function toFragment({ task, aircraft, left, right, seed, at, events }) {
@@ -24,7 +24,7 @@ export function fromFragment(fragment, book) {
     const number = Number(found.get(name));
     if (Number.isInteger(number) && number >= 0) settings[name] = Math.min(number, largest);
   }
-  for (const [, kind, step, list] of (found.get("events") ?? "").matchAll(/(push|wind|rotor|payload)@(\d+):([-\d.,e]+)/g)) {
+  for (const [, kind, step, list] of (found.get("events") ?? "").matchAll(/(task|push|wind|rotor|payload)@(\d+):([-\d.,e]+)/g)) {
     const values = list.split(",").map(Number), [count, least, most] = KINDS[kind];
     if (values.length === count && values.every((x) => least <= x && x <= most)) {
       settings.events.push({ step: Number(step), kind, values });

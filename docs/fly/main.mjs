@@ -86,11 +86,11 @@ class Page {
   controllers() {
     const { task, aircraft } = this.settings;
     const fits = ([, policy]) => !policy.unfit(this.book, task, aircraft);
-    const own = [], others = [];
+    const own = [], several = [], others = [];
     for (const [name, policy] of [...this.policies].filter(fits)) {
-      (policy.task === task ? own : others).push(name);
+      (policy.task === task ? own : policy.several ? several : others).push(name);
     }
-    return { own, others };
+    return { own: [...own, ...several], others };
   }
 
   // Begins the episode of the settings.
@@ -245,20 +245,25 @@ class Page {
       points: history.map(({ time, error }) => [time, error]),
     }));
     this.plots.error.draw(errors, this.time, marks);
+    // What is flown now: a flight may have gone on with another task.
+    const { taskName, task: { asks, starts, ends } } = this.episodes[0].flight;
+    at("task-words").textContent = `It asks to ${asks}. It starts ${starts}. It ends ${ends}.`;
+    pressed("turns", words(taskName));
     at("time").textContent = `${this.time.toFixed(1)} s`;
     document.documentElement.dataset.time = this.time;
   }
 
   showSettings() {
-    const { settings, book } = this, { asks, starts, ends } = book.tasks[settings.task];
+    const { settings } = this;
     at("task").value = settings.task;
-    at("task-words").textContent = `It asks to ${asks}. It starts ${starts}. It ends ${ends}.`;
     at("seed").value = settings.seed;
     pressed("aircraft", settings.aircraft);
     const { mass, size, rotors } = this.vehicle;
     const weight = mass < 0.1 ? `${(1000 * mass).toFixed(0)} g` : `${mass.toFixed(2)} kg`;
     const arm = `${(100 * size).toFixed(1)} cm from the centre to a rotor`;
     at("aircraft-words").textContent = `${weight}, ${rotors} rotors, ${arm}.`;
+    const flies = SIDES.map((side) => this.policies.get(settings[side]));
+    at("turn").hidden = !flies.some((one) => one?.several) || flies.some((one) => one && !one.several);
     at("no-policy").hidden = this.controllers().own.length > 0;
     this.showValues();
   }
@@ -355,6 +360,10 @@ class Page {
     const usual = { left: "", right: "geometric" };
     at("task").append(...Object.keys(book.tasks).map((name) => new Option(words(name), name)));
     at("task").onchange = ({ target }) => this.change({ task: target.value, ...usual });
+    const names = Object.keys(book.tasks);
+    choices("turns", book.standard.filter((name) => names.includes(name)).map(words), (name) => {
+      this.event("task", [names.findIndex((known) => words(known) === name)]);
+    });
     choices("aircraft", Object.keys(book.vehicles), (aircraft) => this.change({ aircraft, ...usual }));
     choices("rate", RATES, (rate) => {
       this.rate = rate;

@@ -1,6 +1,6 @@
 // A trained policy: reads the file and gives the mean action, as quadrl/evaluation/policy.py does.
 
-import { besideAim } from "./flight.mjs";
+import { visible } from "./flight.mjs";
 
 const LAYERS = ["weight", "bias"];
 const DAMAGED = "The file is damaged or not a safetensors file.";
@@ -43,7 +43,7 @@ function readArrays({ entries, data }) {
 const KNOWN = { disturbance: false, action_history: 0, observation_history: 0, rotor_speed: "true", sensors: {} };
 
 // Sensors that it knows, with the options that it knows of each.
-const SENSORS = { aim: ["beside_goal"], disturbance: ["smoothing"] };
+const SENSORS = { aim: ["beside_goal"], disturbance: ["smoothing"], standard: [] };
 
 // What of the options of an observation this page does not know, in words; nothing if it knows all.
 function strange(observe) {
@@ -102,14 +102,21 @@ export class Policy {
     this.actionSize = width / 2;
   }
 
+  // Whether it has learned several tasks, and flies each of them.
+  get several() {
+    return "standard" in this.observe.sensors;
+  }
+
   // Why this policy cannot fly an aircraft of the book in a task; nothing if it can.
   unfit(book, taskName, vehicleName) {
     const { rotors, layout } = book.vehicles[vehicleName], { actionSize, metadata, observe } = this;
-    const pair = book.pairs[`${taskName}_${vehicleName}`], { aim } = observe.sensors;
-    const single = (aim ? besideAim(pair, aim).length + 3 : pair.size) + 3 * observe.disturbance;
+    const pair = book.pairs[`${taskName}_${vehicleName}`], { aim, standard } = observe.sensors;
+    const late = (aim ? 3 : 0) + (standard ? 3 + book.standard.length : 0);
+    const single = visible(book, pair, observe.sensors).length + late + 3 * observe.disturbance;
     const size = single * (1 + observe.observation_history) + rotors * observe.action_history;
     const foreign = strange(observe);
     if (foreign) return `It observes ${foreign}, which this page does not know.`;
+    if (standard && !book.standard.includes(taskName)) return `It has learned ${book.standard.join(", ")}.`;
     const other = this.changed.find((name) => name !== "action_scale");
     if (other) return `It has learned another ${other} than the aircraft here have.`;
     const mode = metadata.control_mode ?? "rotor";

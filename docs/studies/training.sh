@@ -20,6 +20,6 @@ for vehicle in crazyflie crazyflie_brushless hexa racer; do
     quadrl train hover --vehicle "$vehicle" --seeds 385:388 --out "runs/training/hover-$vehicle"
 done
 for task in static_waypoint random_waypoint straight_and_level landing target_following race recovery trajectory \
-    perching deck_landing lsy_race; do
+    perching deck_landing lsy_race navigation; do
     quadrl train "$task" --seeds 385:388 --out "runs/training/$task"
 done
