@@ -11,11 +11,13 @@ import numpy as np
 from quadrl.aircraft import parameters
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.philox import SOLIDS
+from quadrl.conditions import sensors
 from quadrl.conditions.scene import Scene
 from quadrl.control import modes
 from quadrl.core.environment import Environment
 from quadrl.core.rewards import total
 from quadrl.core.snapshot import EpisodeEnd, Snapshot
+from quadrl.core.task import either, ends_of
 from quadrl.engines import mjcf
 from quadrl.engines.rng import Rng
 from quadrl.engines.solids import Solids
@@ -75,13 +77,16 @@ def by_mj_step(task, seed, mode):
     """Bare mj_step and the task's own functions: what every API has to give, bit for bit."""
     vehicle = VEHICLES["paper"]
     model = mjcf.compile_model(vehicle, contact=task.contact, drawn=False, scene=task.build)
-    data, scene = mujoco.MjData(model), Scene(task.solids())
+    rays = {name: sensors.make(name, given).rays for name, given in task.sensors.items()}
+    data, scene = mujoco.MjData(model), Scene(task.solids(), rays)
     finer = round(vehicle.physics_timestep / model.opt.timestep)
     row = parameters.rows(vehicle)
     origin = np.array([0.0, 0.0, max(task.altitude, vehicle.ground_clearance)])
     solids = Solids(model, 1, origin, lambda name: getattr(model, name)[None], Threads(1, 1))
     hits, feet = np.split(data.userdata[None, parameters.AIR :], [parameters.HIT], axis=1)
-    world = types.SimpleNamespace(solids=solids, hits=hits, feet=feet)
+    world = types.SimpleNamespace(
+        solids=solids, hits=hits, feet=feet, qpos=data.qpos[None], num_envs=1, forked=False
+    )
     world.clearance = lambda rows: solids.clearance(data.qpos[None])
     control = modes.kind(mode)(vehicle)
     own = parameters.Parameters.of(row, vehicle.control_timestep)
@@ -103,6 +108,10 @@ def by_mj_step(task, seed, mode):
         seen = scene.world(world)
         now = Snapshot(state(), remembered, own, action, command, time, world=seen)
         return dataclasses.replace(now, potentials=task.measure(now))
+
+    def observed(now):
+        read = {name: own.read(now.world.ranges(name), 0.0, None) for name, own in rays.items()}
+        return flat(task.observe(now) | read)
 
     def move(substep):
         time = np.array([len(errors) * vehicle.control_timestep])
@@ -127,7 +136,7 @@ def by_mj_step(task, seed, mode):
         return snapshot(remembered, np.zeros((1, control.size)), start.rotor_speed)
 
     before = begin()
-    led_to = flat(task.observe(before))[0]
+    led_to = observed(before)[0]
     while True:
         action = (yield led_to)[None].astype(np.float64)
         setpoint = control.setpoint(before.state, action)
@@ -145,7 +154,7 @@ def by_mj_step(task, seed, mode):
         solids.arrive()
         errors.append(0.0)  # counts the step: `snapshot` tells the time
         now = snapshot(before.task, action, command if control.has_loops else setpoint)
-        terminated = task.terminated(now)
+        terminated = either(ends_of(task, now))
         late = len(errors) * vehicle.control_timestep > task.time_limit - 1e-9
         truncated = late & ~terminated
         errors[-1] = float(task.error(now)[0])
@@ -154,10 +163,10 @@ def by_mj_step(task, seed, mode):
         end.succeeded = success = (terminated | truncated) & task.succeeded(now, end)
         reward = total(task.reward(before, now, end))
         before = snapshot(task.update(before, now), now.action, now.rotor_command)
-        seen = begun = flat(task.observe(before))
+        seen = begun = observed(before)
         if terminated or truncated:
             before = begin()
-            begun = flat(task.observe(before))
+            begun = observed(before)
         led_to = seen[0], reward[0], terminated[0], truncated[0], success[0], begun[0]
 
 

@@ -24,6 +24,7 @@ TINY = TrainConfig(
     critic_hidden=(16,),
     task_options={"time_limit": 0.5},
     checkpoint_seconds=0.0,
+    evaluations=0,
     holds_goal=False,
     ppo={"epochs": 2, "minibatch": 16},
 )

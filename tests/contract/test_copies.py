@@ -26,6 +26,7 @@ SETTINGS = {
     "alone": {},
     "randomized": {"randomization": "full", "observe": SEEN},
     "free flight": {"engine": "free_flight", "randomization": {"command_delay": (0.0, 0.1)}},
+    "lost": {"randomization": {"command_loss": 4.0, "command_jitter": 0.5}},
     "dead time": {"engine": "free_flight", "vehicle": "crazyflie", "time_limit": 0.12},
     "loops": {"control_mode": "velocity", "vehicle": "crazyflie", "task": "target_following"},
     "contact": {"task": "landing", "start_height": 0.05},

@@ -60,6 +60,7 @@ def test_a_route_keeps_it_too():
 
 def test_one_of_several_tasks_keeps_it_too():
     check_task(OneOf(members=("hover", "straight_and_level"), time_limit=1.5))
+    check_task(OneOf(members=("hover", "landing"), time_limit=1.5))  # one on the ground
 
 
 def check_identity(task, actions=ACTIONS, mode="rotor"):

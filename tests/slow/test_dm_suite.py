@@ -18,10 +18,10 @@ run = functools.partial(python, "-W", "error", without=("MUJOCO_GL",))
 def test_dm_controls_own_suite_test_passes():
     output = run(Path(__file__).parents[1] / "dm_control_conformance.py").stderr
     assert output.rstrip().endswith("OK"), output  # nothing skipped either
-    # One test of the constants, and nine of every task.
-    assert int(re.search(r"Ran (\d+) tests", output)[1]) == 1 + 9 * len(TASKS)
+    # One test of the constants, and nine of every task but for one of navigation.
+    assert int(re.search(r"Ran (\d+) tests", output)[1]) == 9 * len(TASKS)
     for name in TASKS:
-        assert output.count(f"task='{name}'") >= 2 * 8
+        assert output.count(f"task='{name}'") >= 2 * (8 - (name == "navigation"))
 
 
 @pytest.mark.parametrize("first", ["", "import dm_control.suite; "])

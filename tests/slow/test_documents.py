@@ -32,7 +32,7 @@ from scripts.reports import pages, report
 REPOSITORY = Path(__file__).parents[2]
 PAGES = [*pages.all_pages(), REPOSITORY / "CONTRIBUTING.md"]
 TEXTS = {str(page.relative_to(REPOSITORY)): page.read_text() for page in PAGES}
-LANGUAGES = {"python", "bash", "bibtex", "diff", "toml", ""}  # the first two are run
+LANGUAGES = {"python", "bash", "bibtex", "c", "diff", "toml", ""}  # the first two are run
 SCRIPTS = ("scripts/quickstart", "scripts/test")
 ACTIVATES = "source .venv/bin/activate"
 SHORT_TRAINING = ("--steps", "8192", "--episodes", "4", "--no-video")
@@ -45,11 +45,24 @@ SHORTER = {
 }
 STUDIES = sorted((REPOSITORY / "docs" / "studies").glob("*.toml"))
 RUN = "runs/hover"  # what the pages call their run
-UNRUN = ("quadrl view ", "quadrl study ")  # tested in another way
+UNRUN = (
+    "quadrl view ",
+    "quadrl study ",
+    "quadrl identify ",
+    "quadrl replay ",
+    "quadrl crosscheck ",
+)  # tested in another way
+REFERENCE = {f"docs/{name}.md" for name in ("api", "cli", "paper", "results")}
+GUIDES = sorted(x for x in TEXTS if re.fullmatch(r"docs/(tasks/)?\w+\.md", x) if x not in REFERENCE)
 FENCE = re.compile(r"^( *)```(.*)\n((?:.*\n)*?)\1```$", re.MULTILINE)  # indent, language, block
 
 
-RUNNER = "import runpy, sys\nfor path in sys.argv[1:]: runpy.run_path(path, run_name='__main__')"
+RUNNER = """
+import importlib, runpy, sys
+for name in sys.argv[1:]:  # a file that a reader saves is imported
+    snippet = name.startswith("snippet")
+    runpy.run_path(name, run_name="__main__") if snippet else importlib.import_module(name)
+"""
 
 
 def blocks(language):
@@ -69,7 +82,8 @@ def commands(block):
 def in_turn(block):
     """Its commands of quadrl, those together that need a run which another of them makes."""
     found = [x for x in commands(block) if x.startswith("quadrl ") and not x.startswith(UNRUN)]
-    alone = {*re.findall(r"--out (runs/\S+)", block)} <= {RUN}
+    made = re.findall(r"--out (runs/\S+)|--name (\S+)", block)
+    alone = {out or f"runs/{name}" for out, name in made} <= {RUN}
     return [(command,) for command in found] if alone else [tuple(found)] * bool(found)
 
 
@@ -78,7 +92,14 @@ BASH = [block for page in blocks("bash").values() for block in page]
 COMMANDS = [command for block in BASH for command in commands(block)]
 PIP = [command for command in COMMANDS if command.startswith("python -m pip ")]
 VIEWS = [command for command in COMMANDS if command.startswith("quadrl view ")]
+SAVED = {  # files that a page lets its reader save, by name
+    name: block
+    for text in TEXTS.values()
+    for name, block in re.findall(r"save it as `(\w+\.py)`[^`]*```python\n((?:.*\n)*?)```\n", text)
+}
 QUADRL = list(dict.fromkeys(some for block in BASH for some in in_turn(block)))
+# tests/slow/test_identification.py runs those of the page, with logs of its own.
+LOGS = [x for x in COMMANDS if x.startswith(("quadrl identify ", "quadrl replay "))]
 STARTS_RAY = [command for command in COMMANDS if command.startswith("ray ")]
 PLACEHOLDER = re.compile(r"\b(COMMAND|FOLDER|NAME|TASK|N)\b")
 WRITTEN = {
@@ -87,6 +108,7 @@ WRITTEN = {
     for command in re.findall(r"`(quadrl [^`]*)`", FENCE.sub("", text))
 }
 SENTENCES = sorted(x for x in WRITTEN if not PLACEHOLDER.search(x) and "--help" not in x)
+CROSSCHECKS = [command for command in COMMANDS if command.startswith("quadrl crosscheck ")]
 STUDIED = [command for command in COMMANDS if command.startswith("quadrl study ")]
 
 
@@ -114,8 +136,10 @@ def trained(tmp_path_factory):
 
 @pytest.fixture
 def folder(trained, tmp_path):
-    """A folder of its own with that run."""
+    """A folder of its own with that run, and the files that pages let their readers save."""
     shutil.copytree(trained / RUN, tmp_path / RUN)
+    for name, block in SAVED.items():
+        (tmp_path / name).write_text(block)
     return tmp_path
 
 
@@ -134,9 +158,11 @@ def test_python_snippets_run(page, folder):
     snippets = PYTHON[page]
     if not importlib.util.find_spec("dm_control"):
         snippets = [snippet for snippet in snippets if "quadrl.load(" not in snippet]
-    names = [f"snippet_{k}.py" for k in range(len(snippets))]
+    saved = {block: name.removesuffix(".py") for name, block in SAVED.items()}
+    names = [saved.get(snippet, f"snippet_{k}.py") for k, snippet in enumerate(snippets)]
     for name, snippet in zip(names, snippets, strict=True):
-        (folder / name).write_text(snippet)
+        if snippet not in saved:
+            (folder / name).write_text(snippet)
     python("-c", RUNNER, *names, cwd=folder)
 
 
@@ -149,10 +175,10 @@ def test_quadrl_commands_run(commands, folder):
         python("-m", "quadrl", *shortened(arguments), cwd=folder)
 
 
-@pytest.mark.parametrize("command", [*SENTENCES, *STUDIED])
+@pytest.mark.parametrize("command", [*SENTENCES, *STUDIED, *CROSSCHECKS])
 def test_command_that_is_not_run_is_understood(command):
     _, *arguments = shlex.split(command, comments=True)
-    made_before = {"--import", "--resume", "--from", "--seeds"} & {*arguments}
+    made_before = {"--import", "--resume", "--from", "--seeds", "RUN"} & {*arguments}
     if len(arguments) == 1:
         assert arguments[0] in (*cli.COMMANDS, "--version")
     elif arguments[0] == "train" and not made_before:
@@ -200,7 +226,8 @@ def test_every_command_is_checked():
         for block in blocks("").get(page, ()):  # which nothing runs
             assert not re.search(r"^ *(quadrl|python -m) ", block, re.MULTILINE), page
     tested = {command for some in QUADRL for command in some}
-    assert {*COMMANDS} <= tested | {*VIEWS, *STUDIED, *SCRIPTS, *PIP, *STARTS_RAY, ACTIVATES}
+    other = {*VIEWS, *STUDIED, *SCRIPTS, *PIP, *LOGS, *CROSSCHECKS, *STARTS_RAY, ACTIVATES}
+    assert {*COMMANDS} <= tested | other
     for script in SCRIPTS:
         assert os.access(REPOSITORY / script, os.X_OK)
         run("bash", "-n", REPOSITORY / script)
@@ -228,8 +255,20 @@ def test_every_task_has_a_page():
 
 def test_pages_count_the_tasks_and_the_aircraft():
     counted = f"[{len(tasks.TASKS)} tasks](tasks.md)"
-    assert counted in TEXTS["docs/index.md"] and counted in TEXTS["docs/clients.md"]
+    assert counted in TEXTS["docs/index.md"] and counted in TEXTS["docs/elsewhere.md"]
     assert f"[{len(quadrl.VEHICLES)} aircraft](aircraft.md)" in TEXTS["docs/index.md"]
+
+
+@pytest.mark.parametrize("page", GUIDES)
+def test_a_guide_can_be_read_in_minutes(page):
+    own = re.sub(r"<!-- begin ([\w-]+) -->.*?<!-- end \1 -->", "", TEXTS[page], flags=re.DOTALL)
+    assert len(own.split()) <= 1500
+
+
+def test_what_was_tried_is_linked_from_its_guide():
+    for page in (page for page in TEXTS if page.startswith("docs/lab/")):
+        name = page.removeprefix("docs/")
+        assert [x for x in GUIDES if f"]({name}" in TEXTS[x] or f"](../{name}" in TEXTS[x]], page
 
 
 def test_actions_of_workflows_are_pinned():
@@ -277,6 +316,33 @@ def test_the_commands_of_the_first_page_can_follow_one_another():
 
 def test_generated_parts_are_up_to_date():
     pages.pages(check=True)
+
+
+def test_where_learning_wins_has_the_flights_of_the_reports():
+    """Means over the seeds of each task; a policy and a controller in the order of the page."""
+    rows = re.findall(
+        r"^\| (.*) \| successful \| (.*) \| (.*) \| .* \| .* \| "
+        r"`scripts/report (robust|robustness)` \|",
+        TEXTS["docs/results.md"],
+        re.MULTILINE,
+    )
+    order = "hover static_waypoint random_waypoint straight_and_level landing target_following"
+    parts = {"robust": "rows", "robustness": "alone"}
+    loaded = {name: report.load(name)[part] for name, part in parts.items()}
+    assert {row[-1] for row in rows} == {*parts}
+    for condition, *cells, name in rows:
+        own = [row for row in loaded[name] if row["condition"] == condition]
+        for cell, controller in zip(cells, (False, True), strict=True):
+            if name == "robust":
+                chosen = [row for row in own if (row["seed"] == "controller") == controller]
+                shares = [(row["task"], row["success"]) for row in chosen]
+            else:
+                who = "tuned controller" if controller else "robust policy"
+                shares = [(row["task"], row[who]) for row in own]
+            said = [float(share.removesuffix(" %")) for share in cell.split(", ")]
+            for task, share in zip(order.split(), said, strict=True):
+                flown = [x for of, x in shares if of == task]
+                assert abs(share - 100 * sum(flown) / len(flown)) <= 0.51, (condition, task)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=TEXTS)

@@ -60,9 +60,16 @@ def test_another_seed_is_another_run(finished, tmp_path, seed):
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_algorithm_continues_where_it_was_stopped(tmp_path, algo):
-    # A task with a state of its own; six rotors, and commands that are not theirs.
-    other = {"vehicle": "hexa"} | ({} if algo == "apg" else {"control_mode": "velocity"})
-    config = changed(algo=algo, task="target_following", **other)
+    # A task with a state of its own; six rotors, and commands that are not theirs. One algorithm
+    # differentiates the rotors' own, and the teacher of another flies quadrotors.
+    vehicle, rotors, mode, numbers = {
+        "apg": ("hexa", 6, "rotor", 6),
+        "dagger": ("racer", 4, "share_of_x", 4),
+    }.get(algo, ("hexa", 6, "velocity", 4))
+    other = {"task": "target_following", "vehicle": vehicle, "control_mode": mode}
+    if algo == "dagger":  # what the teacher is asked about
+        other["observe"] = {"action_history": 2, "sensors": {"level": {}}}
+    config = changed(algo=algo, **other)
     alone = train(config, tmp_path / "alone")
     stopped(config, tmp_path / "run", 1)
     stopped(config, tmp_path / "run", 3, resume=True)
@@ -71,9 +78,17 @@ def test_every_algorithm_continues_where_it_was_stopped(tmp_path, algo):
     assert quadrl.Policy.load(folder).metadata["steps"] == 5 * 32  # of the last checkpoint
     assert_same_run(alone, train(config, tmp_path / "run", resume=True))
     policy = quadrl.Policy.load(alone)
-    assert policy.metadata["algo"] == algo and policy.action_size == (6 if algo == "apg" else 4)
-    assert (policy.metadata["vehicle"]["name"], policy.metadata["rotors"]) == ("hexa", 6)
-    assert policy.control_mode == config.conditions["control_mode"]
+    assert policy.metadata["algo"] == algo and policy.action_size == numbers
+    assert (policy.metadata["vehicle"]["name"], policy.metadata["rotors"]) == (vehicle, rotors)
+    assert policy.control_mode == config.conditions["control_mode"] == mode
+
+
+def test_a_training_of_several_tasks_continues_with_their_returns(tmp_path):
+    tasks = {"task": "one_of", "task_options": {"members": ["hover", "landing"]}}
+    config = changed(**tasks, gammas=(0.9, 0.97))
+    alone = train(config, tmp_path / "alone")
+    stopped(config, tmp_path / "run", 3)
+    assert_same_run(alone, train(config, tmp_path / "run", resume=True))
 
 
 def test_an_uncertain_training_continues_and_its_policy_knows_what_it_met(tmp_path):
@@ -276,7 +291,7 @@ def test_values_continue_at_truncation_and_not_at_termination(tmp_path):
         batch["next"] = TensorDict(after, [1, 2])
         with torch.no_grad():
             training._evaluate(batch)
-            training.advantages(batch)
+            training.advantages(batch, np.zeros((1, 2), int))
         return batch["value_target"].flatten().tolist()
 
     # Two steps of one episode: delta_1 = 2 + 5 - 10 = -3, so A_1 = -3 and the target is 7;

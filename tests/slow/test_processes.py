@@ -4,17 +4,22 @@ import importlib.util
 import multiprocessing
 import os
 import pickle
+import re
 import shutil
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import excited
 import mujoco
 import numpy as np
 import pytest
 from apis import APIS
 from processes import python
 
+from quadrl import VEHICLES, cli
+from quadrl.aircraft.command_map import CommandMap
+from quadrl.aircraft.presets import in_real_air
 from quadrl.engines import native
 from quadrl.engines.native import compiling
 from quadrl.testing import varied_actions
@@ -199,3 +204,58 @@ FORKED = """
 
 def test_batches_that_have_flown_fly_on_in_a_forked_process_bit_for_bit():
     python("-c", textwrap.dedent(FORKED))
+
+
+PIPED = """tasks
+train hover --steps 8192 --num-envs 64 --episodes 2 --out run --log wandb
+train --help
+new-task my_task
+check my_task --import my_task.py
+new-aircraft mine
+study study.toml
+runs .
+evaluate run --episodes 2
+evaluate run hover --episodes 2
+evaluate nothing
+robustness run --episodes 2 --no-recovery
+render run --width 160 --height 120 --fps 2
+plot run
+export paper --to mjcf
+crosscheck nothing
+identify --stand STAND --out mine.json
+replay log.npz --vehicle crazyflie_brushless
+benchmark --num-envs 8 --seconds 0.01 --repeats 1
+completion bash"""
+COMMANDS = """
+import sys
+from quadrl.cli import main
+for line in sys.argv[1].splitlines():
+    try:
+        main(line.split())
+    except SystemExit as end:
+        print(line.split()[0], end.code or 0)
+"""
+
+
+def test_no_command_writes_colours_or_moves_the_cursor_in_a_pipe(tmp_path):
+    """Whatever the terminal is called that the pipe is typed into."""
+    pytest.importorskip("wandb")
+    assert {line.split()[0] for line in PIPED.splitlines()} == {*cli.COMMANDS} - {"view"}
+    (tmp_path / "study.toml").write_text(
+        'tasks = ["hover"]\nseeds = [0]\nepisodes = 2\nsettings = { steps = 8192, num_envs = 64 }\n'
+    )
+    forced = "FORCE_COLOR", "CLICOLOR_FORCE", "TTY_COMPATIBLE"
+    terminal = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "WANDB_MODE": "offline"}
+    stand = Path(__file__).parents[2] / "docs/data/thrust_stand_cf2.1-stock-prop.csv"
+    flown = in_real_air(VEHICLES["crazyflie_brushless"]), CommandMap(194.0, 223.0, 834.0)
+    (log,) = excited.fly(*flown, count=1, seconds=12.0)
+    np.savez(tmp_path / "log.npz", **excited.columns(log))
+    lines = PIPED.replace("STAND", str(stand))
+    done = python("-c", COMMANDS, lines, cwd=tmp_path, without=forced, **terminal)
+    ended = re.findall(r"^(\S+) (\d)$", done.stdout, re.MULTILINE)
+    # Help, what there is not, and a script.
+    assert ended == [("train", "0"), ("evaluate", "2"), ("crosscheck", "2"), ("completion", "0")], (
+        done.stderr
+    )
+    for text in (done.stdout, done.stderr):
+        assert not re.findall(r"[\x1b\r\x07\x08].{,20}", text)

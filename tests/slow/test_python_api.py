@@ -51,7 +51,9 @@ def test_train_takes_all_settings_at_once(run, tmp_path):
 def test_train_goes_on_further(run, tmp_path):
     folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
     further = quadrl.train(resume=folder, steps=256, episodes=2)
-    assert further.policy.metadata["steps"] == 256 == further.config.steps
+    assert further.config.steps == 256 >= further.policy.metadata["steps"]
+    rows = (folder / "metrics.csv").read_text().splitlines()
+    assert rows[-1].split(",")[1] == "256"
     with refused("seed", 4):
         quadrl.train(resume=folder, seed=4)
 
@@ -107,9 +109,10 @@ def test_everything_says_what_it_is_in_short(run):
         quadrl.VEHICLES["racer"], quadrl.plot(run),
     )  # fmt: skip
     for one in shown:
-        # A run that misses its task's targets says so in a line of its own, with what to do next.
-        said, *missed = repr(one).split("\n")
-        assert len(said) < 300 and missed == ([run.misses] if one is run else [])
+        # A run that misses its task's targets says so in a line of its own, with what to do next,
+        # and in two how its episodes ended and what its reward was made of.
+        said, *missed = repr(one).split("\n", 2)
+        assert len(said) < 300 and missed == ([run.misses, run.causes] if one is run else [])
     assert run.misses.startswith("misses: ")
     assert repr(TINY.seed) in repr(TINY) and "num_envs=8" in repr(TINY)
 

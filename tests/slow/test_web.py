@@ -94,7 +94,7 @@ def test_policies_act_as_in_python(node):
     rng, jobs, expected = np.random.default_rng(0), [], []
     policies = {file.stem: Policy.load(file) for file in shipped()}
     for name, policy in policies.items():
-        if policy.task in web.FLOWN:
+        if policy.task in web.FLOWN and not policy.memory:
             scale = rng.uniform(0, 3, (200, 1))  # past where the observations are clipped
             away = scale * policy.deviation * rng.normal(size=(200, policy.size))
             observation = (policy.mean + away).astype(np.float32)
@@ -184,6 +184,28 @@ def test_a_flight_of_a_policy_is_pythons(node, name, events):
         assert differences["error"] < 1e-6 and differences["reward"] < 1e-3
 
 
+@pytest.mark.parametrize("task", ["random_waypoint", "target_following"])
+def test_a_flight_goes_on_with_another_task_from_where_it_is(node, task):
+    turn = {"step": 40, "kind": "task", "values": [[*web.FLOWN].index(task)]}
+    settings = {"task": "hover", "aircraft": "paper", "seed": 3}
+    (found,) = node(dict(job="fly", settings=settings, controller=None, steps=160, events=[turn]))
+    environment, seen = begun("hover", "paper", 3)
+    controller = GeometricController(VEHICLES["paper"], environment.task)
+    for _ in range(40):
+        seen = environment.flatten(environment.step(controller(seen)).observation)
+    place, environment = coordinates(environment), begun(task, "paper", 3)[0]
+    start = dict(position=place[:3] - environment.origin, quaternion=place[3:7])
+    start |= dict(velocity=place[7:10], body_rate=place[10:13], rotor_speed=place[13:])
+    environment.seed(3)
+    seen = environment.flatten(environment.reset(start=start))
+    controller = GeometricController(VEHICLES["paper"], environment.task)
+    for there in found["flown"][40:]:
+        seen = environment.flatten(environment.step(controller(seen)).observation)
+        own = coordinates(environment)
+        np.testing.assert_allclose(there["coordinates"], own, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(there["goal"], environment.goals()[0], atol=1e-6)
+
+
 def test_an_estimate_begins_with_what_an_aircraft_can_know(node):
     observe = Policy.load(SHIPPED / "hover_robust.safetensors").scenario.observe
     environment, _ = begun("hover", "paper", 3, observe=observe)
@@ -256,6 +278,7 @@ def test_files_that_cannot_fly_are_refused(node, tmp_path):
                 ({"sensors": {"aim": {"near": 1.0}}}, "observes aim with its own near"),
                 ({"sensors": {"aim": {}}}, "observes 22 numbers; hover shows 19"),
                 ({"sensors": {"aim": {"beside_goal": True}}}, "^$"),
+                ({"sensors": {"standard": {}}}, "observes 22 numbers; hover shows 31"),
             )
         ),
         *((part, "hover", "paper", "damaged") for part in (hover[:1000], hover[:-8], b"", b"no")),

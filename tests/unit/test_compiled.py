@@ -17,8 +17,10 @@ from quadrl import tasks
 from quadrl.base import trace
 from quadrl.base.errors import NativeError, QuadrlWarning
 from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace, look_up
+from quadrl.conditions.sensor import SENSORS
 from quadrl.conditions.solids import Cylinder, Gate, Pose
 from quadrl.core.environment import Environment
+from quadrl.engines.engine import ENGINES
 from quadrl.engines.native import compiling
 from quadrl.engines.rowwise import RowFunction
 from quadrl.learning.config import TrainConfig
@@ -27,6 +29,7 @@ from quadrl.tasks.hover import Hover
 from quadrl.testing import is_the_same_compiled
 
 STEPS = 40
+LOST = {"command_loss": 2.0, "command_jitter": 0.5, "command_delay": (0.0, 0.04)}
 SEEN = {"rotor_speed": "estimated", "airspeed": True, "disturbance": True, "action_history": 2}
 
 
@@ -79,6 +82,7 @@ SETTINGS = {
     "loops in free flight": (21, {"control_mode": "thrust_body_rate", "engine": "free_flight"}),
     "drawn": (9, {"engine": "free_flight", "randomization": {"mass": (0.7, 0.9)}}),
     "randomized": (4, {"randomization": "full", "observe": SEEN}),
+    "lost": (21, {"engine": "free_flight", "randomization": LOST, "observe": SEEN}),
 }
 # A batch of each task; the rest concerns a task's step alike, whatever it computes. The contract
 # flies one aircraft of each.
@@ -225,7 +229,7 @@ def test_a_transition_is_flattened_after_the_next_reset_too():
 
 
 def rays(self, now):
-    return functools.reduce(np.add, [now.potentials.distance * k for k in range(2600)])
+    return functools.reduce(np.add, [now.potentials.distance * k for k in range(4200)])
 
 
 def norm(self, now):
@@ -243,7 +247,7 @@ def summed(self, now):
         ("terminated", branching, "all rows at once"),
         ("error", norm, "numpy.linalg.norm"),
         ("error", summed, "cumsum"),
-        ("error", rays, "it needs more than 5000 operations"),  # the compiler would take long
+        ("error", rays, "it needs more than 8000 operations"),  # the compiler would take long
     ],
 )
 def test_what_is_more_than_arithmetic_is_run_as_it_is_written(name, function, reason):
@@ -571,3 +575,79 @@ def test_a_function_takes_what_it_reads_of_a_hundred_posts_and_no_more():
     compute = compiling.compile_generated(made.source).compute
     compute(*(ctypes.c_void_p(a.ctypes.data) for a in (made.constants, x, y)), 8)
     np.testing.assert_array_equal(y[0], x[2] * x[3] - x[0])
+
+
+ALL_SEEN = {
+    "rotor_speed": "estimated",
+    "relative_rotor_speed": True,
+    "action_history": 1,
+    "observation_history": 1,
+    "privileged": True,
+    "sensors": {
+        "airspeed": {"noise": 0.3, "bias": 0.2, "delay": 0.1},
+        "clearance": {"reach": 2.0, "noise": 0.01},
+        "disturbance": {"rate": 10},
+        "aim": {"beside_goal": True},
+        "estimate": {"rate": 10},
+        "state": {"delay": 0.05},
+    },
+}
+DRAWN = {
+    "noise": {"position": 0.01, "attitude": 0.02, "velocity": 0.05, "body_rate": 0.05},
+    "bias": {"position": 0.02, "velocity": 0.03},
+    "observation_delay": (0.0, 0.07),
+    "rate_delay": (0.0, 0.03),
+    "command_delay": (0.0, 0.03),
+    "mass": (0.9, 1.1),
+}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("mode", ["rotor", "thrust_body_rate"])
+def test_compiled_sensors_are_the_written_ones(engine, mode):
+    """All of them, with errors, ages and rates, among resets and aircraft that diverge."""
+    kind = type("Written", (Hover,), {"compiled": False})
+    flown = {"engine": engine, "control_mode": mode, "num_envs": 11, "seed": 5}
+    flown |= {"observe": ALL_SEEN, "randomization": DRAWN, "weather": "light"}
+    flown |= {"events": ["rotor_failure", "gust_front"]}
+    pair = [Environment(task, **flown) for task in (Hover(), kind())]
+    for each in pair:
+        each.reset()
+    assert not pair[0].not_compiled and pair[1].not_compiled
+    rng, ends, broken = np.random.default_rng(3), 0, 0
+    for step in range(30):
+        action = rng.normal(0, 0.5, (11, pair[0].action_size))
+        if step in (9, 19):
+            for each in pair:
+                each.engine.qvel[step % 4] = 1e6
+        done, expected = (each.step(action) for each in pair)
+        for name, term in expected.observation.items():
+            np.testing.assert_array_equal(done.observation[name], term, err_msg=name)
+        np.testing.assert_array_equal(done.reward, expected.reward)
+        np.testing.assert_array_equal(pair[0].privileged, pair[1].privileged)
+        over = expected.terminated | expected.truncated | (np.arange(11) == step)
+        ends, broken = ends + over.sum(), broken + expected.diverged.sum()
+        first, other = (each.reset(over) for each in pair)
+        for name, term in other.items():
+            np.testing.assert_array_equal(first[name], term, err_msg=name)
+        for name, array in pair[1].save().items():
+            np.testing.assert_array_equal(pair[0].save()[name], array, err_msg=name)
+    assert ends > 15 and broken == 2
+
+
+def test_a_sensor_that_does_not_ask_for_it_is_not_compiled(monkeypatch):
+    monkeypatch.setattr(SENSORS["airspeed"], "compiled", False)
+    environment = Environment("hover", observe={"airspeed": True})
+    environment.reset()
+    assert environment.not_compiled == (
+        "the class of the sensor airspeed does not say `compiled = True`"
+    )
+
+
+def test_long_histories_are_not_compiled():
+    lengths = {length: Environment("hover", observe={"observation_history": length})
+               for length in (2, 20)}  # fmt: skip
+    for environment in lengths.values():
+        environment.reset()
+    assert not lengths[2].not_compiled
+    assert lengths[20].not_compiled.startswith("its sensors remember")

@@ -35,7 +35,7 @@ from quadrl.evaluation.rollout import fly, summarize
 from quadrl.tasks.hover import Hover
 
 PAPER = Vehicle()
-LOOPED = [name for name in CONTROL_MODES if name != "rotor"]
+LOOPED = [name for name, mode in CONTROL_MODES.items() if mode.has_loops]
 # High up, and over only by the clock.
 FREE = Hover(time_limit=100.0, max_distance=1e3, altitude=500.0)
 both = pytest.mark.parametrize("name", CONTROLLERS)
@@ -263,6 +263,8 @@ def test_scales_by_worked_numbers():
     # Yaw: 0.8 * 2 k_Q (260.678^2 - 190.678^2) / J_z = 2.917; sqrt(2.917 * 0.5) = 1.208.
     expected = {
         "rotor": ([225.678] * 4, [35.0] * 4),
+        "share": ([159.578] * 4, [159.578] * 4),  # half of 319.157
+        "share_of_x": ([159.578] * 4, [159.578] * 4),
         "thrust_body_rate": ([1, 0, 0, 0], [1.0, 5.593, 5.593, 2.168]),
         "velocity": ([0] * 4, [4.148, 4.148, 2.246, 1.208]),
         "position": ([0] * 4, [4.148, 4.148, 2.246, 0.5]),
@@ -279,7 +281,7 @@ def test_scales_by_worked_numbers():
 
 
 @layouts
-@pytest.mark.parametrize("name", CONTROL_MODES)
+@pytest.mark.parametrize("name", ["rotor", *LOOPED])
 def test_no_action_hovers_at_any_heading_and_actions_are_clipped(name, vehicle):
     flyer = Flyer(name, vehicle, headings=(0.0, 2.0, -1.5))
     flyer.fly(0.0, 1.0)

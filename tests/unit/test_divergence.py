@@ -1,7 +1,7 @@
 """Extreme aircraft, actions and contacts: what is flown is right, or terminated and counted.
 
 How far a flight can be trusted is told by four numbers of the aircraft and its flight, each a rate
-times the physics step: see `extreme.LIMITS`, and the tables of docs/physics.md. Who is faster
+times the physics step: see `extreme.LIMITS`, and the tables of docs/lab/accuracy.md. Who is faster
 than the step resolves (`Vehicle.resolved_speed`, `resolved_turn`) has diverged.
 """
 

@@ -20,7 +20,7 @@ from processes import python
 import quadrl
 from quadrl import cli
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.control.modes import CONTROL_MODES
+from quadrl.control.modes import modes_of
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.deploy.export import described, export
@@ -136,6 +136,7 @@ POLICIES = [
     Policy.pretrained("hover", variant="robust"),  # sees its last actions and a disturbance
     linear(24, 6, vehicle="hexa"),
     make_remembering(vehicle="crazyflie"),
+    make_remembering(alone=True),
 ]
 policies = pytest.mark.parametrize("k", range(len(POLICIES)), ids=lambda k: repr(POLICIES[k]))
 
@@ -246,8 +247,10 @@ def commanded(said: dict, action: np.ndarray) -> np.ndarray:
     return np.clip(zero + np.where(action > 0, up, -down) * action, least, most)
 
 
-@pytest.mark.parametrize("mode", CONTROL_MODES)
-@pytest.mark.parametrize("vehicle", ["racer", "hexa"])
+@pytest.mark.parametrize(
+    ("mode", "vehicle"),
+    [(mode, name) for name in ("racer", "hexa") for mode in modes_of(VEHICLES[name])],
+)
 def test_an_action_is_the_command_that_the_file_says(mode, vehicle):
     environment = Environment("hover", vehicle=vehicle, control_mode=mode, seed=0)
     size = environment.size, environment.action_size
@@ -256,6 +259,10 @@ def test_an_action_is_the_command_that_the_file_says(mode, vehicle):
     action = np.random.default_rng(0).uniform(-1, 1, (50, environment.action_size))
     action = np.concatenate([action, np.sign(action)])
     expected = environment.control_mode.values(action)
+    if mode == "share_of_x":  # each number names the rotor that it commands
+        expected = expected[
+            :, [int(one["name"].removeprefix("rotor_")) - 1 for one in said["action"]]
+        ]
     np.testing.assert_allclose(commanded(said, action), expected, rtol=1e-12, atol=1e-12)
 
 
@@ -316,8 +323,10 @@ def test_every_term_of_a_shipped_policy_has_its_formula(name):
     assert all(term["formula"] for term in (*said["observation"], *said["sensors"]))
     assert len(said["normalisation"]["mean"]) == 1 + said["observation"][-1]["last"]
     sensors = {sensor["name"]: sensor for sensor in said["sensors"]}
-    assert "privileged" not in sensors and bool(sensors) == ("robust" in name)
-    if sensors:  # constants stand beside the formulas that have them, defaults too
+    assert "privileged" not in sensors
+    senses = "robust", "raptor", "hover_any", "navigation", "all_ppo"
+    assert bool(sensors) == any(word in name for word in senses)
+    if "robust" in name:  # constants stand beside the formulas that have them, defaults too
         for sensor, constants in (
             ("aim", ("gain", "near", "most")),
             ("disturbance", ("smoothing",)),
@@ -331,7 +340,7 @@ def test_every_term_of_a_shipped_policy_has_its_formula(name):
 @functools.cache
 def on_the_page(name: str):
     """A class of the page for those who fly without quadrl."""
-    text = (Path(__file__).parents[2] / "docs" / "clients.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "fly_alone.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     (code,) = [block for block in blocks if f"class {name}" in block]
     exec(code, found := {})
@@ -348,7 +357,7 @@ def test_a_robust_policy_flies_by_its_file_alone(name):
     alone = on_the_page("Robust")(export(name, "onnx"))
     observation, steps, over = environment.reset(), 0, False
     while not over:
-        state, vector = environment.observer.frame.state, np.hstack([*observation.values()])
+        state, vector = environment.observer.estimate, np.hstack([*observation.values()])
         target = environment.task.target_velocity(environment.snapshot)
         rotation, offset = state.rotation[0], state.rotation[0] @ observation["goal"][0]
         motion = np.array(state.velocity[0]), np.array(state.body_rate[0])

@@ -27,15 +27,16 @@ CASES = {
     "holds the goal": {"holds_goal": True},
     "privileged": {"privileged": 3},
     "both": {"holds_goal": True, "privileged": 3},
+    "holds the goal of some of several tasks": {"task": "all", "holds_goal": True, "size": 31},
 }
 SETTINGS = [{}, {"clip": 0.1, "entropy": 0.25, "critic": 0.75}, {"critic": 0.0}]
 
 
 def networks(**settings):
     """Actor and critic in double precision, away from the start, and their normalisers."""
-    settings = {"hidden": (16,), "critic_hidden": (8, 8)} | settings
     # Of the size of hover, whose goal one of the policies holds.
-    actor, critic, normalisers = actor_critic(size=22, actions=4, **settings)
+    settings = {"hidden": (16,), "critic_hidden": (8, 8), "size": 22} | settings
+    actor, critic, normalisers = actor_critic(actions=4, **settings)
     for network in (actor, critic):
         disturbed(network, 0.2).double()
     for normaliser in normalisers.values():

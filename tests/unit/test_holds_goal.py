@@ -57,14 +57,24 @@ def test_errors_of_a_sensor_do_not_move_the_goal():
         goal_state(TrainConfig("hover", observe={"sensors": {"airspeed": errors}}))
         for errors in ({}, {"noise": 0.5, "bias": 0.2})
     )
-    for one, other in zip(exact, noisy, strict=True):
-        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(exact.seen, noisy.seen)
+    np.testing.assert_array_equal(exact.looks, noisy.looks)
 
 
 @pytest.mark.parametrize("variant", ["ideal", "robust"])
 def test_its_file_is_a_plain_network(variant):
-    policy, actor = some_policy("hover", variant=variant)
+    assert_the_same_function(*some_policy("hover", variant=variant))
+
+
+def test_so_is_that_of_one_that_holds_the_goal_state_several_tasks():
+    assert_the_same_function(*some_policy("all", hidden=(16, 12)), flags=6)
+
+
+def assert_the_same_function(policy, actor, flags=0):
+    """Hold a file against its actor, at observations of which each is of one of some tasks."""
     seen = torch.randn(30, policy.size)
+    if flags:
+        seen[:, -flags:] = torch.eye(flags).repeat(30 // flags, 1)
     with torch.no_grad():
         mean = actor.get_dist(TensorDict({"observation": seen}, [30])).mean.numpy()
     assert 0.01 < np.abs(mean).max()
@@ -99,3 +109,32 @@ def test_it_is_trained_and_continued_bit_for_bit(tmp_path):
 def test_a_task_without_one_goal_state_is_refused(task):
     with refused("holds_goal", match="target_velocity"):
         some_policy(task)
+
+
+def test_of_several_tasks_those_that_stay_at_a_goal_look_alike():
+    goal = goal_state(TrainConfig("all"))
+    place = begun("all", 1, observe=TrainConfig("all").scenario.observe).layout["standard"]
+    flags = [*range(place.start + 3, place.stop)]
+    # hover, static_waypoint and random_waypoint: targets of the others move, or it is a pad.
+    assert goal.others == tuple(flags[3:])
+    assert not goal.looks[flags[:3]].any() and goal.looks[flags[3:]].all()
+    assert not goal.seen[flags[3:]].any()
+
+
+def test_it_holds_the_goal_of_each_task_by_that_tasks_own_name():
+    policy, _ = some_policy("all", hidden=(16, 12))
+    for task in HELD:
+        environment = begun(
+            task, 3, engine="free_flight", observe=TrainConfig("all").scenario.observe
+        )
+        goals = environment.goals() - environment.origin
+        environment.seed(0)
+        seen = at_rest(environment, goals, 0.0)
+        np.testing.assert_allclose(policy(seen), 0, atol=2e-6)
+        assert np.abs(policy(seen + np.eye(1, policy.size, 9, dtype=np.float32))).max() > 0.01
+
+
+def test_several_tasks_that_stay_nowhere_are_refused():
+    members = ["straight_and_level", "landing"]
+    with refused("holds_goal", match="no task of one_of stays at a goal"):
+        some_policy("one_of", task_options={"members": members})

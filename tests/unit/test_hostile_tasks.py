@@ -37,6 +37,10 @@ def changed(method, function):
     return {method: replaced}
 
 
+def with_end(function):
+    return changed("terminated", lambda ends: ends | {"own": function(ends["away"])})
+
+
 def with_term(function):
     return changed("reward", lambda terms: terms | {"own": function(terms["progress"])})
 
@@ -55,12 +59,14 @@ HOSTILE = {  # methods, and what the error names
     "reward that is text": (with_term(lambda p: np.full(np.shape(p), "a")), "own"),
     "no reward": (changed("reward", lambda terms: {}), "reward"),
     "a part more": (changed("observe", lambda p: p | {"wind": p["velocity"]}), "observe"),
-    "an end for all": (changed("terminated", lambda end: end.any()), "terminated"),
+    "an end for all": (with_end(lambda end: end.any()), "terminated 'own'"),
+    "no ends": (changed("terminated", lambda ends: {}), "terminated"),
     "a part missing": (changed("observe", lambda p: dict(list(p.items())[1:])), "observe"),
     "a part too wide": (changed("observe", lambda p: p | {"goal": p["velocity"][:, :2]}), "goal"),
     "parts in disorder": (changed("observe", lambda p: dict(sorted(p.items()))), "observe"),
-    "an end that is no bool": (changed("terminated", lambda end: 1.0 * end), "terminated"),
-    "an end of another shape": (changed("terminated", lambda end: end[:, None]), "terminated"),
+    "an end that is no bool": (with_end(lambda end: 1.0 * end), "terminated 'own'"),
+    "an end of another shape": (with_end(lambda end: end[:, None]), "terminated 'own'"),
+    "one end that is no bool": (changed("terminated", lambda ends: 0.0), "terminated"),
     "an error of another shape": (changed("error", lambda error: np.zeros(5)), "error"),
     "a success of another shape": (changed("succeeded", lambda done: done[0]), "succeeded"),
 }

@@ -163,7 +163,7 @@ FOREIGN = [  # what other programs call a setting, and what the answer says
     ({"batch_size": 64}, "did you mean ppo.minibatch"),
     ({"total_timesteps": 1}, r"did you mean steps\?"),
     ({"n_steps": 1}, r"did you mean rollout\?"),
-    ({"wandb": True}, "TensorBoard's files"),
+    ({"wandb": True}, "did you mean log?"),
     ({"algo": "PPO"}, r"did you mean ppo\?"),
     ({"algo": "sac"}, "Stable-Baselines3 has it"),
     ({"task": "quadrl/RandomWaypoint-v0"}, r"did you mean random_waypoint\?"),
@@ -179,7 +179,7 @@ def test_foreign_names_lead_to_ours(given, said):
 
 def test_what_foreign_names_lead_to_is_there():
     own = {field.name for one in ALGORITHM_CONFIGS.values() for field in dataclasses.fields(one)}
-    ours = own | {field.name for field in dataclasses.fields(TrainConfig)} | {"out"}
+    ours = own | {field.name for field in dataclasses.fields(TrainConfig)} | {"out", "config"}
     assert {name for names in foreign.SETTINGS for name in names.split()} <= ours
     theirs = [*foreign.SETTINGS.values(), *foreign.OTHERWISE.values()]
     assert len(names := " ".join(theirs).split()) == len(set(names))
@@ -216,7 +216,7 @@ def test_a_run_in_wind_says_what_the_air_does(tmp_path):
 
 def test_a_setting_that_an_older_run_lacks_has_its_default(tmp_path):
     older = TINY.resolved()
-    del older["evaluations"], older["ppo"]["critic"]
+    del older["keep"], older["ppo"]["critic"]
     write_config(tmp_path, older)
     assert TrainConfig.of_folder(tmp_path) == TINY
 
@@ -283,6 +283,18 @@ def test_a_variant_is_settings_that_go_together():
     assert TrainConfig(**json.loads(json.dumps(dataclasses.asdict(own)))) == own
     racer = TrainConfig("hover", variant="robust", vehicle="racer")
     assert racer.conditions["vehicle_options"] == {}
+
+
+def test_a_variant_may_have_an_aircraft_and_a_control_rate_of_its_own():
+    config = TrainConfig("hover", variant="raptor")
+    assert (config.conditions["vehicle"], config.scenario.aircraft.control_timestep) == (
+        "racer",
+        0.01,
+    )
+    assert config.gamma == 0.9898  # 0.95^(0.01 / 0.05)
+    assert (config.rollout, config.iterations * config.rollout * config.num_envs) == (32, 5_013_504)
+    small = TrainConfig("hover", variant="raptor", vehicle="crazyflie")
+    assert small.scenario.aircraft.control_timestep == 0.01 and small.gamma == config.gamma
 
 
 def test_numbers_of_the_aircraft_can_differ_and_go_with_the_policy(tmp_path):

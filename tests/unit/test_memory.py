@@ -42,9 +42,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 KINDS = {PPO: PPOConfig(fused=False), TRPO: TRPOConfig(), VPG: VPGConfig()}
 
 
-def remembering(privileged=0):
+def remembering(privileged=0, memory="gru"):
     """Networks whose policy remembers, and whose normaliser has seen something."""
-    given = {"memory": "gru", "memory_width": WIDTH, "privileged": privileged}
+    given = {"memory": memory, "memory_width": WIDTH, "privileged": privileged}
     actor, critic, normalisers = actor_critic(0, SIZE, ACTIONS, **given)
     disturbed(actor)
     normalisers["observation"].update(2 * torch.randn(100, SIZE) + 1)
@@ -70,9 +70,11 @@ def unrolled(actor, observation, state, begins):
     for t in range(observation.shape[1]):
         state = torch.where(begins[:, t], torch.zeros_like(state), state)
         seen = memory.normaliser(observation[:, t])
+        seen = seen if memory.first is None else memory.first(seen).clamp(min=0)
         weights = (own.weight_ih, own.weight_hh, own.bias_ih, own.bias_hh)
         state = torch.gru_cell(seen, state, *weights)
-        mean, deviation = memory.network(torch.cat([seen, state], -1))
+        read = torch.cat([seen, state], -1) if memory.first is None else state
+        mean, deviation = memory.network(read)
         loc.append(mean)
         scale.append(deviation)
     return torch.stack(loc, 1), torch.stack(scale, 1)
@@ -88,9 +90,11 @@ def sequence_batch(observation, state, begins):
 # ------------------------------------------------------------------- what it computes
 
 
-def test_an_exported_policy_flies_a_sequence_as_the_actor_does(tmp_path):
-    actor, _, _ = remembering()
+@pytest.mark.parametrize("memory", ["gru", "raptor"])
+def test_an_exported_policy_flies_a_sequence_as_the_actor_does(memory, tmp_path):
+    actor, _, _ = remembering(memory=memory)
     observation, state, begins = sequences()
+    observation[4] *= 100 if memory == "raptor" else 1  # its inputs are clipped nowhere
     with torch.no_grad(), set_recurrent_mode():
         mean = actor.get_dist(sequence_batch(observation, state, begins)).mean
     assert (mean.abs() > 1).any() and (mean.abs() < 1).any()
@@ -103,10 +107,10 @@ def test_an_exported_policy_flies_a_sequence_as_the_actor_does(tmp_path):
         np.testing.assert_allclose(action, mean[:, t].clamp(-1, 1), atol=2e-6)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_gradients_are_those_of_a_loop_over_time(kind):
+@pytest.mark.parametrize(("kind", "memory"), [*((kind, "gru") for kind in KINDS), (PPO, "raptor")])
+def test_gradients_are_those_of_a_loop_over_time(kind, memory):
     """Of the surrogate at the policy that acted: of ratio times advantage."""
-    actor, critic, _ = remembering()
+    actor, critic, _ = remembering(memory=memory)
     observation, state, begins = sequences()
     torch.manual_seed(1)
     batch = sequence_batch(observation, state, begins)

@@ -19,12 +19,16 @@ from quadrl.learning.run import Run
 PAGES = Path(__file__).parents[2] / "docs" / "tasks"
 SUCCESS = Target("success_rate", "successful", 0.95, True)
 TIME = Target("time_s", "to the last gate", 4.65)
+HOW = {
+    "end_diverged_rate": 0.0, "end_away_rate": 0.2, "end_time_limit_rate": 0.8,
+    "reward_progress_mean": 41.0, "reward_spin_mean": -120.0, "reward_survival_mean": 3.5,
+}  # fmt: skip
 
 
 def run(task, metrics, **settings):
     """A finished training that reached these figures."""
     config = TrainConfig(task, **settings)
-    own = {"task": config.scenario.task, "metrics": metrics, "_repr_html_": str}
+    own = {"task": config.scenario.task, "metrics": metrics | HOW, "_repr_html_": str}
     flown = SimpleNamespace(**own)
     return Run(Path("runs/own run"), config, None, flown, 1.0)
 
@@ -91,11 +95,24 @@ def test_other_conditions_go_on_with_their_own_run():
     assert disturbed.endswith(f". They count undisturbed: {calm}")
 
 
+def test_a_task_that_cannot_be_made_without_options_goes_on_too():
+    given = {"task_options": {"members": ["hover", "recovery"]}}
+    training = run("one_of", {"hover_success_rate": 0.5}, **given, steps=1000)
+    assert next_of(training) == "quadrl train --resume 'runs/own run' --steps 2000"
+
+
 def test_python_and_notebooks_say_it():
-    for share, lines in ((0.5, 2), (0.0, 1)):
+    for share, lines in ((0.5, 4), (0.0, 1)):
         training = run("hover", reached("hover", share))
         assert len(repr(training).splitlines()) == lines
-        assert ("misses: " in training._repr_html_()) == (lines == 2)
+        assert ("misses: " in training._repr_html_()) == (lines == 4)
+
+
+def test_how_episodes_ended_and_what_the_reward_was_made_of_is_said_with_a_miss():
+    assert run("hover", reached("hover", 0.0)).causes == ""
+    ended, made = run("hover", reached("hover", 0.5)).causes.split("\n")
+    assert ended == "its episodes ended: time limit 80 %, away 20 %"
+    assert made == "its reward an episode: mostly spin -120, then progress 41, survival 3.5"
 
 
 def test_late_commands_lead_to_the_training_that_stands_them():

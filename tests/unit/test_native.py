@@ -251,6 +251,16 @@ def test_no_callback_of_other_code_changes_a_flight(name, engine):
 
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 @every_kind
+def test_nor_does_one_that_stands_before_the_environment_is_made(name, engine):
+    def fly_anew(begin):
+        return flown(begin())
+
+    refused = is_refused(name, fly_anew, lambda: lambda: helpers.begun("landing", engine=engine))
+    assert refused == (name == "control" or (name == "contactfilter" and engine == "mujoco"))
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+@every_kind
 def test_no_callback_of_other_code_changes_a_flight_in_dm_control(name, engine):
     helpers.needs_dm_control()
     settings = {"random": 0, "engine": engine}

@@ -117,9 +117,9 @@ def test_without_extras_everything_says_in_a_line_what_it_needs(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["study.toml"]
 
 
-PUBLIC = """Aerodynamics Observing Policy RANDOMIZATIONS Randomization Task VEHICLES Vehicle
-__version__ check envs evaluate export load plot register render rendering robustness study suite
-tasks testing train"""
+PUBLIC = """Aerodynamics Observing Policy RANDOMIZATIONS Randomization Rotor Task VEHICLES
+Vehicle __version__ check envs evaluate export load plot register render rendering ring robustness
+study suite tasks testing train"""
 
 
 def test_tab_completion_shows_the_public_names_alone():

@@ -93,10 +93,10 @@ def test_each_part_of_the_estimate_is_as_old_as_is_drawn_for_each_row(engine, mo
             ages = np.rint(drawn[name] / PAPER.physics_timestep).astype(int)
             expected = np.array(log)[np.maximum(len(log) - 1 - ages, begun), rows]
             for part, (first, last) in parts.items():
-                found = getattr(environment.observer.frame.state, part)
+                found = getattr(environment.observer.estimate, part)
                 found = found + environment.origin if part == "position" else found
                 np.testing.assert_array_equal(found, expected[:, first:last], err_msg=part)
-        np.testing.assert_array_equal(environment.observer.frame.state.rotor_speed, flown.act)
+        np.testing.assert_array_equal(environment.observer.estimate.rotor_speed, flown.act)
         if len(log) == 21:
             environment.reset(rows % 3 == 0)
             twin.reset(rows % 3 == 0)

@@ -12,6 +12,7 @@ from quadrl.evaluation import plotting
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.rollout import fly
 from quadrl.learning.folder import read_metrics
+from quadrl.learning.foreign import read_curve
 from quadrl.rendering import read_scenarios
 
 STEPS = np.arange(1.0, 6.0)
@@ -80,6 +81,16 @@ def test_each_flight_has_its_colour_and_its_own_goal():
         np.testing.assert_array_equal(data, rollout.goal[..., 1])
 
 
+def test_the_mean_action_is_the_main_line_where_it_was_evaluated():
+    evaluated = {name: values[::2] for name, values in METRICS.items()}
+    figure = plotting.learning_curve(METRICS, "title", evaluated)
+    for axis, name in zip(figure.axes[:3], plotting.PANELS, strict=True):
+        main = max(axis.lines, key=lambda line: line.get_linewidth())
+        assert main.get_label() == name
+        np.testing.assert_array_equal(main.get_xdata(), evaluated["steps"] / 1000)
+        np.testing.assert_array_equal(main.get_ydata(), evaluated[name])
+
+
 def test_runs_are_compared_by_their_median_where_all_have_been():
     late = METRICS | {"return": np.where(STEPS > 2, 3 * STEPS, np.nan)}
     points, (low, median, high) = plotting.spread([METRICS, late, late], "return", "steps")
@@ -87,9 +98,9 @@ def test_runs_are_compared_by_their_median_where_all_have_been():
     np.testing.assert_allclose([low, median, high], np.outer((1, 3, 3), points))
     figure = plotting.learning_curves({"ppo": [METRICS, late], "own": [late]}, "hover")
     words = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert words == ["PPO, 2 seeds", "OWN, 1 seed"]
+    assert words == ["PPO, 2 seeds", "own, 1 seed"]
     np.testing.assert_allclose(figure.axes[0].lines[0].get_xdata(), points / 1000)  # thousands
-    nothing = METRICS | {"return": np.full(5, np.nan)}
+    nothing = METRICS | dict.fromkeys(("return", "success"), np.full(5, np.nan))
     with refused(match="no episode has ended"):
         plotting.learning_curves({"ppo": [nothing]}, "hover")
 
@@ -130,3 +141,53 @@ def test_metrics_that_cannot_be_drawn_are_refused(tmp_path, text):
         path.write_text(text)
     with refused(match=str(path)):
         read_metrics(path)
+
+
+OTHERS = {  # the content of a csv, and what is read of it: steps, column, values
+    "steps,value\n0,0\n10,0.5\n20,1\n": ([0, 10, 20], "success", [0, 0.5, 1]),
+    "Wall time,Step,Value\n1.7e9,10,-3\n1.7e9,20,250\n": ([10, 20], "return", [-3, 250]),
+    # W&B's export of a run, which went on at an earlier step.
+    '"Step","my - eval/success_rate","my - eval/success_rate__MIN"\n20,0.9,0.1\n10,0.2,""\n':
+        ([10, 20], "success", [0.2, 0.9]),
+    # Stable-Baselines3's progress.csv: evaluations have rows of their own.
+    "time/total_timesteps,rollout/ep_rew_mean,eval/mean_reward\n8,1.5,\n16,,7\n":
+        ([8, 16], "return", [np.nan, 7]),
+    "time/total_timesteps,rollout/ep_rew_mean,eval/mean_reward\n8,1.5,\n16,2.5,\n":
+        ([8, 16], "return", [1.5, 2.5]),
+    '#{"t_start": 1.5, "env_id": "quadrl/Hover-v0"}\nr,l,t\n4.0,10,0.5\n8.0,30,1.5\n':
+        ([10, 40], "return", [4, 6]),  # mean of the episodes so far
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", OTHERS)
+def test_curves_of_other_programs_are_read(tmp_path, text):
+    (tmp_path / "curve.csv").write_text(text)
+    steps, name, values = OTHERS[text]
+    read = read_curve(tmp_path / "curve.csv")
+    np.testing.assert_array_equal(read["steps"], steps)
+    np.testing.assert_array_equal(read[name], values)
+
+
+def test_a_monitor_is_the_mean_of_its_last_hundred_episodes(tmp_path):
+    rows = "".join(f"{k},1,{k}\n" for k in range(150))
+    (tmp_path / "monitor.csv").write_text(f"#{{}}\nr,l,t\n{rows}")
+    mean = read_curve(tmp_path / "monitor.csv")["return"]
+    assert mean[99] == pytest.approx(49.5) and mean[149] == pytest.approx(np.arange(50, 150).mean())
+
+
+@pytest.mark.parametrize("text", ["", "steps,value\n", "a,b\n1,2\n", "steps,loss\n1,2\n"])
+def test_a_csv_without_a_curve_is_refused(tmp_path, text):
+    (tmp_path / "curve.csv").write_text(text)
+    with refused(match="curve.csv has no column of"):
+        read_curve(tmp_path / "curve.csv")
+
+
+def test_curves_of_other_programs_are_drawn_beside_those_of_runs():
+    other = {"steps": STEPS, "success": STEPS / 5}
+    figure = plotting.learning_curves({"ppo": [METRICS], "mine": [other]}, "hover")
+    labels = [[line.get_label() for line in axis.lines] for axis in figure.axes]
+    both = ["PPO, 1 seed", "mine, 1 seed"]
+    assert labels == [both[:1], both, both[:1], both[:1]]  # by steps, then by seconds
+    assert [text.get_text() for text in figure.axes[1].get_legend().get_texts()] == both
+    alone = plotting.learning_curves({"mine": [other]}, "hover")
+    assert [len(axis.lines) for axis in alone.axes] == [0, 1]

@@ -11,13 +11,15 @@ from test_sensors import WILD as EVERY_SENSOR
 from quadrl import tasks
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.philox import NOISE, PUSHES, uniform_array_api
+from quadrl.base.philox import LINK, NOISE, PARAMETERS, PUSHES, uniform_array_api
 from quadrl.base.rotation import norm
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.conditions.sampler import AircraftSampler
 from quadrl.control import CONTROL_MODES
 from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import BatchEngine
+from quadrl.engines.rng import uniform
 
 ENGINES = ("mujoco", "free_flight")
 PAPER = Vehicle()
@@ -135,12 +137,149 @@ def test_each_row_has_a_delay_of_its_own():
     assert (moved[:, None] > moved[None])[earlier].all()
 
 
+LOST = {"command_loss": (0.5, 2.0), "loss_time": (0.1, 0.3), "command_jitter": (0.1, 0.9)}
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("mode", CONTROL_MODES)
+def test_commands_that_are_always_a_step_late_are_a_delay_of_one_step(mode, engine, compiled):
+    vehicle = VEHICLES["hexa" if mode == "rotor" else "paper"]
+    task = helpers.variant(tasks.TASKS["hover"], compiled=compiled)
+    step, spread, records = vehicle.control_timestep, 3 * vehicle.physics_timestep, []
+    for jitter, later in ((1.0, 0.0), (0.0, step)):
+        given = {"command_delay": (later, later + spread), "command_jitter": jitter}
+        flown = {"control_mode": mode, "vehicle": vehicle, "engine": engine}
+        flown |= {"observe": {"action_history": 2}}
+        environment = helpers.begun(task, 4, randomization=given, **flown)
+        assert bool(environment.not_compiled) != compiled
+        actions = helpers.random_actions(30, 4, environment.action_size)
+        records.append(helpers.fly(environment, actions))
+    late, expected = records
+    helpers.assert_records(late, expected)
+    # What was sent is seen, not what flew.
+    sent = late[1]["observation.action_history"]
+    np.testing.assert_array_equal(
+        sent, np.clip(actions[1::-1].swapaxes(0, 1).reshape(4, -1), -1, 1)
+    )
+
+
+def test_links_change_nothing_else_and_no_chance_is_none():
+    given = {"randomization": WILD, "observe": SEEN, "weather": "light"}
+    drawn = dataclasses.replace(WILD, loss_time=0.1, command_jitter=0.0, command_loss=0.0)
+    actions = helpers.random_actions(20, 3)
+    usual, same = (helpers.begun("hover", 3, **given | r) for r in ({}, {"randomization": drawn}))
+    helpers.assert_records(helpers.fly(same, actions), helpers.fly(usual, actions))
+    drawn = dataclasses.replace(WILD, **LOST)
+    other = helpers.begun("hover", 3, **given | {"randomization": drawn})
+    for name in usual.randomizer.sampler.names[: -len(LOST)]:
+        np.testing.assert_array_equal(usual.randomizer.column(name), other.randomizer.column(name))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("mode", ["rotor", "velocity"])
+def test_the_last_command_stays_in_force_in_an_outage(engine, mode):
+    given = {"command_loss": 2.0, "loss_time": 0.15, "command_jitter": 0.5, "command_delay": 0.02}
+    given = {"engine": engine, "control_mode": mode, "randomization": given}
+    environment = helpers.begun("hover", 4, **given, seed=1)
+    other = BatchEngine(PAPER, 4, altitude=3.0, engine=engine)
+    for field in ("qpos", "qvel", "act"):
+        getattr(other, field)[:] = getattr(environment.engine, field)
+    asked = [np.array(other.act)] * 7  # the longest delay: two physics steps and a control step
+    pilot, last, rows = environment.autopilot, np.array(other.act), np.arange(4)
+    if pilot:
+        command = pilot.command
+        pilot.command = lambda: asked.append(command().copy()) or asked[-1]
+        environment.step = lambda action: (
+            [environment.begin(action)]
+            + [environment.engine.advance(steps) for steps in environment.commands()]
+        )  # as engines of one's own are flown
+    lost = np.zeros((20, 4), bool)
+    for k, action in enumerate(helpers.random_actions(20, 4)):
+        keys, episodes = environment.randomizer.place
+        # A block of four numbers for each control step: the first says whether it is late.
+        share = uniform(keys, episodes, LINK, 4 * k, 1)[:, 0]
+        if not pilot:
+            asked += [PAPER.rotor_command(action)] * 5
+        environment.step(action)
+        lost[k] = environment.randomizer.left > 0
+        delay = 2 + 5 * (share < 0.5)
+        for step in range(5):
+            arrives = np.array(asked)[7 + 5 * k + step - delay, rows]
+            other.ctrl[:] = last = np.where(lost[k][:, None], last, arrives)
+            other.advance(1)
+        if pilot:
+            environment.finish()
+        found = helpers.coordinates(environment.engine), helpers.coordinates(other)
+        np.testing.assert_array_equal(*found)
+    begun = np.diff(np.vstack([np.zeros((1, 4)), lost]), axis=0) > 0
+    for row in range(4):  # of three control steps each, or of more that follow at once
+        for first in np.flatnonzero(begun[:, row]):
+            assert lost[first : first + 3, row].all()
+    assert 3 < begun.sum() and not lost.all()
+
+
+def test_links_are_lost_as_often_and_as_long_as_is_asked_for():
+    given = {"command_loss": 1.0, "loss_time": 0.2, "command_jitter": 0.3}
+    environment = helpers.begun("hover", 400, randomization=given, engine="free_flight")
+    found = []
+    for _ in range(200):
+        helpers.idle(environment)
+        source = environment.randomizer
+        found.append((source.left > 0, source.left == 4, source._delay == 5))
+    lost, begun, late = np.mean(found, axis=(0, 2))
+    # 80,000 steps of 50 ms: 4,000 outages of four steps, as regular as geometric gaps let them be.
+    assert lost == pytest.approx(0.2, abs=0.01) and begun == pytest.approx(0.05, abs=0.0025)
+    assert late == pytest.approx(0.3, abs=5 * math.sqrt(0.3 * 0.7 / 80_000))
+    drawn = helpers.begun("hover", 200, randomization=LOST).randomizer.shown()
+    assert set(np.round(drawn["loss_time"] / 0.05).astype(int)) == {2, 3, 4, 5, 6}
+    for name in ("command_loss", "command_jitter"):
+        low, high = LOST[name]
+        assert low <= drawn[name].min() < low + 0.05 < high - 0.05 < drawn[name].max() < high
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_outage_is_saved_and_goes_on(engine):
+    given = {"command_loss": 2.0, "loss_time": 0.4, "command_jitter": 0.5}
+    given = {"engine": engine, "randomization": given, "num_envs": 3}
+    one, other = (Environment("hover", seed=seed, **given) for seed in (2, 7))
+    one.reset()
+    actions, within = helpers.random_actions(40, 3), 0
+    for k, action in enumerate(actions):
+        saved, left = one.save(), one.randomizer.left
+        if ((left > 1) & (left < 8)).any():
+            within += 1
+            other.restore(saved)
+            ahead = actions[k : k + 9]
+            helpers.assert_records(helpers.fly(other, ahead), helpers.fly(one, ahead))
+            one.restore(saved)
+        one.step(action)
+    assert within > 3
+    for left in (-1, 9):
+        with helpers.refused("randomizer.left", lists="the same randomization"):
+            other.restore(saved | {"randomizer.left": np.full(3, left)})
+
+
+def test_impossible_links_are_refused():
+    for name, wrong in (("command_jitter", 1.5), ("command_jitter", (-0.1, 0.5))):
+        with helpers.refused(lists="between 0 and 1", match=name):
+            Randomization(**{name: wrong})
+    for name in ("command_loss", "loss_time"):
+        with helpers.refused(match=rf"^{name}\[0\] = -0.1"):
+            Randomization(**{name: (-0.1, 0.2)})
+    with helpers.refused("command_loss", lists="at most 5 a second", match="never be there"):
+        Randomization(command_loss=(0.0, 6.0))
+    with helpers.refused("loss_time", lists="a whole number of control steps of 0.05 s"):
+        Environment("hover", randomization={"command_loss": 1.0, "loss_time": 0.12})
+    assert Environment("hover", randomization={"loss_time": 0.12}).randomizer.late is False
+
+
 SIZES = Errors(position=0.01, attitude=0.02, velocity=0.03, body_rate=0.04)
 
 
 def angles(environment):
     """Error of the estimated attitude about the axes of the body (N, 3) [rad]."""
-    seen, true = environment.observer.frame.state, environment.engine.state
+    seen, true = environment.observer.estimate, environment.engine.state
     np.testing.assert_allclose(norm(seen.quaternion), 1.0, rtol=1e-12)
     turn = np.swapaxes(true.rotation, -1, -2) @ seen.rotation  # I + [angles]x
     return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0],
@@ -159,7 +298,7 @@ def test_the_noise_is_the_definition_and_the_bias_lasts():
         shown = environment.randomizer.shown()
         lasting = np.stack([shown[f"{k}_bias_{axis}"] for k in vars(bias) for axis in "xyz"], 1)
         expected = lasting + SIZES.sizes * normal
-        seen, engine = environment.observer.frame.state, environment.engine
+        seen, engine = environment.observer.estimate, environment.engine
         position = engine.qpos[:, :3] + expected[:, :3] - engine.origin
         np.testing.assert_array_equal(seen.position, position)
         np.testing.assert_array_equal(seen.velocity, engine.qvel[:, :3] + expected[:, 6:9])
@@ -204,7 +343,7 @@ def test_the_goal_is_seen_from_where_the_estimate_is():
     np.testing.assert_allclose(seen["position"] + to_goal, 0.0, atol=1e-12)  # the goal of hover
     assert np.abs(seen["position"] - state.position).max() > 0.1
     # What has no error is seen as it is, to the last bit.
-    estimate = environment.observer.frame.state
+    estimate = environment.observer.estimate
     np.testing.assert_array_equal(estimate.quaternion, state.quaternion)
 
 
@@ -244,3 +383,18 @@ def test_what_diverges_is_counted_and_seen_finite_however_late():
         assert (now.terminated >= now.diverged).all()
         diverged += now.diverged.sum()
     assert diverged
+
+
+def test_the_flapping_is_drawn_apart_from_all_else():
+    vehicle = VEHICLES["crazyflie_brushless"]
+    tables = []
+    for flapping in ((1.0, 1.0), (0.0, 1.2)):
+        sampler = AircraftSampler(Randomization(mass=(0.8, 1.2), flapping=flapping), vehicle)
+        keys, numbers = np.arange(2000), len(sampler.names)
+        shares = uniform(keys, 0 * keys, PARAMETERS, 0, numbers)
+        tables.append(sampler.table(sampler.sample(shares)))
+    usual, drawn = tables
+    factor = drawn["flapping_moment"] / usual["flapping_moment"]
+    assert 0.0 <= factor.min() < 0.01 and 1.19 < factor.max() <= 1.2
+    others = [name for name in usual.dtype.names if name != "flapping_moment"]
+    np.testing.assert_array_equal(drawn[others], usual[others])

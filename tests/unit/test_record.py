@@ -66,11 +66,11 @@ def test_a_run_of_before_a_number_existed_goes_on_to_the_same_policy(tmp_path):
     run = stopped(TINY, tmp_path / "run", 3)
     config = read_sealed_json(run / RUN, RUN_FORMAT)
     older(config["scenario"])
-    del config["evaluations"], config["reward_scale"]
+    del config["keep"], config["reward_scale"]
     write_sealed_json(run / RUN, config, RUN_FORMAT)
     tensors, numbers = checkpoint.load(run / checkpoint.CHECKPOINT)
     older(numbers["config"]["scenario"])
-    del numbers["config"]["evaluations"], numbers["config"]["reward_scale"]
+    del numbers["config"]["keep"], numbers["config"]["reward_scale"]
     flown = {name: value.numpy() for name, value in tensors["environment"].items()}
     tensors["environment"] = older_rows(flown)
     checkpoint.save(run / checkpoint.CHECKPOINT, tensors, numbers)

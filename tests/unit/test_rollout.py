@@ -19,6 +19,7 @@ from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.rollout import EVALUATION_SEED, Rollout, flights, fly, summarize
 from quadrl.learning.config import MAX_SEED
 from quadrl.learning.environments import SEED_STRIDE
+from quadrl.tasks.hover import Hover
 
 
 def brake(observation: np.ndarray) -> np.ndarray:
@@ -53,6 +54,8 @@ def make_rollout(**changes) -> Rollout:
         is_success=np.array([False, False, True]),
         diverged=np.array([False, True, False]),
         remembered={},
+        ended={},
+        reward_terms={},
         markers=(),
         events=(),
         origin=np.array([0.0, 0.0, 3.0]),
@@ -320,3 +323,38 @@ def test_states_are_a_row_per_control_step_from_the_start_on(tmp_path):
             assert float(row[name]) == pytest.approx(value, rel=1e-8, abs=1e-12)
     assert float(second[0]["action_2"]) == pytest.approx(flown.action[0, 1, 1], rel=1e-8)
     assert second[-1]["action_2"] == ""
+
+
+def test_each_flight_ends_in_one_way_and_the_terms_add_up_to_its_reward():
+    options = {"max_distance": 0.6, "altitude": 0.5, "time_limit": 1.5, "radius": 0.2}
+    generator = np.random.default_rng(0)
+
+    def some_dive(seen):
+        return np.where(np.arange(60)[:, None] < 20, -1.0, generator.uniform(-1, 1, (60, 4)))
+
+    flown = fly(some_dive, tasks.make("hover", **options), episodes=60, seed=3)
+    ends = np.array([*flown.ended.values()])
+    np.testing.assert_array_equal(ends.sum(0), 1)
+    assert {"away", "ground"} <= {name for name, holds in flown.ended.items() if holds.any()}
+    np.testing.assert_array_equal(flown.ended["time_limit"], ~flown.terminated)
+    last, rows = flown.length, np.arange(60)
+    place = flown.position[last, rows]
+    away = np.linalg.norm(place, axis=-1) > 0.6
+    np.testing.assert_array_equal(flown.ended["away"], away)  # the first that it names
+    assert (place[flown.ended["ground"], 2] < 0.1 - 0.5).all()  # within 0.1 m of the ground
+    np.testing.assert_allclose(sum(flown.reward_terms.values()), np.nansum(flown.reward, 0))
+    found = summarize(flown)
+    assert found["end_away_rate"] == flown.ended["away"].mean()
+    assert found["reward_survival_mean"] == pytest.approx(10.0 * flown.length.mean())
+
+
+def test_an_end_without_a_name_is_counted_too():
+    class Own(Hover):
+        def terminated(self, now):
+            return now.time > 0.09
+
+    flown = fly(lambda seen: np.zeros((len(seen), 4)), Own(), episodes=2)
+    assert {name: holds.mean() for name, holds in flown.ended.items()} == {
+        "diverged": 0.0, "terminated": 1.0, "time_limit": 0.0,
+    }  # fmt: skip
+    np.testing.assert_array_equal(flown.length, 2)  # of 0.05 s

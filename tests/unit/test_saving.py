@@ -94,6 +94,36 @@ def test_what_was_drawn_survives_save_and_restore(randomization, engine, tmp_pat
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_numbers_that_were_not_drawn_yet_do_not_stop_a_state_from_going_on(engine):
+    settings = {"engine": engine, "randomization": "full", "count": 3}
+    environment, fresh = (flying("hover", **settings) for _ in range(2))
+    actions = np.random.default_rng(0).uniform(-1, 1, (8, 3, environment.action_size))
+    helpers.fly(environment, actions[:4])
+    saved = environment.save()
+    names = environment.randomizer.sampler.names
+    sizes = len(dataclasses.fields(environment.randomization.sizes))
+    assert names[-3:] == ("command_jitter", "command_loss", "loss_time")
+    assert all(name.startswith("log_") for name in names[-3 - sizes : -3])
+    saved["randomizer.drawn"] = saved["randomizer.drawn"][:, : -3 - sizes]
+    del saved["randomizer.last"], saved["randomizer.left"]
+    expected = helpers.fly(environment, actions[4:])
+    fresh.restore(saved)
+    helpers.assert_records(helpers.fly(fresh, actions[4:]), expected)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_reward_of_the_last_commands_goes_on_from_a_file(engine):
+    """Compiled steps keep columns, and a file keeps rows: actions and commands were mixed up."""
+    given = {"task_options": {"smoothness_weight": 10.0}, "engine": engine, "num_envs": 4}
+    one, other = (Environment("hover", seed=seed, **given) for seed in (1, 2))
+    one.reset()
+    first, second = helpers.random_actions(2, 4)
+    one.step(first)
+    other.restore(safetensors.numpy.load(safetensors.numpy.save(one.save())))
+    np.testing.assert_array_equal(other.step(second).reward, one.step(second).reward)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_wind_that_somebody_sets_survives_save_and_restore(engine):
     # The wind of a batch used to be a field of the model, which no state of MuJoCo's holds.
     environment, other = (flying(randomization=None, engine=engine, seed=s) for s in (1, 2))

@@ -371,7 +371,7 @@ class Posted(Hover):
         return super().reward(before, now, end) | {"room": 0.1 * now.clearance}
 
     def terminated(self, now):
-        return super().terminated(now) | now.touched.any(-1)
+        return super().terminated(now) | {"post": now.touched.any(-1)}
 
 
 def test_pictures_have_solids_where_they_stand_in_the_episode():
@@ -728,6 +728,21 @@ def test_no_thin_wall_is_passed_untouched(name, speed):
     # The drag takes up to a sixth of the speed; who tumbles after a touch may touch again, faster.
     fastest = hits.max(axis=0)
     assert (fastest > 0.8 * sum(speed)).all() and np.median(fastest) < 1.05 * sum(speed)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_a_thin_wall_stops_an_aircraft_at_any_attitude(name):
+    """As fast as the page of own tasks says."""
+    vehicle, rng, count, speed = VEHICLES[name], np.random.default_rng(2), 48, 14.0
+    turn = rng.normal(size=(count, 4))
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    begins = 1.0 + rng.uniform(0, 1, count) * speed * vehicle.physics_timestep
+    still = Pose(np.stack([begins, 0 * begins, 0 * begins], axis=-1))
+    flown = {"quaternion": turn, "velocity": np.tile([speed, 0.0, 0.0], (count, 1))}
+    origin = np.zeros((count, 3))
+    hits, made = struck("free_flight", vehicle, WALL, lambda t: still, origin, 0.5, **flown)
+    assert (hits.max(axis=0) > 0).all()
+    assert (made.state.position[:, 0] < begins - 0.01).all()
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])

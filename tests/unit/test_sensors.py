@@ -23,6 +23,7 @@ NORTH = np.array([0.0, 1.0, 0.0])
 class Compass(Sensor):
     """Direction of a pole, body frame."""
 
+    compiled = True
     name, size, unit = "compass", 3, "1"
     formula = "strength R^T (0, 1, 0)"
 
@@ -149,7 +150,7 @@ def test_a_task_may_ask_for_any_sensor_but_looks_at_none_that_shows_nothing_to_i
 def test_the_aim_moves_on_by_short_offsets_and_no_further_than_it_may():
     options = {"gain": 2.0, "near": 0.5, "most": 0.15}
     environment = helpers.begun("hover", 2, observe={"sensors": {"aim": options}})
-    assert not {"goal", "position"} & environment.observer.terms.keys()
+    assert not {"goal", "position"} & environment.observer.senses.terms.keys()
     east = np.array([1, 0, 0, 1]) / np.sqrt(2)  # x of the body is north
     environment.reset(
         start={"position": np.array([[-0.1, 0, 0], [-0.6, 0, 0]]), "quaternion": east}
@@ -166,7 +167,7 @@ def test_the_aim_moves_on_by_short_offsets_and_no_further_than_it_may():
     start = environment.reset(np.array([0]))["aim"]  # a new episode sums up anew
     np.testing.assert_array_equal(start, environment.task.observe(environment.snapshot)["goal"][:1])
     both = helpers.begun("hover", 2, observe={"sensors": {"aim": {"beside_goal": True}}})
-    assert {"goal", "aim"} <= both.reset().keys() and "position" not in both.observer.terms
+    assert {"goal", "aim"} <= both.reset().keys() and "position" not in both.observer.senses.terms
 
 
 def test_noise_is_new_in_each_sample_and_a_bias_lasts():
@@ -211,7 +212,9 @@ def test_a_sensor_of_ones_own_says_how_its_samples_follow():
     environment = Environment("hover", observe={"sensors": {"compass": {"strength": 2.0}}})
     said = {term["name"]: term["formula"] for term in describe_observation(environment)}
     assert said["compass"] == "strength R^T (0, 1, 0)" and said["velocity"] == "R^T v"
-    (told,) = (described_sensor(s) for s in environment.observer.sensors if s.name == "compass")
+    (told,) = (
+        described_sensor(s) for s in environment.observer.senses.sensors if s.name == "compass"
+    )
     assert told["strength"] == 2.0 and told["meaning"]["rate"].startswith("Samples in a second")
 
 
@@ -274,8 +277,8 @@ class Velocity(Compass):
         ({"compass": {"lag": 1}}, "option of compass", "noise, bias, delay, rate, strength"),
         ({"compass": {"noise": -1}}, "compass noise", "between 0"),
         ({"compass": {"delay": 11}}, "compass delay", "between 0 and 10"),
-        ({"compass": {"delay": 0.07}}, "compass delay and time", "control steps of 0.05 s"),
-        ({"compass": {"rate": 50}}, "compass delay and time", "control steps of 0.05 s"),
+        ({"compass": {"delay": 0.07}}, "compass delay", "control steps of 0.05 s"),
+        ({"compass": {"rate": 50}}, "compass rate", "at most 20, one in each of the control steps"),
         ({"action_history": {"length": 0}}, "action_history length", "between 1"),
         ({"estimate": {"noise": 0.1}}, "estimate noise", "`noise` of the randomization"),
         ({"rotor_speed": {"source": "none"}}, "rotor_speed source", "true, estimated"),

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import re
+from collections.abc import Mapping
 
 import helpers
 import numpy as np
@@ -36,13 +37,15 @@ def check(record, **lengths):
         if not dataclasses.is_dataclass(kind):
             continue
         for name, parts in declared(kind).items():
-            value = getattr(record, name)
+            given = getattr(record, name)
             expected = tuple(int(p) if p.isdigit() else lengths[p] for p in parts)
-            if value is not None:
-                assert np.shape(value)[: len(expected)] == expected, f"{kind.__name__}.{name}"
-                exact = not isinstance(value, tuple)  # of markers, whose own lengths differ
-                assert not exact or np.ndim(value) == len(expected), f"{kind.__name__}.{name}"
-                count += 1
+            # Each array of those that have names.
+            for value in given.values() if isinstance(given, Mapping) else [given]:
+                if value is not None:
+                    assert np.shape(value)[: len(expected)] == expected, f"{kind.__name__}.{name}"
+                    exact = not isinstance(value, tuple)  # of markers, whose own lengths differ
+                    assert not exact or np.ndim(value) == len(expected), f"{kind.__name__}.{name}"
+            count += given is not None
     for field in dataclasses.fields(record):
         inner = getattr(record, field.name)
         if dataclasses.is_dataclass(inner) and not isinstance(inner, type):
@@ -71,7 +74,7 @@ def test_rollouts_and_trajectories_have_the_shapes_that_stand_behind_them():
 
     flown = fly(still, tasks.make("hover", time_limit=0.5), episodes=2)
     longest = int(flown.length.max())
-    assert check(flown, S=longest + 1, T=longest, N=2, R=4, k=4) == 19
+    assert check(flown, S=longest + 1, T=longest, N=2, R=4, k=4) == 21
     steps = int(flown.length[0])
     drawn = flown.trajectory(VEHICLES["paper"])
     assert check(drawn, T=steps, R=4) == 7

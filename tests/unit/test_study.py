@@ -156,7 +156,7 @@ def test_intervals_by_hand():
 
 
 def test_the_file_on_the_page(write):
-    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "studies.md").read_text()
     plan = read_plan(write(page.partition("```toml\n")[2].partition("```")[0]), None)
     assert len(plan.runs) == 40 and {run.config.seed for run in plan.runs[:8]} == {0}
 
@@ -244,7 +244,7 @@ def test_wrong_settings_of_some(only, said):
         read_plan({"tasks": ["hover"], "algorithms": ["ppo"], "only": only}, None)
 
 
-@pytest.mark.parametrize("columns", [80, 200])
+@pytest.mark.parametrize("columns", [80, 220])
 def test_the_table_fits_the_terminal(monkeypatch, capsys, columns):
     figures = {name: 0.0123 for name in FIGURES}
     spread = {f"{name}_{end}": 0.0123 for name in FIGURES for end in ("low", "high")}
@@ -256,4 +256,5 @@ def test_the_table_fits_the_terminal(monkeypatch, capsys, columns):
     _, head, *rows = capsys.readouterr().out.splitlines()
     assert len(head) <= columns and head.split()[-1] == "training" and "variant" not in head
     assert rows[0] == rows[1] and rows[0].startswith("straight_and_level  trpo      3")
-    assert ("1 % (1 % to 1 %)" in rows[0]) == (columns == 200)  # a row is a line
+    assert ("along the training" in head) == (columns == 220)
+    assert ("1 % (1 % to 1 %)" in rows[0]) == (columns == 220)  # a row is a line

@@ -52,7 +52,7 @@ def snapshot(task, *place, **remembered):
     _, task_state, own = drawn(task, len(where.position))
     task_state = task.remember(placed(*place), task_state)
     task_state = dataclasses.replace(task_state, **remembered)
-    return transition.begin(task, where, task_state, own, 4)
+    return transition.begin(task, where, task_state, own, 4)[:2]
 
 
 def finished(task, before, episode, *place, command=VEHICLE.hover_speed):
@@ -231,7 +231,9 @@ def test_straight_and_level():
     left = np.cross([0.0, 0.0, 1.0], direction)
     off = np.array([(0, 0.69), (0, 0.71), (0, -0.71), (2.9, 0), (3.1, 0)])  # [m] across and up
     now, _ = snapshot(task, off[:, :1] * left + off[:, 1:] * [0, 0, 1])
-    np.testing.assert_array_equal(task.terminated(now), [False, True, True, False, True])
+    ends = task.terminated(now)
+    np.testing.assert_array_equal(ends["off_altitude"], [False, True, True, False, False])
+    np.testing.assert_array_equal(ends["off_line"], [False, False, False, False, True])
     # 3 m along the line and 0.4 m to its left the projection is at 3 m, the goal at 4 m.
     now, _ = snapshot(task, 3 * direction + 0.4 * left)
     np.testing.assert_allclose(task.goal(now), 4 * direction, atol=1e-12)

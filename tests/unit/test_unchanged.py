@@ -158,6 +158,8 @@ BEGUN = {
     "deck_landing": (48.8302220445, 10.8269115744, 0, 0, 109.230178326),
     # 8 times the first gate, about: 0.5 + 0.25 + 0.7 = 1.45, and 11.6; low, in less wind.
     "lsy_race": (18.2265067234, 8.3819748764, 0, 12.0073233293, 27.9900591436),
+    # 30 m to the end of the forest each: 240 more than where they begin.
+    "navigation": (21.3704939582, 9.11838189111, 0, 261.370493958, 71.2863949656),
     "recovery": (0, 13.0319790551, 44.0530305481, 0, 81.9243713816),
 }
 

@@ -45,6 +45,7 @@ def test_the_height_above_the_ground_is_that_of_the_lowest_geom(name):
 class NearPost(Sensor):
     """Offset of a post, whether it was touched, and what is free about: a user's own sensor."""
 
+    compiled = True
     name, size = "near_post", 6
 
     def sense(self, now):
