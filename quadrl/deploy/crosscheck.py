@@ -197,6 +197,8 @@ def fly_in(
 ) -> dict[str, np.ndarray]:
     """Fly episodes of a scenario, with physics steps by another simulator.
 
+    An aircraft whose motion it gives as NaN has touched something there: its flight has failed.
+
     Returns:
         Arrays (N,), a number a flight: success and failed, before the end (bool);
         position_error_m: mean error over the last 2 s [m]; length_s.
@@ -205,6 +207,7 @@ def fly_in(
     controller, engine = begun(policy, environment), environment.engine
     observation = environment.flatten(environment.reset())
     alive, length = np.ones(episodes, bool), np.zeros(episodes, int)
+    struck = np.zeros(episodes, bool)
     ends = {name: np.zeros(episodes, bool) for name in ("is_success", "terminated")}
     errors: list[np.ndarray] = []
     while alive.any():
@@ -214,17 +217,19 @@ def fly_in(
                 engine.advance(steps)
                 continue
             motion = np.concatenate([engine.qpos, engine.qvel, engine.act], axis=1)
-            command = np.where(alive[:, None], engine.ctrl, np.nan)
+            command = np.where((alive & ~struck)[:, None], engine.ctrl, np.nan)
             reached = advance(motion, command, steps * scenario.aircraft.physics_timestep)
-            motion[alive] = reached[alive]
+            struck |= alive & np.isnan(reached).all(axis=1)
+            motion[alive & ~struck] = reached[alive & ~struck]
             engine.qpos[:], engine.qvel[:], engine.act[:] = np.split(motion, [7, 13], axis=1)
         now = environment.finish()
         observation = environment.flatten(now.observation)
         errors.append(np.where(alive, now.error, 0.0))
         length += alive
         for name, flags in ends.items():
-            flags |= alive & getattr(now, name)
-        alive &= ~(now.terminated | now.truncated)
+            flags |= alive & ~struck & getattr(now, name)
+        ends["terminated"] |= struck
+        alive &= ~(now.terminated | now.truncated | struck)
     timestep = scenario.aircraft.control_timestep
     return {
         "success": ends["is_success"],

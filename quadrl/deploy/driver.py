@@ -73,7 +73,13 @@ class Rotorpy:
 class Crazyflow:
     """Its Sim: single precision, quaternions end with their real part, rpm, a lag is a rate."""
 
-    def __init__(self, own: str, vehicle: dict[str, Any], brakes: list[float]) -> None:
+    def __init__(
+        self,
+        own: str,
+        vehicle: dict[str, Any],
+        brakes: list[float],
+        course: dict[str, Any] | None = None,
+    ) -> None:
         """Take its own aircraft of a name or, without one, quadrl's, by the means of its rotors."""
         self.own, self.vehicle, self.brakes = own, vehicle, brakes
         # At least its own 500 Hz, in whole parts of quadrl's physics step.
@@ -87,6 +93,7 @@ class Crazyflow:
         mix = np.asarray(params.mixing_matrix)  # its rows are y, -x and the torque
         places = np.array([one["position"] for one in vehicle["rotors"]])
         self.order = in_order(places, np.stack([-mix[1], mix[0]], axis=1))
+        self.course = Course(self.made(1).spec, **course) if course else None
 
     @functools.cache  # noqa: B019 - it lives as long as the process
     def made(self, rows: int) -> Any:
@@ -122,7 +129,7 @@ class Crazyflow:
         return made
 
     def advance(self, motion: np.ndarray, command: np.ndarray, seconds: float) -> np.ndarray:
-        """Fly all rows; what becomes of those without commands does not matter."""
+        """Fly all rows, what touches the course to NaN; without commands it does not matter."""
         sim, array = self.made(len(motion)), importlib.import_module("jax.numpy").asarray
         place, quaternion, velocity, rate, speed = np.split(motion, [3, 7, 10, 13], axis=1)
         there, asked = np.empty_like(speed), np.empty_like(speed)
@@ -132,11 +139,59 @@ class Crazyflow:
         parts = {name: array(part[:, None], dtype="float32") for name, part in parts.items()}
         sim.data = sim.data.replace(states=sim.data.states.replace(**parts))
         sim.rotor_vel_control(array(asked[:, None], dtype="float32"))
-        sim.step(round(seconds * self.frequency))
-        now = sim.data.states
-        found = now.pos, np.roll(now.quat, 1, axis=2), now.vel, now.ang_vel, now.rotor_vel
-        *parts, speed = (np.asarray(part, float)[:, 0] for part in found)
-        return np.concatenate([*parts, speed[:, self.order] / RPM], axis=1)
+        steps, flies = round(seconds * self.frequency), np.isfinite(command).all(axis=1)
+        for _ in range(steps if self.course else 1):
+            sim.step(1 if self.course else steps)
+            now = sim.data.states
+            found = now.pos, np.roll(now.quat, 1, axis=2), now.vel, now.ang_vel, now.rotor_vel
+            *parts, speed = (np.asarray(part, float)[:, 0] for part in found)
+            if self.course:
+                flies = self.course.free(flies, *parts[:2])
+        reached = np.concatenate([*parts, speed[:, self.order] / RPM], axis=1)
+        return np.where(flies[:, None], reached, np.nan) if self.course else reached
+
+
+class Course:
+    """Gates and poles in crazyflow's scene, and its aircraft's box, which must not touch them."""
+
+    def __init__(self, spec: Any, shapes: list[Any], places: list[Any]) -> None:
+        """Build it.
+
+        Args:
+            spec: The scene.
+            shapes: Name and size of each solid, as MuJoCo has them.
+            places: Position and quaternion (7,) of each, a list for each race.
+        """
+        self.mujoco = importlib.import_module("mujoco")
+        made, self.places = spec.copy(), np.array(places)
+        for k, (shape, size) in enumerate(shapes):
+            body = made.worldbody.add_body(name=f"course{k}", mocap=True)
+            body.add_geom(type=getattr(self.mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"), size=size)
+        self.model = made.compile()
+        self.data = self.mujoco.MjData(self.model)
+        solids = [self.model.body(f"course{k}") for k in range(len(shapes))]
+        self.solids = [int(body.geomadr[0]) for body in solids]
+        self.placed = [int(body.mocapid[0]) for body in solids]
+        names = (self.model.geom(k).name for k in range(self.model.ngeom))
+        self.box = next(name for name in names if name.startswith("col_box"))
+        self.drone = int(self.model.body(self.model.geom(self.box).bodyid[0]).mocapid[0])
+
+    def free(self, flies: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+        """Which of the aircraft (n,) that fly touch nothing, with their poses (n, 3), (n, 4)."""
+        found, box = flies.copy(), self.model.geom(self.box).id
+        for row in np.flatnonzero(flies):
+            self.data.mocap_pos[self.placed] = self.places[row, :, :3]
+            self.data.mocap_quat[self.placed] = self.places[row, :, 3:]
+            self.data.mocap_pos[self.drone] = position[row]
+            self.data.mocap_quat[self.drone] = quaternion[row]
+            self.mujoco.mj_kinematics(self.model, self.data)
+            away = np.linalg.norm(self.data.geom_xpos[self.solids] - position[row], axis=1)
+            near = away < self.model.geom_rbound[self.solids] + 0.2
+            found[row] = not any(
+                self.mujoco.mj_geomDistance(self.model, self.data, box, geom, 0.1, None) < 0
+                for geom in np.array(self.solids)[near]
+            )
+        return found
 
 
 def in_order(wanted: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from quadrl.base.errors import QuadrlError
 from quadrl.base.units import length, percent
 from quadrl.conditions.randomization import NONE
 from quadrl.core.scenario import UNDISTURBED
+from quadrl.deploy.crosscheck import crosscheck
+from quadrl.deploy.simulators import SIMULATORS, there
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE
+from quadrl.evaluation.robustness import robustness
 
 Result = tuple[str, dict[str, Any]]
 """Conditions in words, and the figures of the flights in them."""
@@ -42,6 +46,16 @@ quadrl {quadrl}, and no aircraft is known to have flown it: every figure here is
 
 {reached}
 
+## What it withstands
+
+Each disturbance alone, {episodes} flights a level; `quadrl robustness {file}` draws it.
+
+{withstands}
+
+## In simulators of others
+
+{elsewhere}
+
 ## How it was trained
 
 {trained}
@@ -65,8 +79,6 @@ the policy does where it differs: {same}.
 
 ## Before an aircraft
 
-- `quadrl robustness {file}` says how much of each disturbance it withstands.
-- `quadrl crosscheck {file}` flies it in simulators that others wrote, where its task allows it.
 - `quadrl export {file} --to c` (or `crazyflie`, `px4`) writes it for a board, and refuses if the
   policy sees what a board does not know.
 - Your aircraft is not the one above: `quadrl identify LOG` measures how far it is off. Then test on
@@ -127,29 +139,24 @@ def card(
         f"kept. Layers {layers}{memory}; the last holds means and log-variances. All settings are "
         f"in `{FILE}`."
     )
-    head = "| flown | successful | to the end | error over the last 2 s | command |\n"
-    reached = head + "| --- | --- | --- | --- | --- |\n"
-    reached += "\n".join(
-        f"| {words} | {percent(got['success_rate'])} | {percent(got['survival_rate'])} "
-        f"| {length(got['position_error_m'])} "
-        f"| `quadrl evaluate {FILE} --episodes {EPISODES}{FLOWN[words][1]}` |"
-        for words, got in results
-    )
-    sees = "| numbers | entry | unit | meaning |\n| --- | --- | --- | --- |\n" + "\n".join(
-        f"| {one['first']} to {one['last']} | {one['name']} | {one['unit']} | {one['meaning']} |"
-        for one in json.loads(metadata["observation"])
-    )
-    does = "| number | unit | meaning | at -1 | at 0 | at 1 |\n" + 6 * "| --- " + "|\n"
-    does += "\n".join(
-        f"| {one['name']} | {one['unit']} | {one['meaning']} "
-        f"| {one['at_0'] + one['change_down']:.4g} | {one['at_0']:.4g} "
-        f"| {one['at_0'] + one['change']:.4g} |"
-        for one in json.loads(metadata["action"])
-    )
+    reached = [("flown", "successful", "to the end", "error over the last 2 s", "command")]
+    for words, got in results:
+        command = f"`quadrl evaluate {FILE} --episodes {EPISODES}{FLOWN[words][1]}`"
+        shares = percent(got["success_rate"]), percent(got["survival_rate"])
+        reached.append((words, *shares, length(got["position_error_m"]), command))
+    sees = [("numbers", "entry", "unit", "meaning")]
+    for one in json.loads(metadata["observation"]):
+        sees.append((f"{one['first']} to {one['last']}", one["name"], one["unit"], one["meaning"]))
+    does = [("number", "unit", "meaning", "at -1", "at 0", "at 1")]
+    for one in json.loads(metadata["action"]):
+        ends = (one["at_0"] + change for change in (one["change_down"], 0.0, one["change"]))
+        does.append((one["name"], one["unit"], one["meaning"], *(f"{x:.4g}" for x in ends)))
+    withstands = robustness(policy, episodes=EPISODES, recovery=False, progress=False)
     return CARD.format(
         name=name, asks=own.task.asks, quadrl=json.loads(metadata["quadrl"]), episodes=EPISODES,
-        reached=reached, trained=trained, drawn="\n".join(rows) or "| nothing | |",
-        same=", ".join(same), size=policy.size, sees=sees, does=does, file=FILE,
+        reached=_rows(reached), withstands=_rows(withstands.table), elsewhere=_elsewhere(policy),
+        trained=trained, drawn="\n".join(rows) or "| nothing | |", same=", ".join(same),
+        size=policy.size, sees=_rows(sees), does=_rows(does), file=FILE,
         milliseconds=1000 * own.vehicle.control_timestep,
     )  # fmt: skip
 
@@ -158,6 +165,28 @@ def _results(policy: Policy) -> list[Result]:
     """Fly it in each of the conditions; where its training had none, not twice in the same."""
     rows = [*FLOWN.items()][policy.scenario.randomization == NONE :]
     return [(words, evaluate(policy, episodes=EPISODES, **how).metrics) for words, (how, _) in rows]
+
+
+def _elsewhere(policy: Policy) -> str:
+    """What it reaches in the simulators that are installed here, or why it was not flown."""
+    here = [name for name in SIMULATORS if there(name)]
+    try:
+        if not here:
+            raise QuadrlError(f"not installed; `quadrl crosscheck {FILE}` does it, and flies there")
+        found = crosscheck(policy, simulators=here)
+    except QuadrlError as error:
+        return f"It was not flown there: {error}."
+    rows: list[tuple[str, ...]] = [("flown in", "aircraft", "late", "successful", "error", "fell")]
+    for row in found.rows:
+        reached = percent(row.success_rate), length(row.position_error_m), percent(row.fall_rate)
+        rows.append((row.flown_in, row.aircraft, f"{1000 * row.delay:g} ms", *reached))
+    return _rows(rows)
+
+
+def _rows(rows: Sequence[Sequence[str]]) -> str:
+    """A table; the first row is its head."""
+    lines = [" | ".join(row) for row in (rows[0], ["---"] * len(rows[0]), *rows[1:])]
+    return "\n".join(f"| {line} |" for line in lines)
 
 
 def _result(policy: Policy, words: str, got: Mapping[str, Any]) -> dict[str, Any]:

@@ -26,6 +26,11 @@ INSTALLED = "quadrl-installed"
 """A file in an environment that is whole."""
 
 
+def there(name: str) -> bool:
+    """Whether a simulator is installed, so that `environment_of` has nothing to do."""
+    return (_folder(choice("simulator", name, SIMULATORS)) / INSTALLED).exists()
+
+
 def environment_of(name: str, said: Callable[[str], None] = lambda text: None) -> Path:
     """The Python in which a simulator is installed; it is made at the first use.
 
@@ -37,10 +42,9 @@ def environment_of(name: str, said: Callable[[str], None] = lambda text: None) -
         QuadrlError: It is not there and may not be installed, or cannot be.
     """
     wanted = SIMULATORS[choice("simulator", name, SIMULATORS)]
-    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    folder = cache_folder().absolute() / "simulators" / f"{name}-{version}"
+    folder = _folder(name)
     python = folder / "bin" / "python"
-    if (folder / INSTALLED).exists():
+    if there(name):
         return python
     if os.environ.get("QUADRL_INSTALL") == "no":
         where = f"{wanted} is not in {folder}, and QUADRL_INSTALL=no"
@@ -62,6 +66,11 @@ def environment_of(name: str, said: Callable[[str], None] = lambda text: None) -
     finally:
         os.close(descriptor)
     return python
+
+
+def _folder(name: str) -> Path:
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    return cache_folder().absolute() / "simulators" / f"{name}-{version}"
 
 
 class Simulator:

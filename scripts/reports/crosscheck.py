@@ -13,14 +13,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from quadrl.base.errors import QuadrlError
+from quadrl.base.primitives import Primitive
 from quadrl.base.rotation import roll_pitch_yaw
 from quadrl.base.units import length, percent
 from quadrl.control.reading import Reading
+from quadrl.core.environment import Environment
 from quadrl.core.scenario import UNDISTURBED, Scenario
 from quadrl.deploy.crosscheck import LATE, OWN, brakes, crosscheck, fly_in
 from quadrl.deploy.simulators import Simulator, environment_of
 from quadrl.evaluation.policy import Policy, shipped
-from quadrl.evaluation.rollout import flights, fly
+from quadrl.evaluation.rollout import EVALUATION_SEED, flights, fly
+from quadrl.tasks.arena import DEPTH
 from scripts.reports import report
 from scripts.reports.report import Result, say, table
 
@@ -135,29 +138,50 @@ def crosschecked(path: Path) -> list[Result]:
 def race() -> list[Result]:
     """Fly the policy for `lsy_race` by crazyflow's physics: the competition's, on its aircraft.
 
-    Course, box and rules are those of quadrl's task, of the same track file; the floor is
-    crazyflow's. Nothing is drawn for the aircraft, and nothing pushes it.
+    Rules and track file are those of quadrl's task, the floor is crazyflow's. Nothing is drawn for
+    the aircraft, and nothing pushes it. In the last row the course is built in crazyflow's scene,
+    too, and MuJoCo finds there what its aircraft's box touches; quadrl's own box is a point then.
     """
     policy = Policy.pretrained("lsy_race")
     flies = policy.scenario.aircraft
     calm: Any = {**UNDISTURBED, "engine": "free_flight", "aerodynamics": flies.aerodynamics}
     scenario = dataclasses.replace(policy.scenario, vehicle=flies, **calm)
     found: list[Result] = []
-    for own in (None, "", flies.name):
+    for own, built in ((None, False), ("", False), (flies.name, False), (flies.name, True)):
         given = {"own": own, "vehicle": dataclasses.asdict(flies), "brakes": brakes(flies)}
+        flown = scenario
+        if built:
+            point = dataclasses.replace(scenario.task, box=0.0, least_box=0.0)
+            flown = dataclasses.replace(scenario, task=point)
+            given["course"] = course(flown)
         with contextlib.ExitStack() as stack:
             advance, where = None, "quadrl"
             if own is not None:
                 there = Simulator("crazyflow", environment_of("crazyflow", say), given)
                 stack.callback(there.close)
                 advance, where = there.advance, f"crazyflow {there.version}"
-            flown = fly_in(policy, scenario, RACES, 0, advance)
+            got = fly_in(policy, flown, RACES, 0, advance)
         row: Result = {"flown_in": where, "aircraft": own or ("matched" if advance else flies.name)}
-        row |= {"success_rate": float(flown["success"].mean()), "episodes": RACES}
-        row |= {"race_time_s": float(flown["length_s"][flown["success"]].mean())}
+        row |= {"course": "crazyflow" if built else "quadrl"}
+        row |= {"success_rate": float(got["success"].mean()), "episodes": RACES}
+        row |= {"race_time_s": float(got["length_s"][got["success"]].mean())}
         say(row)
         found.append(row)
     return found
+
+
+def course(scenario: Scenario) -> dict[str, Any]:
+    """The solids of each race, as the driver of crazyflow takes them."""
+    environment = Environment(scenario, num_envs=RACES, seed=EVALUATION_SEED)
+    environment.reset()
+    races = [[x for x in environment.markers(k) if isinstance(x, Primitive)] for k in range(RACES)]
+    for solids in races:
+        for k in range(4 * len(scenario.task.course.gates)):  # the sides of frames come first
+            thin = DEPTH, *np.asarray(solids[k].size)[1:]  # they are drawn thicker
+            solids[k] = dataclasses.replace(solids[k], size=thin)
+    places = [[[*x.position, *x.quaternion] for x in solids] for solids in races]
+    shapes = [(x.shape, np.asarray(x.size, float).tolist()) for x in races[0]]
+    return {"shapes": shapes, "places": np.array(places, float).tolist()}
 
 
 def _cells(rows: list[Result]) -> list[str]:
@@ -204,10 +228,10 @@ def raptor_table() -> str:
 
 def race_table() -> str:
     """What the policy for `lsy_race` reaches in the competition's simulator."""
-    head = "flown in", "aircraft", "flights", "through every gate", "mean time"
+    head = "flown in", "aircraft", "collisions by", "flights", "through every gate", "mean time"
     rows = (
         (
-            *(row["flown_in"], row["aircraft"], row["episodes"]),
+            *(row[name] for name in ("flown_in", "aircraft", "course", "episodes")),
             *(percent(row["success_rate"]), f"{row['race_time_s']:.2f} s"),
         )
         for row in report.load("crosscheck")["race"]

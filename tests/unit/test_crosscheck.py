@@ -7,6 +7,7 @@ import sys
 import types
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from helpers import refused
@@ -20,7 +21,7 @@ from quadrl.core.scenario import UNDISTURBED
 from quadrl.deploy import crosscheck as crosschecking
 from quadrl.deploy import simulators
 from quadrl.deploy.crosscheck import brakes, crosscheck, fly_in, scaled
-from quadrl.deploy.driver import in_order
+from quadrl.deploy.driver import Course, in_order
 from quadrl.deploy.manoeuvres import checks, engine_of
 from quadrl.deploy.simulators import Simulator, environment_of
 from quadrl.evaluation.policy import Policy
@@ -66,6 +67,43 @@ def test_an_aircraft_whose_episode_is_over_is_not_flown():
 
     found = fly_in(policy, policy.scenario, 2, 0, advance)
     assert rows[0] == 2 and rows[-1] == 1 and found["failed"].tolist() == [True, False]
+
+
+def test_an_aircraft_that_has_touched_something_there_has_failed():
+    policy = linear(22, 4)
+    motions = []
+
+    def advance(motion, command, seconds):
+        motions.append(motion)
+        touched = motion.copy()
+        touched[1] = np.nan
+        return touched
+
+    found = fly_in(policy, policy.scenario, 2, 0, advance)
+    assert found["failed"].tolist() == [False, True]
+    assert found["length_s"][1] == policy.scenario.vehicle.control_timestep
+    assert np.isfinite(motions[-1]).all()
+
+
+SCENE = """<mujoco><worldbody><body name="drone" mocap="true">
+  <geom type="sphere" size="0.09"/>
+  <geom name="col_box:0" type="box" size="0.07 0.07 0.02" contype="0" conaffinity="0"/>
+</body></worldbody></mujoco>"""
+
+
+def test_the_box_of_the_aircraft_alone_touches_a_course():
+    spec, level = mujoco.MjSpec.from_string(SCENE), [1, 0, 0, 0]
+    solids = [("box", [0.01, 0.5, 0.5]), ("cylinder", [0.015, 1.0, 0.0])]
+    one, other = [0, 0, 1, *level], [5, 0, 1, *level]
+    course = Course(spec, solids, [[one, other], [one, other], [other, one], [one, other]])
+    place = np.array([[0.079, 0, 1], [0.081, 0, 1], [0.079, 0, 1], [0.081, 0, 1]])
+    turned = [np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)]  # its edge is ahead
+    pose = np.array([level, level, level, turned], float)
+    assert course.free(np.ones(4, bool), place, pose).tolist() == [False, True, False, False]
+    assert course.free(np.array([True, False, True, True]), place + 1, pose)[[0, 1]].tolist() == [
+        True,
+        False,
+    ]
 
 
 # -------------------------------------------------------------------------------------- the checks
