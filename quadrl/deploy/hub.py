@@ -139,15 +139,17 @@ def card(
         f"kept. Layers {layers}{memory}; the last holds means and log-variances. All settings are "
         f"in `{FILE}`."
     )
-    reached = [("flown", "successful", "to the end", "error over the last 2 s", "command")]
+    reached: list[tuple[str, ...]] = [
+        ("flown", "successful", "to the end", "error over the last 2 s", "command")
+    ]
     for words, got in results:
         command = f"`quadrl evaluate {FILE} --episodes {EPISODES}{FLOWN[words][1]}`"
         shares = percent(got["success_rate"]), percent(got["survival_rate"])
         reached.append((words, *shares, length(got["position_error_m"]), command))
-    sees = [("numbers", "entry", "unit", "meaning")]
+    sees: list[tuple[str, ...]] = [("numbers", "entry", "unit", "meaning")]
     for one in json.loads(metadata["observation"]):
         sees.append((f"{one['first']} to {one['last']}", one["name"], one["unit"], one["meaning"]))
-    does = [("number", "unit", "meaning", "at -1", "at 0", "at 1")]
+    does: list[tuple[str, ...]] = [("number", "unit", "meaning", "at -1", "at 0", "at 1")]
     for one in json.loads(metadata["action"]):
         ends = (one["at_0"] + change for change in (one["change_down"], 0.0, one["change"]))
         does.append((one["name"], one["unit"], one["meaning"], *(f"{x:.4g}" for x in ends)))

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ INSTALLED = "quadrl-installed"
 
 
 def there(name: str) -> bool:
-    """Whether a simulator is installed, so that `environment_of` has nothing to do."""
-    return (_folder(choice("simulator", name, SIMULATORS)) / INSTALLED).exists()
+    """Whether a simulator is installed."""
+    return (_folder(name) / INSTALLED).exists()
 
 
 def environment_of(name: str, said: Callable[[str], None] = lambda text: None) -> Path:
@@ -44,8 +44,22 @@ def environment_of(name: str, said: Callable[[str], None] = lambda text: None) -
     wanted = SIMULATORS[choice("simulator", name, SIMULATORS)]
     folder = _folder(name)
     python = folder / "bin" / "python"
+    pip = python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wanted
+    install(name, wanted, ((sys.executable, "-m", "venv", folder), pip), said)
+    return python
+
+
+def install(
+    name: str, wanted: str, lines: Iterable[Sequence[str | Path]], said: Callable[[str], None]
+) -> Path:
+    """The folder of a simulator, in which command lines install it at the first use.
+
+    Raises:
+        QuadrlError: It is not there and may not be installed, or a line fails.
+    """
+    folder = _folder(name)
     if there(name):
-        return python
+        return folder
     if os.environ.get("QUADRL_INSTALL") == "no":
         where = f"{wanted} is not in {folder}, and QUADRL_INSTALL=no"
         raise QuadrlError(f"{where}: run again without it, or without {name}")
@@ -55,17 +69,16 @@ def environment_of(name: str, said: Callable[[str], None] = lambda text: None) -
     except BlockingIOError:
         raise QuadrlError(f"another process is installing {name}: run again after it") from None
     try:
-        said(f"installing {wanted} with pip in {folder} (QUADRL_INSTALL=no prevents it)")
-        pip = "pip", "install", "--quiet", "--disable-pip-version-check", wanted
-        for line in ((sys.executable, "-m", "venv", folder), (python, "-m", *pip)):
-            done = subprocess.run(line, capture_output=True, text=True)
+        said(f"installing {wanted} in {folder} (QUADRL_INSTALL=no prevents it)")
+        for line in lines:
+            done = subprocess.run(line, capture_output=True, text=True, cwd=folder)
             if done.returncode:
                 last = (done.stderr.strip() or done.stdout.strip() or "?").splitlines()[-1]
                 raise QuadrlError(f"{name} cannot be installed: {last}; run again without it")
         (folder / INSTALLED).touch()
     finally:
         os.close(descriptor)
-    return python
+    return folder
 
 
 def _folder(name: str) -> Path:

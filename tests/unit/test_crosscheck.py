@@ -371,7 +371,7 @@ def test_an_installation_that_fails_says_why_and_is_tried_again(monkeypatch, tmp
     for _ in range(2):
         with pytest.raises(QuadrlError, match="crazyflow cannot be installed: no room"):
             environment_of("crazyflow", said.append)
-    assert len(said) == 2 and said[0].startswith("installing crazyflow>=0.4 with pip in ")
+    assert len(said) == 2 and said[0].startswith("installing crazyflow>=0.4 in ")
     # What is made in its place is known without pip.
     (folder,) = (tmp_path / "simulators").iterdir()
     (folder / simulators.INSTALLED).touch()
