@@ -84,7 +84,7 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     own = config.named()
     kind = {name: own[name] for name in ("algo", "vehicle", "variant")}
     usual = (trained := TrainConfig(config.task, **kind)).named()
-    named = (*FREE, "seed", "engine", "from_run", "training_options")  # the command says them
+    named = (*FREE, "seed", "steps", "engine", "from_run", "training_options")  # it says them
     if config.from_run:  # a second training
         named += ("randomization",)
     if dataclasses.replace(config, **{name: usual[name] for name in named}) != trained:
@@ -108,6 +108,7 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
         "randomization": (own["randomization"], usual["randomization"]),
         "training_options": (practice, {}),
         "engine": (own["engine"], usual["engine"]),
+        "steps": (own["steps"], usual["steps"]),
         "variant": (config.variant, "ideal"),
     }
     words = written({name: value for name, (value, given) in told.items() if value != given})
