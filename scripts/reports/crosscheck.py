@@ -89,10 +89,12 @@ def crosschecks(only: tuple[str, ...] = ()) -> None:
     This takes the package foundation-policy, which quadrl does not need.
 
     Args:
-        only: Names of policies, beside what was measured of all else; by default everything.
+        only: Names of policies, and `race` for its table, beside what was measured of all else; by
+            default everything.
     """
     if only:
         kept = report.load("crosscheck")
+        kept |= {"race": race()} if "race" in only else {}
         paths = (path for path in shipped() if path.stem in only)
         rows = [{"commit": report.commit()} | row for path in paths for row in crosschecked(path)]
         others = (row for row in kept["rows"] if row["policy"] not in only)

@@ -1,5 +1,6 @@
 """Policies in C on a processor of boards: an STM32F405 (Cortex-M4), which QEMU emulates."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -99,3 +100,20 @@ def test_a_companion_computer_has_the_bits_of_the_reference(policy, optimisation
     source.write_text(source.read_text().replace("_test()", "_test() == 0"))
     subprocess.run([COMPANION[0], *flags, source, "-o", made, "-lm"], check=True)
     assert subprocess.run([COMPANION[1], made]).returncode == 1  # so it was run
+
+
+FIRMWARE = os.environ.get("CRAZYFLIE_FIRMWARE", "")
+
+
+@on_board
+@pytest.mark.skipif(not FIRMWARE, reason="CRAZYFLIE_FIRMWARE names no checkout of the firmware")
+def test_the_firmware_of_a_crazyflie_is_built_with_a_policy_in_it(tmp_path):
+    app = export("hover_robust_crazyflie_brushless", "crazyflie", tmp_path / "app")
+    named = {"PWD": str(app), "CRAZYFLIE_BASE": FIRMWARE}
+    for goal in ("cf21bl_defconfig", "all"):
+        command = ["make", f"CRAZYFLIE_BASE={FIRMWARE}", goal]
+        done = subprocess.run(command, cwd=app, env=os.environ | named, capture_output=True)
+        assert done.returncode == 0, done.stderr.decode()[-2000:]
+    made = (app / "build" / "cf21bl.bin").read_bytes()
+    assert 300_000 < len(made) < 1_032_192  # of its flash
+    assert b"quadrl" in made  # the group of the controller's parameters
