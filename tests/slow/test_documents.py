@@ -7,6 +7,7 @@ studies, which would take hours, are parsed, and the settings of trainings are c
 """
 
 import dataclasses
+import functools
 import importlib.util
 import os
 import re
@@ -210,11 +211,16 @@ def test_quadrl_view_flies_until_it_is_interrupted(command, folder):
     _, *arguments = shlex.split(command, comments=True)
     program = (sys.executable, "-m", "quadrl", *arguments, "--port", "0")
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen(program, cwd=folder, **pipes) as viewer:
-        assert "http://localhost:" in viewer.stdout.readline()
-        time.sleep(2.0)
-        viewer.send_signal(signal.SIGINT)
-        rest = viewer.stdout.read()
+    # What is started in the background by a script ignores the signal, and so would the viewer.
+    heard = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(program, cwd=folder, preexec_fn=heard, **pipes) as viewer:
+        try:
+            assert "http://localhost:" in viewer.stdout.readline()
+            time.sleep(2.0)
+            viewer.send_signal(signal.SIGINT)
+            rest, _ = viewer.communicate(timeout=60)
+        finally:
+            viewer.kill()
     assert viewer.returncode == 0, rest
     assert rest == "stopped\n"
 
