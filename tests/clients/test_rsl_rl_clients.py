@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import importlib
 import sys
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -140,7 +141,10 @@ def test_its_critic_reads_the_privileged_observation_and_its_logs_are_read(tmp_p
     assert (tmp_path / "model_1.pt").exists()
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    events = EventAccumulator(str(tmp_path)).Reload()
+    events, begun = EventAccumulator(str(tmp_path)), time.monotonic()
+    while "Train/mean_episode_length" not in events.Reload().Tags()["scalars"]:
+        assert time.monotonic() < begun + 30  # a thread writes them
+        time.sleep(0.1)
     assert {"Episode/success", "Episode/error"} <= set(events.Tags()["scalars"])
     assert events.Scalars("Train/mean_episode_length")[-1].value <= 10
 
