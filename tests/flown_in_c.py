@@ -28,6 +28,13 @@ int step({name}_memory* m, const {name}_motion* now, float* action, float* comma
   }}
   return bad;
 }}
+#ifdef {upper}_PHYSICS_TIMESTEP
+int loops({name}_memory* m, const {name}_motion* now, float* command, int rows) {{
+  int bad = 0;
+  for (int k = 0; k < rows; ++k) bad |= {name}_loops(m + k, now + k, command + k * {upper}_ROTORS);
+  return bad;
+}}
+#endif
 """
 
 
@@ -47,9 +54,9 @@ def compiled(path, folder, *flags):
     return ctypes.CDLL(str(made))
 
 
-def motions_of(environment):
-    """Motions (N, 13 + R) as the C takes them."""
-    now = environment.snapshot.state
+def motions_of(environment, now=None):
+    """Motions (N, 13 + R) as the C takes them; by default as a control step begins."""
+    now = now or environment.snapshot.state
     parts = now.position, now.quaternion, now.velocity, now.body_rate, now.rotor_speed
     return np.concatenate(parts, axis=1).astype(np.float32)
 
@@ -78,6 +85,11 @@ class Flown:
 
     def step(self, motions):
         return self._call(self.library.step, motions, self.action, self.command, self.observation)
+
+    def loops(self, motions, rotors=4):
+        """Commands (N, R) of the loops; whether they are."""
+        found = np.zeros((self.rows, rotors), np.float32)
+        return found, self._call(self.library.loops, motions, found)
 
     def _call(self, function, *arrays):
         given = [self.memory, *(np.ascontiguousarray(a, np.float32) for a in arrays)]

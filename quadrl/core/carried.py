@@ -72,6 +72,13 @@ class Carried(Program):
             commands of the step, and the memory."""
             self.asked = RowFunction(mode.values, actions)
             """What an action asks for, in the units of the control mode."""
+            self.loops: dict[str, RowFunction] = {}
+            """Of a mode with loops: its setpoint, from the motion and the action of a control step,
+            and its commands of the rotors, from the motion of a physics step and the setpoint."""
+            if mode.has_loops:
+                aimed = RowFunction(self._aimed, motion, actions)
+                looped = RowFunction(self._looped, motion, aimed.width)
+                self.loops = {"aimed": aimed, "looped": looped}
         except NotCompilable as error:
             name = f"task {task.name}"
             allowed = "functions of arithmetic alone, which C can be made of"
@@ -90,6 +97,12 @@ class Carried(Program):
         parts = np.split(motion, [3, 7, 10, 13], axis=1)
         height = float(self.written.engine.origin[2])
         return State.of_coordinates(*parts, origin_height=height)
+
+    def _aimed(self, motion: Array, action: Array) -> Array:
+        return self.environment.control_mode.setpoint(self._state(motion), action)
+
+    def _looped(self, motion: Array, setpoint: Array) -> Array:
+        return self.environment.control_mode.rotor_command(self._state(motion), setpoint)
 
     def _aged(self, motion: Array) -> Array:
         origin = self.written.engine.origin

@@ -26,6 +26,37 @@ from quadrl.evaluation.policy import Policy
 PARTS = "begun", "sensed", "asked"
 TEST_STEPS = 4
 TEMPLATE = Path(__file__).with_name("templates") / "policy.h.in"
+LOOPS = {
+    "setpoint": "\n  float setpoint[{width}];",
+    "aimed": """
+  memcpy(x + {upper}_MOTION, wanted, sizeof wanted);
+  {name}_aimed(x, m->setpoint);""",
+    "loops": """
+// The loops of the control mode, for an autopilot without its own: rotor speeds [rad/s] for a
+// motion, every {upper}_PHYSICS_TIMESTEP between two steps. Returns 0, or -1 and gives nothing
+// where a number is not finite.
+#define {upper}_PHYSICS_TIMESTEP {timestep}f
+static int {name}_loops(const {name}_memory* m, const {name}_motion* now, float* rotor_speed) {{
+  float x[{upper}_MOTION + {width}], y[{upper}_ROTORS];
+  memcpy(x, now, {upper}_MOTION * sizeof(float));
+  memcpy(x + {upper}_MOTION, m->setpoint, sizeof m->setpoint);
+  if (!{name}_sound(x, {upper}_MOTION + {width})) return -1;
+  {name}_looped(x, y);
+  if (!{name}_sound(y, {upper}_ROTORS)) return -1;
+  memcpy(rotor_speed, y, sizeof y);
+  return 0;
+}}
+
+""",
+    "tested": """
+    wrong |= {name}_loops(&m, &now, command);
+    for (int i = 0; i < {upper}_ROTORS; ++i) {{
+      const float known = expected[k][{upper}_OBSERVATION + {upper}_COMMANDS + i];
+      const float most = {slack} * (1.0f + fabsf(known)), off = command[i] - known;
+      wrong |= !(off <= most && -off <= most);
+    }}""",
+}
+"""What a header has more where its control mode has loops."""
 
 
 class Header:
@@ -43,7 +74,9 @@ class Header:
         self.carried = Carried(self.environment)
         self.functions = {name: getattr(self.carried, name) for name in PARTS}
         """The traced functions, by name."""
-        self.exact = all(map(is_exact, self.functions.values()))
+        self.loops = self.carried.loops
+        """Those of a control mode with loops."""
+        self.exact = all(map(is_exact, (self.functions | self.loops).values()))
         """Whether every compiler gives the same bits."""
         variant = str(policy.metadata.get("variant") or "ideal")
         stem = policy.task if variant == "ideal" else f"{policy.task}_{variant}"
@@ -83,7 +116,8 @@ class Header:
         """Bytes of what is remembered of an episode."""
         numbers = 13 + self.environment.vehicle.rotor_count + self.carried.remembered.end
         numbers += self.environment.action_size + self.carried.asked.width
-        return 4 * (numbers + self.environment.size + self.policy.state_size + 1)
+        held = self.loops["aimed"].width if self.loops else 0
+        return 4 * (numbers + held + self.environment.size + self.policy.state_size + 1)
 
     @property
     def cost(self) -> Cost:
@@ -133,7 +167,16 @@ def written(header: Header, metadata: Mapping[str, str]) -> bytes:
     said = {name: json.loads(value) for name, value in metadata.items()}
     task, vehicle = carried.task_memory(), environment.vehicle
     motions = _motions(header)
-    flown = [np.concatenate([seen, asked]) for seen, _, asked in header.flown(motions)]
+    flown = [
+        np.concatenate([seen, asked, *looped(header, motion, action)])
+        for motion, (seen, action, asked) in zip(motions, header.flown(motions), strict=True)
+    ]
+    slack = "0.0f" if header.exact else "1e-5f"
+    more = dict.fromkeys(LOOPS, "")
+    if header.loops:
+        given = {"name": name, "upper": name.upper(), "width": header.loops["aimed"].width}
+        given |= {"timestep": repr(float(vehicle.physics_timestep)), "slack": slack}
+        more = {key: part.format(**given) for key, part in LOOPS.items()}
     first, places = 0, list[str]()
     for key, array in task.items():
         label = f"{name.upper()}_{key.upper()}_AT"
@@ -174,8 +217,8 @@ def written(header: Header, metadata: Mapping[str, str]) -> bytes:
         speeds="measured" if header.reads_speeds else "read at the start: hovering if unknown",
         functions="\n".join(
             [
-                functions(name, header.functions.values()),
-                *(function(name, *part) for part in header.functions.items()),
+                functions(name, (header.functions | header.loops).values()),
+                *(function(name, *part) for part in (header.functions | header.loops).items()),
             ]
         ),
         network=network(name, policy),
@@ -184,9 +227,20 @@ def written(header: Header, metadata: Mapping[str, str]) -> bytes:
         steps=len(motions),
         motions=", ".join(f"{{{numbers(row)}}}" for row in motions),
         expected=", ".join(f"{{{numbers(row)}}}" for row in flown),
-        slack="0.0f" if header.exact else "1e-5f",
+        slack=slack,
+        rooms=max(vehicle.rotor_count, carried.asked.width),
+        given=vehicle.rotor_count if header.loops else 0,
+        **more,
     )
     return text.encode()
+
+
+def looped(header: Header, motion: np.ndarray, action: np.ndarray) -> Iterator[np.ndarray]:
+    """The commands (R,) of the loops as a control step begins, in single precision, if any."""
+    if header.loops:
+        aimed, loops = header.loops.values()
+        setpoint = in_single(aimed, np.concatenate([motion, action]))
+        yield in_single(loops, np.concatenate([motion, setpoint]))
 
 
 def _motions(header: Header) -> np.ndarray:

@@ -210,3 +210,31 @@ def test_what_no_autopilot_knows_is_refused():
     looped = Policy(plain.weights, plain.biases, plain.mean, plain.deviation, "hover", other)
     with pytest.raises(QuadrlError, match="commands of loops"):
         Header(looped)
+
+
+@pytest.mark.parametrize("mode", ["thrust_body_rate", "velocity", "position"])
+def test_the_loops_of_a_control_mode_are_in_the_header(mode, tmp_path):
+    plain = Policy.pretrained("hover")
+    policy = dataclasses.replace(plain, metadata=plain.metadata | {"control_mode": mode})
+    library = compiled(export(policy, "c", tmp_path / "policy.h"), tmp_path, "-O2")
+    assert library.test() == 0
+    environment = Environment(policy.scenario, seed=3, **UNDISTURBED)
+    environment.reset()
+    flown = Flown(library, policy)
+    assert flown.begin(motions_of(environment), tasks_of(environment)) == 0
+    for _ in range(20):
+        assert flown.step(motions_of(environment)) == 0
+        environment.begin(flown.action.astype(float))
+        for steps in environment.commands():
+            found, bad = flown.loops(motions_of(environment, environment.engine.peek()))
+            assert bad == 0
+            assert found == pytest.approx(environment.engine.ctrl, rel=1e-4)
+            environment.engine.advance(steps)
+        environment.finish()
+    lost = motions_of(environment)
+    lost[0, 8] = np.nan
+    assert flown.loops(lost)[1] == -1
+
+
+def test_a_header_without_loops_has_none(tmp_path):
+    assert "_loops" not in export("hover", "c", tmp_path / "hover.h").read_text()
