@@ -1,11 +1,15 @@
 """Policies in the simulators themselves, where their environments exist."""
 
 import pytest
+from runs import train
 
 from quadrl.base.errors import QuadrlError
+from quadrl.deploy import betaflight
 from quadrl.deploy.crosscheck import crosscheck
-from quadrl.deploy.simulators import SIMULATORS, environment_of
+from quadrl.deploy.simulators import SIMULATORS, environment_of, there
 from quadrl.evaluation.controllers import policy_of
+from quadrl.evaluation.policy import Policy
+from quadrl.learning.config import TrainConfig
 
 
 @pytest.mark.parametrize("simulator", SIMULATORS)
@@ -23,3 +27,19 @@ def test_matched_flights_are_those_of_quadrl_in_the_same_air(simulator, name, mo
     for row, like in zip(there, own, strict=True):
         assert row.success_rate == pytest.approx(like.success_rate, abs=0.25)
         assert row.position_error_m == pytest.approx(like.position_error_m, rel=0.3, abs=1e-4)
+
+
+def test_betaflight_holds_a_place_by_its_own_rate_loops(tmp_path):
+    if not there(betaflight.NAME):
+        pytest.skip(f"{betaflight.WANTED} is not installed")
+    config = TrainConfig(
+        "hover", vehicle="racer", control_mode="thrust_body_rate", aerodynamics="full"
+    )
+    policy = Policy.load(train(config, tmp_path / "run"))
+    one, other = (
+        crosscheck(policy, simulators=(betaflight.NAME,), episodes=3).rows[2] for _ in range(2)
+    )
+    assert one.flown_in == "Betaflight 4.6.0" and one.delay == 0.0
+    assert one.success_rate == other.success_rate == 1.0
+    assert one.position_error_m < 0.01
+    assert one.position_error_m == pytest.approx(other.position_error_m, rel=0.2)
