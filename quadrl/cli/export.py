@@ -31,4 +31,6 @@ class Export:
 
     def run(self) -> None:
         """Write the file."""
+        if self.to == "hub":
+            say("flying it for its card, which takes minutes")
         say(f"wrote {export(self.what, self.to, self.out)}")

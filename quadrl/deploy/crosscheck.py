@@ -89,6 +89,12 @@ class Crosscheck:
     """Physics, and how it is in quadrl and in each of SIMULATORS."""
 
 
+def fitting(policy: Policy) -> list[str]:
+    """The names of what can fly a policy: Betaflight those that command body rates."""
+    rates = policy.control_mode == ThrustBodyRate.name
+    return [*SIMULATORS, *[betaflight.NAME] * rates]
+
+
 def crosscheck(
     policy: Policy,
     *,
@@ -116,8 +122,7 @@ def crosscheck(
         number("episodes", episodes, 1, MAX_EPISODES, whole=True)
     scenario = _scenario(policy)
     flies, air = scenario.vehicle, scenario.vehicle.aerodynamics
-    rates = scenario.control_mode == ThrustBodyRate.name
-    names = simulators or (*SIMULATORS, *[betaflight.NAME] * rates)
+    names = simulators or fitting(policy)
     many = {choice("simulator", x, EPISODES): episodes or EPISODES[x] for x in names}
     if betaflight.NAME in many:
         betaflight.check_fits(flies, scenario.control_mode)

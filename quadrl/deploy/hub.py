@@ -12,8 +12,8 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.units import length, percent
 from quadrl.conditions.randomization import NONE
 from quadrl.core.scenario import UNDISTURBED
-from quadrl.deploy.crosscheck import crosscheck
-from quadrl.deploy.simulators import SIMULATORS, there
+from quadrl.deploy.crosscheck import crosscheck, fitting
+from quadrl.deploy.simulators import there
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE
@@ -171,7 +171,7 @@ def _results(policy: Policy) -> list[Result]:
 
 def _elsewhere(policy: Policy) -> str:
     """What it reaches in the simulators that are installed here, or why it was not flown."""
-    here = [name for name in SIMULATORS if there(name)]
+    here = [name for name in fitting(policy) if there(name)]
     try:
         if not here:
             raise QuadrlError(f"not installed; `quadrl crosscheck {FILE}` does it, and flies there")

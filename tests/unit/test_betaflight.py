@@ -13,6 +13,8 @@ from quadrl.aircraft.presets import RACER, VEHICLES
 from quadrl.base.errors import QuadrlError
 from quadrl.deploy import betaflight
 from quadrl.deploy.betaflight import HIGH, IDLE, LOW, Betaflight, check_fits
+from quadrl.deploy.crosscheck import fitting
+from quadrl.evaluation.policy import Policy
 
 AT_REST = np.array([0.0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
 
@@ -152,3 +154,11 @@ def test_dead_time_is_flown(fake, tmp_path):
         later = advance(early, np.zeros((1, 4)), 0.01)
     assert early[0, 13:] == pytest.approx(RACER.hover_speed, rel=1e-6)
     assert (later[0, 13:] > 1.05 * RACER.hover_speed).all()
+
+
+def test_it_flies_by_default_what_commands_body_rates():
+    plain = Policy.pretrained("hover")
+    rates = dataclasses.replace(
+        plain, metadata=plain.metadata | {"control_mode": "thrust_body_rate"}
+    )
+    assert "betaflight" in fitting(rates) and "betaflight" not in fitting(plain)
