@@ -77,7 +77,8 @@ def check_fits(vehicle: Vehicle, mode: str) -> None:
     """Refuse what the firmware cannot fly as it comes.
 
     Raises:
-        QuadrlError: Another control mode, or an aircraft that is no X with its order of motors.
+        QuadrlError: Another control mode, an aircraft that is no X with its order of motors, or one
+            that is flown in other steps than whole milliseconds.
     """
     if mode != ThrustBodyRate.name:
         allowed = "a policy that commands body rates: --control-mode thrust_body_rate in training"
@@ -86,6 +87,10 @@ def check_fits(vehicle: Vehicle, mode: str) -> None:
     if signs != [*PLACES]:
         allowed = "an X as Betaflight numbers its motors, such as racer, back right first"
         raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
+    steps = vehicle.physics_timestep / STEP
+    if abs(steps - round(steps)) > 1e-6:
+        allowed = "whole milliseconds, in which Betaflight is told the motion"
+        raise QuadrlError(name="physics_timestep", value=vehicle.physics_timestep, allowed=allowed)
 
 
 class Betaflight:

@@ -16,7 +16,6 @@ import numpy as np
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, number
-from quadrl.control.modes import ThrustBodyRate
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import UNDISTURBED, Scenario
 from quadrl.deploy import betaflight
@@ -90,9 +89,12 @@ class Crosscheck:
 
 
 def fitting(policy: Policy) -> list[str]:
-    """The names of what can fly a policy: Betaflight those that command body rates."""
-    rates = policy.control_mode == ThrustBodyRate.name
-    return [*SIMULATORS, *[betaflight.NAME] * rates]
+    """The names of what can fly a policy; Betaflight does some that command body rates."""
+    names, own = [*SIMULATORS], policy.scenario
+    with contextlib.suppress(QuadrlError):
+        betaflight.check_fits(own.aircraft, own.control_mode)
+        names.append(betaflight.NAME)
+    return names
 
 
 def crosscheck(

@@ -11,6 +11,7 @@ import pytest
 
 from quadrl.aircraft.presets import RACER, VEHICLES
 from quadrl.base.errors import QuadrlError
+from quadrl.core.scenario import Scenario
 from quadrl.deploy import betaflight
 from quadrl.deploy.betaflight import HIGH, IDLE, LOW, Betaflight, check_fits
 from quadrl.deploy.crosscheck import fitting
@@ -27,7 +28,7 @@ class Fake(threading.Thread):
 
     def __init__(self):
         super().__init__(daemon=True)
-        self.states, self.sticks, self.lines = [], [], []
+        self.states, self.sticks, self.times, self.lines = [], [], [], []
         made = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3))
         self.given, self.asked, self.out = made
         self.given.bind(("127.0.0.1", betaflight.STATES))
@@ -42,7 +43,9 @@ class Fake(threading.Thread):
                 self.asked.setblocking(False)
                 with contextlib.suppress(BlockingIOError):
                     while True:
-                        self.sticks.append(struct.unpack("<d16H", self.asked.recv(256))[1:])
+                        at, *stick = struct.unpack("<d16H", self.asked.recv(256))
+                        self.sticks.append(stick)
+                        self.times.append(at)
                 roll, _, throttle, _, switch = self.sticks[-1][:5]
                 share = max(throttle - LOW, 0) / (HIGH - LOW)
                 one = (IDLE + (1 - IDLE) * share) * (switch > 1700)
@@ -91,11 +94,11 @@ def test_it_is_told_rates_as_sticks_and_the_motors_turn_the_aircraft_as_asked(fa
 def test_what_is_late_is_the_setpoint(fake, tmp_path):
     with contextlib.closing(Betaflight(tmp_path, RACER)) as pilot:
         asked, advance = pilot.flying(delay=0.02)
-        begun = len(fake.states)
+        begun, now = len(fake.states), pilot._time
         asked(np.array([[1.0, 0.0, 0.0, 0.0]]))
         advance(np.array([[0, 0, 100.0, 1, *[0] * 13]]), np.zeros((1, 4)), 0.04)
-    flown = [stick for stick in fake.sticks if stick[2] > 1010]
-    assert len(flown) == 1 and len(fake.states) == begun + 40
+    lifted = [at for at, stick in zip(fake.times, fake.sticks, strict=True) if stick[2] > 1010]
+    assert lifted == [pytest.approx(now + 0.02)] and len(fake.states) == begun + 40
 
 
 def test_rates_of_the_body_come_forward_right_down(fake, tmp_path):
@@ -156,9 +159,18 @@ def test_dead_time_is_flown(fake, tmp_path):
     assert (later[0, 13:] > 1.05 * RACER.hover_speed).all()
 
 
-def test_it_flies_by_default_what_commands_body_rates():
-    plain = Policy.pretrained("hover")
-    rates = dataclasses.replace(
-        plain, metadata=plain.metadata | {"control_mode": "thrust_body_rate"}
-    )
-    assert "betaflight" in fitting(rates) and "betaflight" not in fitting(plain)
+def test_it_flies_by_default_what_it_can():
+    def named(vehicle, mode):
+        plain = Policy.pretrained("hover")
+        record = Scenario.of("hover", vehicle=vehicle, control_mode=mode).to_json()
+        return fitting(dataclasses.replace(plain, metadata=plain.metadata | record))
+
+    assert "betaflight" in named("racer", "thrust_body_rate")
+    assert "betaflight" not in named("racer", "rotor")
+    assert "betaflight" not in named("paper", "thrust_body_rate")  # the others fly it
+
+
+def test_steps_that_are_no_whole_milliseconds_are_refused():
+    fine = dataclasses.replace(RACER, physics_timestep=0.0025)
+    with pytest.raises(QuadrlError, match="whole milliseconds"):
+        check_fits(fine, "thrust_body_rate")
