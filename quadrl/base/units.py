@@ -20,10 +20,10 @@ def quantity(name: str, value: object) -> str:
 
     Args:
         name: The metric's name, such as `position_error_m`, `success_rate` or `yaw_rate_rad_s`.
-        value: A number in the unit of the name, or None for no number; anything but a float is
-            shown as it is.
+        value: A number in the unit of the name, or None or NaN for no number; anything but a
+            float is shown as it is.
     """
-    if value is None:
+    if value is None or value != value:
         return "none"
     if not isinstance(value, float):
         return str(value)

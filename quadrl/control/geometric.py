@@ -35,7 +35,8 @@ class Controller(abc.ABC):
     def __call__(self, observation: Array) -> Array:
         """Actions (..., R), within [-1, 1], for flat observations (..., size)."""
         rows = np.asarray(observation, dtype=np.float64)
-        reading = Reading.of(rows.reshape(-1, rows.shape[-1]), self.task.observation, self.vehicle)
+        seen = rows.reshape(-1, rows.shape[-1])
+        reading = Reading.of(seen, self.task.observation, self.vehicle, self.task.sensors)
         action = self.action(reading, *self.task.guide(reading))
         return action.reshape(*rows.shape[:-1], -1)
 

@@ -16,6 +16,8 @@ from quadrl.base.rotation import Array, heading_of, norm, rotation_of_angles, to
 Motion = tuple[Array, Array]
 """Acceleration [m/s^2] and jerk [m/s^3] of a target, (N, 3) each, world frame."""
 
+NO_SENSORS: Mapping[str, Any] = {}
+
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
@@ -31,14 +33,28 @@ class Reading:
     height: Array | None = None  # (N,) [m] over the task's origin; None where it is not observed
 
     @classmethod
-    def of(cls, observation: Array, terms: Mapping[str, Any], vehicle: Vehicle) -> Reading:
+    def of(
+        cls,
+        observation: Array,
+        terms: Mapping[str, Any],
+        vehicle: Vehicle,
+        sensors: Mapping[str, Any] = NO_SENSORS,
+    ) -> Reading:
         """Decode the flat observation (N, size) of a task by its observation terms.
+
+        Args:
+            observation: Flat observations.
+            terms: The task's own, in order.
+            vehicle: The aircraft.
+            sensors: The task's own; what they measure follows its terms and is left out.
 
         Raises:
             QuadrlError: The observation has another size.
         """
         widths = [term.width(vehicle.rotor_count) for term in terms.values()]
         ends = np.cumsum(widths)
+        if sensors:
+            observation = observation[:, : ends[-1]]
         if observation.shape[1] != ends[-1]:
             size, allowed = observation.shape[1], f"{ends[-1]} for this task and aircraft"
             raise QuadrlError(name="observation size", value=size, allowed=allowed)
@@ -84,6 +100,8 @@ class Guide(Protocol):
 
     observation: ClassVar[dict[str, Any]]
     """The terms of the flat observation."""
+    sensors: ClassVar[dict[str, Any]]
+    """The sensors that follow them."""
     gains: ClassVar[dict[str, float]]
     """Gains of the geometric controller that differ from its defaults."""
     heading_matters: ClassVar[bool]

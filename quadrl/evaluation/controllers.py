@@ -55,6 +55,8 @@ class EachMember:
         which = observation[..., self._places["task"]].argmax(-1)
         for number, (member, own) in enumerate(self._own):
             seen = observation[rows := which == number]
+            if not len(seen):
+                continue
             parts = [seen[:, self._places[name]] for name in member.observation]
             action[rows] = own(np.concatenate(parts, axis=-1))
         return action
@@ -62,7 +64,8 @@ class EachMember:
 
 def comes_with_quadrl(name: str) -> bool:
     """Whether a name is that of a task, or of a policy that comes with quadrl."""
-    return name in TASKS or name in {file.stem for file in shipped()}
+    known = {file.stem for file in shipped()}
+    return name in TASKS or name in known or f"{name}_ppo" in known
 
 
 def policy_of(given: str | Path) -> Policy:

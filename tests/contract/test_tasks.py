@@ -13,6 +13,7 @@ from quadrl.control.reading import Reading
 from quadrl.core.one_of import OneOf
 from quadrl.core.task import Potentials, TaskState
 from quadrl.envs.gymnasium import QuadrotorEnv
+from quadrl.evaluation.evaluate import evaluate
 from quadrl.tasks import TASKS, make
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.landing import Landing
@@ -51,6 +52,12 @@ def test_the_yardstick_is_guided_in_any_namespace(name):
             assert got.shape == wanted.shape and got.device.type == settings.get("device", "cpu")
             if not settings:
                 np.testing.assert_allclose(got.numpy(), wanted, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [*TASKS, "all"])
+def test_the_yardstick_flies_what_the_task_senses(name):
+    alone = evaluate("geometric", name, episodes=1, engine="free_flight", time_limit=0.2)
+    assert alone.rollout.action.shape[1:] == (1, alone.vehicle.rotor_count)
 
 
 def test_a_route_keeps_it_too():

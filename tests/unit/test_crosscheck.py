@@ -332,7 +332,7 @@ def test_a_simulator_that_means_something_else_is_refused(stubbed, monkeypatch):
     {
         ("landing",): "task = 'landing': must be one without ground and solids",
         ("lsy_race",): "task = 'lsy_race': must be one without",
-        ("nowhere",): "there is no policy at nowhere",
+        ("nowhere",): "there is no policy at 'nowhere'",
         ("hover", "--simulators", "gazebo"): "must be one of rotorpy, crazyflow",
         ("hover", "--episodes", "0"): "episodes = 0",
         ("hover", "--seed", "-1"): "seed = -1",

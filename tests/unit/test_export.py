@@ -418,7 +418,7 @@ def test_a_run_is_exported_by_its_folder(tmp_path):
         (VEHICLES["hexa"], "torch", None, "must be mjcf for hexa"),
         ("geometric", "onnx", None, "must be one of a run folder"),
         (len, "onnx", None, "a policy or an aircraft"),
-        (".", "onnx", None, "there is no policy at policy.safetensors"),
+        (".", "onnx", None, "there is no policy at 'policy.safetensors'"),
         ("hover", "onnx", "hover.xml", "the name of a file ending in .onnx"),
         ("hexa", "mjcf", ".", "the name of a file ending in .xml"),
     ],

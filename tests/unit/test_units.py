@@ -48,6 +48,7 @@ def test_a_metric_has_the_unit_of_its_name():
         "command_change_rate": (None, "none"),
         "circling_m_s": (0.00712, "0.007 m/s"),
     }
+    assert units.quantity("race_time_best_s", float("nan")) == "none"
     shown = {name: units.quantity(name, value) for name, (value, _) in metrics.items()}
     assert shown == {name: text for name, (_, text) in metrics.items()}
 
