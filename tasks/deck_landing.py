@@ -17,7 +17,7 @@ from quadrl.base.validation import number
 from quadrl.conditions.solids import Pose, Solid
 from quadrl.control.reading import Reading
 from quadrl.core.markers import Marker
-from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY, ObservationTerm
+from quadrl.core.observation import OBSERVATION, TARGET_VELOCITY, TRACKS, ObservationTerm
 from quadrl.core.snapshot import Rollout, statistic
 from quadrl.core.task import EpisodeEnd, Snapshot, Target, TaskState, heads_east
 from quadrl.engines.rng import Rng
@@ -73,6 +73,10 @@ class DeckLanding(Landing):
         **{name: term for name, term in OBSERVATION.items() if name != "position"},
         **TARGET_VELOCITY,
         "normal": NORMAL,
+    }
+    tracks = TRACKS | {
+        "goal": ObservationTerm(3, "m", "where its centre is on the middle of the pad, task frame"),
+        "normal": ObservationTerm(3, "1", "unit vector out of the deck, world frame"),
     }
 
     time_limit: float = 20.0
@@ -141,8 +145,11 @@ class DeckLanding(Landing):
         """The aircraft's motion, and the deck as it sees it: its height over the water is not."""
         terms = super().observe(now)
         terms.pop("position")
-        normal = sea.deck(now.task, now.time).normal
-        return {**terms, "normal": to_body(now.state.rotation, normal)}
+        return {**terms, "normal": to_body(now.state.rotation, self.normal(now))}
+
+    def normal(self, now: Snapshot) -> Array:
+        """Unit vectors (N, 3) out of the deck."""
+        return sea.deck(now.task, now.time).normal
 
     def terminated(self, now: Snapshot) -> dict[str, Array]:
         """Crashed, in its own wash, in the water, away, or at rest for long enough."""
@@ -162,7 +169,7 @@ class DeckLanding(Landing):
         task, xp = now.task, namespace(now.time)
         first = now.landed & (task.down == 0)
         into, along, cosine = (now.touch[..., k] for k in range(3))
-        normal = sea.deck(task, now.time).normal
+        normal = self.normal(now)
         aside = now.potentials.to_goal - dot(now.potentials.to_goal, normal)[..., None] * normal
         return dataclasses.replace(
             task,
@@ -207,7 +214,7 @@ class DeckLanding(Landing):
         """Whether it struck with anything but its feet, touched down hard or tipped, (N,) bool."""
         into, along, cosine = (now.touch[..., k] for k in range(3))
         hard = into * into + along * along > self.max_touchdown**2
-        normal = sea.deck(now.task, now.time).normal
+        normal = self.normal(now)
         upright = dot(now.state.rotation[..., :, 2], normal)
         least = math.cos(self.max_tilt)
         tipped = now.landed & (hard | (cosine < least) | (upright < least))

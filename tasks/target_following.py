@@ -15,7 +15,7 @@ from quadrl.control.reading import Reading
 from quadrl.core import rewards
 from quadrl.core.contact import touches_ground
 from quadrl.core.markers import Marker
-from quadrl.core.observation import OBSERVATION, TARGET_MOTION, TARGET_VELOCITY
+from quadrl.core.observation import OBSERVATION, TARGET_MOTION, TARGET_VELOCITY, TRACKS
 from quadrl.core.task import TURNING, EpisodeEnd, Potentials, Rollout, Snapshot, Target, Task
 from quadrl.engines.rng import FULL_TURN, Rng
 from quadrl.engines.state import Start
@@ -54,6 +54,7 @@ class TargetFollowing(Task):
     # with 40 for the speed they circled at 0.1 m/s in calm air.
     variants = {"robust": {"training_options": {"spin_weight": 30.0, "speed_weight": 80.0}}}
     observation = OBSERVATION | TARGET_VELOCITY
+    tracks = TRACKS
 
     time_limit: float = 20.0
     """Time limit of an episode [s]."""

@@ -6,6 +6,7 @@ import subprocess
 
 import numpy as np
 
+from quadrl.base import records
 from quadrl.engines.native.compiling import compiler
 
 FLAGS = ("-std=c99", "-Wall", "-Werror", "-Wno-unused-function", "-ffp-contract=off")
@@ -55,17 +56,26 @@ def compiled(path, folder, *flags):
 
 
 def motions_of(environment, now=None):
-    """Motions (N, 13 + R) as the C takes them; by default as a control step begins."""
-    now = now or environment.snapshot.state
-    parts = now.position, now.quaternion, now.velocity, now.body_rate, now.rotor_speed
+    """Motions (N, k) as the C takes them; by default as a control step begins.
+
+    They end with distances along rays, which a sensor may read as logarithms, and with what the
+    task tracks.
+    """
+    seen, task = environment.snapshot, environment.task
+    now = now or seen.state
+    parts = [now.position, now.quaternion, now.velocity, now.body_rate, now.rotor_speed]
+    for sensor in environment.observer.senses.sensors if environment.observer else ():
+        if sensor.rays:
+            read = seen.world.ranges(sensor.name)
+            parts.append(np.exp(read) if sensor.log else read)
+    parts += [getattr(task, name)(seen) for name in task.tracks]
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 
 def tasks_of(environment):
     """What the task remembers (N, k)."""
-    record, count = environment.snapshot.task, environment.num_envs
-    arrays = (np.asarray(getattr(record, name)) for name in record.__dataclass_fields__)
-    parts = [array.reshape(count, -1) for array in arrays]
+    count = environment.num_envs
+    parts = [array.reshape(count, -1) for array in records.leaves(environment.snapshot.task)]
     return np.concatenate([np.zeros((count, 0)), *parts], axis=1).astype(np.float32)
 
 

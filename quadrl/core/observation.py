@@ -62,6 +62,11 @@ TARGET_VELOCITY = {
     )
 }
 """What tasks with a moving target add at the end."""
+TRACKS = {
+    "goal": ObservationTerm(3, "m", "place of the target, task frame"),
+    "target_velocity": ObservationTerm(3, "m/s", "of the target, world frame"),
+}
+"""What is measured of a moving target; `Task.tracks`."""
 
 TARGET_MOTION = {
     "target_acceleration": ObservationTerm(3, "m/s^2", "of the target, body frame", "R^T a"),

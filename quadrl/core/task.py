@@ -94,6 +94,9 @@ class Task(abc.ABC):
     sensors: ClassVar[dict[str, dict[str, Any]]] = {}
     """Sensors that it reads in `Snapshot.sensed`, by name, with their options; policies see what
     they give."""
+    tracks: ClassVar[dict[str, ObservationTerm]] = {}
+    """What an aircraft measures in flight of what moves of itself: names of methods of a snapshot,
+    such as goal, and what they give. An exported policy is given it in each step."""
     variants: ClassVar[dict[str, dict[str, Any]]] = {}
     """Settings of other trainings, by variant: what differs from the usual one."""
     signed: ClassVar[tuple[str, ...]] = ()

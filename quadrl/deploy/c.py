@@ -96,6 +96,9 @@ class Header:
         if task.contact or not task.keeps_place or {*self.carried.task_memory()} != {"goal"}:
             allowed = "one that holds a place, such as hover; any other flies by --to c"
             raise QuadrlError(name="task", value=task.name, allowed=allowed)
+        if around := self.carried.around:
+            allowed = "none; a policy that measures what is around it flies by --to c"
+            raise QuadrlError(name="sensor", value=", ".join(around), allowed=allowed)
         if self.environment.control_mode.has_loops:
             reason, allowed = "the firmware has loops of its own", "rotor or share"
             mode = self.policy.control_mode
@@ -112,9 +115,14 @@ class Header:
             raise QuadrlError(name="rotor_speed", value="measured", allowed=allowed)
 
     @property
+    def motion(self) -> int:
+        """Numbers that it is given in each step."""
+        return 13 + self.environment.vehicle.rotor_count + sum(self.carried.around.values())
+
+    @property
     def memory(self) -> int:
         """Bytes of what is remembered of an episode."""
-        numbers = 13 + self.environment.vehicle.rotor_count + self.carried.remembered.end
+        numbers = self.motion + self.carried.remembered.end
         numbers += self.environment.action_size + self.carried.asked.width
         held = self.loops["aimed"].width if self.loops else 0
         return 4 * (numbers + held + self.environment.size + self.policy.state_size + 1)
@@ -122,13 +130,13 @@ class Header:
     @property
     def cost(self) -> Cost:
         """What it costs on a board."""
-        motion, size = 13 + self.environment.vehicle.rotor_count, self.environment.size
-        test = TEST_STEPS * (motion + size + self.carried.asked.width)
+        size = self.environment.size
+        test = TEST_STEPS * (self.motion + size + self.carried.asked.width)
         # The next memory is made beside the last one, and the last motion is taken with this one.
         return cost(self.policy, self.functions, test, 2 * self.memory // 4 - size)
 
     def flown(self, motions: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Observation, action and command for motions (steps, 13 + R), in single precision.
+        """Observation, action and command for motions (steps, k), in single precision.
 
         The first one begins an episode. NumPy computes them, an operation at a time.
         """
@@ -179,7 +187,7 @@ def written(header: Header, metadata: Mapping[str, str]) -> bytes:
         more = {key: part.format(**given) for key, part in LOOPS.items()}
     first, places = 0, list[str]()
     for key, array in task.items():
-        label = f"{name.upper()}_{key.upper()}_AT"
+        label = re.sub(r"\W", "_", f"{name}_{key}_at").upper()
         places.append(f"  {label} = {first},  // {array.size} number{'s' * (array.size > 1)}")
         first += array.size
     sizes = (
@@ -214,6 +222,8 @@ def written(header: Header, metadata: Mapping[str, str]) -> bytes:
         places="\n".join([*places, *sizes]),
         kept=carried.remembered.end,
         state_size=policy.state_size,
+        motion=header.motion,
+        around="".join(f"\n{line}" for line in _around(header)),
         speeds="measured" if header.reads_speeds else "read at the start: hovering if unknown",
         functions="\n".join(
             [
@@ -243,14 +253,27 @@ def looped(header: Header, motion: np.ndarray, action: np.ndarray) -> Iterator[n
         yield in_single(loops, np.concatenate([motion, setpoint]))
 
 
+def _around(header: Header) -> Iterator[str]:
+    """What is measured of what is around, as members of a motion."""
+    for name, rays in header.carried.rays.items():
+        angles = np.degrees(np.transpose([rays.azimuth, rays.elevation])).round(2) + 0.0
+        listed = ", ".join(f"{left:g} {up:g}" for left, up in angles)
+        said = f"turned with the {rays.frame}, from {rays.place} m on the body"
+        yield from _wrapped([f"  // Degrees to the left and up of each ray, {said}: {listed}"])
+        yield f"  float {name}[{rays.count}];  // [m], {rays.reach:g} where nothing is nearer"
+    for name, term in header.environment.task.tracks.items():
+        yield f"  float {name}[{term.size}];  // [{term.unit}], {term.meaning}"
+
+
 def _motions(header: Header) -> np.ndarray:
-    """Motions (steps, 13 + R) of a flight by the policy, single precision, task frame."""
+    """Motions (steps, k) of a flight by the policy, single precision, task frame."""
     environment, flight = header.environment, header.policy.flying(1)
     observation, motions = environment.reset(seed=0), list[np.ndarray]()
     for _ in range(TEST_STEPS):
         now = environment.snapshot.state
         parts = now.position, now.quaternion, now.velocity, now.body_rate, now.rotor_speed
-        motions.append(np.concatenate(parts, axis=1)[0].astype(np.float32))
+        seen = header.carried.around_of(environment.snapshot)
+        motions.append(np.concatenate([*parts, seen], axis=1)[0].astype(np.float32))
         done = environment.step(flight(environment.flatten(observation)))
         observation = done.observation
     environment.reset(seed=0)

@@ -15,6 +15,7 @@ from quadrl.engines.rowwise import RowFunction
 from quadrl.evaluation.policy import Policy
 
 PER_WEIGHT, PER_TANH, PER_OPERATION, PER_SINE = 3.1, 53.0, 2.0, 47.0  # instructions
+PER_LOGARITHM = 140.0
 CODE, PER_LINE, PER_CALL = 3560, 7.5, 59.0  # bytes of flash
 SINE = r"\b(?:sin|cos)\("
 STACK, SPILLED = 256, 0.4  # bytes, and bytes of an operation
@@ -57,6 +58,7 @@ def cost(policy: Policy, functions: Mapping[str, RowFunction], numbers: int, arr
     divided = len(re.findall(r" / |\bsqrt\(", step)) + policy.size + hidden
     instructions = PER_WEIGHT * stored + PER_TANH * hidden
     instructions += PER_OPERATION * operations + PER_SINE * sines
+    instructions += PER_LOGARITHM * step.count("log(")
     calls = len(re.findall(SINE, "\n".join(bodies.values())))
     numbers += stored + sum(len(function.constants) for function in functions.values())
     widest = max(policy.size + policy.state_size, *(len(x) for x in layers))

@@ -123,7 +123,7 @@ def in_single(traced: RowFunction, given: np.ndarray) -> np.ndarray:
     def value(operand: Any) -> Any:
         if isinstance(operand, Symbol):
             return values[operand]
-        return operand if isinstance(operand, bool) else np.float32(operand)
+        return operand if isinstance(operand, (bool, np.bool_)) else np.float32(operand)
 
     for symbol in trace.known.values():
         if not symbol.operands:

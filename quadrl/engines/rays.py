@@ -93,6 +93,16 @@ class Rays:
         return out
 
     @property
+    def azimuth(self) -> Array:
+        """Angle of each to the left of straight ahead, (B,) [rad]."""
+        return np.arctan2(self.along[:, 1], self.along[:, 0])
+
+    @property
+    def elevation(self) -> Array:
+        """Angle of each above the level, (B,) [rad]."""
+        return np.arcsin(self.along[:, 2])
+
+    @property
     def drawn(self) -> int:
         """How many normal numbers the errors of an aircraft's distances take."""
         return self.count * (bool(self.noise or self.share) + bool(self.dropout))
@@ -109,6 +119,15 @@ class Rays:
             seen = self.step * np.floor(seen / self.step + 0.5)
         seen = np.where(nothing, self.reach, np.clip(seen, 0.0, self.reach))
         return np.log(np.maximum(seen, LEAST)) if self.log else seen
+
+    def distance(self, read: Array) -> np.ndarray:
+        """The distances (n, B) [m] that what is read stands for."""
+        return np.exp(read) if self.log else read
+
+    @property
+    def sharp(self) -> Rays:
+        """The same without errors."""
+        return dataclasses.replace(self, noise=0.0, share=0.0, dropout=0.0)
 
     def ends(self, position: Array, quaternion: Array, distance: Array) -> np.ndarray:
         """Both ends of the rays of one aircraft, (B, 2, 3) [m], world frame.

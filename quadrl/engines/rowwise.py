@@ -137,6 +137,15 @@ class RowFunction:
         self.source = SOURCE.format(export=export, function=whole, **sizes)
         """Its C, without the constants."""
 
+    def depends(self, places: set[int]) -> list[bool]:
+        """Which numbers of its result depend on arguments at some places."""
+        known: set[Any] = set()
+        for symbol in self.trace.known.values():
+            read = re.match(r"x\[(\d+)\]", symbol.text)
+            if int(read[1]) in places if read else not known.isdisjoint(symbol.operands):
+                known.add(symbol)
+        return [value in known for value in self.result]
+
     def _function(self, name: str, linkage: str, constants: str) -> str:
         names = {"name": name, "linkage": linkage, "constants": constants}
         return FUNCTION.format(body=self.body, **names)

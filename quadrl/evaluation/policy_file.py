@@ -69,7 +69,7 @@ def read(path: Path) -> dict[str, Any]:
                 f"checkpoint; continue it: quadrl train --resume {path}"
             )
         raise QuadrlError(
-            f"there is no policy at {str(file)!r}; give a run folder (quadrl train ... --out FOLDER "
+            f"there is no policy at '{file}'; give a run folder (quadrl train ... --out FOLDER "
             "makes one) or a .safetensors file"
         )
     arrays, header = read_safetensors(file, (FORMAT, RECURRENT_FORMAT), of_bytes)

@@ -66,6 +66,7 @@ def flown(header, name, folder, optimisation):
         ("landing_robust", "landing_robust", 45_000),
         ("lsy_race_ppo", "lsy_race", 45_000),
         ("trajectory_ppo", "trajectory", 70_000),
+        ("navigation_ppo", "navigation", 100_000),
     ],
 )
 def test_a_board_has_the_bits_of_the_reference(policy, name, most, optimisation, tmp_path):

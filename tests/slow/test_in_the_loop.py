@@ -16,6 +16,7 @@ FLOWN = {
     "hover_ppo": {}, "static_waypoint_ppo": {}, "random_waypoint_ppo": {},
     "straight_and_level_ppo": {}, "target_following_ppo": {}, "landing_ppo": {},
     "trajectory_ppo": {}, "race_apg": {}, "recovery_ppo": {}, "lsy_race_ppo": {},
+    "perching_ppo": {}, "deck_landing_ppo": {}, "navigation_ppo": {}, "all_ppo": {},
     "hover_robust": LATE, "hover_robust_crazyflie_brushless": LATE,
 }  # fmt: skip
 """A policy of each task that an autopilot can fly, and two that were trained for delays."""
@@ -70,4 +71,4 @@ def test_the_c_flies_the_episodes_of_the_policy(name, tmp_path):
         assert np.median(error) == pytest.approx(np.median(usual), abs=1e-4)
     else:
         # A race at the limit is chaos: from the first contact that a rounding shifts, flights part.
-        assert ks_2samp(error, usual).pvalue > 0.01
+        assert ks_2samp(error, usual, method="asymp").pvalue > 0.01

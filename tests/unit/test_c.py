@@ -9,6 +9,7 @@ import pytest
 from flown_in_c import Flown, compiled, motions_of, tasks_of
 
 from quadrl.base.errors import QuadrlError
+from quadrl.conditions.solids import Sphere
 from quadrl.core.environment import Environment
 from quadrl.core.observation import ObservationTerm
 from quadrl.core.scenario import UNDISTURBED, Scenario
@@ -23,15 +24,20 @@ from quadrl.tasks.hover import Hover
 
 def sampling():
     """A policy whose sensors have rates and delays."""
-    rng, plain = np.random.default_rng(1), Policy.pretrained("hover")
     held = {"airspeed": {"rate": 5}, "state": {"delay": 0.05}, "disturbance": {"rate": 10}}
-    metadata = plain.metadata | {"observe": {"sensors": held, "observation_history": 1}}
-    size = Environment(Scenario.of({"task": "hover", "observe": metadata["observe"]})).size
+    return seeing({"sensors": held, "observation_history": 1})
+
+
+def seeing(observe, task="hover"):
+    """A policy by hand for a task and options of its observation."""
+    rng, plain = np.random.default_rng(1), Policy.pretrained("hover")
+    metadata = plain.metadata | {"observe": observe, "task": task}
+    size = Environment(Scenario.of({"task": task, "observe": observe})).size
     weights = rng.normal(0, 0.3, (12, size)), rng.normal(0, 0.3, (8, 12))
     biases = rng.normal(0, 0.3, 12), rng.normal(0, 0.3, 8)
     singles = (tuple(x.astype(np.float32) for x in arrays) for arrays in (weights, biases))
     seen = np.zeros(size, np.float32), np.ones(size, np.float32)
-    return Policy(*singles, *seen, "hover", metadata)
+    return Policy(*singles, *seen, task, metadata)
 
 
 def remembering(neurons=0):
@@ -82,9 +88,47 @@ def passing():
     return Policy(single, plain.biases, *seen, "passing", plain.metadata | {"task": "passing"})
 
 
+@dataclasses.dataclass(frozen=True)
+class Bumped(TaskState):
+    """What a task remembers: whether a post was touched."""
+
+    bumped: np.ndarray  # (N,)
+
+
+class Bumping(Hover):
+    """A task of one's own beside a post, which sees what an aircraft cannot measure."""
+
+    name = "bumping"
+    compiled = True
+    observation = Hover.observation | {"way": ObservationTerm(1, "m", "to the post")}
+    remembers = True
+
+    def solids(self):
+        return [Sphere("post", position=(1.0, 0.0, 0.0), radius=0.1)]
+
+    def begin(self, rng, parameters):
+        start, state = super().begin(rng, parameters)
+        return start, Bumped(state.goal, 0.0 * state.goal[..., 0])
+
+    def update(self, before, now):
+        return Bumped(now.task.goal, now.task.bumped + now.touched[..., 0])
+
+    def observe(self, now):
+        known = now.task.bumped if self.remembers else now.clearance
+        return super().observe(now) | {"way": known[..., None]}
+
+
+class Nearing(Bumping):
+    """The same by the distance."""
+
+    name = "nearing"
+    remembers = False
+
+
 @pytest.fixture(autouse=True)
 def task_of_ones_own(monkeypatch):
-    monkeypatch.setitem(TASKS, "passing", Passing)
+    for task in (Passing, Bumping, Nearing):
+        monkeypatch.setitem(TASKS, task.name, task)
 
 
 POLICIES = {
@@ -156,11 +200,16 @@ def test_the_c_flies_as_the_policy_does(name, tmp_path):
         np.testing.assert_allclose(own.error, done.error, rtol=1e-2, atol=1e-3)
 
 
-def test_what_the_c_sees_is_the_observation(tmp_path):
-    policy = Policy.pretrained("hover", variant="robust")
+@pytest.mark.parametrize(
+    "name",
+    ["hover_robust", "target_following", "deck_landing", "perching", "navigation", "all"],
+)
+def test_what_the_c_sees_is_the_observation(name, tmp_path):
+    policy = Policy.pretrained(name)
     environment = Environment(policy.scenario, seed=2, **UNDISTURBED)
     observation = environment.reset()
     flown = Flown(compiled(export(policy, "c", tmp_path / "x.h"), tmp_path, "-O2"), policy)
+    assert flown.library.test() == 0
     assert flown.begin(motions_of(environment), tasks_of(environment)) == 0
     for _ in range(40):
         assert flown.step(motions_of(environment)) == 0
@@ -203,8 +252,19 @@ def test_numbers_that_are_not_finite_change_nothing(tmp_path):
 
 
 def test_what_no_autopilot_knows_is_refused():
-    with helpers.refused(match="task", lists="without solids"):
-        Header(Policy.pretrained("perching"))
+    for own in ("bumping", "nearing"):
+        with helpers.refused(match=f"task = '{own}'", lists="rays"):
+            Header(seeing({}, own))
+    plain = Policy.pretrained("target_following")
+    options = plain.metadata | {"task_options": {"sees_motion": True}}
+    del options["changed"]  # so that it is a record by hand
+    more = [np.concatenate([a, np.ones(6, np.float32)]) for a in (plain.mean, plain.deviation)]
+    first, *rest = plain.weights
+    wider = np.concatenate([first, np.ones((len(first), 6), np.float32)], axis=1), *rest
+    with helpers.refused(match="task = 'target_following'", lists="tracks"):
+        Header(Policy(wider, plain.biases, *more, plain.task, options))
+    with helpers.refused(match="sensor = 'ring'", lists="--to c"):
+        Header(seeing({"sensors": {"ring": {}}})).check_holds_a_place()
     plain = Policy.pretrained("hover", variant="robust")
     other = plain.metadata | {"control_mode": "thrust_body_rate"}
     looped = Policy(plain.weights, plain.biases, plain.mean, plain.deviation, "hover", other)
