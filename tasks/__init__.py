@@ -14,7 +14,7 @@ from quadrl.base.rotation import (
     to_world,
     zeros,
 )  # fmt: skip
-from quadrl.conditions.solids import Box, Cylinder, Gate, Pose, Sphere
+from quadrl.conditions.solids import Box, Capsule, Cylinder, Gate, Pose, Sphere
 from quadrl.core.catalogue import COMPOSED, TASKS, make, register
 from quadrl.core.contact import stands, strikes_ground, touches_ground
 from quadrl.core.markers import Marker
@@ -39,9 +39,9 @@ from quadrl.tasks.trajectory import Trajectory
 
 __all__ = [
     "OBSERVATION", "ROTATION", "TARGET_MOTION", "TARGET_VELOCITY", "TASKS", "All", "Array",
-    "Box", "Cylinder", "DeckLanding", "Gate", "Hover", "Landing", "LsyRace", "Marker", "Navigation",
-    "ObservationTerm", "OneOf", "Perching", "Pose", "Race", "RandomWaypoint", "Recovery", "Sphere",
-    "StaticWaypoint", "StraightAndLevel", "Target", "TargetFollowing", "Task", "TaskState",
+    "Box", "Capsule", "Cylinder", "DeckLanding", "Gate", "Hover", "Landing", "LsyRace", "Marker",
+    "Navigation", "ObservationTerm", "OneOf", "Perching", "Pose", "Race", "RandomWaypoint",
+    "Recovery", "Sphere", "StaticWaypoint", "StraightAndLevel", "Target", "TargetFollowing", "Task", "TaskState",
     "Trajectory", "cross", "dot", "filled", "make", "namespace", "norm", "once", "register",
     "stack", "stands", "strikes_ground", "to_body", "to_world", "touches_ground", "weighted",
     "zeros",

@@ -110,6 +110,22 @@ class Cylinder(Solid):
 
 
 @dataclasses.dataclass(frozen=True)
+class Capsule(Solid):
+    """A post, a branch or a cable with round ends; upright unless it is turned."""
+
+    radius: float = 0.1
+    """[m]"""
+    length: float = 2.0
+    """Between the middles of its ends [m]."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """One capsule."""
+        size = (self.radius, self.length / 2, 0.0)
+        return (Part(mujoco.mjtGeom.mjGEOM_CAPSULE, size),)
+
+
+@dataclasses.dataclass(frozen=True)
 class Box(Solid):
     """A block, a wall or a floor."""
 

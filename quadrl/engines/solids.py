@@ -22,6 +22,7 @@ from quadrl.engines.threads import Threads
 
 KINDS: dict[mujoco.mjtGeom, Shape] = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
     mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
     mujoco.mjtGeom.mjGEOM_BOX: "box",
 }

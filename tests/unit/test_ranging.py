@@ -9,7 +9,7 @@ from helpers import begun, idle, refused
 
 from quadrl.conditions.ranging import RangeFinder
 from quadrl.conditions.sensor import SENSORS, Sensor, register_sensor
-from quadrl.conditions.solids import Box, Cylinder, Gate, Pose, Sphere
+from quadrl.conditions.solids import Box, Capsule, Cylinder, Gate, Pose, Sphere
 from quadrl.core.environment import Environment
 from quadrl.core.saving import Copied
 from quadrl.engines.rays import Rays
@@ -30,7 +30,7 @@ class Rubble(Hover):
         """A few of each."""
         return [
             Cylinder("post", count=20), Sphere("ball", count=20), Box("block", count=20),
-            Gate("gate", count=3),
+            Gate("gate", count=3), Capsule("branch", count=20),
         ]  # fmt: skip
 
     def place(self, rng, start, state):

@@ -10,7 +10,7 @@ from helpers import begun, refused
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.rotation import rotation_matrix
 from quadrl.conditions.scene import Scene
-from quadrl.conditions.solids import Box, Cylinder, Gate, Pose, Sphere, heading
+from quadrl.conditions.solids import Box, Capsule, Cylinder, Gate, Pose, Sphere, heading
 from quadrl.core.environment import Environment
 from quadrl.engines.mjcf import compile_model
 from quadrl.engines.mujoco import make
@@ -24,6 +24,7 @@ EVERY = Scene(
     [
         Sphere("ball", radius=0.3),
         Cylinder("post", radius=0.1, height=4.0),
+        Capsule("branch", radius=0.1, length=3.6),
         Box("wall", length=0.2, width=3.0, height=2.0),
         Gate("gate", opening=1.2, frame=0.1),
     ]

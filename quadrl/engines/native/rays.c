@@ -56,6 +56,14 @@ static inline void between(Piece* piece, double from, double slope, double half)
   cut(piece, (-half - from) / by, (half - from) / by);
 }
 
+// As far as either reaches: both lie in something convex.
+static inline void join(Piece* piece, const Piece* other) {
+  if (!(other->enter < other->leave)) return;
+  if (!(piece->enter < piece->leave)) *piece = *other;
+  piece->enter = other->enter < piece->enter ? other->enter : piece->enter;
+  piece->leave = other->leave > piece->leave ? other->leave : piece->leave;
+}
+
 // Within a ball about the origin (flat = 1), or within a mantle about the z axis (flat = 0).
 static inline void within(Piece* piece, const double p[3], const double d[3], double radius,
                           double flat) {
@@ -81,7 +89,13 @@ static double meet(const Solid* solid, const double from[3], const double along[
     for (int j = 0; j < 3; ++j) between(&piece, from[j], d[j], size[j]);
   } else {
     within(&piece, from, d, size[0], solid->kind == SPHERE);
-    if (solid->kind == CYLINDER) between(&piece, from[2], d[2], size[1]);
+    if (solid->kind != SPHERE) between(&piece, from[2], d[2], size[1]);
+  }
+  for (int end = -1; end <= 1 && solid->kind == CAPSULE; end += 2) {
+    const double off[3] = {from[0], from[1], from[2] - end * size[1]};
+    Piece ball = {-HUGE_VAL, HUGE_VAL};
+    within(&ball, off, d, size[0], 1);
+    join(&piece, &ball);
   }
   if (piece.enter > piece.leave || piece.leave < 0) return HUGE_VAL;
   return piece.enter < 0 ? piece.leave : piece.enter;

@@ -3,9 +3,10 @@
 #include <stdint.h>
 
 // Kinds of solids, by MuJoCo's numbers (mjtGeom).
-enum { SPHERE = 2, CYLINDER = 5, BOX = 6 };
+enum { SPHERE = 2, CAPSULE = 3, CYLINDER = 5, BOX = 6 };
 
-// size: radius; radius and half the height; halves of the edges [m]. turn: rotation matrix to the
+// size: radius; radius and half the height, of a capsule half the way between the middles of its
+// ends; halves of the edges [m]. turn: rotation matrix to the
 // world. Written by quadrl/engines/solids.py.
 typedef struct {
   double kind, size[3], position[3], turn[9];
@@ -28,15 +29,23 @@ static inline void to_solid(const Solid* s, const double point[3], double local[
   }
 }
 
+// Of a point in a solid's own frame, what lies beyond the piece of the axis inside a capsule.
+static inline double past_axis(const Solid* s, double z) {
+  const double past = fabs(z) - s->size[1];
+  return past > 0 ? copysign(past, z) : 0;
+}
+
 // Unit vector to a point outside of a solid from the nearest one of it, at a distance.
 static inline void solid_normal(const Solid* s, const double point[3], double distance,
                                 double normal[3]) {
   double local[3], off[3], squares;
   to_solid(s, point, local);
+  if (s->kind == CAPSULE) local[2] = past_axis(s, local[2]);
+  const int is_ball = s->kind == SPHERE || s->kind == CAPSULE;
   squares = local[0] * local[0] + local[1] * local[1];
-  const double round = sqrt(s->kind == SPHERE ? squares + local[2] * local[2] : squares);
+  const double round = sqrt(is_ball ? squares + local[2] * local[2] : squares);
   for (int k = 0; k < 3; ++k) {
-    const int is_round = s->kind == SPHERE || (s->kind == CYLINDER && k < 2);
+    const int is_round = is_ball || (s->kind == CYLINDER && k < 2);
     const double from = is_round ? round : fabs(local[k]);
     const double past = from - s->size[is_round ? 0 : s->kind == CYLINDER ? 1 : k];
     off[k] = past > 0 ? past * local[k] / from : 0;
@@ -51,7 +60,8 @@ static inline void solid_normal(const Solid* s, const double point[3], double di
 static double solid_distance(const Solid* s, const double point[3]) {
   double local[3], out = 0, in;
   to_solid(s, point, local);
-  if (s->kind == SPHERE) {
+  if (s->kind == CAPSULE) local[2] = past_axis(s, local[2]);
+  if (s->kind == SPHERE || s->kind == CAPSULE) {
     return sqrt(local[0] * local[0] + local[1] * local[1] + local[2] * local[2]) - s->size[0];
   }
   // Distance beyond each pair of faces, or beyond the mantle: positive outside.
