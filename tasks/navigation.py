@@ -198,9 +198,14 @@ class Navigation(Task):
             placed["wall"] = Pose(place, turned, size)
         return placed
 
+    @property
+    def moves(self) -> bool:
+        """Whether there are balls that swing."""
+        return bool(self.balls and self.ball_speed)
+
     def move(self, state: Any, time: Array) -> Mapping[str, Pose]:
         """Balls to and fro."""
-        if not (self.balls and self.ball_speed):
+        if not self.moves:
             return {}
         away = np.sin(self.ball_speed / SWING * time[:, None] + state.phase)
         return {"ball": Pose(state.middle + away[..., None] * state.way)}
@@ -219,7 +224,7 @@ class Navigation(Task):
         start = dataclasses.replace(start, quaternion=level)
         wanted = rng.uniform(self.slowest, self.fastest)
         drawn = Crossing(stack(filled(LENGTH, zero), aside, zero), wanted)
-        if not (self.balls and self.ball_speed):
+        if not self.moves:
             return start, drawn
         middle = self._places(rng, self.balls, -1.0, 1.0)
         turn, phase = (rng.uniform(0.0, FULL_TURN, self.balls) for _ in range(2))

@@ -158,6 +158,11 @@ class Sensor(abc.ABC):
         """Its memory at the start of episodes, arrays (n, ...) by name."""
         return {}
 
+    @property
+    def follows(self) -> bool:
+        """Whether it follows the commands to the rotors."""
+        return type(self).follow is not Sensor.follow
+
     def follow(
         self, memory: Memory, specified: Parameters, command: Array, seconds: float
     ) -> Memory:
@@ -248,8 +253,6 @@ class Channel:
         self._period = float(whole) if abs(period - whole) < ROUNDING * period else period
         self.stream = STREAMS + 2 * (zlib.crc32(sensor.name.encode()) >> 3)
         """Stream of the errors of samples; that of the lasting errors is the next one."""
-        self.follows = type(sensor).follow is not Sensor.follow
-        """Whether it follows the commands to the rotors."""
 
     def seen(self, memory: Memory) -> Array:
         """What is seen, (n, width)."""

@@ -68,12 +68,15 @@ class RotorSpeed(Sensor):
         hover, shape = now.parameters.rotor.hover_speed, now.true.rotor_speed.shape
         return {} if self.source == "true" else {"speed": np.broadcast_to(hover, shape)}
 
+    @property
+    def follows(self) -> bool:
+        """Whether they are modelled."""
+        return self.source == "estimated"
+
     def follow(
         self, memory: Memory, specified: Parameters, command: Array, seconds: float
     ) -> Memory:
         """Each speed approaches its command, up to the rotor's largest speed."""
-        if not memory:
-            return memory
         speed, rotor = memory["speed"], specified.rotor
         goal = np.minimum(command, rotor.max_speed)
         up, down = (1 - np.exp(-seconds * lag) for lag in (rotor.lag_up, rotor.lag_down))

@@ -53,12 +53,10 @@ class Carried(Program):
         self.around = {name: one.count for name, one in self.rays.items()} | tracked
         """Numbers that an aircraft measures of what is around it, by name: distances [m] along the
         rays of a sensor, the largest where nothing is nearer, and what the task tracks."""
-        if observer and observer.senses.loops and any(c.follows for c in observer.senses.early):
-            given = observer.kept.get("rotor_speed", {})
-            if "speed" in given:
-                allowed = "rotor_speed none, or a control mode without loops"
-                reason = "its rotor speeds follow commands of loops, which are the autopilot's own"
-                raise QuadrlError(reason, name="rotor_speed", value="estimated", allowed=allowed)
+        if observer and observer.senses.loops and observer.follows:
+            allowed = "rotor_speed none, or a control mode without loops"
+            reason = "its rotor speeds follow commands of loops, which are the autopilot's own"
+            raise QuadrlError(reason, name="rotor_speed", value="estimated", allowed=allowed)
         row = environment.engine.parameters[:1]
         self._row = numbers(row).reshape(1, ROW_SIZE)
         self.environment = environment

@@ -136,7 +136,7 @@ class Environment(saving.Copied):
         self.layout = layout(terms, self.vehicle.rotor_count)
         """Where each named term of the observation stands in the flat vector."""
         self.size = max(part.stop for part in self.layout.values())
-        self._solids_move = type(self.task).move is not Task.move
+        self._solids_move = self.task.moves
         self._solids_leave = self._solids_move or type(self.task).place is not Task.place
         if self.scene.solids and not self._solids_leave:
             declared = self.scene.poses({}, self.num_envs, self.origin)
@@ -146,7 +146,7 @@ class Environment(saving.Copied):
         self._plain = not (self.randomizer.active or self.observer or self.scene.solids)
         self._plain &= not self.weather.wind_speed
         """Whether an episode begins as the task says, and nothing else begins with it."""
-        follows = self.observer is not None and self.control_mode.has_loops
+        follows = self.control_mode.has_loops and bool(self.observer and self.observer.follows)
         self._parted = self._solids_move or follows
         """Whether Python acts within a control step."""
         acting = self.randomizer, self.blowing, self.events, self.observer

@@ -112,6 +112,11 @@ class Observer(Process):
         if self._events:
             self.given["happening"][rows] = self._events.seen(rows)
 
+    @property
+    def follows(self) -> bool:
+        """Whether a sensor follows the commands to the rotors."""
+        return any(channel.sensor.follows for channel in self.senses.early)
+
     def follow(self, command: Array, seconds: float) -> None:
         """Let modelled rotors follow commands (N, R) [rad/s] for a time [s]."""
         for name, memory in self.senses.followed(self.kept, command, seconds).items():

@@ -152,7 +152,7 @@ class Senses:
     def followed(self, kept: Kept, command: Array, seconds: float) -> Kept:
         """What modelled rotors remember after commands (n, R) [rad/s] for a time [s]."""
         found: Kept = {}
-        for sensor in (channel.sensor for channel in self.early if channel.follows):
+        for sensor in (channel.sensor for channel in self.early if channel.sensor.follows):
             memory = kept[sensor.name]
             own = {key: array for key, array in memory.items() if key != VALUES}
             own = sensor.follow(own, self._specified, command, seconds)

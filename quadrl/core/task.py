@@ -301,6 +301,12 @@ class Task(abc.ABC):
         """
         return self.move(state, 0.0 * state.goal[..., 0])
 
+    @property
+    def moves(self) -> bool:
+        """Whether solids move in an episode; where none does, steps are flown several times as fast
+        and `move` is not asked."""
+        return type(self).move is not Task.move
+
     def move(self, state: TaskState, time: Array) -> Mapping[str, Pose]:
         """Where solids that move are at a time (n,) [s] of episodes, by name.
 

@@ -25,6 +25,31 @@ def test_trees_stand_in_the_forest_as_many_as_each_episode_draws():
     assert 0.15 <= radius.min() < 0.16 and 0.39 < radius.max() <= 0.4
 
 
+class Stirring(Navigation):
+    """The same, as if trees might move."""
+
+    moves = True
+
+    def move(self, state, time):
+        return {}
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
+def test_a_forest_that_stands_is_flown_in_whole_steps_to_the_same_bits(engine, monkeypatch):
+    settings = dict(num_envs=8, seed=3, control_mode="velocity", engine=engine)
+    stands, stirs = (Environment(kind(), **settings) for kind in (Navigation, Stirring))
+    stands.reset(), stirs.reset()
+    monkeypatch.setattr(stands.engine.solids, "move", None)
+    rng = np.random.default_rng(0)
+    for _ in range(80):
+        action = rng.uniform(-0.2, 1.0, (8, 4))
+        one, other = (flown.step(action) for flown in (stands, stirs))
+        np.testing.assert_array_equal(one.reward, other.reward)
+        for name, seen in one.observation.items():
+            np.testing.assert_array_equal(seen, other.observation[name])
+    assert stirs.engine.solids.moves and not stands.engine.solids.moves
+
+
 @pytest.mark.parametrize(("speed", "paid"), [(1.0, 1.0), (2.0, 2.0), (3.0, 1.0)])
 def test_progress_pays_up_to_the_speed_that_is_asked_and_less_beyond(speed, paid):
     task = Navigation(trees=0, slowest=2.0, fastest=2.0, progress_weight=1.0)
