@@ -75,6 +75,30 @@ class Navigation(Task):
         "initial_deviation": 0.25,
         "ppo": {"learning_rate": 1.5e-3, "minibatch": 4096},
     }  # fmt: skip
+    # Loops fly the velocities, so that what else other robust policies see would tell little.
+    variants = {
+        "robust": {
+            "observe": {
+                "rotor_speed": "none",
+                "disturbance": False,
+                "sensors": {
+                    "aim": None,
+                    "disturbance": None,
+                    "range_finder": {"rate": 15.0, "share": 0.02, "dropout": 0.02},
+                },
+            },
+            "task_options": {
+                "spin_weight": 0.5,
+                "attitude_weight": 10.0,
+                "progress_weight": 20.0,
+                "smoothness_weight": 0.3,
+            },
+            "gamma": 0.98,
+            "gae_lambda": 0.95,
+            "ppo": {"learning_rate": 1.5e-3},
+            "steps": 16_000_000,
+        }
+    }
     sensors = {
         "range_finder": {"across": 40, "wide": 240.0, "frame": "yaw", "reach": 8.0, "log": True}
     }

@@ -282,11 +282,17 @@ def _unusual(task: Task | type[Task], algo: str) -> dict[str, Any]:
 
 
 def merged(*settings: dict[str, Any]) -> dict[str, Any]:
-    """Merge settings: later ones replace earlier ones; dicts are merged, at every depth."""
+    """Merge settings: later ones replace earlier ones; dicts are merged, at every depth.
+
+    None in place of a dict takes it away, such as a sensor of a variant.
+    """
     whole: dict[str, Any] = {}
     for given in settings:
         for name, value in given.items():
             old = whole.get(name)
+            if value is None and isinstance(old, dict):
+                del whole[name]
+                continue
             if isinstance(old, dict) and isinstance(value, dict):
                 value = merged(old, value)
             whole[name] = value

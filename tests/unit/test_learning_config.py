@@ -285,6 +285,13 @@ def test_a_variant_is_settings_that_go_together():
     assert racer.conditions["vehicle_options"] == {}
 
 
+def test_a_task_may_leave_out_what_others_see_in_a_variant():
+    seen = TrainConfig("navigation", variant="robust").conditions["observe"]
+    assert {*seen["sensors"]} == {"range_finder"} and not seen["disturbance"]
+    usual = TrainConfig("hover", variant="robust").conditions["observe"]
+    assert {*usual["sensors"]} == {"aim", "disturbance"}
+
+
 def test_a_variant_may_have_an_aircraft_and_a_control_rate_of_its_own():
     config = TrainConfig("hover", variant="raptor")
     assert (config.conditions["vehicle"], config.scenario.aircraft.control_timestep) == (
