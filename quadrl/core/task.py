@@ -303,8 +303,7 @@ class Task(abc.ABC):
 
     @property
     def moves(self) -> bool:
-        """Whether solids move in an episode; where none does, steps are flown several times as fast
-        and `move` is not asked."""
+        """Whether `move` moves solids; where none moves, steps are many times as fast."""
         return type(self).move is not Task.move
 
     def move(self, state: TaskState, time: Array) -> Mapping[str, Pose]:

@@ -5,7 +5,7 @@ import tyro
 from scripts.reports.any_aircraft import any_aircraft, any_memories
 from scripts.reports.crosscheck import crosschecks
 from scripts.reports.flights import flights
-from scripts.reports.forest import forest
+from scripts.reports.forest import forest, rays
 from scripts.reports.measure import speed, training
 from scripts.reports.one_policy import one_policy
 from scripts.reports.pages import pages
@@ -21,6 +21,7 @@ REPORTS = (
     robustness,
     flights,
     forest,
+    rays,
     crosschecks,
     any_aircraft,
     any_memories,

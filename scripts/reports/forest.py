@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from quadrl.base.rotation import Array
+from quadrl.conditions.solids import Cylinder, Pose, Solid
 from quadrl.control.modes import Velocity
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
+from quadrl.engines.rng import Rng
+from quadrl.engines.state import Start
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import fly
+from quadrl.tasks.hover import Hover
 from quadrl.tasks.navigation import LENGTH, Navigation
 from scripts.reports import report
 from scripts.reports.report import Result, say, table
@@ -22,6 +27,14 @@ from scripts.reports.report import Result, say, table
 TREES, SPEEDS = (18, 36, 54, 72), (1.0, 2.0, 3.0, 4.0, 6.0)
 SEEDS = 910_000, 920_000, 930_000  # fresh ones; planners are tuned on TUNING
 TUNING, TRIES = 300_000, 24
+WORLDS: dict[str, dict[str, Any]] = {
+    "8 walls": {"walls": 8},
+    "12 balls": {"balls": 12},
+    "12 balls that swing at 1 m/s": {"balls": 12, "ball_speed": 1.0},
+}
+"""What stands among 36 trees that no training had."""
+UNCERTAIN = 36, 54  # trees, for the robust policy
+STILL: dict[str, Any] = {}
 FOREST: dict[str, Any] = {
     "control_mode": "velocity", "vehicle_options": {"action_scale": 90.0}, "engine": "free_flight",
 }  # fmt: skip
@@ -88,9 +101,9 @@ def sampler(sight: Sight, p: Mapping[str, float]) -> Array:
     rays = np.stack([np.cos(sight.angle), np.sin(sight.angle)], axis=-1)
     points = sight.distance[..., None] * rays  # (N, K, 2)
     far = np.where(sight.seen, sight.distance, np.inf)[:, None] ** 2
-    for time in p["horizon"] * np.array([0.25, 0.5, 0.75, 1.0]):
-        share = p["lag"] * (1 - np.exp(-time / p["lag"]))
-        at = asked * time + change * share  # a velocity is reached with a lag
+    for seconds in p["horizon"] * np.array([0.25, 0.5, 0.75, 1.0]):
+        share = p["lag"] * (1 - np.exp(-seconds / p["lag"]))
+        at = asked * seconds + change * share  # a velocity is reached with a lag
         # |at - point|^2, multiplied out: a matrix product takes a tenth of the time.
         away = (far - 2 * at @ points.swapaxes(1, 2)).min(axis=-1) + (at**2).sum(axis=-1)
         away = np.sqrt(np.maximum(away, 0.0))
@@ -143,9 +156,12 @@ class Flyer:
         return np.clip(velocity / self._scale, -1.0, 1.0)
 
 
-def flown(flyer: Any, seed: int, episodes: int, **options: Any) -> Result:
+def flown(
+    flyer: Any, seed: int, episodes: int, conditions: Mapping[str, Any] = STILL, **options: Any
+) -> Result:
     """Success and mean speed of a flyer in a forest."""
-    flights = fly(flyer, Navigation(**options), episodes=episodes, seed=seed, **FOREST)
+    given = FOREST | {**conditions}
+    flights = fly(flyer, Navigation(**options), episodes=episodes, seed=seed, **given)
     speed = LENGTH / flights.success_time.mean() if flights.is_success.any() else 0.0
     return {"success": float(flights.is_success.mean()), "speed": float(speed)}
 
@@ -165,61 +181,160 @@ def tuned(name: str) -> Result:
     return best
 
 
-def forest(policy: Path, episodes: int = 1000) -> None:
-    """Fly forests of every density and speed by a policy and by tuned planners.
+def forest(*policies: Path, robust: Path, episodes: int = 1000) -> None:
+    """Fly forests of every density and speed by policies and by tuned planners.
 
     Args:
-        policy: A run folder, or the file of a policy.
+        policies: Run folders, or files, of policies of the same settings.
+        robust: The same of a robust one, which flies beside the first and the best planner in the
+            conditions of its training.
         episodes: Flights of each seed and density; a fifth of them for each speed.
     """
-    own, usual, rows = Policy.load(policy), Navigation().slowest, list[Result]()
+    usual, rows = Navigation().slowest, list[Result]()
     planners = [tuned(name) for name in PLANNERS]
-    flyers: dict[str, Any] = {"policy": own}
+    flyers: dict[str, Any] = {}
+    for own in map(Policy.load, policies):
+        flyers[f"policy, seed {own.metadata['seed']}"] = own
     for row in planners:
         planner = PLANNERS[row["planner"]][0]
         flyers[row["planner"]] = Flyer(planner, row["numbers"], Scenario.of(Navigation(), **FOREST))
+
+    def note(**row: Any) -> None:
+        rows.append(row)
+        # After each: one that is stopped keeps what it has flown.
+        report.save("forest", {"episodes": episodes, "planners": planners, "flights": rows})
+
     for name, flyer in flyers.items():
         for trees in TREES:
             for seed in SEEDS:
                 got = flown(flyer, seed, episodes, trees=trees)
-                rows.append({"flyer": name, "trees": trees, "asked": usual, "seed": seed, **got})
-            for asked in SPEEDS:
-                given: Any = {"trees": trees, "slowest": asked, "fastest": asked}
-                got = flown(flyer, SEEDS[0], episodes // 5, time_limit=40.0, **given)
-                rows.append({"flyer": name, "trees": trees, "asked": asked, "seed": 0, **got})
-            say(rows[-1])
-        # After each: one that is stopped keeps what it has flown.
-        report.save("forest", {"episodes": episodes, "planners": planners, "flights": rows})
+                note(flyer=name, trees=trees, asked=usual, seed=seed, **got)
+        for asked in SPEEDS:
+            given: Any = {"trees": 36, "slowest": asked, "fastest": asked}
+            got = flown(flyer, SEEDS[0], episodes // 5, time_limit=40.0, **given)
+            note(flyer=name, trees=36, asked=asked, seed=0, **got)
+        for world, given in WORLDS.items():
+            for seed in SEEDS:
+                got = flown(flyer, seed, episodes, trees=36, **given)
+                note(flyer=name, world=world, seed=seed, **got)
+        say(rows[-1])
+    sturdy = Policy.load(robust)
+    uncertain = {name: getattr(sturdy.scenario, name) for name in ("weather", "randomization")}
+    finder = {"range_finder": sturdy.scenario.observe.sensors["range_finder"]}
+    best = max(planners, key=lambda row: row["success"])["planner"]
+    beside = {name: flyers[name] for name in (next(iter(flyers)), best)}
+    for name, flyer in {"robust policy": sturdy, **beside}.items():
+        own = uncertain if flyer is sturdy else uncertain | {"observe": {"sensors": finder}}
+        for trees in UNCERTAIN:
+            for seed in SEEDS:
+                got = flown(flyer, seed, episodes, own, trees=trees)
+                note(flyer=name, uncertain=trees, seed=seed, **got)
+        say(rows[-1])
+
+
+@dataclasses.dataclass(frozen=True)
+class Posts(Hover):
+    """Hover amid posts, as many as a forest has."""
+
+    name = "posts"
+    compiled = True
+
+    def solids(self) -> Sequence[Solid]:
+        """A hundred."""
+        return [Cylinder("post", radius=0.2, height=6.0, count=100)]
+
+    def place(self, rng: Rng, start: Start, state: Any) -> Mapping[str, Pose]:
+        """Anywhere from 1.5 to 10 m away."""
+        angle, far = (rng.uniform(*ends, 100) for ends in ((0.0, 6.28), (1.5, 10.0)))
+        return {"post": Pose(np.stack([far * np.cos(angle), far * np.sin(angle), 0 * far], -1))}
+
+
+def rays(repeats: int = 50) -> None:
+    """Measure a batch with range finders: 256 aircraft of 64 rays amid 100 posts.
+
+    Args:
+        repeats: Measurements, in turns with one of the rays alone; the fastest count.
+    """
+    observe = {"sensors": {"range_finder": {"across": 64, "reach": 8.0}}}
+    environment = Environment(Posts(), num_envs=256, observe=observe, engine="free_flight")
+    environment.reset()
+    finder, action = environment.scene.rays["range_finder"], np.zeros((256, 4))
+
+    def timed(call: Callable[[], Any], times: int = 20) -> float:
+        begun = time.perf_counter()
+        for _ in range(times):
+            call()
+        return (time.perf_counter() - begun) / times
+
+    turns = list[tuple[float, float]]()
+    for _ in range(repeats):
+        step = timed(lambda: environment.step(action))
+        turns.append((step, timed(lambda: finder.measured(environment.engine))))
+    step, alone = map(min, zip(*turns, strict=True))
+    report.save("rays", {"steps_per_s": 256 / step, "share": alone / step})
+
+
+def rays_table() -> str:
+    """How fast a batch with range finders is."""
+    result = report.load("rays")
+    said = f"{result['steps_per_s']:,.0f} control steps a second; rays take {result['share']:.0%}"
+    return f"256 aircraft with 64 rays each amid 100 posts: {said}. {report.source(result)}"
+
+
+def _cell(found: list[Result]) -> str:
+    success = [100 * row["success"] for row in found]
+    speed = np.mean([row["speed"] for row in found])
+    return f"{np.mean(success):.1f} % ({min(success):.1f} to {max(success):.1f}), {speed:.2f} m/s"
+
+
+def _by_flyer(key: str, values: Sequence[Any], flights: list[Result]) -> list[list[str]]:
+    """A row for each that flies, a cell for each value of a key."""
+    rows = list[list[str]]()
+    for name in dict.fromkeys(row["flyer"] for row in flights):
+        own = [row for row in flights if row["flyer"] == name and row["seed"]]
+        found = ([row for row in own if row.get(key) == value] for value in values)
+        rows.append([name, *map(_cell, found)])
+    return rows
 
 
 def forest_table() -> str:
     """Success in forests of every density, by what flies."""
     result = report.load("forest")
-    rows = []
-    for name in dict.fromkeys(row["flyer"] for row in result["flights"]):
-        own = [row for row in result["flights"] if row["flyer"] == name and row["seed"]]
-        cells = []
-        for trees in TREES:
-            found = [row for row in own if row["trees"] == trees]
-            success = [100 * row["success"] for row in found]
-            speed = np.mean([row["speed"] for row in found])
-            cells.append(f"{np.mean(success):.1f} % ({min(success):.1f} to {max(success):.1f}), "
-                         f"{speed:.2f} m/s")  # fmt: skip
-        rows.append([name, *cells])
+    flights = [row for row in result["flights"] if "asked" in row]
     head = ["flies", *(f"{trees} trees" for trees in TREES)]
     note = f"{len(SEEDS)} seeds of {result['episodes']} flights each: mean (range), mean speed."
+    rows = _by_flyer("trees", TREES, flights)
     return f"{table(head, rows)}\n\n{note} {report.source(result)}"
+
+
+def worlds_table() -> str:
+    """Success where more than trees stands, by what flies."""
+    flights = [row for row in report.load("forest")["flights"] if "world" in row]
+    rows = _by_flyer("world", [*WORLDS], flights)
+    return table(["flies", *WORLDS], rows)
+
+
+def uncertain_table() -> str:
+    """Success in the conditions of a robust training, by what flies."""
+    flights = [row for row in report.load("forest")["flights"] if "uncertain" in row]
+    rows = _by_flyer("uncertain", UNCERTAIN, flights)
+    return table(["flies", *(f"{trees} trees" for trees in UNCERTAIN)], rows)
 
 
 def speed_table() -> str:
     """Success and speed by the speed that is asked, in 36 trees."""
     result, rows = report.load("forest"), []
     for name in dict.fromkeys(row["flyer"] for row in result["flights"]):
-        own = [r for r in result["flights"] if r["flyer"] == name and r["trees"] == 36]
-        found = {r["asked"]: r for r in own if not r["seed"]}
+        own = [r for r in result["flights"] if r["flyer"] == name and not r["seed"]]
+        if not own:
+            continue
+        found = {r["asked"]: r for r in own}
         cells = (f"{100 * found[v]['success']:.0f} %, {found[v]['speed']:.1f} m/s" for v in SPEEDS)
         rows.append([name, *cells])
     return table(["flies", *(f"asked {v:g} m/s" for v in SPEEDS)], rows)
 
 
-PARTS: report.Parts = {"forest": forest_table, "forest-speed": speed_table}
+PARTS: report.Parts = {
+    "forest": forest_table, "forest-worlds": worlds_table, "forest-uncertain": uncertain_table,
+    "forest-speed": speed_table, "rays": rays_table,
+}  # fmt: skip
