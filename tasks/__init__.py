@@ -38,13 +38,13 @@ from quadrl.tasks.target_following import TargetFollowing
 from quadrl.tasks.trajectory import Trajectory
 
 __all__ = [
-    "OBSERVATION", "ROTATION", "TARGET_MOTION", "TARGET_VELOCITY", "TASKS", "All", "Array",
-    "Box", "Capsule", "Cylinder", "DeckLanding", "Gate", "Hover", "Landing", "LsyRace", "Marker",
+    "OBSERVATION", "ROTATION", "TARGET_MOTION", "TARGET_VELOCITY", "TASKS", "All", "Array", "Box",
+    "Capsule", "Cylinder", "DeckLanding", "Gate", "Hover", "Landing", "LsyRace", "Marker",
     "Navigation", "ObservationTerm", "OneOf", "Perching", "Pose", "Race", "RandomWaypoint",
-    "Recovery", "Sphere", "StaticWaypoint", "StraightAndLevel", "Target", "TargetFollowing", "Task", "TaskState",
-    "Trajectory", "cross", "dot", "filled", "make", "namespace", "norm", "once", "register",
-    "stack", "stands", "strikes_ground", "to_body", "to_world", "touches_ground", "weighted",
-    "zeros",
+    "Recovery", "Sphere", "StaticWaypoint", "StraightAndLevel", "Target", "TargetFollowing", "Task",
+    "TaskState", "Trajectory", "cross", "dot", "filled", "make", "namespace", "norm", "once",
+    "register", "stack", "stands", "strikes_ground", "to_body", "to_world", "touches_ground",
+    "weighted", "zeros",
 ]  # fmt: skip
 
 for _task in (
