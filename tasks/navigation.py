@@ -97,10 +97,11 @@ class Navigation(Task):
                 "progress_weight": 20.0,
                 "smoothness_weight": 0.3,
             },
+            "training_options": {"crash_weight": 150.0},
             "gamma": 0.98,
             "gae_lambda": 0.95,
             "ppo": {"learning_rate": 1.5e-3},
-            "steps": 16_000_000,
+            "steps": 10_000_000,
         }
     }
     sensors = {

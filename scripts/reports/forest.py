@@ -181,7 +181,9 @@ def tuned(name: str) -> Result:
     return best
 
 
-def forest(*policies: Path, robust: Path, episodes: int = 1000) -> None:
+def forest(
+    *policies: Path, robust: Path, episodes: int = 1000, tuned_before: bool = False
+) -> None:
     """Fly forests of every density and speed by policies and by tuned planners.
 
     Args:
@@ -189,9 +191,10 @@ def forest(*policies: Path, robust: Path, episodes: int = 1000) -> None:
         robust: The same of a robust one, which flies beside the first and the best planner in the
             conditions of its training.
         episodes: Flights of each seed and density; a fifth of them for each speed.
+        tuned_before: Whether to fly the planners as the last report tuned them.
     """
     usual, rows = Navigation().slowest, list[Result]()
-    planners = [tuned(name) for name in PLANNERS]
+    planners = report.load("forest")["planners"] if tuned_before else [*map(tuned, PLANNERS)]
     flyers: dict[str, Any] = {}
     for own in map(Policy.load, policies):
         flyers[f"policy, seed {own.metadata['seed']}"] = own
@@ -268,6 +271,7 @@ def rays(repeats: int = 50) -> None:
 
     turns = list[tuple[float, float]]()
     for _ in range(repeats):
+        environment.reset()
         step = timed(lambda: environment.step(action))
         turns.append((step, timed(lambda: finder.measured(environment.engine))))
     step, alone = map(min, zip(*turns, strict=True))
