@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Literal
 
 from quadrl.base.errors import QuadrlError
@@ -105,6 +105,20 @@ class Observing:
         """The options that change what a policy observes."""
         own = {name: options for name, options in self.sensors.items() if name != "privileged"}
         return dataclasses.replace(self, privileged=False, sensors=own).given()
+
+    def meaning(self, usual: Collection[str]) -> dict[str, Any]:
+        """Those that change what its numbers mean: without errors and ages of samples.
+
+        Args:
+            usual: Sensors that are there in any case.
+        """
+        own: dict[str, Mapping[str, Any]] = {}
+        for name, options in self.sensors.items():
+            errors = {*sensors.SENSORS[name].exact, "delay", "rate"}
+            kept = {key: value for key, value in options.items() if key not in errors}
+            if kept or name not in usual:
+                own[name] = kept
+        return dataclasses.replace(self, sensors=own).for_policy()
 
 
 Observed = Observing | Mapping[str, Any] | None

@@ -208,8 +208,9 @@ class Policy:
         # One that is not known here is taken for the one that it is to fly.
         known = name if isinstance(name, dict) or name in VEHICLES else vehicle
         trained = resolve_vehicle(known, self.metadata.get("vehicle_options"), whole=True)
-        needed = observing.resolve(self.metadata.get("observe")).for_policy()
-        seen = environment.scenario.observe.for_policy()
+        usual = environment.task.sensors
+        needed = observing.resolve(self.metadata.get("observe")).meaning(usual)
+        seen = environment.scenario.observe.meaning(usual)
         if needed != seen:
             raise QuadrlError(name="observe", value=seen, allowed=f"{needed}, {as_trained}")
         for what, own, needed in (

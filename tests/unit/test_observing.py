@@ -318,3 +318,18 @@ def test_a_policy_flies_with_the_options_of_its_training_and_no_others(tmp_path)
 def test_an_impossible_option_is_refused(observe, name, value):
     with helpers.refused(name, value):
         Environment("hover", observe=observe)
+
+
+def test_a_policy_flies_with_a_worse_sensor_and_not_with_another_one():
+    policy, task = Policy.pretrained("navigation"), {"trees": 12, "time_limit": 0.5}
+    worse = {"rate": 15.0, "share": 0.02, "dropout": 0.5, "noise": 0.1, "delay": 0.05}
+
+    def seen(options):
+        observe = {"sensors": options}
+        return evaluate(policy, episodes=2, engine="free_flight", observe=observe, **task)
+
+    usual, late = (seen({"range_finder": own}).rollout.action for own in ({}, worse))
+    assert usual.shape == late.shape and (usual != late).any()
+    for other in ({"range_finder": {"reach": 5.0}}, {"airspeed": {"noise": 0.1}}):
+        with helpers.refused(match="observe", lists="as in the training"):
+            seen(other)
