@@ -210,7 +210,9 @@ def test_what_the_c_sees_is_the_observation(name, tmp_path):
     observation = environment.reset()
     flown = Flown(compiled(export(policy, "c", tmp_path / "x.h"), tmp_path, "-O2"), policy)
     assert flown.library.test() == 0
-    assert flown.begin(motions_of(environment), tasks_of(environment)) == 0
+    given, motion = Header(policy).carried.around_of(environment.snapshot), motions_of(environment)
+    np.testing.assert_allclose(given, motion[:, motion.shape[1] - given.shape[1] :], rtol=1e-5)
+    assert flown.begin(motion, tasks_of(environment)) == 0
     for _ in range(40):
         assert flown.step(motions_of(environment)) == 0
         seen = environment.flatten(observation)
