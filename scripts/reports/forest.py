@@ -181,9 +181,7 @@ def tuned(name: str) -> Result:
     return best
 
 
-def forest(
-    *policies: Path, robust: Path, episodes: int = 1000, tuned_before: bool = False
-) -> None:
+def forest(*policies: Path, robust: Path, episodes: int = 1000, tuned_before: bool = False) -> None:
     """Fly forests of every density and speed by policies and by tuned planners.
 
     Args:
