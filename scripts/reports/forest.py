@@ -220,7 +220,8 @@ def forest(*policies: Path, robust: Path, episodes: int = 1000, tuned_before: bo
                 note(flyer=name, world=world, seed=seed, **got)
         say(rows[-1])
     sturdy = Policy.load(robust)
-    uncertain = {name: getattr(sturdy.scenario, name) for name in ("weather", "randomization")}
+    named = "weather", "randomization", "aerodynamics"
+    uncertain = {name: getattr(sturdy.scenario, name) for name in named}
     finder = {"range_finder": sturdy.scenario.observe.sensors["range_finder"]}
     best = max(planners, key=lambda row: row["success"])["planner"]
     beside = {name: flyers[name] for name in (next(iter(flyers)), best)}
