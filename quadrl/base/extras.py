@@ -13,6 +13,7 @@ _BROUGHT = {
     "'quadrl[video]'": "matplotlib PIL mediapy imageio_ffmpeg",
     "'quadrl[view]'": "viser trimesh msgspec websockets",
     "'quadrl[export]'": "onnx onnxruntime",
+    "'quadrl[gpu]'": "cuda",
     "'quadrl[logs]'": "pyulog orangebox rosbags",
     "'quadrl[wandb]'": "wandb",
     "'quadrl[ray]'": "ray",

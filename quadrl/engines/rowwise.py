@@ -151,12 +151,17 @@ class RowFunction:
         return FUNCTION.format(body=self.body, **names)
 
     def text(self, name: str) -> str:
-        """Its C as the function of a name, with the constants, for LANES rows."""
-        constants: list[float] = self.constants.tolist()
-        numbers = ", ".join(k.hex() if math.isfinite(k) else WITHOUT_HEX[str(k)] for k in constants)
-        known = f"static const double {name}_constants[] = {{{numbers}}};"
-        given = f"(void)constants;\n  const double* c = {name}_constants;"
-        return known + self._function(name, "static", given)
+        """Its C as the function of a name for LANES rows, its constants written out in it."""
+        texts = [
+            k.hex() if math.isfinite(k) else WITHOUT_HEX[str(k)] for k in self.constants.tolist()
+        ]
+        body = re.sub(r"\bc\[(\d+)\]", lambda found: f"({texts[int(found[1])]})", self.body)
+        known = f"static const double {name}_constants[] = {{{', '.join(texts)}}};"
+        if not re.search(r"\bc\[", body):  # nothing is looked up
+            known = ""
+        given = f"const double* c = {name}_constants;" if known else "const double* c = 0;"
+        names = {"name": name, "linkage": "static", "constants": f"(void)constants;\n  {given}"}
+        return known + FUNCTION.format(body=body, **names)
 
     def load(self) -> Any:
         """The C function, compiled unless it is in the cache.

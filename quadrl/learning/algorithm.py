@@ -32,8 +32,11 @@ class Algorithm(abc.ABC):
 
     def add_optimiser(self, name: str, network: nn.Module, rate: float, **options: Any) -> None:
         """Let Adam optimise a network under a name, with an initial learning rate."""
-        group = {"params": [*network.parameters()], "initial_rate": rate}
-        self._optimisers[name] = torch.optim.Adam([group], lr=rate, eps=1e-5, **options)
+        weights = [*network.parameters()]
+        group: dict[str, Any] = {"params": weights, "initial_rate": rate, "lr": rate}
+        if weights[0].is_cuda:  # such steps can be recorded
+            group |= {"lr": torch.tensor(rate, device=weights[0].device), "capturable": True}
+        self._optimisers[name] = torch.optim.Adam([group], eps=1e-5, **options)
 
     def update(self, batch: TensorDictBase, remaining: float) -> dict[str, float]:
         """Learn from a batch.
@@ -47,11 +50,19 @@ class Algorithm(abc.ABC):
         Returns:
             Metrics for the log.
         """
-        for adam in self._optimisers.values():
-            for group in adam.param_groups:
-                group["lr"] = group["initial_rate"] * remaining
+        self.set_rates(remaining)
         with set_recurrent_mode():
             return self.learn(batch)
+
+    def set_rates(self, remaining: float) -> None:
+        """Set the learning rates for the share of the training that is left, 1 to 0."""
+        for adam in self._optimisers.values():
+            for group in adam.param_groups:
+                rate = group["initial_rate"] * remaining
+                if isinstance(group["lr"], Tensor):  # a graph reads it
+                    group["lr"].fill_(rate)
+                else:
+                    group["lr"] = rate
 
     @abc.abstractmethod
     def learn(self, batch: TensorDictBase) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,10 @@ class TrainingEnv(QuadrotorEnv):
         self.teacher: Teacher | None = None
         """Who says before each step what it would do."""
         self._taught: list[np.ndarray] = []
+
+    def save(self) -> dict[str, np.ndarray]:
+        """All that the next steps depend on, for `restore`."""
+        return self.environment.save()
 
     def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the T steps since the last call say of N aircraft.
@@ -141,6 +145,7 @@ class EpisodeStatistics:
         rollout: int,
         terms: Sequence[str] = (),
         ends: Sequence[str] = (),
+        device: torch.device | str = "cpu",
     ) -> None:
         """Begin with every aircraft at the start of an episode.
 
@@ -150,14 +155,16 @@ class EpisodeStatistics:
             rollout: Control steps of a batch.
             terms: Names of the terms of the reward.
             ends: Names of the ends of an episode.
+            device: Where the batches are.
         """
         self._limit = time_limit_steps
         self._terms = [f"reward/{name}" for name in terms]
         self._ends = [f"end/{name}" for name in ends]
-        self.running: dict[str, np.ndarray] = {name: np.zeros(num_envs) for name in ENDED}
-        self.running["terms"] = np.zeros((len(terms), num_envs))
+        whole: Any = {"dtype": torch.float64, "device": device}
+        self.running = {name: torch.zeros(num_envs, **whole) for name in ENDED}
+        self.running["terms"] = torch.zeros(len(terms), num_envs, **whole)
         ages = 2 * time_limit_steps + rollout
-        self.running["outcomes"] = np.zeros((ages, len(OUTCOMES) + len(ends)))
+        self.running["outcomes"] = torch.zeros(ages, len(OUTCOMES) + len(ends), **whole)
         """Numbers of the `OUTCOMES` and ends of episodes, by the steps since they began."""
 
     @property
@@ -165,38 +172,55 @@ class EpisodeStatistics:
         """Names of the metrics of terms and ends."""
         return [*self._terms, *self._ends]
 
-    def count(self, batch: Any, terms: np.ndarray, ends: np.ndarray) -> dict[str, float]:
+    @torch.no_grad()
+    def count(
+        self, batch: Mapping[str, torch.Tensor], terms: torch.Tensor, ends: torch.Tensor
+    ) -> dict[str, float]:
         """Include a batch, and return its metrics.
 
         Args:
-            batch: What a collector gives, (N, T).
+            batch: reward, done, terminated, is_success and error (T, N).
             terms: The terms of its rewards, (T, terms, N).
             ends: How its episodes ended, (T, ends, N) bool.
         """
         names = ("reward", "done", "terminated", "is_success", "error")
-        columns = (batch["next", name][..., 0].cpu().numpy().T for name in names)
-        reward, done, terminated, success, error = columns  # (time, aircraft)
-        ended: dict[str, list[np.ndarray]] = {name: [] for name in (*ENDED, "terms")}
-        outcomes, steps = self.running["outcomes"], len(reward)
-        outcomes[steps:], outcomes[:steps] = outcomes[:-steps].copy(), 0.0
-        judged = np.stack([done, success, ~terminated | success], axis=-1)
-        judged = np.concatenate([judged, ends.swapaxes(1, 2)], axis=-1)
-        for step, (gained, over) in enumerate(zip(reward, done, strict=True)):
-            self.running["return"] += gained
-            self.running["length"] += 1
-            self.running["terms"] += terms[step]
-            ages = self.running["length"][over].astype(int) + steps - 1 - step
-            np.add.at(outcomes, ages, judged[step, over])
-            for name, found in ended.items():
-                found.append(self.running[name][..., over])
-                self.running[name][..., over] = 0.0
-        metrics = {"episodes": float(done.sum()), "reward": float(reward.mean())}
-        metrics["error"] = float(error.mean())
-        if done.any():
-            metrics |= {name: float(np.concatenate(ended[name]).mean()) for name in ENDED}
-            means = np.concatenate(ended["terms"], axis=-1).mean(-1)
-            metrics |= dict(zip(self._terms, means.tolist(), strict=True))
-        over, *shares = outcomes[self._limit :].sum(axis=0).tolist()
+        reward, done, terminated, success, error = (batch[name] for name in names)
+        steps, outcomes = len(reward), self.running["outcomes"]
+        last, aircraft = done.nonzero(as_tuple=True)  # of each episode that ends, in time's order
+        times = torch.arange(steps, device=done.device)[:, None]
+        begun = torch.where(done, times, -1).cummax(0).values  # the last end so far, -1 for none
+        before = begun.roll(1, 0)
+        before[0] = -1
+        before, remained = before[last, aircraft], begun[-1]
+
+        def sums(values: torch.Tensor, running: torch.Tensor) -> torch.Tensor:
+            """Sums (..., k) of values (..., T, N) over episodes that end; the others' go on."""
+            total = values.double().cumsum(-2)
+            until = total[..., before.clamp(min=0), aircraft]
+            carried = torch.where(before < 0, running[..., aircraft], -until)
+            found = total[..., last, aircraft] + carried
+            each = torch.arange(total.shape[-1], device=done.device)
+            until = total[..., remained.clamp(min=0), each]
+            running.copy_(total[..., -1, :] + torch.where(remained < 0, running, -until))
+            return found
+
+        ended = {
+            "return": sums(reward, self.running["return"]),
+            "length": sums(torch.ones_like(reward), self.running["length"]),
+        }
+        means = sums(terms.movedim(1, 0), self.running["terms"]).mean(-1)
+        outcomes[steps:], outcomes[:steps] = outcomes[:-steps].clone(), 0.0
+        judged = torch.stack([done, success, ~terminated | success], -1)
+        judged = torch.cat([judged, ends.movedim(1, -1)], -1)[last, aircraft]
+        ages = ended["length"].long() + steps - 1 - last
+        outcomes.index_put_((ages,), judged.double(), accumulate=True)
+        own = [x.double().mean() for x in (reward, error, *ended.values())]
+        over = outcomes[self._limit :].sum(0)
+        gained, missed, *kept = torch.cat([torch.stack(own), means, over]).tolist()
+        metrics = {"episodes": float(len(last)), "reward": gained, "error": missed}
+        if len(last):
+            metrics |= dict(zip((*ENDED, *self._terms), kept, strict=False))
+        over, *shares = kept[len(ENDED) + len(self._terms) :]
         if over:
             names = (*OUTCOMES[1:], *self._ends)
             metrics |= {k: share / over for k, share in zip(names, shares, strict=True)}

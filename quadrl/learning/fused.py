@@ -33,9 +33,9 @@ class Plain:
     goal: Any = None
     """The `HoldsGoal` whose mean at the goal is subtracted, if there is one."""
 
-    def seen(self, batch: TensorDictBase) -> Tensor:
+    def seen(self, batch: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
         """Return what the first layer reads of a batch, (n, inputs)."""
-        parts = [_rows(sees(batch.get(name))) for name, sees in self.sees.items()]
+        parts = [_rows(sees(batch[name])) for name, sees in self.sees.items()]
         return torch.cat(parts, -1) if len(parts) > 1 else parts[0]
 
     def forward_policy(
@@ -133,7 +133,7 @@ class PPOGradients:
         """Keep the networks and the settings."""
         self._policy, self._critic, self._config = policy, critic, config
         clip = torch.tensor(config.clip)
-        self._bounds = (-clip).log1p(), clip.log1p()  # of the log-ratio
+        self._bounds = (-clip).log1p().item(), clip.log1p().item()  # of the log-ratio
 
     def prepare(self, batch: TensorDictBase) -> TensorDict:
         """Make the n rows that `gradients` reads of a batch (...), with normalised observations."""

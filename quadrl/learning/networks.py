@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ class Normaliser(nn.Module):
         self.deviation.copy_((self.square_sum / total).sqrt().clamp(min=1e-4))
 
 
-def update_normalisers(normalisers: dict[str, Normaliser], batch: TensorDictBase) -> None:
+def update_normalisers(normalisers: dict[str, Normaliser], batch: Mapping[str, Any]) -> None:
     """Include a batch in the normaliser of each of its entries."""
     for name, normaliser in normalisers.items():
         normaliser.update(batch[name])

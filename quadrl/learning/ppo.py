@@ -38,19 +38,20 @@ class PPO(Algorithm):
             log_explained_variance=False,
             functional=False,
         )
-        self._fused: PPOGradients | None = None
+        self.fused: PPOGradients | None = None
+        """The gradients that are written by hand, where they are used."""
         if config.fused:
             if policy.plain is None or critic.plain is None:
                 reason = "the gradients written by hand are those of networks of plain layers"
                 raise QuadrlError(reason, name="ppo.fused", value=True, allowed="False for others")
-            self._fused = PPOGradients(policy.plain, critic.plain, config)
+            self.fused = PPOGradients(policy.plain, critic.plain, config)
         adam = {"betas": (0.9, config.beta2), "fused": True}
         self.add_optimiser("policy", actor, config.learning_rate, **adam)
         self.add_optimiser("critic", critic, config.learning_rate, **adam)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Take gradient steps on the minibatches of several epochs."""
-        batch, fused = batch.exclude("loc", "scale"), self._fused
+        batch, fused = batch.exclude("loc", "scale"), self.fused
         if fused is not None:
             batch = fused.prepare(batch)
         found: Any = None

@@ -73,6 +73,9 @@ def make_algorithm(
 class Training:
     """A training, and the folder of its run."""
 
+    on_device = False
+    """Whether its aircraft are where its networks are."""
+
     @one_thread()  # for the bits of the first weights
     def __init__(self, config: TrainConfig, folder: Path, *, resume: bool = False) -> None:
         """Make environments, networks and algorithm; then make the folder, or load its checkpoint.
@@ -85,7 +88,7 @@ class Training:
         self.config, self.folder = config, folder
         device = environments.make_device(config.device)
         torch.manual_seed(config.seed)
-        self.env = environments.make_env(config, device)
+        self.env = self._make_env(device)
         size, actions = self.env.environment.size, self.env.environment.action_size
         networks.check_fits(config, size)
         given = self.env.observation_spec.get(PRIVILEGED, None)
@@ -108,6 +111,7 @@ class Training:
         self._episodes = environments.EpisodeStatistics(
             *(config.num_envs, flown.time_limit_steps, config.rollout),
             *(flown.term_names, ("diverged", *flown.end_names, TIME_LIMIT)),
+            device if self.on_device else "cpu",
         )
         self._generators: dict[str, torch.Tensor] = {}
         self._remembered: dict[str, np.ndarray] = {}  # the states of a recurrent policy
@@ -140,6 +144,15 @@ class Training:
         if self._evaluations:
             self._evaluations.begin(self.steps)
 
+    def _make_env(self, device: torch.device) -> Any:
+        """The aircraft of the training."""
+        return environments.make_env(self.config, device)
+
+    def _make_collector(self) -> Any:
+        """What flies them, batch after batch."""
+        frames = self.config.num_envs * self.config.rollout
+        return environments.make_collector(self.env, self.actor, frames)
+
     @property
     def steps(self) -> int:
         """Control steps of all aircraft so far."""
@@ -162,9 +175,7 @@ class Training:
                 policy = self.policy()  # it may have been killed between checkpoint and policy
                 policy.save(self.folder / POLICY_FILE)
                 return policy
-            collector = environments.make_collector(
-                self.env, self.actor, config.num_envs * config.rollout
-            )
+            collector = self._make_collector()
             stack.callback(collector.shutdown, close_env=False)
             set_generators(self._generators, self.env.device)
             self.env.told()  # what the collector asked of it before
@@ -186,7 +197,8 @@ class Training:
                 self.iteration += 1
                 now = time.perf_counter()
                 self.seconds = before + now - started
-                if not all(weight.isfinite().all() for weight in self.algorithm.parameters):
+                sound = [weight.isfinite().all() for weight in self.algorithm.parameters]
+                if not torch.stack(sound).all():
                     raise QuadrlError(
                         f"the training diverged after {self.steps} steps: a weight is no longer "
                         "finite; lower the learning rate and start a new run"
@@ -255,7 +267,9 @@ class Training:
     def _learn(self, batch: Any) -> dict[str, float]:
         """Do one iteration with a batch (aircraft, time)."""
         terms, ends, which = self.env.told()
-        metrics = self._episodes.count(batch, terms, ends)
+        names = ("reward", "done", "terminated", "is_success", "error")
+        told = {name: batch["next", name][..., 0].cpu().T for name in names}
+        metrics = self._episodes.count(told, *map(torch.from_numpy, (terms, ends)))
         with torch.no_grad():
             if self.config.memory != "none":
                 done, state = (batch["next", name] for name in ("done", STATE))
@@ -301,7 +315,7 @@ class Training:
             "critic": self.critic.state_dict(),
             "returns": self.advantages.returns,
             "optimisers": self.algorithm.save(),
-            "environment": self.env.environment.save() | self._remembered,
+            "environment": self.env.save() | self._remembered,
             "running": self._episodes.running,
             "generators": generators(self.env.device),
         }
@@ -332,7 +346,8 @@ class Training:
                 self.advantages.returns[name].copy_(values)
             self.algorithm.restore(tensors.get("optimisers", {}))
             self.env.restore({k: v.numpy() for k, v in tensors["environment"].items()})
-            self._episodes.running |= {k: v.numpy().copy() for k, v in tensors["running"].items()}
+            for name, values in tensors["running"].items():
+                self._episodes.running[name].copy_(values)
             self._generators = tensors["generators"]
             if self._evaluations and numbers["best"]:
                 steps, success, error, layers = numbers["best"]

@@ -73,7 +73,7 @@ def compare(actor, critic, batch, /, digits=1e-12, **settings):
     wanted = torch.autograd.grad(losses, parameters, allow_unused=True)
     for parameter in parameters:
         parameter.grad = torch.full_like(parameter, 9.0)  # of an earlier step: replaced
-    fused = algorithm._fused
+    fused = algorithm.fused
     found = fused.figures(*fused.gradients(fused.prepare(batch)))
     for name in found.keys() & expected.keys():
         torch.testing.assert_close(found[name], expected[name].detach(), rtol=digits, atol=digits)

@@ -26,8 +26,9 @@ def batches(steps, lives):
     for first in range(0, steps, BATCH):
         here = {k: np.array(v[first : first + BATCH]) for k, v in columns.items()}
         ends = np.stack([here["terminated"], here["done"] & ~here["terminated"]], axis=1)
-        part = {("next", k): torch.from_numpy(v.T[..., None]) for k, v in here.items()}
-        yield part, here["reward"][:, None] * [[3.0], [-2.0]], ends
+        part = {name: torch.from_numpy(column) for name, column in here.items()}
+        terms = here["reward"][:, None] * [[3.0], [-2.0]]
+        yield part, torch.from_numpy(terms), torch.from_numpy(ends)
 
 
 def test_success_is_that_of_episodes_which_are_all_over_by_now():
@@ -58,10 +59,10 @@ def test_a_crash_of_all_in_the_first_step_is_no_success_while_others_are_cut_off
 
 def test_batches_longer_than_an_episode_count_every_one():
     statistics = EpisodeStatistics(1, 1, BATCH)
-    done = torch.ones(1, BATCH, 1, dtype=torch.bool)
-    batch = {("next", name): done for name in ("done", "terminated")}
-    batch |= {("next", "is_success"): ~done}
-    batch |= {("next", name): done.double() for name in ("reward", "error")}
+    done = torch.ones(BATCH, 1, dtype=torch.bool)
+    batch = {"done": done, "terminated": done, "is_success": ~done}
+    batch |= {name: done.double() for name in ("reward", "error")}
+    none = torch.ones(BATCH, 0, 1)
     for _ in range(3):
-        found = statistics.count(batch, np.ones((BATCH, 0, 1)), np.ones((BATCH, 0, 1), bool))
+        found = statistics.count(batch, none, none.bool())
     assert found["success"] == found["survival"] == 0.0 and found["length"] == 1.0

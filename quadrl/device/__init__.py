@@ -1,0 +1,1 @@
+"""Whole batches on a device: the control step as one text, compiled for a GPU."""
