@@ -17,7 +17,7 @@ from quadrl.base.validation import number
 
 MAX_SEED = (1 << 62) - 1
 # Streams of an episode. A new purpose takes a new number, so that the others do not change.
-START, PARAMETERS, SOLIDS, MEMBERS = 0, 1, 2, 3
+START, PARAMETERS, SOLIDS, MEMBERS, POOL = 0, 1, 2, 3, 4
 WEATHER, TURBULENCE = 8, 9  # drawn once an episode; drawn at each control step
 NOISE, PUSHES, LINK = 16, 17, 18  # drawn at each control step
 SENSORS = 1 << 30  # the first of two for each sensor, its noise and its bias

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,6 +20,8 @@ from quadrl.device.text import Layout, Precision, text
 
 MARKS = ("action", "reward", "start")
 """What may be no number, in the order of `marks` in native/kernel.h."""
+FEWEST, MOST = 16_384, 65_536
+"""Aircraft and starts that are drawn on the processor, where a start is more than arithmetic."""
 HINT = "allowed: device 'cpu', or engine 'mujoco', which simulates on the CPU"
 
 
@@ -30,6 +32,8 @@ class Slot:
     action: Tensor  # (N, k), taken
     observation: Tensor  # (N, size), of the present moment
     final: Tensor  # (N, size), of the moment before rows began anew
+    privileged: Tensor  # (N, p), of the present moment, for the critic alone
+    final_privileged: Tensor  # (N, p), of the moment before rows began anew
     reward: Tensor  # (N,)
     error: Tensor  # (N,) [m]
     terms: Tensor  # (terms, N), of the reward
@@ -79,11 +83,14 @@ class Batch:
         if why := uncovered(self.environment):
             raise QuadrlError(f"{refused}: free flight on a GPU has no {why}; {HINT}")
         self.environment.reset()
+        seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
         try:
-            whole = text(self.environment, precision)
+            self.layout = Layout(self.environment)
+            self._begun = self._pool(seed) if self.layout.pooled else self.environment
+            whole = text(self._begun, precision)
         except NotCompilable as error:
             raise QuadrlError(f"{refused}: the task is not compiled: {error}; {HINT}") from error
-        self.layout = layout = Layout(self.environment)
+        self.layout = layout = Layout(self._begun)
         self._run = kernels(whole, precision, self.device)
         dtype, actions = getattr(torch, precision), self.environment.action_size
         numbers = layout.rows + slots * (layout.out + actions)
@@ -101,22 +108,37 @@ class Batch:
         on_gpu = self.device.type == "cuda"
         self._marks = torch.zeros(len(MARKS), dtype=torch.int32, pin_memory=on_gpu)
         self.slots = [
-            self._slot(*parts) for parts in zip(self.action, self.out, self.flags, strict=True)
+            self.slot(*parts) for parts in zip(self.action, self.out, self.flags, strict=True)
         ]
+        pool = layout.pool(self._begun, self._first) if layout.pooled else np.zeros((1, 1))
+        self._columns = torch.from_numpy(pool).to(**given)
+        """Columns with which episodes begin, where they do not begin on the device."""
         structs = [
-            (self.table, out, action, self.keys, self.episodes, flags, self._marks)
+            (self.table, self._columns, out, action, self.keys, self.episodes, flags, self._marks)
             for action, out, flags in zip(self.action, self.out, self.flags, strict=True)
         ]
-        addresses = [[*(tensor.data_ptr() for tensor in own), num_envs] for own in structs]
+        sizes = num_envs, self._columns.shape[1]
+        addresses = [[*(tensor.data_ptr() for tensor in own), *sizes] for own in structs]
         self._structs = torch.tensor(addresses, dtype=torch.int64).to(self.device)
         """A `Batch` of native/kernel.h for each slot."""
         self.seed(seed)
 
-    def _slot(self, action: Tensor, out: Tensor, flags: Tensor) -> Slot:
-        seen, reward = self.layout.seen, self.layout.reward
-        parts = out[:seen].T, out[seen:reward].T, out[reward], out[reward + 1], out[reward + 2 :]
-        named: Any = (*parts, *flags[:5], flags[5:])
-        return Slot(action, *named)
+    def _pool(self, seed: Seed) -> Environment:
+        """Environments whose episodes have just begun, as many as there are aircraft or POOL."""
+        count = min(max(self.num_envs, FEWEST), MOST)
+        if not isinstance(seed, int):
+            allowed = "one number where episodes begin with what a processor has drawn"
+            raise QuadrlError(name="seed", value=seed, allowed=allowed)
+        made = Environment(self.scenario, num_envs=count, seed=seed)
+        self._first = made.reset()
+        return made
+
+    def slot(self, action: Tensor, out: Tensor, flags: Tensor) -> Slot:
+        """Tensors as a slot: actions (N, k), what a step gives (rows, N) and flags (flags, N)."""
+        seen, reward, own = self.layout.seen, self.layout.reward, self.layout.observed
+        first = out[:own].T, out[seen : seen + own].T, out[own:seen].T, out[seen + own : reward].T
+        named = *first, out[reward], out[reward + 1], out[reward + 2 :], *flags[:5], flags[5:]
+        return Slot(*cast(Any, (action, *named)))
 
     def _check_memory(self, size: int) -> None:
         if self.device.type == "cuda":
@@ -135,14 +157,19 @@ class Batch:
         self.keys.copy_(keys)
         self.episodes.copy_(episodes)
 
-    def reset(self, chosen: Tensor | None = None) -> Tensor:
-        """Begin an episode of the aircraft of a mask (N,), or of all; return the observation."""
+    def reset(self, chosen: Tensor | None = None, slot: int = -1) -> Tensor:
+        """Begin an episode of the aircraft of a mask (N,), or of all; return the observation.
+
+        Args:
+            chosen: The mask.
+            slot: The slot that has the present observation.
+        """
         mask = 0
         if chosen is not None:
             self._chosen = chosen.reshape(self.num_envs).to(self.device, torch.bool).contiguous()
             mask = self._chosen.data_ptr()
-        self._run["start"](self.num_envs, self._address(-1), mask)
-        return self.slots[-1].observation
+        self._run["start"](self.num_envs, self._address(slot), mask)
+        return self.slots[slot].observation
 
     def _address(self, slot: int) -> int:
         return self._structs[slot].data_ptr()
@@ -182,7 +209,7 @@ class Batch:
     @property
     def _kept(self) -> dict[str, Tensor]:
         own = {name: getattr(self, name) for name in ("table", "keys", "episodes")}
-        return own | {"observation": self.slots[-1].observation}
+        return own | {"observed": self.out[-1, : self.layout.seen]}
 
     def restore(self, saved: dict[str, np.ndarray]) -> Tensor:
         """Restore what `save` returned; return the observation of that moment.
@@ -201,7 +228,13 @@ class Batch:
         return self.slots[-1].observation
 
     def row(self, row: int) -> dict[str, np.ndarray]:
-        """The state of an aircraft as one that an `Environment` of the scenario restores."""
+        """The state of an aircraft as one that an `Environment` of the scenario restores.
+
+        Raises:
+            QuadrlError: Its episode began with what was drawn for others.
+        """
+        if self.layout.pooled:
+            raise QuadrlError("episodes that begin with what a processor has drawn cannot be saved")
         environment, layout = self.environment, self.layout
         column = self.table[:, row].double().cpu().numpy()[:, None]
         seeds = environment.seeds
@@ -216,15 +249,14 @@ class Batch:
 
 
 def uncovered(environment: Environment) -> str:
-    """What of an environment a GPU does not fly yet, in words; empty where it flies all of it."""
-    task = environment.task
+    """What of an environment a GPU does not fly, in words; empty where it flies all of it."""
+    task, observer = environment.task, environment.observer
+    follows = environment.control_mode.has_loops and bool(observer and observer.follows)
     for name, holds in {
         "contact (the task touches the ground or solids)": task.contact,
-        "solids": bool(environment.scene.solids),
-        "wind": environment.blowing is not None,
+        "solids that move": task.moves,
         "events": environment.events is not None,
-        "sensors": environment.observer is not None,
-        "randomization": environment.randomizer.active,
+        "sensors that follow the commands of loops": follows,
         "engine 'mujoco'": environment.engine.name != "free_flight",
     }.items():
         if holds:

@@ -8,19 +8,25 @@ its own. Compiled for a processor in double precision it gives the bits of `Envi
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal
+from statistics import NormalDist
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import AIRCRAFT, ROTOR, c_structs
-from quadrl.base.philox import MEMBERS, START
+from quadrl.base.philox import LINK, MEMBERS, POOL, PUSHES, START
+from quadrl.base.trace import NotCompilable
+from quadrl.conditions.randomization import OFF
+from quadrl.conditions.weather import noise_time_of
 from quadrl.control.autopilot import Laws
 from quadrl.core.environment import Environment
 from quadrl.core.program import MAX_DRAWN, Program
 from quadrl.engines import native
+from quadrl.engines.air import DRAWN, FILTERS, FIXED, ROWS, c_weather
+from quadrl.engines.rays import LEAST, Frame
 from quadrl.engines.rowwise import WITHOUT_HEX
 
 Precision = Literal["float32", "float64"]
@@ -44,14 +50,13 @@ typedef unsigned long long uint64_t;
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
-#define QUADRL_EXPORT __attribute__((visibility("default")))
+#include <string.h>
 #endif
 #define VECTORISED
 {structs}
 enum {{ {sizes} }};
-#define LOOPS {loops}
-#define EFFECTS {effects}
-#define WORLD {{{timestep}, {gravity}, -HUGE_VAL, 0}}
+{defines}
+#define FREE_WORLD {{{timestep}, {gravity}, -HUGE_VAL, 0}}
 typedef double Lanes[LANES];
 // A random word as a number in [0, 1).
 static inline double uniform(uint32_t word) {{ return {uniform}; }}
@@ -62,17 +67,37 @@ static inline void aircraft(Aircraft* a, const double* column, int64_t columns) 
 }}
 // What the task's part and the start take.
 static inline void finish_takes(Lanes* x, const Lanes* last, const double* action,
-                                const Lanes* mean, const double* column, int64_t columns,
-                                const Aircraft* a) {{
+                                const Lanes* mean, const Lanes* air, const double* column,
+                                int64_t columns, const Aircraft* a, double clearance,
+                                const double* read) {{
   {finish_takes}
 }}
 static inline void start_takes(Lanes* x, const Aircraft* a) {{
   {start_takes}
 }}
+{weather}
+{world}
 {kernel}
 """
 NUMBER = r"(?<![\w.])(0x[\da-fA-F]*\.?[\da-fA-F]*p[+-]?\d+|\d+\.\d*(?:e[+-]?\d+)?|\d+e[+-]?\d+)\b"
 """A literal of a double."""
+WEATHER = """
+static inline void weather_takes(Lanes* t, const double* column, int64_t columns) {{
+  {takes}
+}}
+static inline void weather_gives(const Lanes* t, double* column, int64_t columns) {{
+  {gives}
+}}
+"""
+TAKE_SOLID = """
+static inline void take_solid(Solid* solid, int k, const double* column, int64_t columns) {
+  double* to = (double*)solid;
+  int64_t at = AT_SOLIDS + solid_first[k];
+  for (int j = 0; j < 16; ++j) {
+    to[j] = solid_varies[k] >> j & 1 ? column[at++ * columns] : solid_numbers[16 * k + j];
+  }
+}
+"""
 UNIFORM = {"float64": "word * 0x1p-32", "float32": "(word >> 8) * 0x1p-24"}
 
 
@@ -81,16 +106,96 @@ class Layout:
 
     def __init__(self, environment: Environment) -> None:
         """Lay them out for an environment whose episodes have begun."""
-        program: Program = environment._step._program  # type: ignore[union-attr]
-        self.program, self.motion = program, 13 + environment.vehicle.rotor_count
-        self.kept, self.seen = program.remembered.end, environment.size
+        program: Program = cast(Any, environment)._step._program
+        vehicle, observer = environment.vehicle, environment.observer
+        self.program, self.motion = program, 13 + vehicle.rotor_count
+        self.kept, self.observed = program.remembered.end, environment.size
         self.terms, self.ends = program.rewarded, program.ended
-        self.rows = self.motion + self.kept
-        """Rows of what is remembered."""
+        self.privileged = np.zeros(0, int)
+        """Where in what is kept the privileged observation stands."""
+        if observer and (channel := observer.senses.channels.get("privileged")):
+            numbers = np.arange(program.seen.end)[:, None]
+            self.privileged = channel.seen(program.memory(numbers)["privileged"])[0]
+        self.seen = self.observed + len(self.privileged)
+        """Rows of what is observed: by policies, then by the critic alone."""
+        self.pooled = not cast(Any, environment)._plain or environment.blowing is not None
+        """Whether episodes begin with columns of a pool."""
+        rows = parameters.numbers(environment.engine.begun)
+        self.varying: list[int] = np.flatnonzero((rows != rows[:1]).any(0)).tolist()
+        """Parameters that differ between aircraft."""
+        randomizer, weather = environment.randomizer, environment.blowing
+        ages = len(randomizer.past) > 0
+        self.late = len(randomizer.queue) if randomizer.late else 0
+        self.linked = bool(randomizer.late and cast(Any, randomizer)._links)
+        changing = [*DRAWN, "steps", *FILTERS] if weather else []
+        changing += FIXED if weather and environment.randomization.wind != OFF else ()
+        self.weather = [k for k, name in enumerate(ROWS) if name in changing]
+        """Rows of the weather's table that differ between aircraft, or change."""
+        self.solids = _solids(environment)
+        parts = {
+            "motion": self.motion,
+            "kept": self.kept,
+            "parameters": len(self.varying),
+            "given": program.parts["given"],
+            "delay": int(self.late > 0),
+            "ages": 2 * ages,
+            "link": 4 * self.linked,
+            "last": vehicle.rotor_count * self.linked,
+            "weather": len(self.weather),
+            "solids": sum(varies.sum() for _, varies in self.solids),
+            "queue": self.late * vehicle.rotor_count,
+            "past": self.late * 13 * ages,
+        }
+        ends = np.cumsum([0, *parts.values()]).tolist()
+        self.first = dict(zip(parts, ends, strict=False))
+        """The first row of each part of the table."""
+        self.begun, self.rows = self.first["queue"], ends[-1]
+        """Rows of a column of the pool without its observation, and of all."""
         self.reward = 2 * self.seen
         self.out = self.reward + 2 + len(self.terms)
         """Rows of what a step gives."""
         self.flags = 5 + len(self.ends)
+
+    def pool(self, environment: Environment, observed: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The columns with which the episodes of an environment have just begun.
+
+        Args:
+            environment: The environment.
+            observed: What its reset returned.
+        """
+        engine, observer = environment.engine, environment.observer
+        randomizer, weather = environment.randomizer, cast(Any, environment.blowing)
+        hidden, count = cast(Any, randomizer), environment.num_envs
+        table: Any = cast(Any, environment)._step._tables.pages[engine.turn].whole
+        given = [*observer.given.values()] if observer else []
+        varying = len(self.varying)
+        parts = [
+            np.concatenate([engine.qpos, engine.qvel, engine.act], axis=1).T,
+            table[: self.kept, :count],
+            np.broadcast_to(parameters.numbers(engine.begun)[:, self.varying].T, (varying, count)),
+            *(array.T for array in given),
+        ]
+        if self.late:
+            parts += [hidden._usual[None], *([randomizer.ages] if len(randomizer.past) else [])]
+        if self.linked:
+            often = hidden._jitter, hidden._loss, hidden._outage, randomizer.left
+            parts += [np.stack(often), engine.act.T]
+        if weather:
+            parts.append(weather._table[self.weather])
+        every = engine.solids.table
+        numbers = every.view(np.float64).reshape(*every.shape, every.itemsize // 8)
+        parts += [numbers[:, k, varies].T for k, (_, varies) in enumerate(self.solids)]
+        seen = [array.T for array in observed.values()], table[self.privileged, :count]
+        made = np.concatenate([*parts, *seen[0], seen[1]])
+        assert len(made) == self.begun + self.seen
+        return made
+
+
+def _solids(environment: Environment) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Of each solid its numbers, as `Solid` of native/solids.h, and which differ between rows."""
+    table = environment.engine.solids.table
+    numbers = table.view(np.float64).reshape(*table.shape, table.itemsize // 8)
+    return [(own[0], (own != own[:1]).any(0)) for own in numbers.swapaxes(0, 1)]
 
 
 def text(environment: Environment, precision: Precision = "float64") -> str:
@@ -100,34 +205,133 @@ def text(environment: Environment, precision: Precision = "float64") -> str:
         NotCompilable: The task or the mode does more than arithmetic.
     """
     layout, vehicle, engine = Layout(environment), environment.vehicle, environment.engine
-    program, mode = layout.program, environment.control_mode
+    program, mode, observer = layout.program, environment.control_mode, environment.observer
     first, command = Laws(mode, engine).functions()
-    functions = {"begin": first, "finish": program.function, "start": program.start}
+    functions = {"begin": first, "finish": program.function}
+    if not layout.pooled:
+        functions["start"] = program.start
     if mode.has_loops:
         functions["command"] = command
+    draws = [*observer.senses.draws.values()] if observer else []
+    randomizer: Any = environment.randomizer
     sizes: dict[str, int] = {"ROTORS": vehicle.rotor_count, "ACTIONS": mode.size}
     sizes |= {"SUBSTEPS": vehicle.substeps, "KEPT": layout.kept, "SEEN": layout.seen}
+    sizes |= {"OBSERVED": layout.observed, "PRIVILEGED": int(min(layout.privileged, default=0))}
+    sizes |= {"TRUTH": program.seen.end - program.remembered.end - layout.observed}
     sizes |= {"TERMS": len(layout.terms), "ENDS": len(layout.ends), "DRAWN": program.drawn}
-    sizes |= {"START": START, "MEMBERS": MEMBERS}
+    sizes |= {"BEGUN": layout.begun, "LENGTH": layout.late}
+    sizes |= {"AT_STEPS": layout.motion + program.kept.end - 3}  # of the record `Episode`
+    sizes |= {f"AT_{name.upper()}": at for name, at in layout.first.items()}
+    streams = {"START": START, "MEMBERS": MEMBERS, "POOL": POOL, "PUSHES": PUSHES, "LINK": LINK}
     for name, function in functions.items():
         sizes |= {f"{name}_taken": function.taken, f"{name}_given": function.width}
+    defines: dict[str, Any] = {
+        "LOOPS": mode.has_loops,
+        "EFFECTS": vehicle.aerodynamics.effects,
+        "POOLED": layout.pooled,
+        "LATE": layout.late > 0,
+        "LINKED": layout.linked,
+        "AGED": len(randomizer.past) > 0,
+        "PUSHED": randomizer._chance > 0,
+        "SENSES": observer is not None,
+        "SENSORS": len(draws),
+        "BLOWS": environment.blowing is not None,
+        "SOLIDS": len(layout.solids),
+        **({"SINGLE": 1} if precision == "float32" else {}),
+    }
+    pushes = environment.randomization.pushes
+    defines |= {"PUSH_CHANCE": literal(randomizer._chance)}
+    defines |= {"PUSH_VELOCITY": literal(pushes.velocity)}
+    defines |= {"PUSH_BODY_RATE": literal(pushes.body_rate)}
+    weather, about = _weather(environment, layout), _world(environment, layout)
+    defines |= weather[0] | about[0]
+    opened = {"layout.h", "export.h"}
+    known = (
+        f"static const int64_t sensed[][2] = {{{', '.join(f'{{{a}, {b}}}' for a, b in draws)}}};"
+    )
     whole = TEXT.format(
         name=environment.task.name,
         vehicle=vehicle.name,
-        structs=c_structs(),
-        sizes=", ".join(f"{name} = {size}" for name, size in sizes.items()),
-        loops=int(mode.has_loops),
-        effects=vehicle.aerodynamics.effects,
+        structs=c_structs() + c_weather(),
+        sizes=", ".join(f"{name} = {size}" for name, size in (sizes | streams).items()),
+        defines="\n".join(
+            f"#define {k} {int(v) if isinstance(v, bool) else v}" for k, v in defines.items()
+        ),
         timestep=vehicle.physics_timestep.hex(),
         gravity=float(engine.model.opt.gravity[2]).hex(),
         uniform=UNIFORM[precision],
-        functions="\n".join(f.text(f"{name}_function") for name, f in functions.items()),
-        aircraft="\n  ".join(_aircraft(engine.begun[:1], vehicle.rotor_count)),
-        finish_takes="\n  ".join(_finish_takes(program)),
-        start_takes="\n  ".join(_parameters(program.start.places, 1 + MAX_DRAWN)),
-        kernel=_opened("kernel.h", {"layout.h"}),
+        functions="\n".join(f.text(f"{name}_function") for name, f in functions.items())
+        + (known if draws else ""),
+        aircraft="\n  ".join(_aircraft(environment, layout)),
+        finish_takes="\n  ".join(_finish_takes(environment, layout)),
+        start_takes=""
+        if layout.pooled
+        else "\n  ".join(_parameters(environment, program.start.places, 1 + MAX_DRAWN)),
+        weather=weather[1],
+        world=(_opened("solids.h", opened) if about[1] else "") + about[1],
+        kernel=_opened("kernel.h", opened),
     )
     return single(whole) if precision == "float32" else whole
+
+
+def _weather(environment: Environment, layout: Layout) -> tuple[dict[str, Any], str]:
+    """Numbers of the weather, and the functions that read and write its rows."""
+    if (process := cast(Any, environment.blowing)) is None:
+        return {}, ""
+    weather, vehicle = environment.weather, environment.vehicle
+    noisy = vehicle.rotor_count if noise_time_of(vehicle) else 0
+    defines = {
+        "NOISY": noisy,
+        "PER_ROUGHNESS": literal(1 / weather.roughness),
+        "CONTROL_TIMESTEP": literal(vehicle.control_timestep),
+        "PER_GUST_TIME": literal(1 / weather.gust_time),
+    }
+    first, takes, gives = layout.first["weather"], list[str](), list[str]()
+    for k in range(len(ROWS)):
+        if k in layout.weather:
+            place = f"column[{first + layout.weather.index(k)} * columns]"
+            takes.append(f"t[{k}][0] = {place};")
+            if k >= ROWS.index("steps"):
+                gives.append(f"{place} = t[{k}][0];")
+        else:
+            takes.append(f"t[{k}][0] = {literal(float(process._table[k, 0]))};")
+    return defines, WEATHER.format(takes="\n  ".join(takes), gives="\n  ".join(gives))
+
+
+def _world(environment: Environment, layout: Layout) -> tuple[dict[str, Any], str]:
+    """Numbers of rays, and what measures them and the solids."""
+    observer, engine = environment.observer, environment.engine
+    rays = {k: own for k, own in observer.senses.rays.items() if own} if observer else {}
+    if not (layout.solids or rays):
+        return {"RAYS": 0}, ""
+    defines: dict[str, Any] = {"RAYS": sum(own.count for own in rays.values())}
+    parts: list[str] = []
+    for name, own in rays.items():
+        stream = cast(Any, observer).senses.channels[name].stream
+        biases = [*cast(Any, observer).senses.given.items()]
+        at = (
+            sum(width for k, width in biases[: [k for k, _ in biases].index(name)])
+            if (name in dict(biases))
+            else 0
+        )
+        lost = NormalDist().inv_cdf(1 - own.dropout) if own.dropout else 0.0
+        numbers = {"NOISE": own.noise, "SHARE": own.share, "REACH": own.reach, "STEP": own.step}
+        numbers |= {"LOST": lost, "LEAST": LEAST}
+        defines |= {f"RAY_{k}": literal(float(x)) for k, x in numbers.items()}
+        defines |= {"RAY_DROPOUT": own.dropout > 0, "RAY_LOG": own.log, "RAY_STREAM": stream}
+        defines |= {"RAYS_DRAWN": own.drawn, "RAY_FRAME": get_args(Frame).index(own.frame)}
+        defines |= {"RAY_BIASED": name in dict(biases), "RAY_BIAS": at, "MAX_RAYS": own.count}
+        parts += [_array("ray_along", own.along.T), _array("ray_place", np.array(own.place))]
+    outline = np.asarray(cast(Any, engine.solids)._outline)
+    defines |= {"BALLS": len(outline), "BALLS_REACH": literal(float(outline[:1, 4].sum()))}
+    rows = ", ".join(
+        f"{{{{{literal(x)}, {literal(y)}, {literal(z)}}}, {literal(r)}, {literal(far)}}}"
+        for x, y, z, r, far in outline.tolist()
+    )
+    parts.append(f"static const Ball balls[] = {{{rows}}};")
+    if layout.solids:
+        parts += _take_solid(layout)
+    return defines, "\n".join(parts)
 
 
 def single(whole: str) -> str:
@@ -136,10 +340,30 @@ def single(whole: str) -> str:
     return whole.replace("__longlong_as_double(0x7ff0000000000000)", "__int_as_float(0x7f800000)")
 
 
-def _aircraft(row: np.ndarray, rotors: int) -> Iterator[str]:
+def _array(name: str, numbers: np.ndarray) -> str:
+    """A constant array in C."""
+    flat = ", ".join(literal(number) for number in numbers.ravel().tolist())
+    return f"static const double {name}[] = {{{flat}}};"
+
+
+def _take_solid(layout: Layout) -> Iterator[str]:
+    """What gives a solid of a row: its own numbers, and those that are the same for all."""
+    firsts = np.cumsum([0, *(varies.sum() for _, varies in layout.solids)])[:-1].tolist()
+    masks = [int((2 ** np.flatnonzero(varies)).sum()) for _, varies in layout.solids]
+    yield _array("solid_numbers", np.stack([numbers for numbers, _ in layout.solids]))
+    for name, whole in (("first", firsts), ("varies", masks)):
+        yield f"static const int32_t solid_{name}[] = {{{', '.join(map(str, whole))}}};"
+    yield TAKE_SOLID
+
+
+def _aircraft(environment: Environment, layout: Layout) -> Iterator[str]:
     """The statements that fill an Aircraft."""
-    for path, number in _fields(row, rotors):
-        yield f"{path} = {literal(number)};"
+    rotors, first = environment.vehicle.rotor_count, layout.first["parameters"]
+    places = dict(zip(layout.varying, range(first, first + len(layout.varying)), strict=True))
+    own = _fields(environment.engine.begun[:1], rotors)
+    for (path, number), (_, at) in zip(own, _fields(parameters.PLACES, rotors), strict=True):
+        place = places.get(int(at))
+        yield f"{path} = {literal(number) if place is None else f'column[{place} * columns]'};"
 
 
 def _fields(row: np.ndarray, rotors: int) -> Iterator[tuple[str, float]]:
@@ -154,32 +378,58 @@ def _fields(row: np.ndarray, rotors: int) -> Iterator[tuple[str, float]]:
                 yield path + "".join(f"[{k}]" for k in place) + "[0]", float(number)
 
 
-def _finish_takes(program: Program) -> Iterator[str]:
-    """The statements that gather what the task's part takes after the motion."""
-    motion = program.parts["last_motion"]
+def _finish_takes(environment: Environment, layout: Layout) -> Iterator[str]:
+    """The statements that gather what the task's part takes after the motion.
+
+    Raises:
+        NotCompilable: It reads something of solids that is not measured here.
+    """
+    program, motion, given = layout.program, layout.motion, layout.first["given"]
     texts = {
         "last_motion": "last[{}][0]",
         "action": "action[{}]",
         "command": "mean[{}][0]",
         "was": f"column[({motion} + {{}}) * columns]",
+        "wind": "air[{}][0]",
+        "given": f"column[({given} + {{}}) * columns]",
     }
     first = motion + 1 + sum(program.sensed.values())
     for name, count in program.parts.items():
-        if name in texts:
-            for number, place in program.function.places.items():
-                if 0 <= number - first < count:
-                    yield f"x[{place}][0] = {texts[name].format(number - first)};"
-        elif name == "parameters":
-            yield from _parameters(program.function.places, first)
+        known = _measured(program) if name == "world" else {}
+        for number, place in program.function.places.items():
+            if not 0 <= number - first < count or name == "parameters":
+                continue
+            if name not in texts and number - first not in known:
+                raise NotCompilable("it reads more of solids than clearance, touch and rays")
+            text = known.get(number - first) or texts[name].format(number - first)
+            yield f"x[{place}][0] = {text};"
+        if name == "parameters":
+            yield from _parameters(environment, program.function.places, first)
         first += count
 
 
-def _parameters(places: dict[int, int], first: int) -> Iterator[str]:
-    """The statements that gather parameters of an aircraft, which come from a place on."""
+def _measured(program: Program) -> dict[int, str]:
+    """What is measured of the world, by its place.
+
+    A solid is touched where the clearance, a lower bound, is not positive; which one, nobody asks.
+    """
+    if not program.world.end:
+        return {}
+    _, clearance, touched, *_, rays = program.world.views(np.arange(program.world.end)[:, None])
+    found = {int(clearance.item()): "clearance"}
+    found |= {int(at): "clearance <= 0" if not k else "0" for k, at in enumerate(touched.flat)}
+    return found | {int(at): f"read[{k}]" for k, at in enumerate(rays.flat)}
+
+
+def _parameters(environment: Environment, places: dict[int, int], first: int) -> Iterator[str]:
+    """The statements that gather the parameters that a task sees, which come from a place on."""
+    hidden: Any = environment
+    seen = parameters.numbers(hidden._rows[:1])[0]
     names = {int(at): path for path, at in _fields(parameters.PLACES, parameters.MAX_ROTORS)}
     for number, place in places.items():
-        if 0 <= number - first < parameters.ROW_SIZE:
-            yield f"x[{place}][0] = {names[number - first]};"
+        at = number - first
+        if 0 <= at < parameters.ROW_SIZE:
+            yield f"x[{place}][0] = {names[at] if hidden._true else literal(float(seen[at]))};"
 
 
 def literal(number: float) -> str:
@@ -192,5 +442,9 @@ def _opened(name: str, seen: set[str]) -> str:
     if name in seen:
         return ""
     seen.add(name)
-    whole = re.sub(r"#include <.*\n", "", (FOLDER / name).read_text())
+    whole = re.sub(
+        r"#include <.*\n|#define LANES .*\n|#pragma GCC optimize.*\n",
+        "",
+        (FOLDER / name).read_text(),
+    )
     return re.sub(r'#include "(.+?)".*\n', lambda found: _opened(found[1], seen), whole)

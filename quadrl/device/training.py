@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from quadrl.base.errors import QuadrlError
-from quadrl.device.batch import Batch
+from quadrl.core.environment import Environment
+from quadrl.device.batch import Batch, uncovered
 from quadrl.evaluation.policy import LOG_VARIANCE
 from quadrl.learning import environments, networks
 from quadrl.learning.advantages import LEAST
@@ -23,7 +23,7 @@ from quadrl.learning.fused import LOG_2_PI, forward
 from quadrl.learning.train import Training
 
 
-class DeviceEnv:
+class Flown:
     """The aircraft of a training on a device, as `Training` sees them."""
 
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
@@ -34,7 +34,11 @@ class DeviceEnv:
         self.environment, self.device = self.batch.environment, device
         self.batch.reset()
 
-    observation_spec: Mapping[str, Any] = {}
+    @property
+    def observation_spec(self) -> Mapping[str, Tensor]:
+        """The privileged observation (N, p), where there is one, by its name."""
+        slot = self.batch.slots[0]
+        return {networks.PRIVILEGED: slot.privileged} if slot.privileged.shape[1] else {}
 
     def told(self) -> None:
         """Nothing: the batch has it."""
@@ -67,27 +71,14 @@ class DeviceTraining(Training):
     on_device = True
 
     def __init__(self, config: TrainConfig, *given: Any, **more: Any) -> None:
-        """Make it as `Training` does.
-
-        Raises:
-            QuadrlError: The settings ask for another algorithm or a memory.
-        """
-        for name, value, allowed in (
-            ("algo", config.algo, "ppo"),
-            ("memory", config.memory, "none"),
-            ("ppo.fused", config.ppo.fused, True),
-            ("gammas", config.gammas, ()),
-        ):
-            if value != allowed:
-                said = f"{allowed!r} for a training on a GPU, or device 'cpu'"
-                raise QuadrlError(name=name, value=value, allowed=said)
+        """Make it as `Training` does, with settings for which `elsewhere` says nothing."""
         super().__init__(config, *given, **more)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._warm = False
         self._learner = Learner(self)
 
-    def _make_env(self, device: torch.device) -> DeviceEnv:
-        return DeviceEnv(self.config, device)
+    def _make_env(self, device: torch.device) -> Flown:
+        return Flown(self.config, device)
 
     def _make_collector(self) -> Rollouts:
         return Rollouts()
@@ -110,6 +101,23 @@ class DeviceTraining(Training):
         return metrics
 
 
+def elsewhere(config: TrainConfig) -> str:
+    """Why a training cannot be on its device alone, in words; empty where it can."""
+    for name, value, allowed in (
+        ("algo", config.algo, "ppo"),
+        ("memory", config.memory, "none"),
+        ("ppo.fused", config.ppo.fused, True),
+        ("gammas", config.gammas, ()),
+    ):
+        if value != allowed:
+            return f"trainings there take {name} = {allowed!r} alone"
+    environment = Environment(config.training_scenario, num_envs=1, seed=0)
+    if why := uncovered(environment):
+        return f"free flight on a GPU has no {why}"
+    environment.reset()
+    return environment.not_compiled
+
+
 class Learner:
     """One iteration: T steps of N aircraft, their advantages, and PPO's gradient steps."""
 
@@ -120,7 +128,7 @@ class Learner:
         steps, count = self._config.rollout, self._batch.num_envs
         given: Any = {"device": self._batch.device}
         self._before = torch.zeros(steps, count, **given)  # log-probabilities
-        self._first = torch.zeros_like(self._batch.slots[-1].observation.T)  # (size, N)
+        self._first = torch.zeros_like(self._batch.out[-1, : self._batch.layout.seen])
         self._figures = torch.zeros(4, **given)
         self._policy: Any = training.actor.module[0].plain
         self._critic: Any = training.critic.plain
@@ -159,10 +167,10 @@ class Learner:
     def _fly(self) -> None:
         """Fly a rollout with the present policy."""
         batch, policy = self._batch, self._policy
-        self._first.copy_(batch.slots[-1].observation.T)
+        self._first.copy_(batch.out[-1, : batch.layout.seen])
         weights, deviations = policy.weights(), self._figures[3:]
         deviations.zero_()
-        seen = self._first.T
+        seen = self._first[: batch.layout.observed].T
         for step, slot in enumerate(batch.slots):
             _, mean, free = policy.forward_policy(policy.seen({"observation": seen}), weights)
             log_variance = free.clamp(*LOG_VARIANCE)
@@ -174,19 +182,23 @@ class Learner:
             batch.fly(step)
             seen = slot.observation
 
-    def _observed(self) -> Tensor:
-        """What was observed before each step, (T, size, N)."""
+    def _observed(self) -> Mapping[str, Tensor]:
+        """What was observed before each step, (T N, size) by name."""
         size = self._batch.layout.seen
-        return torch.cat([self._first[None], self._batch.out[:-1, :size]])
+        return self._named(torch.cat([self._first[None], self._batch.out[:-1, :size]]))
+
+    def _named(self, seen: Tensor) -> Mapping[str, Tensor]:
+        """Rows (T N, size) by name of what is seen (T, sizes, N) in all."""
+        own = self._batch.layout.observed
+        rows = seen.movedim(1, 2).flatten(0, 1)
+        return {"observation": rows[:, :own], networks.PRIVILEGED: rows[:, own:]}
 
     def _update(self, normalisers: dict[str, networks.Normaliser]) -> None:
-        rows = self._observed().movedim(1, 0).flatten(1).T
-        networks.update_normalisers(normalisers, {"observation": rows})
+        networks.update_normalisers(normalisers, self._observed())
 
     def _prepare(self) -> dict[str, Tensor]:
         """The rows that gradients read."""
-        rows = self._observed().movedim(1, 2).flatten(0, 1)
-        seen = {"observation": rows}
+        seen = self._observed()
         return {
             "policy": self._policy.seen(seen).contiguous(),
             "critic": self._critic.seen(seen).contiguous(),
@@ -204,10 +216,10 @@ class Learner:
         """Add advantages and the critic's targets to the rows."""
         batch, config, weights = self._batch, self._config, self._critic.weights()
         layout = batch.layout
-        final = batch.out[:, layout.seen : layout.reward].movedim(1, 2).flatten(0, 1)
+        final = self._named(batch.out[:, layout.seen : layout.reward])
         values, after = (
             forward(seen, weights)[1].view(config.rollout, -1)
-            for seen in (part["critic"], self._critic.seen({"observation": final}))
+            for seen in (part["critic"], self._critic.seen(final))
         )
         over, terminated = batch.flags[:, 0], batch.flags[:, 1]
         after = after * ~terminated

@@ -27,8 +27,22 @@ class QuadrotorVecEnv(Changing, VecEnv):
 
     Observations are a TensorDict with the group `policy` (N, size) and, with
     `observe={"privileged": True}`, the group `critic` (N, p): the privileged observation, in which
-    the true one is. A row begins anew in the step that ends its episode. The CPU simulates.
+    the true one is. A row begins anew in the step that ends its episode. With the device cuda and
+    `engine="free_flight"` the GPU simulates, and tensors are its own, filled again by the second
+    step after (`quadrl.device.vec_env`); else the CPU does.
     """
+
+    def __new__(
+        cls, task: Any = "hover", num_envs: int = 1, seed: Any = None, device: Any = "cpu",
+        **settings: Any,
+    ) -> Any:  # fmt: skip
+        """Choose who simulates."""
+        on_gpu = torch.device(device).type == "cuda" and settings.get("engine") == "free_flight"
+        if cls is QuadrotorVecEnv and on_gpu:
+            from quadrl.device.vec_env import DeviceVecEnv
+
+            return object.__new__(DeviceVecEnv)
+        return object.__new__(cls)
 
     def __init__(
         self,

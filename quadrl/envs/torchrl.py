@@ -15,6 +15,7 @@ with needed("quadrl.envs.torchrl"):
     from torchrl.data import Binary, Bounded, Composite, Unbounded
     from torchrl.envs import EnvBase
 
+from quadrl.core.environment import Environment
 from quadrl.core.task import Task
 from quadrl.core.transition import Transition
 from quadrl.envs.common import PICTURE, Changing, make
@@ -26,11 +27,25 @@ DONE = ("done", "terminated", "truncated")
 class QuadrotorEnv(Changing, EnvBase):
     """N aircraft, batch size [N]; observation (N, size) float32, action (N, k) in [-1, 1].
 
-    Simulated on the CPU, whatever the device of the tensors. `is_success`, `error` [m] and, on
-    request, the named `reward_terms` and `pixels` stand beside the observation. `reset(start=...)`
-    takes a start as `quadrl.core.environment.Environment.reset` does. TorchRL's
-    PixelRenderTransform and VideoRecorder draw with `render`.
+    With the device cuda and `engine="free_flight"` the GPU simulates them, in single precision
+    unless `precision="float64"` is given (`quadrl.device.envs.DeviceEnv`); else the CPU, whatever
+    the device of the tensors. `is_success`, `error` [m] and, on request, the named `reward_terms`
+    and `pixels` stand beside the observation. `reset(start=...)` takes a start as
+    `quadrl.core.environment.Environment.reset` does. TorchRL's PixelRenderTransform and
+    VideoRecorder draw with `render`.
     """
+
+    def __new__(
+        cls, task: Any = "hover", num_envs: int = 1, seed: Any = None, device: Any = "cpu",
+        **settings: Any,
+    ) -> Any:  # fmt: skip
+        """Choose who simulates."""
+        engine = settings.get("engine") or getattr(task, "engine", None)
+        if cls is QuadrotorEnv and engine == "free_flight" and torch.device(device).type == "cuda":
+            from quadrl.device.envs import DeviceEnv
+
+            return super().__new__(DeviceEnv)
+        return super().__new__(cls)
 
     def __init__(
         self,
@@ -64,7 +79,8 @@ class QuadrotorEnv(Changing, EnvBase):
             QuadrlError: Unknown name or impossible value.
         """
         also = ("from_pixels", *PICTURE)
-        self.environment = make(task, num_envs, also, seed=seed, **settings)
+        made = self._make(task, num_envs, also, seed=seed, device=device, **settings)
+        self.environment: Environment = made
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._terms = self.environment.term_names if reward_terms else ()
         shape, column = torch.Size([num_envs]), torch.Size([num_envs, 1])
@@ -92,6 +108,12 @@ class QuadrotorEnv(Changing, EnvBase):
         self.reward_spec = Unbounded(column, dtype=torch.float32).to(self.device)
         self.done_spec = Composite(done, shape=shape).to(self.device)
         self._restored = False
+
+    def _make(
+        self, task: Any, num_envs: int, also: Any, *, seed: Any, device: Any, **settings: Any
+    ) -> Environment:
+        """Make the environment."""
+        return make(task, num_envs, also, seed=seed, **settings)
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Restore what `environment.save` returned: the next full reset returns that moment."""

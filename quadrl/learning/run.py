@@ -27,6 +27,7 @@ from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import written
+from quadrl.learning.environments import make_device
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training
@@ -207,7 +208,7 @@ def train_in(
     scenario = config.scenario
     asked = scenario.randomization, scenario.control_mode, scenario.mean_wind, scenario.lands
     warn_of_unreached(scenario.aircraft, *asked)
-    training = Training(config, folder, resume=resume)
+    training = kind_of(config)(config, folder, resume=resume)
     with heed(training.ask):
         policy = training.run(show)
     found = evaluate(policy, scenario, episodes=config.episodes)
@@ -218,6 +219,23 @@ def train_in(
         record["success_rate_later"] = {f"{s:g}": share for s, share in late.items()}
     write_json(folder / EVALUATION, found.metrics | record)
     return Run(folder, config, policy, found, seconds, late)
+
+
+def kind_of(config: TrainConfig) -> type[Training]:
+    """What trains: on a GPU alone where it can, else with aircraft that the processor flies.
+
+    Raises:
+        QuadrlError: There is no such device.
+    """
+    if make_device(config.device).type != "cuda":
+        return Training
+    from quadrl.device.training import DeviceTraining, elsewhere
+
+    if why := elsewhere(config):
+        said = f"device = {config.device}: only the networks are there, and a processor flies"
+        warnings.warn(f"{said} the aircraft, since {why}", QuadrlWarning, stacklevel=2)
+        return Training
+    return DeviceTraining
 
 
 def would_gain(config: TrainConfig) -> str:

@@ -264,7 +264,8 @@ class TrainSettings:
     dagger: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
     """Settings of the imitation of a teacher."""
     device: str = "cpu"
-    """Device of the networks, such as cuda; the simulation stays on the CPU."""
+    """Device: cpu, or cuda for a GPU, where PPO flies and learns without a processor as far as free
+    flight is covered there (docs/gpu.md); what is not covered is flown on the CPU."""
     num_threads: int = 0
     """Threads of the simulation; 0 for one per core. The results do not depend on it."""
     checkpoint_seconds: float = 5.0

@@ -154,3 +154,27 @@ def test_without_it_the_import_says_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "quadrl.envs.rsl_rl")
     with pytest.raises(ImportError, match=r"pip install 'quadrl\[rsl_rl\]'"):
         importlib.import_module("quadrl.envs.rsl_rl")
+
+
+def test_a_gpus_environment_gives_what_the_processors_gives(monkeypatch):
+    from quadrl.device.vec_env import DeviceVecEnv
+
+    monkeypatch.setenv("QUADRL_CFLAGS", "-O1")
+    given = {"num_envs": 16, "seed": 3, "engine": "free_flight"}
+    one = QuadrotorVecEnv("hover", **given)
+    other = DeviceVecEnv("hover", **given, device="cpu", precision="float64")
+    for env in (one, other):
+        env.reset()
+        env.episode_length_buf = torch.arange(16) * 10
+    torch.manual_seed(1)
+    ended = 0
+    for _ in range(60):
+        actions = torch.rand(16, 4) - 0.5
+        first, second = (env.step(actions) for env in (one, other))
+        assert torch.equal(first[0]["policy"], second[0]["policy"].float())
+        assert torch.equal(first[1], second[1].float())
+        assert torch.equal(first[2], second[2])
+        assert torch.equal(first[3]["time_outs"], second[3]["time_outs"])
+        assert torch.equal(one.episode_length_buf, other.episode_length_buf)
+        ended += int(first[2].sum())
+    assert ended > 5

@@ -8,8 +8,14 @@
 
 // Frames in which rays keep their directions, in the order of quadrl/engines/solids.py.
 enum { BODY, YAW, WORLD };
-enum { MAX_RAYS = 1024 };
+#ifndef MAX_RAYS
+#define MAX_RAYS 1024
+#endif
+#ifdef SINGLE
+#define TINY 1e-30
+#else
 #define TINY 1e-300
+#endif
 
 // Rays of a sensor on aircraft i, whose qpos (7) is at i * stride doubles and whose solids, `count`
 // of them, are at i * count. along: unit vectors, x, y and z of all after each other. place: where
@@ -29,7 +35,7 @@ typedef struct {
 // those whose number is not negative. Most solids are met by few rays, so that most of the time goes
 // into this. off: of the point from the middle; along: its part along the axis; outside: square of
 // its distance from the axis less that of the radius [m].
-VECTORISED void pass(Fan* fan, int64_t n, const double off[3], const double axis[3], double along,
+VECTORISED static void pass(Fan* fan, int64_t n, const double off[3], const double axis[3], double along,
                      double outside) {
   for (int64_t k = 0; k < n; ++k) {
     const double x = fan->x[k], y = fan->y[k], z = fan->z[k];
@@ -131,41 +137,54 @@ static void shorten(const Solid* solid, const double point[3], double reach, int
   }
 }
 
+// Turns rays with an aircraft of qpos p: where they begin, their directions, and distances [m] to the
+// ground, or reach.
+static void aim(Fan* fan, int64_t n, const double* along, const double* place, int frame,
+                double reach, const double* p, double point[3], double* out) {
+  double r[9], turn[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+  rotation_of(p + 3, r);
+  if (frame == YAW) {
+    const double level = sqrt(r[0] * r[0] + r[3] * r[3]);
+    const double c = level > 0 ? r[0] / level : 1, s = level > 0 ? r[3] / level : 0;
+    turn[0] = turn[4] = c, turn[1] = -s, turn[3] = s;
+  }
+  const double* t = frame == BODY ? r : turn;
+  for (int j = 0; j < 3; ++j) {
+    point[j] = p[j] + r[3 * j] * place[0] + r[3 * j + 1] * place[1] + r[3 * j + 2] * place[2];
+  }
+  for (int64_t k = 0; k < n; ++k) {
+    const double x = along[k], y = along[n + k], z = along[2 * n + k];
+    fan->x[k] = t[0] * x + t[1] * y + t[2] * z;
+    fan->y[k] = t[3] * x + t[4] * y + t[5] * z;
+    fan->z[k] = t[6] * x + t[7] * y + t[8] * z;
+    const double ground = point[2] / (fan->z[k] < -TINY ? -fan->z[k] : TINY);
+    out[k] = ground >= 0 && ground < reach ? ground : reach;
+  }
+}
+
+// Shortens them to the distance of a solid, if that is near enough.
+static void look(const Solid* solid, const double point[3], double reach, int64_t n, Fan* fan,
+                 double* out) {
+  const double far = reach + solid->size[0] + solid->size[1] + solid->size[2];
+  if (squared(point, solid->position) < far * far) shorten(solid, point, reach, n, fan, out);
+}
+
+#ifdef QUADRL_EXPORT
 // Distances [m] (rays) for the aircraft first..last-1, or for those of ids; reach where none meets.
 QUADRL_EXPORT int64_t quadrl_rays(const Finder* finder, int64_t first, int64_t last,
                                   const int64_t* ids, double* out) {
   const int64_t n = finder->rays;
-  const double reach = *finder->reach;
   Fan fan;
   for (int64_t row = first; row < last; ++row) {
     const int64_t i = ids ? ids[row] : row;
-    const double* p = finder->qpos + i * finder->stride;
-    double r[9], turn[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1}, point[3], *least = out + row * n;
-    rotation_of(p + 3, r);
-    if (finder->frame == YAW) {
-      const double level = sqrt(r[0] * r[0] + r[3] * r[3]);
-      const double c = level > 0 ? r[0] / level : 1, s = level > 0 ? r[3] / level : 0;
-      turn[0] = turn[4] = c, turn[1] = -s, turn[3] = s;
-    }
-    const double *t = finder->frame == BODY ? r : turn, *a = finder->along, *at = finder->place;
-    for (int j = 0; j < 3; ++j) {
-      point[j] = p[j] + r[3 * j] * at[0] + r[3 * j + 1] * at[1] + r[3 * j + 2] * at[2];
-    }
-    for (int64_t k = 0; k < n; ++k) {
-      const double x = a[k], y = a[n + k], z = a[2 * n + k];
-      fan.x[k] = t[0] * x + t[1] * y + t[2] * z;
-      fan.y[k] = t[3] * x + t[4] * y + t[5] * z;
-      fan.z[k] = t[6] * x + t[7] * y + t[8] * z;
-      const double ground = point[2] / (fan.z[k] < -TINY ? -fan.z[k] : TINY);
-      least[k] = ground >= 0 && ground < reach ? ground : reach;
-    }
+    double point[3], *least = out + row * n;
+    aim(&fan, n, finder->along, finder->place, (int)finder->frame, *finder->reach,
+        finder->qpos + i * finder->stride, point, least);
     const Solid* solids = finder->solids + i * finder->count;
     for (const Solid* solid = solids; solid < solids + finder->count; ++solid) {
-      const double far = reach + solid->size[0] + solid->size[1] + solid->size[2];
-      if (squared(point, solid->position) < far * far) {
-        shorten(solid, point, reach, n, &fan, least);
-      }
+      look(solid, point, *finder->reach, n, &fan, least);
     }
   }
   return last - first;
 }
+#endif

@@ -7,12 +7,6 @@
 #include "export.h"
 #include "solids.h"
 
-// A ball about some of what can touch of an aircraft: its centre, body frame, its radius, and how
-// far from the centre of mass it reaches [m].
-typedef struct {
-  double centre[3], radius, reach;
-} Ball;
-
 // Addresses of the rows of a simulation: qpos (7) of aircraft i is at i * stride doubles, its
 // solids, `count` of them, are at i * count, and its list of the nearest ones at i. balls: those of
 // all aircraft, at least one, the one that reaches farthest first.
@@ -120,26 +114,7 @@ QUADRL_EXPORT int64_t quadrl_clearance(const Rows* rows, int64_t first, int64_t 
       // Most solids need no closer look: no part of the aircraft is nearer to this one than that,
       // nor to any of those after it, which were farther when they were listed.
       if (!all && then[s] - way - reach > least) break;
-      const Solid* solid = (all ? solids : list->solid) + s;
-      const double away = solid_distance(solid, p);
-      if (away - reach > least + ROUNDING) continue;
-      double normal[3] = {0}, along[3];
-      if (away > 0) solid_normal(solid, p, away, normal);
-      for (int j = 0; j < 3; ++j) {
-        along[j] = r[j] * normal[0] + r[3 + j] * normal[1] + r[6 + j] * normal[2];
-      }
-      for (const Ball* ball = balls; ball < balls + rows->parts; ++ball) {
-        if (away - ball->reach > least + ROUNDING) break;  // nor does what reaches less far
-        const double *c = ball->centre, off = along[0] * c[0] + along[1] * c[1] + along[2] * c[2];
-        // The distance from something convex grows at least as its slope says.
-        if (away > 0 && away + off - ball->radius > least + ROUNDING) continue;
-        double place[3];
-        for (int j = 0; j < 3; ++j) {
-          place[j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
-        }
-        const double free = solid_distance(solid, place) - ball->radius;
-        least = free < least ? free : least;
-      }
+      least = nearer((all ? solids : list->solid) + s, balls, rows->parts, p, r, least);
     }
     out[row] = least;
   }

@@ -126,3 +126,35 @@ static void list_nearest(const Solid* solids, int64_t count, const double point[
   for (int k = 0; k < 3; ++k) list->place[k] = point[k];
   for (int k = 0; k < LISTED && k < count; ++k) list->solid[k] = solids[which[k]];
 }
+
+// A ball about some of what can touch of an aircraft: its centre, body frame, its radius, and how
+// far from the centre of mass it reaches [m].
+typedef struct {
+  double centre[3], radius, reach;
+} Ball;
+
+// The distance [m] of the balls of an aircraft, the one that reaches farthest first, from a solid, or
+// `least` where that is less. p, r: position and rotation matrix to the world.
+static inline double nearer(const Solid* solid, const Ball* balls, int64_t parts, const double* p,
+                            const double r[9], double least) {
+  const double away = solid_distance(solid, p);
+  if (away - balls->reach > least + ROUNDING) return least;
+  double normal[3] = {0}, along[3];
+  if (away > 0) solid_normal(solid, p, away, normal);
+  for (int j = 0; j < 3; ++j) {
+    along[j] = r[j] * normal[0] + r[3 + j] * normal[1] + r[6 + j] * normal[2];
+  }
+  for (const Ball* ball = balls; ball < balls + parts; ++ball) {
+    if (away - ball->reach > least + ROUNDING) break;  // nor does what reaches less far
+    const double *c = ball->centre, off = along[0] * c[0] + along[1] * c[1] + along[2] * c[2];
+    // The distance from something convex grows at least as its slope says.
+    if (away > 0 && away + off - ball->radius > least + ROUNDING) continue;
+    double place[3];
+    for (int j = 0; j < 3; ++j) {
+      place[j] = p[j] + r[3 * j] * c[0] + r[3 * j + 1] * c[1] + r[3 * j + 2] * c[2];
+    }
+    const double free = solid_distance(solid, place) - ball->radius;
+    least = free < least ? free : least;
+  }
+  return least;
+}

@@ -47,6 +47,9 @@ AERO void words_of(const Streams* s, int block, uint32_t w[4][LANES]) {
 // ln(max(x, 1)). With the C library's logarithm, bits would depend on the machine.
 AERO double logarithm(double x) {
   x = x > 1.0 ? x : 1.0;
+#ifdef SINGLE
+  return log(x);
+#else
   uint64_t bits, exponent;
   memcpy(&bits, &x, sizeof bits);
   // Vectors cannot convert an integer of 64 bits: its bits stand behind the point of 2^52.
@@ -65,6 +68,7 @@ AERO double logarithm(double x) {
 #pragma GCC unroll 16
   for (int k = LOG_TERMS - 1; k >= 0; --k) total = 1.0 / (2 * k + 1) + square * total;
   return power * 0x1.62e42fefa39efp-1 + 2.0 * ratio * total;
+#endif
 }
 
 // sin(pi share) for a share between 0 and 1, else 0.
@@ -154,6 +158,7 @@ VECTORISED static void blow(Lanes* t, Streams* s, const Rows* r, const double* h
   blowing(t, r, height, wind);
 }
 
+#ifdef QUADRL_EXPORT
 // Begins the episodes of n aircraft, or advances them by a control step, and writes their air.
 // ids lists them, or is NULL for the first n.
 QUADRL_EXPORT void quadrl_weather(const Rows* rows, int64_t n, const int64_t* ids, int64_t begin) {
@@ -189,3 +194,4 @@ QUADRL_EXPORT void quadrl_weather(const Rows* rows, int64_t n, const int64_t* id
     }
   }
 }
+#endif
