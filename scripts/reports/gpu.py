@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,17 @@ import numpy as np
 import torch
 import tyro
 
+from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.files import write_json
+from quadrl.base.units import percent
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.device.batch import Batch
 from quadrl.device.training import DeviceTraining, Learner
 from quadrl.evaluation.evaluate import evaluate
+from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig
+from scripts.reports import report
 
 LATE = {"command_delay": (0.0, 0.04), "observation_delay": (0.0, 0.03), "mass": (0.9, 1.1)}
 LATE |= {"command_loss": (0.0, 2.0), "command_jitter": (0.0, 0.5), "noise": {"position": 0.01}}
@@ -43,7 +49,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "navigation": {"task": "navigation", "control_mode": "velocity"},
 }
 TIMED = ("hover", "body rates", "race", "full air", "uncertain", "navigation")
-AIRCRAFT = (4_096, 65_536, 262_144, 1_048_576)
+AIRCRAFT = (4_096, 65_536, 1_048_576)
 COMPARED, STEPS = 256, 100
 """Aircraft and control steps of a comparison."""
 EXACT, NEAR, LOOSE = 1e-6, 1e-5, 1e-3
@@ -52,13 +58,29 @@ others than the processor's; and of the motion after a step in single precision,
 aircraft in a hundred, without and with loops, which take roots of thrusts that are nearly zero."""
 NEAR_SOLIDS = 0.5
 """Clearance [m] from which on MuJoCo has not flown an aircraft."""
+WIDE = {"hidden": (128, 128), "critic_hidden": (128, 128)}
+RACE = {
+    **{"laps": 3, "flying": 0.95, "margin": 0.1, "crash_weight": 20.0, "miss_weight": 5.0},
+    **{"pass_weight": 20.0, "progress_weight": 20.0, "low_weight": 1.0},
+}
 TRAININGS: dict[str, dict[str, Any]] = {
     "hover": {
         "num_envs": 2048,
         "steps": 983_040,
-        "ppo": {"learning_rate": 1e-2, "beta2": 0.99, "minibatch": 4096},
+        "ppo": {"learning_rate": 1.5e-2, "beta2": 0.99, "minibatch": 8192},
+    },
+    "navigation": {"num_envs": 2048, "steps": 16_777_216, "ppo": {"minibatch": 16384}},
+    "race": {
+        **{"algo": "ppo", "vehicle": "racer", "control_mode": "thrust_body_rate", **WIDE},
+        **{"num_envs": 4096, "rollout": 32, "steps": 65_536_000, "gamma": 0.985},
+        **{"initial_deviation": 0.5, "training_options": RACE},
+        "ppo": {"learning_rate": 1e-3, "minibatch": 16384},
     },
 }
+"""Settings for many aircraft, chosen by a search with other seeds than SEEDS."""
+SEEDS = (21, 22, 23)
+TESTED = 1_000_000
+"""Seed of the flights that judge."""
 
 
 def scenario(name: str) -> Scenario:
@@ -168,68 +190,140 @@ def with_policy(count: int) -> dict[str, Any]:
     return {"flight": name, "aircraft": count, "us": 1e6 * each, "steps_per_second": count / each}
 
 
-def trained(task: str, seed: int) -> dict[str, Any]:
-    """A training from nothing: its time, and how its policy flies in MuJoCo."""
-    config = TrainConfig(task, seed=seed, device="cuda", **TRAININGS[task])
-    with tempfile.TemporaryDirectory() as folder:
+def trained(task: str, seed: int, runs: Path) -> dict[str, Any]:
+    """A training from nothing: how long it took; how its policy flies, `flown` tells."""
+    config = TrainConfig(task, seed=seed, device="cuda", evaluations=0, **TRAININGS[task])
+    begun = time.perf_counter()
+    training = DeviceTraining(config, runs / f"{task}-{seed}")
+    ready = time.perf_counter()
+    training.run()
+    times = {"seconds": training.seconds, "ready": ready - begun}
+    return {"task": task, "seed": seed, "steps": training.steps, **times}
+
+
+def flown(row: dict[str, Any], runs: Path) -> dict[str, Any]:
+    """Shares of 1,000 flights in MuJoCo that a trained policy ends with success."""
+    folder = runs / f"{row['task']}-{row['seed']}"
+    policy, own = Policy.load(folder), TrainConfig.of_folder(folder).scenario
+    crowded = {"crowded": {"trees": 54}} if row["task"] == "navigation" else {}
+    for what, options in {"success": {}, **crowded}.items():
+        done = evaluate(policy, own, episodes=1000, seed=TESTED, task_options=options)
+        row[what] = done.metrics["success_rate"]
+    report.say(row)
+    return row
+
+
+def crazyflow(count: int) -> dict[str, Any]:
+    """Physics steps a second of crazyflow, its fastest way: rotor speeds, steps in one scan.
+
+    Raises:
+        ImportError: It is not installed.
+    """
+    jax: Any = importlib.import_module("jax")
+    flow: Any = importlib.import_module("crazyflow")
+    turned: Any = importlib.import_module("crazyflow.control.transform")
+    kinds = {"dynamics": flow.Dynamics.first_principles, "control": flow.Control.rotor_vel}
+    sim = flow.Sim(n_worlds=1, n_drones=1, device="gpu", **kinds)
+    sim.n_worlds = count  # without MJX's data of each world, which takes no part in the steps
+    sim.build_data()
+    sim.build_default_data()
+    params, numpy = sim.data.params, jax.numpy
+    lift = numpy.full(4, float(numpy.ravel(params.mass)[0]) * GRAVITY / 4)
+    speeds = numpy.ravel(turned.motor_force2rotor_vel(lift, params.rpm2thrust))
+    every = numpy.broadcast_to(speeds, (count, 1, 4)).copy()
+    sim.rotor_vel_control(jax.device_put(every, sim.device))
+    best, steps = math.inf, 200
+    for _ in range(8):  # the first ones compile
         begun = time.perf_counter()
-        training = DeviceTraining(config, Path(folder) / "run")
-        ready = time.perf_counter()
-        policy = training.run()
-        over = time.perf_counter()
-    flown = evaluate(policy, config.scenario, episodes=300).metrics
-    return {
-        "task": task,
-        "seed": seed,
-        "steps": training.steps,
-        "seconds": training.seconds,
-        "ready": ready - begun,
-        "whole": over - begun,
-        "success": flown["success_rate"],
-    }
-
-
-def rows(trainings: bool, aircraft: tuple[int, ...]) -> Iterator[dict[str, Any]]:
-    """All that is measured."""
-    for name in TIMED:
-        for count in aircraft:
-            yield timed(name, count)
-    for count in aircraft:
-        yield with_policy(count)
-    for task in TRAININGS if trainings else ():
-        for seed in (11, 12, 13):
-            yield trained(task, seed)
+        for _ in range(3):
+            sim.step(steps)
+        jax.block_until_ready(sim.data)
+        best = min(best, time.perf_counter() - begun)
+    rate = 3 * steps * count / best
+    return {"version": flow.__version__, "aircraft": count, "physics_steps_per_second": rate}
 
 
 def gpu(
-    out: Path | None = None, trainings: bool = True, aircraft: tuple[int, ...] = AIRCRAFT
+    runs: Path = report.RUNS / "gpu", again: bool = False, aircraft: tuple[int, ...] = AIRCRAFT
 ) -> None:
-    """Check a GPU against the processor, then measure it.
+    """Check a GPU against the processor, then measure it; or fly the policies of its trainings.
 
     Args:
-        out: A file for the figures, in JSON.
-        trainings: Whether trainings are measured, too.
+        runs: Where the trainings go.
+        again: Fly the policies that are there, here, and add their success to the figures.
         aircraft: How many fly at once.
     """
+    if again:
+        kept = report.load("gpu")
+        kept["trainings"] = [flown(row, runs) for row in kept["trainings"]]
+        write_json(report.RESULTS / "gpu.json", kept)
+        return
     if not torch.cuda.is_available():
         sys.exit("there is no GPU that this torch can use: nothing was measured")
-    checked = {name: check(name, "cuda") for name in FLIGHTS}
-    for name, found in checked.items():
-        print(
-            f"{'ok' if passes(name, found) else 'FAILED':7}{name:22}{json.dumps(found)}", flush=True
-        )
+    checked: dict[str, dict[str, float]] = {}
+    for name in FLIGHTS:
+        checked[name] = check(name, "cuda")
+        fine = "ok" if passes(name, checked[name]) else "FAILED"
+        print(f"{fine:7}{name:20}{json.dumps(checked[name])}", flush=True)
     if not all(passes(*one) for one in checked.items()):
         sys.exit("the GPU does not fly what the processor does: nothing was measured")
-    found: list[dict[str, Any]] = []
-    for row in rows(trainings, aircraft):
-        found.append(row)
-        print(json.dumps(row), flush=True)
-    if out:
-        card = torch.cuda.get_device_name()
-        write_json(
-            out, {"card": card, "torch": torch.__version__, "checked": checked, "rows": found}
-        )
+    found: dict[str, list[dict[str, Any]]] = {"speed": [], "trainings": [], "crazyflow": []}
 
+    def measured(kind: str, row: dict[str, Any]) -> None:
+        found[kind].append(row)
+        print(json.dumps(row), flush=True)
+        card = {"card": torch.cuda.get_device_name(), "checked": checked}
+        report.save("gpu", {**card, **found})
+
+    for task in TRAININGS:
+        for seed in SEEDS:
+            measured("trainings", trained(task, seed, runs))
+    for name in TIMED:
+        for count in aircraft:
+            measured("speed", timed(name, count))
+    for count in aircraft:
+        measured("speed", with_policy(count))
+    for count in reversed(aircraft):
+        try:
+            measured("crazyflow", crazyflow(count))
+        except ImportError:
+            print("crazyflow is not installed, and not measured")
+            break
+
+
+def table() -> str:
+    """What was measured: control steps a second by flight and aircraft, and crazyflow's."""
+    found = report.load("gpu")
+    counts = sorted({row["aircraft"] for row in found["speed"]})
+    rates = {(row["flight"], row["aircraft"]): row["steps_per_second"] for row in found["speed"]}
+    rows: list[list[str]] = []
+    for name in dict.fromkeys(row["flight"] for row in found["speed"]):
+        own = (rates.get((name, count)) for count in counts)
+        rows.append([name, *("" if rate is None else f"{1e-6 * rate:,.0f}" for rate in own)])
+    peers = {row["aircraft"]: row["physics_steps_per_second"] for row in found["crazyflow"]}
+    if peers:
+        substeps = Environment("hover").vehicle.substeps
+        own = [f"{1e-6 * substeps * rates['hover', count]:,.0f}" for count in counts]
+        rows.append(["hover, in physics steps", *own])
+        own = [f"{1e-6 * peers[count]:,.0f}" if count in peers else "" for count in counts]
+        rows.append([f"crazyflow {found['crazyflow'][0]['version']}, in physics steps", *own])
+    head = ["million control steps/s", *(f"{count:,} aircraft" for count in counts)]
+    said = f"One {found['card']}, single precision, random actions, episodes' starts included."
+    return f"{report.table(head, rows)}\n\n{said}"
+
+
+def trainings() -> str:
+    """The trainings: seconds, and the success of their policies in MuJoCo."""
+    rows: list[list[str]] = []
+    for row in report.load("gpu")["trainings"]:
+        crowded = f"; {percent(row['crowded'])} in 54 trees" if "crowded" in row else ""
+        said = percent(row["success"]) + crowded if "success" in row else ""
+        steps = f"{1e-6 * row['steps']:.1f} million"
+        rows.append([row["task"], str(row["seed"]), steps, f"{row['seconds']:.2f} s", said])
+    return report.table(["task", "seed", "control steps", "time", "success of 1,000 flights"], rows)
+
+
+PARTS: report.Parts = {"gpu": table, "gpu-trainings": trainings}
 
 if __name__ == "__main__":
     tyro.cli(gpu)
