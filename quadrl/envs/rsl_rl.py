@@ -15,11 +15,14 @@ with needed("quadrl.envs.rsl_rl"):
     from rsl_rl.env import VecEnv  # isort: skip
     import torch
     from tensordict import TensorDict
+    from torch import Tensor
 
 from quadrl.base.errors import QuadrlError
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
+from quadrl.device.batch import Slot
 from quadrl.envs.common import Changing, make
+from quadrl.envs.on_device import asks, batch_of
 
 
 class QuadrotorVecEnv(Changing, VecEnv):
@@ -29,7 +32,7 @@ class QuadrotorVecEnv(Changing, VecEnv):
     `observe={"privileged": True}`, the group `critic` (N, p): the privileged observation, in which
     the true one is. A row begins anew in the step that ends its episode. With the device cuda and
     `engine="free_flight"` the GPU simulates, and tensors are its own, filled again by the second
-    step after (`quadrl.device.vec_env`); else the CPU does.
+    step after (`DeviceVecEnv`); else the CPU does.
     """
 
     def __new__(
@@ -37,12 +40,7 @@ class QuadrotorVecEnv(Changing, VecEnv):
         **settings: Any,
     ) -> Any:  # fmt: skip
         """Choose who simulates."""
-        on_gpu = torch.device(device).type == "cuda" and settings.get("engine") == "free_flight"
-        if cls is QuadrotorVecEnv and on_gpu:
-            from quadrl.device.vec_env import DeviceVecEnv
-
-            return object.__new__(DeviceVecEnv)
-        return object.__new__(cls)
+        return object.__new__(DeviceVecEnv if asks(task, device, settings) else cls)
 
     def __init__(
         self,
@@ -151,3 +149,81 @@ class QuadrotorVecEnv(Changing, VecEnv):
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(array).to(self.device)
+
+
+class DeviceVecEnv(QuadrotorVecEnv):
+    """QuadrotorVecEnv whose aircraft fly where its tensors are.
+
+    What `step` returns are views of one of two slots, which the second step after fills again.
+    """
+
+    def __init__(
+        self,
+        task: Any = "hover",
+        num_envs: int = 1,
+        seed: int | None = None,
+        device: str | torch.device = "cuda",
+        **settings: Any,
+    ) -> None:
+        """Make N environments; arguments as for QuadrotorVecEnv, and the `precision`.
+
+        Raises:
+            QuadrlError: As `Batch` does.
+        """
+        own: Any = settings | {"slots": 2}
+        self.batch = batch_of(task, num_envs, seed, device, own)
+        self.environment = self.batch.environment
+        self.num_envs, self.num_actions = num_envs, self.environment.action_size
+        self.device, self._turn, self._begun = self.batch.device, 1, False
+        self._lengths: Any = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """As of QuadrotorVecEnv."""
+        return self._lengths.clone()
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, lengths: Tensor) -> None:
+        given = torch.as_tensor(lengths, device=self.device)
+        kind = not (given.is_floating_point() or given.dtype == torch.bool)
+        if given.shape != (self.num_envs,) or not kind or bool((given < 0).any()):
+            allowed = f"{self.num_envs} whole numbers from 0 on"
+            raise QuadrlError(name="episode_length_buf", value=lengths, allowed=allowed)
+        self._lengths = given.long()
+
+    def get_observations(self) -> TensorDict:
+        """The observations now; the first call begins the first episodes."""
+        if not self._begun:
+            self.reset()
+        slot: Slot = self.batch.slots[self._turn]
+        return self._groups_of(slot.observation, slot.privileged)
+
+    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+        """Begin an episode in every row; returns the observations and nothing further."""
+        self.batch.reset()
+        self._begun, self._turn = True, 1
+        self._lengths.zero_()
+        return self.get_observations(), {}
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """As of QuadrotorVecEnv, but that `final_obs` and `log` are of every step."""
+        self._turn = 1 - self._turn
+        slot: Slot = self.batch.slots[self._turn]
+        slot.action.copy_(actions)
+        self.batch.step(self._turn)
+        self._lengths += 1
+        late = ~slot.over & (self._lengths >= self.max_episode_length)
+        over = slot.over | late
+        extras: dict[str, Any] = {"time_outs": over & ~slot.terminated}
+        extras["final_obs"] = self._groups_of(slot.final, slot.final_privileged)
+        ended = slot.over.sum().clamp(min=1)
+        named = {"success": slot.success, "error": slot.error}
+        extras["log"] = {k: (x * slot.over).sum() / ended for k, x in named.items()}
+        self.batch.reset(late, self._turn)
+        self._lengths.masked_fill_(over, 0)
+        seen = self._groups_of(slot.observation, slot.privileged)
+        return seen, slot.reward, over.long(), extras
+
+    def _groups_of(self, observation: Tensor, privileged: Tensor) -> TensorDict:
+        groups = {"policy": observation} | ({"critic": privileged} if privileged.shape[1] else {})
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)

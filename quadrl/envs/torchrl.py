@@ -15,10 +15,12 @@ with needed("quadrl.envs.torchrl"):
     from torchrl.data import Binary, Bounded, Composite, Unbounded
     from torchrl.envs import EnvBase
 
-from quadrl.core.environment import Environment
+from quadrl.base.errors import QuadrlError
 from quadrl.core.task import Task
 from quadrl.core.transition import Transition
+from quadrl.device.batch import Batch
 from quadrl.envs.common import PICTURE, Changing, make
+from quadrl.envs.on_device import OnDevice, asks, batch_of
 from quadrl.rendering.pictures import Pictures
 
 DONE = ("done", "terminated", "truncated")
@@ -28,24 +30,12 @@ class QuadrotorEnv(Changing, EnvBase):
     """N aircraft, batch size [N]; observation (N, size) float32, action (N, k) in [-1, 1].
 
     With the device cuda and `engine="free_flight"` the GPU simulates them, in single precision
-    unless `precision="float64"` is given (`quadrl.device.envs.DeviceEnv`); else the CPU, whatever
-    the device of the tensors. `is_success`, `error` [m] and, on request, the named `reward_terms`
+    unless `precision="float64"` is given, and without pixels or starts; else the CPU, whatever the
+    device of the tensors. `is_success`, `error` [m] and, on request, the named `reward_terms`
     and `pixels` stand beside the observation. `reset(start=...)` takes a start as
     `quadrl.core.environment.Environment.reset` does. TorchRL's PixelRenderTransform and
     VideoRecorder draw with `render`.
     """
-
-    def __new__(
-        cls, task: Any = "hover", num_envs: int = 1, seed: Any = None, device: Any = "cpu",
-        **settings: Any,
-    ) -> Any:  # fmt: skip
-        """Choose who simulates."""
-        engine = settings.get("engine") or getattr(task, "engine", None)
-        if cls is QuadrotorEnv and engine == "free_flight" and torch.device(device).type == "cuda":
-            from quadrl.device.envs import DeviceEnv
-
-            return super().__new__(DeviceEnv)
-        return super().__new__(cls)
 
     def __init__(
         self,
@@ -79,8 +69,17 @@ class QuadrotorEnv(Changing, EnvBase):
             QuadrlError: Unknown name or impossible value.
         """
         also = ("from_pixels", *PICTURE)
-        made = self._make(task, num_envs, also, seed=seed, device=device, **settings)
-        self.environment: Environment = made
+        self._flown: OnDevice | None = None
+        if asks(task, device, settings):
+            if from_pixels:
+                allowed = "False on a GPU, where free flight has none"
+                raise QuadrlError(name="from_pixels", value=True, allowed=allowed)
+            batch = batch_of(task, num_envs, seed, device, settings)
+            self.environment = batch.environment
+            terms = batch.environment.term_names if reward_terms else ()
+            self._flown = OnDevice(batch, terms)
+        else:
+            self.environment = make(task, num_envs, also, seed=seed, **settings)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._terms = self.environment.term_names if reward_terms else ()
         shape, column = torch.Size([num_envs]), torch.Size([num_envs, 1])
@@ -109,14 +108,13 @@ class QuadrotorEnv(Changing, EnvBase):
         self.done_spec = Composite(done, shape=shape).to(self.device)
         self._restored = False
 
-    def _make(
-        self, task: Any, num_envs: int, also: Any, *, seed: Any, device: Any, **settings: Any
-    ) -> Environment:
-        """Make the environment."""
-        return make(task, num_envs, also, seed=seed, **settings)
-
     def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Restore what `environment.save` returned: the next full reset returns that moment."""
+        """Restore what `environment.save` returned, or `batch.save` of aircraft on a GPU.
+
+        The next full reset returns that moment.
+        """
+        if self._flown:
+            return self._flown.restore(saved)
         self._observation = self.environment.flatten(self.environment.restore(saved))
         self._restored = True
 
@@ -127,6 +125,8 @@ class QuadrotorEnv(Changing, EnvBase):
         start: Mapping[str, Any] | None = None,
         **_: Any,
     ) -> TensorDictBase:
+        if self._flown:
+            return self._flown.reset(tensordict, start)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None and not mask.all():
             self._begin(mask, start)
@@ -142,6 +142,8 @@ class QuadrotorEnv(Changing, EnvBase):
 
         The result is that of EnvBase, whose generality would cost more than the whole step.
         """
+        if self._flown:
+            return self._flown.maybe_reset(tensordict)
         over = tensordict.get("done")
         values = dict(tensordict.items())
         some = bool(over.any() and not over.all())
@@ -156,6 +158,8 @@ class QuadrotorEnv(Changing, EnvBase):
         return tensordict
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self._flown:
+            return self._flown.step(tensordict["action"])
         self._restored = False
         now = self._fly(tensordict["action"].detach().cpu())
         self._observation = self.environment.flatten(now.observation)
@@ -200,7 +204,13 @@ class QuadrotorEnv(Changing, EnvBase):
         return packed if self.device.type == "cpu" else packed.to(self.device)
 
     def render(self) -> np.ndarray:
-        """A picture of each aircraft, (N, height, width, 3) uint8."""
+        """A picture of each aircraft, (N, height, width, 3) uint8.
+
+        Raises:
+            QuadrlError: They are on a GPU.
+        """
+        if self._flown:
+            raise QuadrlError("aircraft on a GPU are drawn from `batch.row`, by an Environment")
         return np.stack([self._pictures.frame(row) for row in range(self.num_envs)])
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -209,9 +219,14 @@ class QuadrotorEnv(Changing, EnvBase):
         super().close(raise_if_closed=raise_if_closed)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.environment.seed(seed)
+        (self._flown.batch if self._flown else self.environment).seed(seed)
+
+    @property
+    def batch(self) -> Batch | None:
+        """The aircraft, where they fly on a GPU; `environment` then has one of them."""
+        return self._flown.batch if self._flown else None
 
     @property
     def num_envs(self) -> int:
         """N."""
-        return self.environment.num_envs
+        return (self._flown.batch if self._flown else self.environment).num_envs

@@ -229,7 +229,7 @@ def kind_of(config: TrainConfig) -> type[Training]:
     """
     if make_device(config.device).type != "cuda":
         return Training
-    from quadrl.device.training import DeviceTraining, elsewhere
+    from quadrl.learning.device import DeviceTraining, elsewhere
 
     if why := elsewhere(config):
         said = f"device = {config.device}: only the networks are there, and a processor flies"

@@ -22,10 +22,10 @@ from quadrl.base.units import percent
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.device.batch import Batch
-from quadrl.device.training import DeviceTraining, Learner
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.device import DeviceTraining, Learner
 from scripts.reports import report
 
 LATE = {"command_delay": (0.0, 0.04), "observation_delay": (0.0, 0.03), "mass": (0.9, 1.1)}

@@ -157,7 +157,7 @@ def test_without_it_the_import_says_what_to_install(monkeypatch):
 
 
 def test_a_gpus_environment_gives_what_the_processors_gives(monkeypatch):
-    from quadrl.device.vec_env import DeviceVecEnv
+    from quadrl.envs.rsl_rl import DeviceVecEnv
 
     monkeypatch.setenv("QUADRL_CFLAGS", "-O1")
     given = {"num_envs": 16, "seed": 3, "engine": "free_flight"}

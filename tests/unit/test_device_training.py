@@ -9,9 +9,9 @@ import torch
 
 from quadrl.base.errors import QuadrlWarning
 from quadrl.device import batch as batch_module
-from quadrl.device.training import DeviceTraining, elsewhere
 from quadrl.learning import run
 from quadrl.learning.config import TrainConfig
+from quadrl.learning.device import DeviceTraining, elsewhere
 from quadrl.learning.train import Training
 
 SMALL = {"num_envs": 64, "rollout": 8, "steps": 64 * 8 * 6, "evaluations": 0}
