@@ -9,8 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from quadrl.base.errors import QuadrlError
+from quadrl.core.batch import Batch, Slot
 from quadrl.core.scenario import Scenario
-from quadrl.device.batch import Batch, Slot
 from quadrl.envs.common import OWN
 
 

@@ -18,9 +18,9 @@ with needed("quadrl.envs.rsl_rl"):
     from torch import Tensor
 
 from quadrl.base.errors import QuadrlError
+from quadrl.core.batch import Slot
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
-from quadrl.device.batch import Slot
 from quadrl.envs.common import Changing, make
 from quadrl.envs.on_device import asks, batch_of
 

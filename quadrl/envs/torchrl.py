@@ -16,9 +16,9 @@ with needed("quadrl.envs.torchrl"):
     from torchrl.envs import EnvBase
 
 from quadrl.base.errors import QuadrlError
+from quadrl.core.batch import Batch
 from quadrl.core.task import Task
 from quadrl.core.transition import Transition
-from quadrl.device.batch import Batch
 from quadrl.envs.common import PICTURE, Changing, make
 from quadrl.envs.on_device import OnDevice, asks, batch_of
 from quadrl.rendering.pictures import Pictures

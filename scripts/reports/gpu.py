@@ -19,9 +19,9 @@ import tyro
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.files import write_json
 from quadrl.base.units import percent
+from quadrl.core.batch import Batch
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
-from quadrl.device.batch import Batch
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig

@@ -3,8 +3,8 @@
 import pytest
 
 from quadrl.core.environment import Environment
-from quadrl.device.launch import cubin
-from quadrl.device.text import text
+from quadrl.core.launch import cubin
+from quadrl.core.source import text
 
 pytest.importorskip("cuda.core", reason="the extra gpu is not installed")
 TASKS = (

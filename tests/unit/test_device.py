@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from quadrl.base.errors import QuadrlError
+from quadrl.core import batch as batch_module
+from quadrl.core import launch
+from quadrl.core.batch import Batch
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
-from quadrl.device import batch as batch_module
-from quadrl.device import launch
-from quadrl.device.batch import Batch
-from quadrl.device.text import text
+from quadrl.core.source import text
 
 AIRCRAFT, STEPS = 24, 60
 UNCERTAIN = {

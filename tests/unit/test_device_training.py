@@ -8,7 +8,7 @@ pytest.importorskip("torchrl")
 import torch
 
 from quadrl.base.errors import QuadrlWarning
-from quadrl.device import batch as batch_module
+from quadrl.core import batch as batch_module
 from quadrl.learning import run
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.device import DeviceTraining, elsewhere

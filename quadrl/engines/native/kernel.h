@@ -1,7 +1,7 @@
 // A control step of free flight for one aircraft of many, from its column of a table to its next
 // observation, and to the start of its next episode where one is over: a thread of a GPU for each.
 //
-// quadrl/device/text.py writes what stands before it: numbers (ROTORS, ...), where things stand in the
+// quadrl/core/source.py writes what stands before it: numbers (ROTORS, ...), where things stand in the
 // tables (AT_...), the functions begin, command, finish and start, and those that give them what they
 // take. The forces, the integrator, the weather, solids, rays and the random numbers are those of
 // free flight, whose steps this one's equal to the bit.

@@ -13,10 +13,12 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.machine import GIB
 from quadrl.base.philox import Seed, seeds_of_rows
 from quadrl.base.trace import NotCompilable
+from quadrl.core.columns import Layout
 from quadrl.core.environment import Environment
+from quadrl.core.launch import kernels
+from quadrl.core.saving import Memory
 from quadrl.core.scenario import Scenario
-from quadrl.device.launch import kernels
-from quadrl.device.text import Layout, Precision, text
+from quadrl.core.source import Precision, text
 
 MARKS = ("action", "reward", "start")
 """What may be no number, in the order of `marks` in native/kernel.h."""
@@ -111,7 +113,7 @@ class Batch:
             self.slot(*parts) for parts in zip(self.action, self.out, self.flags, strict=True)
         ]
         pool = layout.pool(self._begun, self._first) if layout.pooled else np.zeros((1, 1))
-        self._columns = torch.from_numpy(pool).to(**given)
+        self._columns = torch.as_tensor(pool).to(**given)
         """Columns with which episodes begin, where they do not begin on the device."""
         structs = [
             (self.table, self._columns, out, action, self.keys, self.episodes, flags, self._marks)
@@ -196,7 +198,8 @@ class Batch:
         Raises:
             QuadrlError: The message names the first kind, and an aircraft.
         """
-        for what, row in zip(MARKS, self._marks.tolist(), strict=True):
+        marks: list[int] = cast(Any, self._marks).tolist()
+        for what, row in zip(MARKS, marks, strict=True):
             if row:
                 self._marks.zero_()
                 allowed = f"finite; that of aircraft {row - 1} was not, in one of the last steps"
@@ -224,7 +227,7 @@ class Batch:
                 allowed = f"{array.dtype} {array.shape}"
                 raise QuadrlError(name=name, value=getattr(given, "shape", None), allowed=allowed)
         for name, tensor in self._kept.items():
-            tensor.copy_(torch.from_numpy(np.array(saved[name])))
+            tensor.copy_(torch.as_tensor(np.array(saved[name])))
         return self.slots[-1].observation
 
     def row(self, row: int) -> dict[str, np.ndarray]:
@@ -244,7 +247,8 @@ class Batch:
         engine.qpos[0], engine.qvel[0], engine.act[0] = motion[:7], motion[7:13], motion[13:]
         now, episode = layout.program.records(column[layout.motion :])
         now.time = episode.steps * environment.vehicle.control_timestep  # in double precision
-        memory = dataclasses.replace(environment._memory(), snapshot=now, episode=episode)
+        own = cast(Any, environment)._memory()
+        memory: Memory = dataclasses.replace(own, snapshot=now, episode=episode)
         return memory.save()
 
 
@@ -252,11 +256,13 @@ def uncovered(environment: Environment) -> str:
     """What of an environment a GPU does not fly, in words; empty where it flies all of it."""
     task, observer = environment.task, environment.observer
     follows = environment.control_mode.has_loops and bool(observer and observer.follows)
+    rays = [own for own in observer.senses.rays.values() if own] if observer else []
     for name, holds in {
         "contact (the task touches the ground or solids)": task.contact,
         "solids that move": task.moves,
         "events": environment.events is not None,
         "sensors that follow the commands of loops": follows,
+        "two sensors with rays": len(rays) > 1,
         "engine 'mujoco'": environment.engine.name != "free_flight",
     }.items():
         if holds:

@@ -8,7 +8,7 @@ its own. Compiled for a processor in double precision it gives the bits of `Envi
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any, Literal, cast, get_args
@@ -19,19 +19,19 @@ from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import AIRCRAFT, ROTOR, c_structs
 from quadrl.base.philox import LINK, MEMBERS, POOL, PUSHES, START
 from quadrl.base.trace import NotCompilable
-from quadrl.conditions.randomization import OFF
 from quadrl.conditions.weather import noise_time_of
 from quadrl.control.autopilot import Laws
+from quadrl.core.columns import Layout
 from quadrl.core.environment import Environment
 from quadrl.core.program import MAX_DRAWN, Program
 from quadrl.engines import native
-from quadrl.engines.air import DRAWN, FILTERS, FIXED, ROWS, c_weather
+from quadrl.engines.air import ROWS, c_weather
 from quadrl.engines.rays import LEAST, Frame
 from quadrl.engines.rowwise import WITHOUT_HEX
 
 Precision = Literal["float32", "float64"]
 FOLDER = Path(native.__file__).parent
-TEXT = """// {name}: a control step of the {vehicle}, written by quadrl/device/text.py.
+TEXT = """// {name}: a control step of the {vehicle}, written by quadrl/core/source.py.
 #define LANES 1
 #ifdef __CUDACC__
 typedef signed char int8_t;
@@ -99,103 +99,6 @@ static inline void take_solid(Solid* solid, int k, const double* column, int64_t
 }
 """
 UNIFORM = {"float64": "word * 0x1p-32", "float32": "(word >> 8) * 0x1p-24"}
-
-
-class Layout:
-    """Where the numbers of an aircraft stand in the tables of a batch."""
-
-    def __init__(self, environment: Environment) -> None:
-        """Lay them out for an environment whose episodes have begun."""
-        program: Program = cast(Any, environment)._step._program
-        vehicle, observer = environment.vehicle, environment.observer
-        self.program, self.motion = program, 13 + vehicle.rotor_count
-        self.kept, self.observed = program.remembered.end, environment.size
-        self.terms, self.ends = program.rewarded, program.ended
-        self.privileged = np.zeros(0, int)
-        """Where in what is kept the privileged observation stands."""
-        if observer and (channel := observer.senses.channels.get("privileged")):
-            numbers = np.arange(program.seen.end)[:, None]
-            self.privileged = channel.seen(program.memory(numbers)["privileged"])[0]
-        self.seen = self.observed + len(self.privileged)
-        """Rows of what is observed: by policies, then by the critic alone."""
-        self.pooled = not cast(Any, environment)._plain or environment.blowing is not None
-        """Whether episodes begin with columns of a pool."""
-        rows = parameters.numbers(environment.engine.begun)
-        self.varying: list[int] = np.flatnonzero((rows != rows[:1]).any(0)).tolist()
-        """Parameters that differ between aircraft."""
-        randomizer, weather = environment.randomizer, environment.blowing
-        ages = len(randomizer.past) > 0
-        self.late = len(randomizer.queue) if randomizer.late else 0
-        self.linked = bool(randomizer.late and cast(Any, randomizer)._links)
-        changing = [*DRAWN, "steps", *FILTERS] if weather else []
-        changing += FIXED if weather and environment.randomization.wind != OFF else ()
-        self.weather = [k for k, name in enumerate(ROWS) if name in changing]
-        """Rows of the weather's table that differ between aircraft, or change."""
-        self.solids = _solids(environment)
-        parts = {
-            "motion": self.motion,
-            "kept": self.kept,
-            "parameters": len(self.varying),
-            "given": program.parts["given"],
-            "delay": int(self.late > 0),
-            "ages": 2 * ages,
-            "link": 4 * self.linked,
-            "last": vehicle.rotor_count * self.linked,
-            "weather": len(self.weather),
-            "solids": sum(varies.sum() for _, varies in self.solids),
-            "queue": self.late * vehicle.rotor_count,
-            "past": self.late * 13 * ages,
-        }
-        ends = np.cumsum([0, *parts.values()]).tolist()
-        self.first = dict(zip(parts, ends, strict=False))
-        """The first row of each part of the table."""
-        self.begun, self.rows = self.first["queue"], ends[-1]
-        """Rows of a column of the pool without its observation, and of all."""
-        self.reward = 2 * self.seen
-        self.out = self.reward + 2 + len(self.terms)
-        """Rows of what a step gives."""
-        self.flags = 5 + len(self.ends)
-
-    def pool(self, environment: Environment, observed: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The columns with which the episodes of an environment have just begun.
-
-        Args:
-            environment: The environment.
-            observed: What its reset returned.
-        """
-        engine, observer = environment.engine, environment.observer
-        randomizer, weather = environment.randomizer, cast(Any, environment.blowing)
-        hidden, count = cast(Any, randomizer), environment.num_envs
-        table: Any = cast(Any, environment)._step._tables.pages[engine.turn].whole
-        given = [*observer.given.values()] if observer else []
-        varying = len(self.varying)
-        parts = [
-            np.concatenate([engine.qpos, engine.qvel, engine.act], axis=1).T,
-            table[: self.kept, :count],
-            np.broadcast_to(parameters.numbers(engine.begun)[:, self.varying].T, (varying, count)),
-            *(array.T for array in given),
-        ]
-        if self.late:
-            parts += [hidden._usual[None], *([randomizer.ages] if len(randomizer.past) else [])]
-        if self.linked:
-            often = hidden._jitter, hidden._loss, hidden._outage, randomizer.left
-            parts += [np.stack(often), engine.act.T]
-        if weather:
-            parts.append(weather._table[self.weather])
-        every = engine.solids.table
-        numbers = every.view(np.float64).reshape(*every.shape, every.itemsize // 8)
-        parts += [numbers[:, k, varies].T for k, (_, varies) in enumerate(self.solids)]
-        seen = [array.T for array in observed.values()], table[self.privileged, :count]
-        made = np.concatenate([*parts, *seen[0], seen[1]])
-        assert len(made) == self.begun + self.seen
-        return made
-
-
-def _solids(environment: Environment) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each solid its numbers, as `Solid` of native/solids.h, and which differ between rows."""
-    table = environment.engine.solids.table
-    numbers = table.view(np.float64).reshape(*table.shape, table.itemsize // 8)
-    return [(own[0], (own != own[:1]).any(0)) for own in numbers.swapaxes(0, 1)]
 
 
 def text(environment: Environment, precision: Precision = "float64") -> str:
@@ -299,29 +202,25 @@ def _weather(environment: Environment, layout: Layout) -> tuple[dict[str, Any], 
 
 
 def _world(environment: Environment, layout: Layout) -> tuple[dict[str, Any], str]:
-    """Numbers of rays, and what measures them and the solids."""
-    observer, engine = environment.observer, environment.engine
-    rays = {k: own for k, own in observer.senses.rays.items() if own} if observer else {}
-    if not (layout.solids or rays):
-        return {"RAYS": 0}, ""
-    defines: dict[str, Any] = {"RAYS": sum(own.count for own in rays.values())}
-    parts: list[str] = []
-    for name, own in rays.items():
-        stream = cast(Any, observer).senses.channels[name].stream
-        biases = [*cast(Any, observer).senses.given.items()]
-        at = (
-            sum(width for k, width in biases[: [k for k, _ in biases].index(name)])
-            if (name in dict(biases))
-            else 0
-        )
-        lost = NormalDist().inv_cdf(1 - own.dropout) if own.dropout else 0.0
+    """Numbers of the rays of a sensor, and what measures them and the solids."""
+    observer, engine, parts = environment.observer, environment.engine, list[str]()
+    defines: dict[str, Any] = {"RAYS": 0}
+    for name, own in observer.senses.rays.items() if observer else ():
+        if own is None:
+            continue
+        senses = cast(Any, observer).senses
+        places = dict(zip(senses.given, np.cumsum([0, *senses.given.values()]), strict=False))
         numbers = {"NOISE": own.noise, "SHARE": own.share, "REACH": own.reach, "STEP": own.step}
-        numbers |= {"LOST": lost, "LEAST": LEAST}
-        defines |= {f"RAY_{k}": literal(float(x)) for k, x in numbers.items()}
-        defines |= {"RAY_DROPOUT": own.dropout > 0, "RAY_LOG": own.log, "RAY_STREAM": stream}
-        defines |= {"RAYS_DRAWN": own.drawn, "RAY_FRAME": get_args(Frame).index(own.frame)}
-        defines |= {"RAY_BIASED": name in dict(biases), "RAY_BIAS": at, "MAX_RAYS": own.count}
+        numbers["LOST"] = NormalDist().inv_cdf(1 - own.dropout) if own.dropout else 0.0
+        numbers["LEAST"] = LEAST
+        defines = {f"RAY_{k}": literal(float(x)) for k, x in numbers.items()}
+        defines |= {"RAYS": own.count, "MAX_RAYS": own.count, "RAYS_DRAWN": own.drawn}
+        defines |= {"RAY_STREAM": senses.channels[name].stream, "RAY_LOG": own.log}
+        defines |= {"RAY_DROPOUT": own.dropout > 0, "RAY_FRAME": get_args(Frame).index(own.frame)}
+        defines |= {"RAY_BIASED": name in places, "RAY_BIAS": places.get(name, 0)}
         parts += [_array("ray_along", own.along.T), _array("ray_place", np.array(own.place))]
+    if not (layout.solids or parts):
+        return defines, ""
     outline = np.asarray(cast(Any, engine.solids)._outline)
     defines |= {"BALLS": len(outline), "BALLS_REACH": literal(float(outline[:1, 4].sum()))}
     rows = ", ".join(

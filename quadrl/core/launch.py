@@ -16,7 +16,7 @@ import torch
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.extras import needed
-from quadrl.device.text import Precision
+from quadrl.core.source import Precision
 from quadrl.engines.native.compiling import compile_generated
 
 KERNELS = ("step", "start")
