@@ -16,6 +16,7 @@ import numpy as np
 import torch
 import tyro
 
+import quadrl
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.files import write_json
 from quadrl.base.units import percent
@@ -198,7 +199,8 @@ def trained(task: str, seed: int, runs: Path) -> dict[str, Any]:
     ready = time.perf_counter()
     training.run()
     times = {"seconds": training.seconds, "ready": ready - begun}
-    return {"task": task, "seed": seed, "steps": training.steps, **times}
+    known = {"task": task, "aircraft": config.num_envs, "seed": seed, "steps": training.steps}
+    return known | times
 
 
 def flown(row: dict[str, Any], runs: Path) -> dict[str, Any]:
@@ -206,8 +208,9 @@ def flown(row: dict[str, Any], runs: Path) -> dict[str, Any]:
     folder = runs / f"{row['task']}-{row['seed']}"
     policy, own = Policy.load(folder), TrainConfig.of_folder(folder).scenario
     crowded = {"crowded": {"trees": 54}} if row["task"] == "navigation" else {}
+    row |= {"flights": 1000, "engine": "MuJoCo"}
     for what, options in {"success": {}, **crowded}.items():
-        done = evaluate(policy, own, episodes=1000, seed=TESTED, task_options=options)
+        done = evaluate(policy, own, episodes=row["flights"], seed=TESTED, task_options=options)
         row[what] = done.metrics["success_rate"]
     report.say(row)
     return row
@@ -302,7 +305,7 @@ def table() -> str:
         rows.append([name, *("" if rate is None else f"{1e-6 * rate:,.0f}" for rate in own)])
     peers = {row["aircraft"]: row["physics_steps_per_second"] for row in found["crazyflow"]}
     if peers:
-        substeps = Environment("hover").vehicle.substeps
+        substeps = quadrl.VEHICLES["paper"].substeps
         own = [f"{1e-6 * substeps * rates['hover', count]:,.0f}" for count in counts]
         rows.append(["hover, in physics steps", *own])
         own = [f"{1e-6 * peers[count]:,.0f}" if count in peers else "" for count in counts]
@@ -313,14 +316,16 @@ def table() -> str:
 
 
 def trainings() -> str:
-    """The trainings: seconds, and the success of their policies in MuJoCo."""
+    """The trainings: how long they took, and the success of their policies."""
     rows: list[list[str]] = []
     for row in report.load("gpu")["trainings"]:
-        crowded = f"; {percent(row['crowded'])} in 54 trees" if "crowded" in row else ""
-        said = percent(row["success"]) + crowded if "success" in row else ""
+        crowded = f"; {percent(row['crowded'])} in 54 trees" if row.get("crowded") else ""
+        judged = f"{percent(row['success'])} of {row['flights']:,} in {row['engine']}{crowded}"
         steps = f"{1e-6 * row['steps']:.1f} million"
-        rows.append([row["task"], str(row["seed"]), steps, f"{row['seconds']:.2f} s", said])
-    return report.table(["task", "seed", "control steps", "time", "success of 1,000 flights"], rows)
+        own = row["task"], f"{row['aircraft']:,}", str(row["seed"]), steps
+        rows.append([*own, f"{row['seconds']:.2g} s", judged])
+    head = ["task", "aircraft", "seed", "control steps", "time", "successful flights"]
+    return report.table(head, rows)
 
 
 PARTS: report.Parts = {"gpu": table, "gpu-trainings": trainings}
