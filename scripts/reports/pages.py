@@ -30,8 +30,8 @@ def pages(check: bool = False) -> None:
     Args:
         check: Write nothing; exit with 1 and a message if a page would change.
     """
-    modules = (any_aircraft, code, crosscheck, flights, forest, gpu, measure, one_policy, robustness,
-               shipping, task_pages, world)  # fmt: skip
+    modules = (any_aircraft, code, crosscheck, flights, forest, gpu, measure, one_policy,
+               robustness, shipping, task_pages, world)  # fmt: skip
     parts = {name: part for module in modules for name, part in module.PARTS.items()}
     stale = [page for page in all_pages() if written(page, parts) != page.read_text()]
     if check and stale:
