@@ -15,7 +15,7 @@ from quadrl.base.philox import Seed, seeds_of_rows
 from quadrl.base.trace import NotCompilable
 from quadrl.core.columns import Layout
 from quadrl.core.environment import Environment
-from quadrl.core.launch import kernels
+from quadrl.core.launch import kernels, make_device
 from quadrl.core.saving import Memory
 from quadrl.core.scenario import Scenario
 from quadrl.core.source import Precision, text
@@ -78,7 +78,7 @@ class Batch:
                 nothing was allocated then.
         """
         self.scenario, self.num_envs, self.precision = scenario, num_envs, precision
-        self.device = torch.device(device)
+        self.device = make_device(device)
         refused = f"device = {str(device)!r}"
         self.environment = Environment(scenario, num_envs=1, seed=0)
         """One of them on the CPU, for what is the same for all."""

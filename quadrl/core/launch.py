@@ -27,6 +27,22 @@ OLDEST = (7, 5)
 Run = Callable[..., None]
 
 
+def make_device(name: str | torch.device) -> torch.device:
+    """Find the device of a name.
+
+    Raises:
+        QuadrlError: This torch, or this machine, does not have it.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).strip().partition("\n")[0].partition("Expected one of")[0]
+        allowed = "a device that this torch can use, such as cpu, or cuda for a GPU of NVIDIA"
+        raise QuadrlError(reason, name="device", value=str(name), allowed=allowed) from error
+    return device
+
+
 def kernels(text: str, precision: Precision, device: torch.device) -> dict[str, Run]:
     """The functions of a text, by name, each called with N and numbers or addresses.
 

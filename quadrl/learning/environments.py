@@ -14,7 +14,7 @@ from torchrl.data import Unbounded
 from torchrl.modules import ProbabilisticActor
 
 from quadrl.aircraft.aerodynamics import ROTOR_EFFECTS
-from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.base.errors import QuadrlWarning
 from quadrl.core.transition import Transition
 from quadrl.engines.adjoint import kernel
 from quadrl.envs.torchrl import QuadrotorEnv
@@ -225,22 +225,6 @@ class EpisodeStatistics:
             names = (*OUTCOMES[1:], *self._ends)
             metrics |= {k: share / over for k, share in zip(names, shares, strict=True)}
         return metrics
-
-
-def make_device(name: str) -> torch.device:
-    """Find the device of a name.
-
-    Raises:
-        QuadrlError: This torch, or this machine, does not have it.
-    """
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).strip().partition("\n")[0].partition("Expected one of")[0]
-        allowed = "a device that this torch can use, such as cpu, or cuda for a GPU of NVIDIA"
-        raise QuadrlError(reason, name="device", value=name, allowed=allowed) from error
-    return device
 
 
 def make_env(config: TrainConfig, device: torch.device) -> TrainingEnv:

@@ -21,13 +21,13 @@ from quadrl.base.progress import Progress, ProgressBar
 from quadrl.base.units import digits, percent
 from quadrl.control.feasibility import warn_of_unreached
 from quadrl.core.environment import Environment
+from quadrl.core.launch import make_device
 from quadrl.core.scenario import UNDISTURBED, Scenario
 from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import written
-from quadrl.learning.environments import make_device
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training

@@ -25,6 +25,7 @@ from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import PART
 from quadrl.base.machine import processor_kind
 from quadrl.base.progress import Progress
+from quadrl.core.launch import make_device
 from quadrl.core.transition import TIME_LIMIT
 from quadrl.engines import native
 from quadrl.evaluation.policy import Policy
@@ -86,7 +87,7 @@ class Training:
             QuadrlError: The folder or the device cannot be used.
         """
         self.config, self.folder = config, folder
-        device = environments.make_device(config.device)
+        device = make_device(config.device)
         torch.manual_seed(config.seed)
         self.env = self._make_env(device)
         size, actions = self.env.environment.size, self.env.environment.action_size

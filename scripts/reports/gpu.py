@@ -57,7 +57,7 @@ EXACT, NEAR, LOOSE = 1e-6, 1e-5, 1e-3
 """Largest differences, relative to 1 + the number: of flights in double precision, whose sines are
 others than the processor's; and of the motion after a step in single precision, of all but one
 aircraft in a hundred, without and with loops, which take roots of thrusts that are nearly zero."""
-NEAR_SOLIDS = 0.5
+NEAR_SOLIDS = 1.0
 """Clearance [m] from which on MuJoCo has not flown an aircraft."""
 WIDE = {"hidden": (128, 128), "critic_hidden": (128, 128)}
 RACE = {

@@ -198,42 +198,6 @@ def test_what_is_not_covered_is_refused(task, settings, what):
         Batch(scenario(task, **settings), 5, 3, "cpu")
 
 
-def test_navigation_measures_what_the_engine_measures():
-    flown = scenario("navigation", trees=20, control_mode="velocity")
-    batch, environment = (
-        Batch(flown, AIRCRAFT, 3, "cpu", "float64"),
-        Environment(flown, num_envs=AIRCRAFT, seed=3),
-    )
-    environment.reset()
-    batch.reset()
-    same, nearest = np.ones(AIRCRAFT, dtype=bool), np.inf
-    for _ in range(STEPS):
-        batch.action[0].uniform_(-1.0, 1.0)
-        batch.action[0, :, 0] = 1.0
-        done, found = environment.step(batch.action[0].numpy()), batch.step()
-        same &= environment.engine.clearance() > 0.5  # nearer, MuJoCo flies
-        over = done.terminated | done.truncated
-        np.testing.assert_allclose(
-            found.final.numpy()[same], flat(done.observation)[same], rtol=0, atol=1e-14
-        )
-        np.testing.assert_array_equal(found.over.numpy()[same], over[same])
-        ranges = np.exp(done.observation["range_finder"])
-        nearest = min(nearest, ranges[same].min(initial=np.inf))
-    assert nearest < 1.0
-
-
-def test_an_aircraft_that_flies_into_a_tree_has_touched_it():
-    flown = scenario("navigation", trees=66, control_mode="velocity")
-    batch = Batch(flown, AIRCRAFT, 3, "cpu")
-    batch.reset()
-    batch.action[0, :, 0] = 1.0
-    ends = torch.zeros(len(batch.layout.ends))
-    for _ in range(200):
-        ends += batch.step().ends.sum(1)
-    found = dict(zip(batch.layout.ends, ends.tolist(), strict=True))
-    assert found["obstacle"] > AIRCRAFT / 2
-
-
 def test_it_flies_in_free_flight_alone():
     with pytest.raises(QuadrlError, match="engine 'mujoco'"):
         Batch(dataclasses.replace(scenario(), engine="mujoco"), 5, 3, "cpu")
@@ -263,3 +227,27 @@ def test_torchrl_flies_the_same_as_on_the_processor(monkeypatch):
         flown.append(torch.stack(seen))
     assert flown[0]["next", "done"].any()
     torch.testing.assert_close(flown[0], flown[1].select(*flown[0].keys(True, True)))
+
+
+def test_a_device_that_is_not_there_is_one_line():
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(QuadrlError, match=r"device = 'cuda': must be a device that this torch"):
+        Batch(scenario(), 5, 3, "cuda")
+
+
+@pytest.mark.parametrize(
+    ("chip", "free", "said"),
+    [
+        ((7, 0), 1 << 40, "compute capability 7.5 or newer"),
+        ((9, 0), 1000, "are free: ask for fewer"),
+    ],
+)
+def test_a_card_that_cannot_is_one_line(chip, free, said, monkeypatch):
+    monkeypatch.setattr(batch_module, "make_device", torch.device)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: chip)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
+    if chip > (8, 0):
+        monkeypatch.setattr(batch_module, "kernels", lambda *_: {})
+    with pytest.raises(QuadrlError, match=said):
+        Batch(scenario(), 5, 3, "cuda")
