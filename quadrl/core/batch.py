@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
 from quadrl.base.machine import GIB
 from quadrl.base.philox import Seed, seeds_of_rows
@@ -19,11 +20,13 @@ from quadrl.core.launch import kernels, make_device
 from quadrl.core.saving import Memory
 from quadrl.core.scenario import Scenario
 from quadrl.core.source import Precision, text
+from quadrl.core.transition import Observation
 
 MARKS = ("action", "reward", "start")
 """What may be no number, in the order of `marks` in native/kernel.h."""
 FEWEST, MOST = 16_384, 65_536
 """Aircraft and starts that are drawn on the processor, where a start is more than arithmetic."""
+MAX_AIRCRAFT = 1 << 30
 HINT = "allowed: device 'cpu', or engine 'mujoco', which simulates on the CPU"
 
 
@@ -77,6 +80,7 @@ class Batch:
             QuadrlError: The device cannot be used, has too little memory, or does not fly that;
                 nothing was allocated then.
         """
+        validation.number("num_envs", num_envs, 1, MAX_AIRCRAFT, whole=True)
         self.scenario, self.num_envs, self.precision = scenario, num_envs, precision
         self.device = make_device(device)
         refused = f"device = {str(device)!r}"
@@ -85,18 +89,20 @@ class Batch:
         if why := uncovered(self.environment):
             raise QuadrlError(f"{refused}: free flight on a GPU has no {why}; {HINT}")
         self.environment.reset()
-        seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+        if why := self.environment.not_compiled:
+            raise QuadrlError(f"{refused}: the step is not compiled: {why}; {HINT}")
+        seed = _chosen(seed)
+        begun = self._drawn(seed) if Layout(self.environment).pooled else None
         try:
-            self.layout = Layout(self.environment)
-            self._begun = self._pool(seed) if self.layout.pooled else self.environment
-            whole = text(self._begun, precision)
+            whole = text(begun[0] if begun else self.environment, precision)
         except NotCompilable as error:
             raise QuadrlError(f"{refused}: the task is not compiled: {error}; {HINT}") from error
-        self.layout = layout = Layout(self._begun)
+        self.layout = layout = Layout(begun[0] if begun else self.environment)
         self._run = kernels(whole, precision, self.device)
         dtype, actions = getattr(torch, precision), self.environment.action_size
-        numbers = layout.rows + slots * (layout.out + actions)
-        self._check_memory(num_envs * (numbers * dtype.itemsize + slots * layout.flags + 16))
+        pool = layout.pool(*begun) if begun else np.zeros((1, 1))
+        numbers = num_envs * (layout.rows + slots * (layout.out + actions)) + pool.size
+        self._check_memory(numbers * dtype.itemsize + num_envs * (slots * layout.flags + 16))
         given: Any = {"dtype": dtype, "device": self.device}
         self.table = torch.zeros(layout.rows, num_envs, **given)
         self.action = torch.zeros(slots, num_envs, actions, **given)
@@ -112,7 +118,6 @@ class Batch:
         self.slots = [
             self.slot(*parts) for parts in zip(self.action, self.out, self.flags, strict=True)
         ]
-        pool = layout.pool(self._begun, self._first) if layout.pooled else np.zeros((1, 1))
         self._columns = torch.as_tensor(pool).to(**given)
         """Columns with which episodes begin, where they do not begin on the device."""
         structs = [
@@ -123,17 +128,20 @@ class Batch:
         addresses = [[*(tensor.data_ptr() for tensor in own), *sizes] for own in structs]
         self._structs = torch.tensor(addresses, dtype=torch.int64).to(self.device)
         """A `Batch` of native/kernel.h for each slot."""
-        self.seed(seed)
+        self._place(seed)
 
-    def _pool(self, seed: Seed) -> Environment:
-        """Environments whose episodes have just begun, as many as there are aircraft or POOL."""
-        count = min(max(self.num_envs, FEWEST), MOST)
+    def _drawn(self, seed: Seed) -> tuple[Environment, Observation]:
+        """Environments whose episodes have just begun, and their first observations.
+
+        Raises:
+            QuadrlError: There is a seed for each row.
+        """
         if not isinstance(seed, int):
             allowed = "one number where episodes begin with what a processor has drawn"
             raise QuadrlError(name="seed", value=seed, allowed=allowed)
+        count = min(max(self.num_envs, FEWEST), MOST)
         made = Environment(self.scenario, num_envs=count, seed=seed)
-        self._first = made.reset()
-        return made
+        return made, made.reset()
 
     def slot(self, action: Tensor, out: Tensor, flags: Tensor) -> Slot:
         """Tensors as a slot: actions (N, k), what a step gives (rows, N) and flags (flags, N)."""
@@ -151,8 +159,12 @@ class Batch:
 
     def seed(self, seed: Seed = None) -> None:
         """Let the next reset begin the first episode of a seed, as `Environment.seed` does."""
-        if seed is None:
-            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        seed = _chosen(seed)
+        if self.layout.pooled:
+            self._columns.copy_(torch.as_tensor(self.layout.pool(*self._drawn(seed))))
+        self._place(seed)
+
+    def _place(self, seed: Seed) -> None:
         rows, own = seeds_of_rows(seed, np.arange(self.num_envs), self.num_envs)
         keys, episodes = self.keys.cpu(), self.episodes.cpu()
         keys[rows], episodes[rows] = torch.as_tensor(np.asarray(own)), 0
@@ -250,6 +262,11 @@ class Batch:
         own = cast(Any, environment)._memory()
         memory: Memory = dataclasses.replace(own, snapshot=now, episode=episode)
         return memory.save()
+
+
+def _chosen(seed: Seed) -> Seed:
+    """A seed, one from the system where there is none."""
+    return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
 
 
 def uncovered(environment: Environment) -> str:

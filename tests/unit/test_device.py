@@ -251,3 +251,16 @@ def test_a_card_that_cannot_is_one_line(chip, free, said, monkeypatch):
         monkeypatch.setattr(batch_module, "kernels", lambda *_: {})
     with pytest.raises(QuadrlError, match=said):
         Batch(scenario(), 5, 3, "cuda")
+
+
+def test_another_seed_draws_other_starts():
+    batch = Batch(scenario(weather="light"), AIRCRAFT, 3, "cpu", "float64")
+    batch.seed(40)
+    environment = Environment(scenario(weather="light"), num_envs=AIRCRAFT, seed=40)
+    assert same_flights(batch, environment, 20) >= 0
+    with pytest.raises(QuadrlError, match="one number where episodes begin"):
+        batch.seed([*range(AIRCRAFT)])
+    with pytest.raises(QuadrlError, match="num_envs"):
+        Batch(scenario(), 0, 3, "cpu")
+    with pytest.raises(QuadrlError, match="not compiled: its sensors remember"):
+        Batch(scenario(observe={"observation_history": 16}), 5, 3, "cpu")
