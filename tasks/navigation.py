@@ -59,13 +59,14 @@ class Navigation(Task):
     ends = "30 m ahead (success); at a tree, a ball, a wall or on the ground; 2 m too high"
     solved = "30 m ahead within 20 s, without a touch"
     targets = (Target("success_rate", "successful", 0.95, True),)
-    # With batches of 256 aircraft and 16 steps, and 80 for a crash, trainings end at 75 to 88 %.
+    # With batches of 256 aircraft and 16 steps, and 80 for a crash, trainings end at 75 to 88 %; of
+    # 512 and 32, and gradient steps of a quarter, at 94 to 97, and seeds differ by 5 points.
     training = {
         "control_mode": "velocity",
         "vehicle_options": {"action_scale": 90.0},
-        "num_envs": 512,
+        "num_envs": 2048,
         "rollout": 32,
-        "steps": 16_000_000,
+        "steps": 16_777_216,
         "hidden": (128, 128),
         "critic_hidden": (128, 128),
         "training_options": {
@@ -73,7 +74,7 @@ class Navigation(Task):
         },
         "gamma": 0.98,
         "initial_deviation": 0.25,
-        "ppo": {"learning_rate": 1.5e-3, "minibatch": 4096},
+        "ppo": {"learning_rate": 1.5e-3, "minibatch": 16384},
     }  # fmt: skip
     # Loops fly the velocities, so that what else other robust policies see would tell little. They
     # have no integral: in wind, and with a mass a fifth off, every third flight left its height.
@@ -100,7 +101,8 @@ class Navigation(Task):
             "training_options": {"crash_weight": 150.0},
             "gamma": 0.98,
             "gae_lambda": 0.95,
-            "ppo": {"learning_rate": 1.5e-3},
+            "num_envs": 512,
+            "ppo": {"learning_rate": 1.5e-3, "minibatch": 4096},
             "steps": 10_000_000,
         }
     }
