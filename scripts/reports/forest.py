@@ -181,18 +181,21 @@ def tuned(name: str) -> Result:
     return best
 
 
-def forest(*policies: Path, robust: Path, episodes: int = 1000, tuned_before: bool = False) -> None:
+def forest(
+    *policies: Path, robust: Path | None = None, episodes: int = 1000, planned_before: bool = False
+) -> None:
     """Fly forests of every density and speed by policies and by tuned planners.
 
     Args:
         policies: Run folders, or files, of policies of the same settings.
         robust: The same of a robust one, which flies beside the first and the best planner in the
-            conditions of its training.
+            conditions of its training; without one the last report's counts, with its flights.
         episodes: Flights of each seed and density; a fifth of them for each speed.
-        tuned_before: Whether to fly the planners as the last report tuned them.
+        planned_before: Whether the planners count as the last report tuned and flew them.
     """
     usual, rows = Navigation().slowest, list[Result]()
-    planners = report.load("forest")["planners"] if tuned_before else [*map(tuned, PLANNERS)]
+    before = report.load("forest") if planned_before or not robust else {"flights": []}
+    planners = before["planners"] if planned_before else [*map(tuned, PLANNERS)]
     flyers: dict[str, Any] = {}
     for own in map(Policy.load, policies):
         flyers[f"policy, seed {own.metadata['seed']}"] = own
@@ -205,7 +208,16 @@ def forest(*policies: Path, robust: Path, episodes: int = 1000, tuned_before: bo
         # After each: one that is stopped keeps what it has flown.
         report.save("forest", {"episodes": episodes, "planners": planners, "flights": rows})
 
+    def kept(name: str, *, uncertain: bool) -> bool:
+        """Take the flights of the last report, where they count; whether they do."""
+        holds = planned_before if name in PLANNERS else name == "robust policy" and not robust
+        own = (row for row in before["flights"] if row["flyer"] == name)
+        rows.extend(row for row in own if holds and ("uncertain" in row) == uncertain)
+        return holds
+
     for name, flyer in flyers.items():
+        if kept(name, uncertain=False):
+            continue
         for trees in TREES:
             for seed in SEEDS:
                 got = flown(flyer, seed, episodes, trees=trees)
@@ -219,13 +231,15 @@ def forest(*policies: Path, robust: Path, episodes: int = 1000, tuned_before: bo
                 got = flown(flyer, seed, episodes, trees=36, **given)
                 note(flyer=name, world=world, seed=seed, **got)
         say(rows[-1])
-    sturdy = Policy.load(robust)
+    sturdy = Policy.load(robust) if robust else Policy.pretrained("navigation_robust")
     named = "weather", "randomization", "aerodynamics"
     uncertain = {name: getattr(sturdy.scenario, name) for name in named}
     finder = {"range_finder": sturdy.scenario.observe.sensors["range_finder"]}
     best = max(planners, key=lambda row: row["success"])["planner"]
     beside = {name: flyers[name] for name in (next(iter(flyers)), best)}
     for name, flyer in {"robust policy": sturdy, **beside}.items():
+        if kept(name, uncertain=True):
+            continue
         own = uncertain if flyer is sturdy else uncertain | {"observe": {"sensors": finder}}
         for trees in UNCERTAIN:
             for seed in SEEDS:
