@@ -246,6 +246,7 @@ def forest(
                 got = flown(flyer, seed, episodes, own, trees=trees)
                 note(flyer=name, uncertain=trees, seed=seed, **got)
         say(rows[-1])
+    report.save("forest", {"episodes": episodes, "planners": planners, "flights": rows})
 
 
 @dataclasses.dataclass(frozen=True)
