@@ -83,6 +83,9 @@ class Batch:
         validation.number("num_envs", num_envs, 1, MAX_AIRCRAFT, whole=True)
         self.scenario, self.num_envs, self.precision = scenario, num_envs, precision
         self.device = make_device(device)
+        if scenario.engine != "free_flight":
+            allowed = "'free_flight', the only one of a batch"
+            raise QuadrlError(name="engine", value=scenario.engine, allowed=allowed)
         refused = f"device = {str(device)!r}"
         self.environment = Environment(scenario, num_envs=1, seed=0)
         """One of them on the CPU, for what is the same for all."""
@@ -280,7 +283,6 @@ def uncovered(environment: Environment) -> str:
         "events": environment.events is not None,
         "sensors that follow the commands of loops": follows,
         "two sensors with rays": len(rays) > 1,
-        "engine 'mujoco'": environment.engine.name != "free_flight",
     }.items():
         if holds:
             return name

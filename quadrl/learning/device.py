@@ -111,6 +111,8 @@ def elsewhere(config: TrainConfig) -> str:
     ):
         if value != allowed:
             return f"trainings there take {name} = {allowed!r} alone"
+    if config.training_scenario.engine != "free_flight":
+        return "the engine is not free_flight"
     environment = Environment(config.training_scenario, num_envs=1, seed=0)
     if why := uncovered(environment):
         return f"free flight on a GPU has no {why}"

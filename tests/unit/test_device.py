@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import quadrl
 from quadrl.base.errors import QuadrlError
 from quadrl.core import batch as batch_module
 from quadrl.core import launch
@@ -132,6 +133,22 @@ def test_single_precision_is_near_double():
         assert ((motion - other).abs() / (1 + motion.abs())).max() < 1e-5
 
 
+def test_a_policy_flies_in_single_precision_as_in_double():
+    policy, errors = quadrl.Policy.pretrained("hover"), list[float]()
+    for precision in ("float64", "float32"):
+        flown = dataclasses.replace(policy.scenario, engine="free_flight")
+        batch = Batch(flown, 200, 3, "cpu", precision)
+        seen, ends = batch.reset(), torch.zeros(200)
+        for _ in range(batch.environment.time_limit_steps):
+            batch.action[0].copy_(torch.from_numpy(policy(seen.float().numpy())))
+            now = batch.step()
+            ends += now.success
+            seen = now.observation
+        assert (ends == 1).all()
+        errors.append(float(now.error.mean()))
+    assert errors[1] == pytest.approx(errors[0], abs=1e-4)
+
+
 def test_no_number_of_single_precision_is_a_double():
     environment = Environment(scenario())
     environment.reset()
@@ -199,7 +216,7 @@ def test_what_is_not_covered_is_refused(task, settings, what):
 
 
 def test_it_flies_in_free_flight_alone():
-    with pytest.raises(QuadrlError, match="engine 'mujoco'"):
+    with pytest.raises(QuadrlError, match="engine = 'mujoco': must be 'free_flight'"):
         Batch(dataclasses.replace(scenario(), engine="mujoco"), 5, 3, "cpu")
 
 
