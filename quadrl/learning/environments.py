@@ -161,8 +161,9 @@ class EpisodeStatistics:
         self._terms = [f"reward/{name}" for name in terms]
         self._ends = [f"end/{name}" for name in ends]
         whole: Any = {"dtype": torch.float64, "device": device}
-        self.running = {name: torch.zeros(num_envs, **whole) for name in ENDED}
-        self.running["terms"] = torch.zeros(len(terms), num_envs, **whole)
+        self._sums = torch.zeros(len(ENDED) + len(terms), num_envs, **whole)
+        self.running = dict(zip(ENDED, self._sums, strict=False))
+        self.running["terms"] = self._sums[len(ENDED) :]
         ages = 2 * time_limit_steps + rollout
         self.running["outcomes"] = torch.zeros(ages, len(OUTCOMES) + len(ends), **whole)
         """Numbers of the `OUTCOMES` and ends of episodes, by the steps since they began."""
@@ -193,30 +194,21 @@ class EpisodeStatistics:
         before[0] = -1
         before, remained = before[last, aircraft], begun[-1]
 
-        def sums(values: torch.Tensor, running: torch.Tensor) -> torch.Tensor:
-            """Sums (..., k) of values (..., T, N) over episodes that end; the others' go on."""
-            total = values.double().cumsum(-2)
-            until = total[..., before.clamp(min=0), aircraft]
-            carried = torch.where(before < 0, running[..., aircraft], -until)
-            found = total[..., last, aircraft] + carried
-            each = torch.arange(total.shape[-1], device=done.device)
-            until = total[..., remained.clamp(min=0), each]
-            running.copy_(total[..., -1, :] + torch.where(remained < 0, running, -until))
-            return found
-
-        ended = {
-            "return": sums(reward, self.running["return"]),
-            "length": sums(torch.ones_like(reward), self.running["length"]),
-        }
-        means = sums(terms.movedim(1, 0), self.running["terms"]).mean(-1)
+        # Sums over the episodes that end; those of the others go on.
+        values = torch.cat([torch.stack([reward, torch.ones_like(reward)]), terms.movedim(1, 0)])
+        total, each = values.double().cumsum(1), torch.arange(done.shape[1], device=done.device)
+        carried = torch.where(before < 0, self._sums[:, aircraft], -total[:, before, aircraft])
+        ended = total[:, last, aircraft] + carried
+        going = torch.where(remained < 0, self._sums, -total[:, remained, each])
+        self._sums.copy_(total[:, -1] + going)
         outcomes[steps:], outcomes[:steps] = outcomes[:-steps].clone(), 0.0
         judged = torch.stack([done, success, ~terminated | success], -1)
         judged = torch.cat([judged, ends.movedim(1, -1)], -1)[last, aircraft]
-        ages = ended["length"].long() + steps - 1 - last
+        ages = ended[1].long() + steps - 1 - last
         outcomes.index_put_((ages,), judged.double(), accumulate=True)
-        own = [x.double().mean() for x in (reward, error, *ended.values())]
+        own = [reward.double().mean(), error.double().mean(), *ended.mean(1)]
         over = outcomes[self._limit :].sum(0)
-        gained, missed, *kept = torch.cat([torch.stack(own), means, over]).tolist()
+        gained, missed, *kept = torch.cat([torch.stack(own), over]).tolist()
         metrics = {"episodes": float(len(last)), "reward": gained, "error": missed}
         if len(last):
             metrics |= dict(zip((*ENDED, *self._terms), kept, strict=False))
