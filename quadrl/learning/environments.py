@@ -162,8 +162,8 @@ class EpisodeStatistics:
         self._ends = [f"end/{name}" for name in ends]
         whole: Any = {"dtype": torch.float64, "device": device}
         self._sums = torch.zeros(len(ENDED) + len(terms), num_envs, **whole)
-        self.running = dict(zip(ENDED, self._sums, strict=False))
-        self.running["terms"] = self._sums[len(ENDED) :]
+        self.running: dict[str, torch.Tensor] = {"terms": self._sums[len(ENDED) :]}
+        self.running |= zip(ENDED, self._sums, strict=False)
         ages = 2 * time_limit_steps + rollout
         self.running["outcomes"] = torch.zeros(ages, len(OUTCOMES) + len(ends), **whole)
         """Numbers of the `OUTCOMES` and ends of episodes, by the steps since they began."""
