@@ -135,8 +135,9 @@ typedef struct {
 
 // The distance [m] of the balls of an aircraft, the one that reaches farthest first, from a solid, or
 // `least` where that is less. p, r: position and rotation matrix to the world.
-static inline double nearer(const Solid* solid, const Ball* balls, int64_t parts, const double* p,
-                            const double r[9], double least) {
+static inline __attribute__((always_inline)) double nearer(const Solid* solid, const Ball* balls,
+                                                           int64_t parts, const double* p,
+                                                           const double r[9], double least) {
   const double away = solid_distance(solid, p);
   if (away - balls->reach > least + ROUNDING) return least;
   double normal[3] = {0}, along[3];
