@@ -28,6 +28,8 @@ class Flown:
 
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         """Make them; each step of a rollout has a slot."""
+        if device.type == "cuda":
+            torch.cuda.set_device(device)  # graphs are recorded on the present one
         scenario, seed = config.training_scenario, config.seed * environments.SEED_STRIDE
         slots = config.rollout
         self.batch = Batch(scenario, config.num_envs, seed, device, slots=slots)
