@@ -20,7 +20,7 @@ AIRCRAFT, STEPS = 24, 60
 UNCERTAIN = {
     **{"command_delay": (0.0, 0.04), "observation_delay": (0.0, 0.03), "mass": (0.9, 1.1)},
     **{"command_loss": (0.0, 2.0), "command_jitter": (0.0, 0.5), "noise": {"position": 0.01}},
-    "pushes": {"rate": 2.0, "velocity": 0.5, "body_rate": 1.0},
+    **{"pushes": {"rate": 2.0, "velocity": 0.5, "body_rate": 1.0}, "wind": (0.5, 1.5)},
 }
 SEES = {"rotor_speed": "estimated", "disturbance": True, "action_history": 2, "privileged": True}
 CASES = [
