@@ -191,6 +191,19 @@ class Batch:
     def _address(self, slot: int) -> int:
         return self._structs[slot].data_ptr()
 
+    def take(self, action: Tensor, slot: int = 0) -> None:
+        """Write actions (N, k) into a slot.
+
+        Raises:
+            QuadrlError: They are of another shape, or on another device.
+        """
+        taken = self.action[slot]
+        if action.shape != taken.shape or str(action.device) != str(taken.device):
+            allowed = f"{tuple(taken.shape)} on {taken.device}"
+            value = f"{tuple(action.shape)} on {action.device}"
+            raise QuadrlError(name="action", value=value, allowed=allowed)
+        taken.copy_(action.detach())
+
     def step(self, slot: int = 0) -> Slot:
         """Fly a control step with the actions of a slot; return the slot.
 

@@ -58,8 +58,6 @@ enum {{ {sizes} }};
 {defines}
 #define FREE_WORLD {{{timestep}, {gravity}, -HUGE_VAL, 0}}
 typedef double Lanes[LANES];
-// A random word as a number in [0, 1).
-static inline double uniform(uint32_t word) {{ return {uniform}; }}
 {functions}
 // The parameters of an aircraft.
 static inline void aircraft(Aircraft* a, const double* column, int64_t columns) {{
@@ -98,7 +96,6 @@ static inline void take_solid(Solid* solid, int k, const double* column, int64_t
   }
 }
 """
-UNIFORM = {"float64": "word * 0x1p-32", "float32": "(word >> 8) * 0x1p-24"}
 
 
 def text(environment: Environment, precision: Precision = "float64") -> str:
@@ -162,7 +159,6 @@ def text(environment: Environment, precision: Precision = "float64") -> str:
         ),
         timestep=vehicle.physics_timestep.hex(),
         gravity=float(engine.model.opt.gravity[2]).hex(),
-        uniform=UNIFORM[precision],
         functions="\n".join(f.text(f"{name}_function") for name, f in functions.items())
         + (known if draws else ""),
         aircraft="\n  ".join(_aircraft(environment, layout)),

@@ -81,16 +81,11 @@ class OnDevice:
         Raises:
             QuadrlError: The actions are of another shape, or on another device.
         """
-        taken = self.batch.action[0]
-        if action.shape != taken.shape or str(action.device) != str(taken.device):
-            allowed = f"{tuple(taken.shape)} on {taken.device}"
-            value = f"{tuple(action.shape)} on {action.device}"
-            raise QuadrlError(name="action", value=value, allowed=allowed)
-        taken.copy_(action.detach())
+        self.batch.take(action)
         self._restored = False
         self.batch.step()
         # Those of the next step will be others.
-        now = self.batch.slot(taken, self.batch.out[0].clone(), self.batch.flags[0].clone())
+        now = self.batch.slot(action, self.batch.out[0].clone(), self.batch.flags[0].clone())
         self._fresh = now.over
         entries = {"reward": now.reward, "done": now.over, "terminated": now.terminated}
         entries |= {"truncated": now.truncated, "is_success": now.success, "error": now.error}

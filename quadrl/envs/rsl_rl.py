@@ -209,7 +209,7 @@ class DeviceVecEnv(QuadrotorVecEnv):
         """As of QuadrotorVecEnv, but that `final_obs` and `log` are of every step."""
         self._turn = 1 - self._turn
         slot: Slot = self.batch.slots[self._turn]
-        slot.action.copy_(actions)
+        self.batch.take(actions, self._turn)
         self.batch.step(self._turn)
         self._lengths += 1
         late = ~slot.over & (self._lengths >= self.max_episode_length)

@@ -281,3 +281,11 @@ def test_another_seed_draws_other_starts():
         Batch(scenario(), 0, 3, "cpu")
     with pytest.raises(QuadrlError, match="not compiled: its sensors remember"):
         Batch(scenario(observe={"observation_history": 16}), 5, 3, "cpu")
+
+
+def test_actions_of_another_shape_are_refused():
+    batch = Batch(scenario(), AIRCRAFT, 3, "cpu")
+    batch.reset()
+    with pytest.raises(QuadrlError, match=r"action .*\(24, 4\) on cpu"):
+        batch.take(torch.ones(AIRCRAFT, 1))  # it would be spread over the rotors
+    assert not batch.action.any()

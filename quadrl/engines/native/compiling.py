@@ -43,7 +43,8 @@ from quadrl.engines.state import c_state
 
 SOURCES = ("callbacks.c", "free_flight.c", "state.c", "random.c", "weather.c",
            "disturbances.c", "solids.c", "rays.c", "warnings.c")  # fmt: skip
-HEADERS = ("aero.h", "contacts.h", "export.h", "flight.h", "philox.h", "runge_kutta.h", "solids.h")
+HEADERS = ("aero.h", "contacts.h", "export.h", "flight.h", "philox.h", "push.h", "runge_kutta.h",
+           "solids.h")  # fmt: skip
 # No contraction, since a fused multiply-add rounds differently from NumPy.
 FLAGS = (
     "-std=c11",

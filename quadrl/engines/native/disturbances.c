@@ -8,6 +8,7 @@
 
 #include "export.h"
 #include "philox.h"
+#include "push.h"
 
 enum { PUSH_BLOCKS = 2 };
 
@@ -24,15 +25,6 @@ QUADRL_EXPORT void quadrl_normal(int64_t n, const int64_t* keys, const int64_t* 
   }
 }
 
-// Adds a vector of a length; two uniform words choose its direction, evenly over the sphere.
-static void add(double* to, double length, uint32_t share, uint32_t turn) {
-  const double height = 2 * (share * 0x1p-32) - 1, level = sqrt(1 - height * height);
-  const double heading = 0x1.921fb54442d18p+2 * (turn * 0x1p-32);
-  to[0] += length * (level * cos(heading));
-  to[1] += length * (level * sin(heading));
-  to[2] += length * height;
-}
-
 // Changes velocity and body rate of the aircraft among n that a push hits at this control step.
 QUADRL_EXPORT void quadrl_push(int64_t n, const int64_t* keys, const int64_t* episodes,
                                const int64_t* steps, int64_t stream, double chance,
@@ -42,8 +34,8 @@ QUADRL_EXPORT void quadrl_push(int64_t n, const int64_t* keys, const int64_t* ep
     words(w, steps[i] * PUSH_BLOCKS, stream, episodes[i], keys[i]);
     if (w[0] * 0x1p-32 >= chance) continue;
     words(w + 4, steps[i] * PUSH_BLOCKS + 1, stream, episodes[i], keys[i]);
-    add(qvel + i * stride, velocity, w[1], w[2]);
-    add(qvel + i * stride + 3, body_rate, w[3], w[4]);
+    add_push(qvel + i * stride, velocity, w[1], w[2]);
+    add_push(qvel + i * stride + 3, body_rate, w[3], w[4]);
   }
 }
 

@@ -29,13 +29,10 @@ typedef struct {
   int64_t taken, given;
 } Function;
 
-// Calls a function of a Step, and tells how many numbers it has (`taken`, `given`). A program that is
-// one text defines both before, so that its functions are called by their names.
-#ifndef RUN
-#define RUN(step, function, x, y, rows) \
-  (step)->function->run((step)->function->constants, x, y, rows)
-#define NUMBERS(step, function, numbers) ((step)->function->numbers)
-#endif
+// Calls a function of a Step.
+static inline void run(const Function* function, const Lanes* x, Lanes* y, int rows) {
+  function->run(function->constants, x, y, rows);
+}
 
 // A number that each row has, at i * stride for row i, and which one it is for a function.
 typedef struct {
@@ -144,8 +141,8 @@ static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean,
   const int rotors = (int)s->rows->rotors, motion = SPEED + rotors;
   if (s->loops) {
     memcpy(x, b->m, motion * sizeof(Lanes));
-    memcpy(x + motion, setpoint, NUMBERS(s, begin, given) * sizeof(Lanes));
-    RUN(s, command, (const Lanes*)x, b->s.command, b->filled);
+    memcpy(x + motion, setpoint, s->begin->given * sizeof(Lanes));
+    run(s->command, (const Lanes*)x, b->s.command, b->filled);
     twin(b->s.command, rotors, b->filled);
   }
   for (int k = 0; k < rotors; ++k) {
@@ -170,14 +167,14 @@ static void command(const Step* s, Block* b, const Lanes* setpoint, Lanes* mean,
 static void fly_on(const Step* s, Block* b, int64_t first, int64_t end, Lanes* x) {
   const Rows* r = s->rows;
   const int rotors = (int)r->rotors, motion = SPEED + rotors;
-  const int64_t numbers = NUMBERS(s, begin, given);
-  Lanes setpoint[NUMBERS(s, begin, given)], mean[MAX_ROTORS];
+  const int64_t numbers = s->begin->given;
+  Lanes setpoint[s->begin->given], mean[MAX_ROTORS];
   if (first == 0) {
     memcpy(x, b->m, motion * sizeof(Lanes));
     for (int64_t k = 0; k < s->actions; ++k) {
       for (int i = 0; i < LANES; ++i) x[motion + k][i] = s->action[b->row[i] * s->actions + k];
     }
-    RUN(s, begin, (const Lanes*)x, setpoint, b->filled);
+    run(s->begin, (const Lanes*)x, setpoint, b->filled);
     twin(setpoint, numbers, b->filled);
     memset(mean, 0, sizeof mean);
   } else {
@@ -238,8 +235,8 @@ static void sense(const Senses* s, const Late* late, const Block* b, Lanes* x) {
 // that is not finite.
 VECTORISED static int64_t finish(const Step* s, const Block* b, Lanes* x) {
   const int motion = SPEED + (int)s->rows->rotors, whole = is_whole(s->rows, b);
-  const int64_t first = b->row[0], flags = NUMBERS(s, finish, given) - BYTES;
-  Lanes y[NUMBERS(s, finish, given)];
+  const int64_t first = b->row[0], flags = s->finish->given - BYTES;
+  Lanes y[s->finish->given];
   memcpy(x, b->m, motion * sizeof(Lanes));
   for (int i = 0; i < LANES; ++i) x[motion][i] = s->diverged[b->row[i]];
   if (s->senses) sense(s->senses, s->late, b, x + motion + 1);
@@ -253,7 +250,7 @@ VECTORISED static int64_t finish(const Step* s, const Block* b, Lanes* x) {
       }
     }
   }
-  RUN(s, finish, (const Lanes*)x, y, b->filled);
+  run(s->finish, (const Lanes*)x, y, b->filled);
   int64_t unsound = 0;
   for (int64_t k = 0; k < flags; ++k) {
     double* to = k < s->kept ? s->out + k * s->columns : s->rest + (k - s->kept) * s->columns;
@@ -286,7 +283,7 @@ QUADRL_EXPORT int64_t quadrl_step(const Step* s, const int64_t* ids, int64_t fir
   Block b;
   Aircraft own;
   // For the motion and an action or a setpoint, or for what the task's part takes.
-  Lanes x[NUMBERS(s, begin, taken) + NUMBERS(s, begin, given) + NUMBERS(s, finish, taken)];
+  Lanes x[s->begin->taken + s->begin->given + s->finish->taken];
   int64_t marked = 0;
   if (!r->block) spread(r->parameters, &own);
   for (int64_t row = first; row < last; row += LANES) {
@@ -324,7 +321,6 @@ QUADRL_EXPORT int64_t quadrl_step(const Step* s, const int64_t* ids, int64_t fir
   return marked;
 }
 
-#ifndef WITHOUT_STARTS
 // Begins episodes of aircraft `ids` (n). Their `start` takes the first random number of each episode's
 // stream `members` and the first `numbers` of its `stream`, for keys and episodes of the aircraft
 // in the list, and what is at `places`; it gives a motion, numbers for `out`, and the observation;
@@ -334,8 +330,8 @@ QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Place* places, int64_t r
                                    const int64_t* episodes, int64_t stream, int64_t numbers,
                                    int64_t members, double* room) {
   const int rotors = (int)s->rows->rotors;
-  const int64_t given = NUMBERS(s, start, given);
-  Lanes x[NUMBERS(s, start, taken)], y[NUMBERS(s, start, given)];
+  const int64_t given = s->start->given;
+  Lanes x[s->start->taken], y[s->start->given];
   int64_t unsound = 0;
   for (int64_t first = 0; first < n; first += LANES) {
     const int filled = n - first < LANES ? (int)(n - first) : LANES;
@@ -355,7 +351,7 @@ QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Place* places, int64_t r
       }
       for (int k = 0; k < 2; ++k) limits[k][i] = s->limits[ids[at] * s->limit_stride + k];
     }
-    RUN(s, start, (const Lanes*)x, y, filled);
+    run(s->start, (const Lanes*)x, y, filled);
     twin(y, given, filled);
     resolve((const Lanes*)y, rotors, (const Lanes*)limits, sound);
     for (int i = 0; i < filled; ++i) {
@@ -365,7 +361,6 @@ QUADRL_EXPORT int64_t quadrl_begin(const Step* s, const Place* places, int64_t r
   }
   return unsound;
 }
-#endif
 
 // Puts aircraft `ids` (n) where quadrl_begin lets their episodes begin. The first `kept` numbers
 // after the motion go to `out`; an observation there is that of the last control step.

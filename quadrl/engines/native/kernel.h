@@ -10,6 +10,7 @@
 
 #include "aero.h"
 #include "philox.h"
+#include "push.h"
 #include "runge_kutta.h"
 #if BLOWS
 #include "weather.c"
@@ -95,17 +96,6 @@ static inline void begin_row(const Batch* b, int64_t row) {
 }
 #endif
 
-#if PUSHED
-// Adds a vector of a length; two uniform words choose its direction, evenly over the sphere.
-static inline void push(Lanes* to, double length, uint32_t share, uint32_t turn) {
-  const double height = 2 * uniform(share) - 1, level = sqrt(1 - height * height);
-  const double heading = 0x1.921fb54442d18p+2 * uniform(turn);
-  to[0][0] += length * (level * cos(heading));
-  to[1][0] += length * (level * sin(heading));
-  to[2][0] += length * height;
-}
-#endif
-
 // A normal number of a control step: number j of `count` of a stream.
 static inline double normal_of(int64_t key, int64_t episode, int64_t step, int64_t stream,
                                int64_t count, int64_t j) {
@@ -182,8 +172,13 @@ static inline void step_row(const Batch* b, int64_t row) {
   words(hit, begun * 2, PUSHES, episode, key);
   if (uniform(hit[0]) < PUSH_CHANCE) {
     words(hit + 4, begun * 2 + 1, PUSHES, episode, key);
-    push(m + VELOCITY, PUSH_VELOCITY, hit[1], hit[2]);
-    push(m + BODY_RATE, PUSH_BODY_RATE, hit[3], hit[4]);
+    double speed[3] = {m[VELOCITY][0], m[VELOCITY + 1][0], m[VELOCITY + 2][0]};
+    double turn[3] = {m[BODY_RATE][0], m[BODY_RATE + 1][0], m[BODY_RATE + 2][0]};
+    add_push(speed, PUSH_VELOCITY, hit[1], hit[2]);
+    add_push(turn, PUSH_BODY_RATE, hit[3], hit[4]);
+    UNROLLED for (int k = 0; k < 3; ++k) {
+      m[VELOCITY + k][0] = speed[k], m[BODY_RATE + k][0] = turn[k];
+    }
     UNROLLED for (int k = 0; k < MOTION; ++k) x[k][0] = m[k][0];
   }
 #endif

@@ -31,6 +31,15 @@ static inline __attribute__((always_inline)) void words(uint32_t w[4], int64_t b
   philox(w, (uint32_t)key, (uint32_t)(key >> 32));
 }
 
+// A random word as a number in [0, 1); in single precision its last bits would round to 1.
+static inline double uniform(uint32_t word) {
+#ifdef SINGLE
+  return (word >> 8) * 0x1p-24;
+#else
+  return word * 0x1p-32;
+#endif
+}
+
 // A nearly normal number, of mean 0 and variance 1: the sum of four uniform ones of 16 bits.
 static inline __attribute__((always_inline)) double normal(uint32_t one, uint32_t other) {
   const int32_t halves = (int32_t)((one & 0xFFFF) + (one >> 16) + (other & 0xFFFF) + (other >> 16));
