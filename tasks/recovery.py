@@ -40,8 +40,9 @@ class Recovery(Task):
             "gae_lambda": 0.95,
             "training_options": {"smoothness_weight": 10.0},
         },
-        # From APG's networks, `quadrl train --from RUN`: it adds the dead time and the rest.
+        # APG finds how to turn over, which PPO from nothing hardly does; PPO adds the dead time.
         "ppo": {
+            "phases": ({"algo": "apg"},),
             "steps": 400_000,
             "gamma": 0.95,
             "gae_lambda": 0.95,
@@ -55,7 +56,6 @@ class Recovery(Task):
             },
         },
     }
-    trainings = {"algo": "apg"}, {"algo": "ppo"}
     observation = ROTATION | MOTION
 
     time_limit: float = 5.0

@@ -22,6 +22,8 @@ class Progress:
     steps: int
     seconds: float
     metrics: dict[str, float]
+    phase: str = ""
+    """Which one it is of trainings in turn."""
 
 
 class TimeLeft:
@@ -62,6 +64,7 @@ class ProgressBar:
         )
         self._row: progress.TaskID | None = None
         self._begun: tuple[int, float] | None = None  # iteration and seconds of the first update
+        self._phase = ""
         self._clock = TimeLeft()
         self._last_line = time.monotonic()
         self._metrics: dict[str, float] = {}
@@ -104,6 +107,9 @@ class ProgressBar:
 
     def show(self, now: Progress) -> None:
         """Show steps, steps/s, return and success after an iteration of a training."""
+        if now.phase != self._phase:  # the next of several trainings
+            self._phase, self._begun = now.phase, None
+            self._row, self._clock, self._metrics = None, TimeLeft(), {}
         if self._begun is None:
             self._begun = (now.iteration - 1, 0.0 if now.iteration == 1 else now.seconds)
         first, since = self._begun
@@ -113,7 +119,7 @@ class ProgressBar:
         # Until the first whole episodes end there is neither.
         gained, success = (self._metrics.get(name) for name in ("return", "success"))
         report = (
-            f"{now.steps:>9,} steps  {rate:>7,.0f}/s  "
+            f"{now.phase}{'  ' * bool(now.phase)}{now.steps:>9,} steps  {rate:>7,.0f}/s  "
             f"return {'-' if gained is None else f'{gained:.0f}':>7}  "
             f"success {'-' if success is None else f'{100 * success:.0f}':>3} %"
         )

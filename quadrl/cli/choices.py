@@ -55,6 +55,7 @@ SETTINGS = {
     "memory": Annotated[str, words(MEMORIES)],
     "keep": Annotated[str, words(KEEPS)],
     "log": Annotated[str, words(WRITERS)],
+    "phases": str,
 }
 """Of settings, by name."""
 FLAGS = {"from_run": "from"}

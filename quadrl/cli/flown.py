@@ -94,12 +94,12 @@ def policy_named(word: str) -> str | Path:
 
 
 def parse_named(name: str, text: Any) -> Any:
-    """A name as it is, or what JSON such as {"mass": [0.8, 1.2]} stands for.
+    """A name as it is, or what JSON such as {"mass": [0.8, 1.2]} or [{"algo": "apg"}] stands for.
 
     Raises:
         QuadrlError: It begins like JSON and is none.
     """
-    if not isinstance(text, str) or not text.startswith("{"):
+    if not isinstance(text, str) or not text.startswith(("{", "[")):
         return text
     try:
         return tuples(json.loads(text))

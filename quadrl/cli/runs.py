@@ -13,7 +13,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.units import quantity
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say
-from quadrl.learning.folder import CONFIG, EVALUATION, read_config
+from quadrl.learning.folder import CONFIG, EVALUATION, is_earlier, read_config
 
 AGES = {"d": 86_400, "h": 3_600, "min": 60, "s": 1}
 """Units of the age of a run [s]."""
@@ -29,7 +29,8 @@ class Runs:
     def run(self) -> None:
         """Print a row for each run."""
         rows: list[tuple[str, ...]] = []
-        for since, path in sorted((x.stat().st_mtime, x) for x in self.folder.rglob(CONFIG)):
+        found = [x for x in self.folder.rglob(CONFIG) if not is_earlier(x.parent)]
+        for since, path in sorted((x.stat().st_mtime, x) for x in found):
             try:
                 config = read_config(path.parent)
             except QuadrlError as error:
@@ -37,8 +38,8 @@ class Runs:
                 continue
             success = "none yet"
             with contextlib.suppress(OSError, ValueError, LookupError):
-                found = json.loads((path.parent / EVALUATION).read_text())
-                success = quantity("success_rate", found["success_rate"])
+                reached = json.loads((path.parent / EVALUATION).read_text())
+                success = quantity("success_rate", reached["success_rate"])
             known = (str(config[name]) for name in ("task", "algo", "seed"))
             name = str(path.parent.relative_to(self.folder))
             rows.append((name, *known, success, _age(time.time() - since)))

@@ -20,8 +20,9 @@ def touches_ground(now: Snapshot, *, bounces: bool = False) -> Array:
     """
     if not bounces and now.world is not None and now.world.places:
         return stands(now) | strikes_ground(now)
-    lowest = _lowest(now) if bounces else now.state.height
-    return lowest < now.parameters.ground_clearance
+    if bounces:  # an aircraft that lies on its back or its side is on the ground, too
+        return (_lowest(now) < now.parameters.ground_clearance) | strikes_ground(now)
+    return now.state.height < now.parameters.ground_clearance
 
 
 def stands(now: Snapshot) -> Array:

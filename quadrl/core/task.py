@@ -74,8 +74,6 @@ class Task(abc.ABC):
     `vehicle_options` are those of that aircraft, and no other's."""
     training_with: ClassVar[dict[str, dict[str, Any]]] = {}
     """What is different with an algorithm, by its name."""
-    trainings: ClassVar[tuple[dict[str, Any], ...]] = ()
-    """Where one training is not enough: settings of the first, and of one from its networks."""
     gains: ClassVar[dict[str, float]] = {}
     """Gains of the geometric controller that differ from its defaults."""
     observation: ClassVar[dict[str, ObservationTerm]] = OBSERVATION

@@ -102,11 +102,17 @@ def head(figure: Figure, title: str) -> None:
 
 
 @styled
-def learning_curve(metrics: Metrics, title: str, evaluated: Metrics | None = None) -> Figure:
+def learning_curve(
+    metrics: Metrics,
+    title: str,
+    evaluated: Metrics | None = None,
+    ends: Sequence[float] = (),
+) -> Figure:
     """Return, success and error over the steps of a run; figure 3 of the paper.
 
     The main line is the mean action, as it was evaluated along the training; beside it, or alone
-    where there was no evaluation, are the sampled actions of the training itself.
+    where there was no evaluation, are the sampled actions of the training itself. Lines mark the
+    `ends` of trainings before the last [control steps].
     """
     figure = Figure(figsize=(8.0, 7.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)
@@ -118,11 +124,14 @@ def learning_curve(metrics: Metrics, title: str, evaluated: Metrics | None = Non
             _curve(axis, metrics, name, color=colour, lw=2, label=name)
         axis.set_ylabel(label)
         axis.set_ylim(bottom=0 if name != "return" else None)
+        for end in ends:
+            axis.axvline(end / 1e3, color=GREY, lw=1, ls=":")
         tidy(axis)
     _curve(axes[1], evaluated or metrics, "survival", color=GREY, lw=1.5, label="survival")
     axes[1].set_ylim(-0.03, 1.03)
     axes[1].legend(frameon=False, loc="best")
     flown = "sampled actions" if evaluated is None else "mean action; thin: sampled actions"
+    flown += "; dotted: a training from here on" * bool(ends)
     axes[-1].set_xlabel(f"control steps [thousands], {flown}")
     seconds = _steps_to_seconds(metrics["steps"] / 1e3, metrics["seconds"])
     top = axes[0].secondary_xaxis("top", functions=seconds)

@@ -28,10 +28,10 @@ from quadrl.core.task import Task
 from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
 from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning import foreign
-from quadrl.learning.defaults import flat, training_defaults, usual_vehicle
+from quadrl.learning.defaults import flat, merged, training_defaults, usual_vehicle
 from quadrl.learning.folder import CHANGEABLE, CONFIG, FIGURES, read_config
 from quadrl.learning.log import WRITERS
-from quadrl.learning.origin import Origin, with_networks
+from quadrl.learning.origin import NETWORKS, Origin, with_networks
 from quadrl.learning.settings import ALGORITHM_CONFIGS, PAIRED, USUAL, TrainSettings
 from quadrl.tasks import TASKS
 
@@ -43,6 +43,13 @@ MAX_BATCH = 1 << 24
 MAX_WIDTH = 1 << 16
 MEMORIES = ("none", "gru", "raptor")
 KEEPS = ("best", "last")
+ONE = ("task", "seed", "variant", "device", "num_threads", "checkpoint_seconds", "evaluations",
+       "keep", "log", "episodes", "reward_scale", *NETWORKS)  # fmt: skip
+"""Settings that trainings in turn share, beside the conditions of flight."""
+LAST = ("phases", "from_run", "until", "checkpoint_every")
+"""Settings of the last of them alone."""
+ALIKE = (*ONE, *LAST, "vehicle", "control_mode", "observe")
+"""What cannot differ between them: a policy's networks fit one task, aircraft and observation."""
 
 
 @dataclasses.dataclass(frozen=True, init=False)
@@ -84,6 +91,8 @@ class TrainConfig(TrainSettings):
         variant = settings.get("variant", TrainConfig.variant)
         varied = self._known(vehicle), variant, settings.get("memory")
         values, _ = training_defaults(task, algo, *varied)
+        if settings.get("from_run"):  # which has learned what they are for
+            values["phases"] = ()
         for name, own in ALGORITHM_CONFIGS.items():
             given = settings.get(name, {})
             if name != algo:
@@ -122,6 +131,7 @@ class TrainConfig(TrainSettings):
         if not values["aerodynamics"] and (brought := self._wind_brings()):
             values["aerodynamics"], sources["aerodynamics"] = brought, "in wind"
         if self.from_run:
+            values["phases"] = ()
             with contextlib.suppress(QuadrlError):  # it may be gone by now
                 origin = Origin.of(self.from_run)
                 values |= (networks := origin.networks())
@@ -202,7 +212,42 @@ class TrainConfig(TrainSettings):
             given = numbers("gammas", self.gammas, len(scenario.task.parts), 0, 1)
             object.__setattr__(self, "gammas", given)
         AircraftSampler(scenario.randomization, scenario.aircraft)
+        self._check_phases()
         getattr(self, self.algo).check(self)
+
+    def _check_phases(self) -> None:
+        if not isinstance(self.phases, tuple):
+            allowed = "a list of trainings, a table of settings each"
+            raise QuadrlError(name="phases", value=self.phases, allowed=allowed)
+        for count, given in enumerate(self.phases, 1):
+            name = f"phase {count}"
+            if not isinstance(given, dict) or "algo" not in given:
+                allowed = 'a table of settings with its algorithm, such as {"algo": "apg"}'
+                raise QuadrlError(name=name, value=given, allowed=allowed)
+            if alike := [one for one in ALIKE if one in given]:
+                reason = "trainings in turn share it"
+                value = given[alike[0]]
+                allowed = "given for all of them"
+                raise QuadrlError(
+                    reason, name=f"{alike[0]} of {name}", value=value, allowed=allowed
+                )
+        try:
+            _ = self.earlier
+        except QuadrlError as error:
+            raise QuadrlError(f"phases: {error}") from error
+
+    @functools.cached_property
+    def earlier(self) -> tuple[TrainConfig, ...]:
+        """The settings of the trainings that come before, in their order."""
+        whole, found = self.named(), list[TrainConfig]()
+        for given in self.phases:
+            same = algorithm_of(self.task, given["algo"]) == self.algo
+            kept = whole if same else {name: whole[name] for name in (*ONE, *GIVEN)}
+            kept = {name: value for name, value in kept.items() if name not in LAST}
+            settings = merged(kept, given, {"phases": ()})
+            recorded = None if given.keys() & GIVEN.keys() else self.recorded
+            found.append(TrainConfig(**settings, recorded=recorded))
+        return tuple(found)
 
     @property
     def scenario(self) -> Scenario:
@@ -257,6 +302,7 @@ class TrainConfig(TrainSettings):
             QuadrlError: Its task is not known here, or something in it cannot be used.
         """
         given = {name: saved[name] for name in USUAL if name in saved} | changes
+        given.setdefault("phases", ())
         if not isinstance(recorded := saved.get("scenario"), Mapping):
             raise QuadrlError(name="scenario of a run", value=recorded, allowed="a table")
         return cls(**given, recorded=recorded)

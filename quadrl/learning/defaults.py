@@ -320,6 +320,8 @@ def written(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
             yield from written(value, f"{word}.")
         elif isinstance(value, bool):
             yield prefix + "no-" * (not value) + word.removeprefix(prefix)
+        elif name == "phases":
+            yield f"{word} {shlex.quote(json.dumps(value))}"
         elif isinstance(value, tuple | list):
             yield " ".join((word, *map(str, value)))
         else:

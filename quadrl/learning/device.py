@@ -87,7 +87,7 @@ class DeviceTraining(Training):
 
     def _learn(self, batch: None) -> dict[str, float]:
         learner, remaining = self._learner, 1 - self.iteration / self.config.iterations
-        fresh = self.iteration == 0 and not self.config.from_run
+        fresh = self.iteration == 0 and not self._origin
         self.algorithm.set_rates(remaining)
         if self.env.device.type != "cuda" or not self._warm:
             learner.iterate(fresh)

@@ -154,6 +154,16 @@ def run_of(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def earlier(folder: Path, number: int) -> Path:
+    """The folder of a training, from 1 on, that comes before the last one of a run."""
+    return folder / f"phase_{number}"
+
+
+def is_earlier(folder: Path) -> bool:
+    """Whether a folder is that of such a training."""
+    return folder.name.startswith("phase_") and (folder.parent / CONFIG).exists()
+
+
 def write_config(folder: Path, config: Mapping[str, Any], processors: Sequence[str] = ()) -> None:
     """Write the resolved configuration of a run, its files of `--import` and its processor.
 

@@ -26,8 +26,8 @@ from quadrl.core.scenario import UNDISTURBED, Scenario
 from quadrl.core.solved import missed
 from quadrl.evaluation.evaluate import Evaluation, evaluate, html_table
 from quadrl.evaluation.policy import Policy
+from quadrl.learning import phases
 from quadrl.learning.config import TrainConfig, prepare
-from quadrl.learning.defaults import written
 from quadrl.learning.folder import EVALUATION, LEARNING_CURVE, TRAJECTORY, VIDEO
 from quadrl.learning.show import curve
 from quadrl.learning.train import Training
@@ -73,6 +73,7 @@ class Run:
     def kept(self) -> str:
         """Which policy it is, in a line."""
         after = f"kept: the policy after {self.policy.metadata['steps']:,} control steps"
+        after += " of the last training" * bool(self.config.phases)
         if self.config.keep == "last" or not self.config.evaluations:
             return f"{after}, the last"
         return f"{after}, the best in the evaluations along the training"
@@ -117,18 +118,12 @@ class Run:
     def _next(self) -> str:
         """The command that goes on where targets are missed."""
         config, run, flown = self.config, shlex.quote(str(self.folder)), self.config.scenario
-        # Some tasks cannot be made without; where trainings follow each other, options differ.
-        own = {} if flown.task.trainings else {"task_options": config.conditions["task_options"]}
+        own = {"task_options": config.conditions["task_options"]}  # some cannot be made without
         usual = TrainConfig(config.task, algo=config.algo, **own).scenario
         differ = [k for k in UNDISTURBED if getattr(flown, k) != getattr(usual, k)]
         if differ:
             calm = " ".join(f"--{name} {UNDISTURBED[name]}" for name in differ)
             return f"They count undisturbed: quadrl evaluate {run} {calm}"
-        if flown.task.trainings and flown == usual and not config.from_run:
-            first, second = flown.task.trainings
-            begun = config.algo == first.get("algo", flown.task.trained_by)
-            settings = {"seed": config.seed, **({"from": run, **second} if begun else first)}
-            return f"Next: quadrl train {config.task} {' '.join(written(settings))}"
         return f"Next: quadrl train --resume {run} --steps {2 * config.steps}"
 
     def _repr_html_(self) -> str:
@@ -208,11 +203,15 @@ def train_in(
     scenario = config.scenario
     asked = scenario.randomization, scenario.control_mode, scenario.mean_wind, scenario.lands
     warn_of_unreached(scenario.aircraft, *asked)
+    before = 0.0
+    if config.phases:
+        phases.prepare(folder, config, kind_of, resume=resume, show=show, heed=heed)
+        before, resume = phases.seconds(folder), True
     training = kind_of(config)(config, folder, resume=resume)
     with heed(training.ask):
-        policy = training.run(show)
+        policy = training.run(phases.shown(show, len(config.phases) + 1, config))
     found = evaluate(policy, scenario, episodes=config.episodes)
-    seconds = round(training.seconds, 2)
+    seconds = round(before + training.seconds, 2)
     record = {"training_s": seconds, "scenario": scenario.to_json()}
     late = _later(policy, scenario, config.episodes)
     if late:

@@ -253,6 +253,11 @@ class TrainSettings:
     deviation of what they see. Their widths, memory, holds_goal and deviation are those of that
     run; task, algorithm and all else may differ. Saved as FOLDER@DIGEST, with the digest of its
     checkpoint."""
+    phases: tuple[dict[str, Any], ...] = ()
+    """Trainings that come before, in turn, each from the networks of the one before it: the
+    algorithm of each, and what else differs there, such as [{"algo": "apg", "steps": 200000}]. One
+    with the same algorithm has the settings of this training, another one its own defaults; all
+    have the same task, seed and networks. They are in the same folder, as phase_1, phase_2, ..."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     """Settings of PPO."""
     trpo: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)

@@ -8,8 +8,6 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-import numpy as np
-
 from quadrl.base.errors import QuadrlError
 from quadrl.base.extras import needed
 from quadrl.base.media import Media
@@ -18,7 +16,8 @@ from quadrl.base.validation import choice
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import Evaluation, beside, evaluate
-from quadrl.learning.folder import EVALUATIONS, METRICS, read_config, read_metrics
+from quadrl.learning import phases
+from quadrl.learning.folder import read_config
 from quadrl.learning.foreign import read_curve
 from quadrl.rendering.scenarios import comment
 from quadrl.rendering.sheet import SHEETS, write_contact_sheet
@@ -143,15 +142,9 @@ def curve(folder: Path) -> Figure:
     """
     from quadrl.evaluation import plotting
 
-    config, metrics = read_config(folder), read_metrics(folder / METRICS)
+    config, (metrics, evaluated, ends) = read_config(folder), phases.curve(folder)
     title = f"{config['task']}, {str(config['algo']).upper()}, seed {config['seed']}"
-    return plotting.learning_curve(metrics, title, _evaluated(folder))
-
-
-def _evaluated(folder: Path) -> dict[str, np.ndarray] | None:
-    """The evaluations of the mean action along a training; None where there was none."""
-    file = folder / EVALUATIONS
-    return read_metrics(file) if file.exists() else None
+    return plotting.learning_curve(metrics, title, evaluated, ends)
 
 
 def curves(
@@ -196,9 +189,8 @@ def curves(
                 read = read_curve(folder)
                 others.setdefault(folder.stem, []).append(read)
                 continue
-            config, metrics = read_config(folder), read_metrics(folder / METRICS)
+            config, both = read_config(folder), phases.curve(folder)[:2]
             label = folders[folder] if isinstance(folders, Mapping) else config["algo"]
-            both = metrics, _evaluated(folder)
             runs.setdefault(config["task"], {}).setdefault(label, []).append(both)
     for task, found in runs.items():
         mean = all(evaluated for pairs in found.values() for _, evaluated in pairs)

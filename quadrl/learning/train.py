@@ -41,6 +41,7 @@ from quadrl.learning.evaluations import Evaluations, Kept
 from quadrl.learning.folder import (
     EVALUATION,
     WARNINGS,
+    earlier,
     lock_folder,
     new_folder,
     read_config,
@@ -99,10 +100,11 @@ class Training:
         for network in (self.actor, self.critic):
             network.to(device)
         begun = resume and any((folder / x).exists() for x in (checkpoint.CHECKPOINT, POLICY_FILE))
-        if config.from_run and not begun:
-            checkpoint.begin_with(
-                Origin.of(config.from_run).checkpoint(size, actions), self.actor, self.critic
-            )
+        self._origin = earlier(folder, len(config.phases)) if config.phases else config.from_run
+        """The run whose networks it begins with, or none."""
+        if self._origin and not begun:
+            found = Origin.of(self._origin).checkpoint(size, actions)
+            checkpoint.begin_with(found, self.actor, self.critic)
         self.algorithm = make_algorithm(config, self.env, self.actor, self.critic)
         self.advantages = Advantages(config, device)
         self.iteration = 0
@@ -277,7 +279,7 @@ class Training:
                 batch[BEGINS] = torch.roll(done, 1, dims=1)
                 batch[BEGINS][:, 0] = False  # a state with which an episode begins is zero
                 self._remembered = {STATE: state[:, -1].masked_fill(done[:, -1], 0.0).cpu().numpy()}
-            fresh = self.iteration == 0 and not self.config.from_run
+            fresh = self.iteration == 0 and not self._origin
             first = fresh and not self.algorithm.whole
             if first:  # the first batch was collected without a normaliser
                 networks.update_normalisers(self.normalisers, batch)

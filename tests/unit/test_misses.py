@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import shlex
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 
 from quadrl import cli, tasks
-from quadrl.cli.flown import parse_options
 from quadrl.core.solved import Target, missed
 from quadrl.learning import run as learning_run
 from quadrl.learning.config import TrainConfig
@@ -60,30 +58,10 @@ def test_every_task_says_each_target_that_it_misses_and_a_command_that_is_unders
     said, command = training.misses.split(". Next: ")
     assert said.startswith("misses: ") and "\n" not in training.misses
     cli.parse(shlex.split(command)[1:])
-    assert ("--from 'runs/own run'" in command) == (task == "lsy_race")
 
 
 def next_of(training):
     return training.misses.split(". Next: ")[1]
-
-
-def test_trainings_in_turn_are_the_commands_of_the_page():
-    figures = reached("recovery", 0.5)
-    assert next_of(run("recovery", figures, seed=7)) == (
-        "quadrl train recovery --seed 7 --algo apg"  # with PPO from nothing nobody gets there
-    )
-    assert next_of(run("recovery", figures, algo="apg")) == (
-        "quadrl train recovery --seed 0 --from 'runs/own run' --algo ppo"
-    )
-    for task in ("recovery", "lsy_race"):
-        page = re.sub(r"\\\n *", "", (PAGES / f"{task}.md").read_text())
-        (command,) = re.findall(rf"^quadrl (train {task} .*--from .*)$", page, re.MULTILINE)
-        given = cli.parse(shlex.split(command)).command.settings
-        first, second = tasks.TASKS[task].trainings
-        assert given.algo in ("", second.get("algo"))
-        shown = parse_options(given.training_options or ())
-        assert shown == second.get("training_options", {})
-        assert TrainConfig(task, **first) != TrainConfig(task, **second)
 
 
 def test_other_conditions_go_on_with_their_own_run():
