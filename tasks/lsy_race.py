@@ -38,8 +38,8 @@ STRAIGHT, LEAD = 0.05, 0.3
 MOST = 1.9  # size of the box at which it would reach both sides of an opening at once
 ROOM = 0.15  # [m], about the box, in which a flight costs more
 SPEED = 1.0  # [m/s], most at a start in flight; much faster ones end in the pole behind gate three
-# The first training finds the way. From the start alone the last gates are hardly seen, and a policy
-# that seldom gets through a gate learns to wait before it: some episodes have a smaller box.
+# The first training finds the way. From the start alone the last gates are hardly seen, and a
+# policy that seldom gets through a gate learns to wait before it: some episodes have a smaller box.
 FINDS = {"flying": 0.95, "least_box": 0.3, "box": 1.0, "crash_weight": 20.0, "paid_speed": 2.0}
 # The second one flies it with more room than the rules ask for.
 WITH_ROOM = {"flying": 0.5, "least_box": 0.7, "box": 1.2, "crash_weight": 60.0, "paid_speed": 2.4}
