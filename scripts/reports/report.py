@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -49,6 +50,8 @@ def load(name: str) -> Result:
     def unpack(found: Result) -> Any:
         if found.keys() == {"columns", "rows"}:
             return [dict(zip(found["columns"], row, strict=True)) for row in found["rows"]]
+        if found.keys() == {"tables"}:
+            return [row for table in found["tables"] for row in table]
         return found
 
     return json.loads((RESULTS / f"{name}.json").read_text(), object_hook=unpack)
@@ -72,14 +75,20 @@ def save(name: str, result: Result) -> None:
 
 
 def packed(value: Any) -> Any:
-    """The same value in five digits, None for what is not finite, equal records as a table."""
+    """The same value in five digits, None for what is not finite, rows with equal names as tables."""
     if isinstance(value, dict):
         return {name: packed(part) for name, part in value.items()}
     if isinstance(value, (list, tuple)):
         rows = [packed(part) for part in value]
-        if len(rows) > 1 and isinstance(rows[0], dict) and len({(*x,) for x in rows}) == 1:
-            return {"columns": [*rows[0]], "rows": [[*row.values()] for row in rows]}
-        return rows
+        if not all(isinstance(row, dict) for row in rows):
+            return rows
+        tables = [
+            {"columns": head, "rows": [[*row.values()] for row in alike]}
+            for head, alike in itertools.groupby(rows, list)
+        ]
+        if 2 * len(tables) > len(rows):  # some two rows each, or fewer
+            return rows
+        return tables[0] if len(tables) == 1 else {"tables": tables}
     if isinstance(value, float):
         return float(f"{value:.5g}") if math.isfinite(value) else None
     return value

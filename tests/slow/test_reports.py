@@ -59,11 +59,15 @@ def test_parts_are_spliced_into_a_page(tmp_path, monkeypatch):
 
 def test_results_keep_machine_commit_and_five_digits():
     rows = [{"a": 1, "b": {"c": 2.0}}, {"a": 3, "b": {"c": math.inf}}]
-    report.save("x", {"a": [1 / 3, math.nan], "rows": rows, "others": [{"a": 1}, {"b": 1}]})
+    mixed = [{"d": k} for k in range(3)] + [{"d": k, "e": None} for k in range(3)]
+    whole = {"a": [1 / 3, math.nan], "rows": rows, "others": [{"a": 1}, {"b": 1}], "mixed": mixed}
+    report.save("x", whole)
     text = (report.RESULTS / "x.json").read_text()
     assert text.count('"c"') == 2 and text.count('"a"') == 3  # a name of a column stands once
+    assert text.count('"d"') == 2
     saved = report.load("x")
     assert saved["a"] == [0.33333, None] and saved["others"] == [{"a": 1}, {"b": 1}]
+    assert saved["mixed"] == mixed
     assert saved["rows"] == [{"a": 1, "b": {"c": 2.0}}, {"a": 3, "b": {"c": None}}]
     assert saved["machine"]["mujoco"] == mujoco.__version__
     assert f"Measured at commit {saved['commit']}." in report.source(saved)
