@@ -75,7 +75,7 @@ def save(name: str, result: Result) -> None:
 
 
 def packed(value: Any) -> Any:
-    """The same value in five digits, None for what is not finite, rows with equal names as tables."""
+    """The same value in five digits, None for what is not finite, rows of equal names as tables."""
     if isinstance(value, dict):
         return {name: packed(part) for name, part in value.items()}
     if isinstance(value, (list, tuple)):
