@@ -56,6 +56,7 @@ class Recovery(Task):
             },
         },
     }
+    variants = {"robust": {"phases": ()}}  # APG cannot begin with late commands and noise
     observation = ROTATION | MOTION
 
     time_limit: float = 5.0
