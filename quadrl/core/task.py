@@ -96,7 +96,8 @@ class Task(abc.ABC):
     """What an aircraft measures in flight of what moves of itself: names of methods of a snapshot,
     such as goal, and what they give. An exported policy is given it in each step."""
     variants: ClassVar[dict[str, dict[str, Any]]] = {}
-    """Settings of other trainings, by variant: what differs from the usual one."""
+    """Settings of other trainings, by variant: what differs from the usual one; also the algorithm,
+    where that is another one."""
     signed: ClassVar[tuple[str, ...]] = ()
     """Options that may be negative although their default is positive."""
 

@@ -80,7 +80,7 @@ class TrainConfig(TrainSettings):
             allowed = "a mapping of conditions by name"
             raise QuadrlError(name="conditions", value=conditions, allowed=allowed)
         settings = _given({**conditions, **settings})
-        algo = algorithm_of(task, settings.get("algo"))
+        algo = algorithm_of(task, settings.get("algo"), settings.get("variant"))
         foreign.refuse_unknown("setting", settings, USUAL, algo)
         settings = with_networks(settings)
         # An unknown task is refused with the defaults.
@@ -339,9 +339,11 @@ def prepare(
     return config, free_name(named, CONFIG) if out is None else Path(out)
 
 
-def algorithm_of(task: str, algo: str | None) -> str:
+def algorithm_of(task: str, algo: str | None, variant: str | None = None) -> str:
     """Name the algorithm that trains a task: the given one or, if that is None, the task's own."""
-    algo = TASKS.get(task, Task).trained_by if algo is None else algo
+    kind = TASKS.get(task, Task)
+    if algo is None:
+        algo = kind.variants.get(variant or "", {}).get("algo", kind.trained_by)
     return choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS, known_as=foreign.ALGORITHMS)
 
 

@@ -251,9 +251,11 @@ def check_stated(task: type[Task]) -> None:
     Raises:
         QuadrlError: The message lists the settings.
     """
-    stated = merged(task.training, *task.training_with.values(), *task.variants.values())
+    stated = merged(task.training, *task.training_with.values())
     known = [name for name in USUAL if name not in CHOSEN]
     keys(f"training default of {task.name}", stated, known)
+    varied = merged(*task.variants.values())
+    keys(f"training default of {task.name}", varied, [*known, "algo"])
 
 
 def at_rate(layer: dict[str, Any], timestep: float) -> dict[str, Any]:
