@@ -360,3 +360,8 @@ def refused(name=None, value=..., allowed=None, *, lists="", match=None):
     assert value is ... or [type(value), value] == [type(error.value), error.value]
     assert allowed in (None, error.allowed) and lists in error.allowed
     assert error.name is None or error.allowed
+
+
+def mostly_slow(names, *fast):
+    """Parameters of a test that takes seconds with each: all but some are slow."""
+    return [name if name in fast else pytest.param(name, marks=pytest.mark.slow) for name in names]

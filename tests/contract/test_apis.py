@@ -23,6 +23,7 @@ def episode(flown, actions=ACTIONS):
     return np.stack(seen + [flown.observation(flown.step(a[: flown.rows])) for a in actions])
 
 
+@pytest.mark.slow
 @every_api
 def test_a_seed_gives_the_episodes_one_after_the_other(api):
     one, same, other = api(seed=3), api(seed=3), api(seed=5)
@@ -137,6 +138,7 @@ def test_the_import_and_a_policy_are_light_and_set_no_variable():
     python("-W", "error", "-c", code)
 
 
+@pytest.mark.slow
 def test_without_dm_control_its_own_api_alone_is_missing_and_says_so_in_a_line():
     code = (
         "import sys; sys.modules.update(dm_control=None, dm_env=None);"

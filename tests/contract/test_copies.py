@@ -42,6 +42,7 @@ def assert_same(one, other):
         np.testing.assert_array_equal(value, other[name], err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
 @pytest.mark.parametrize("api", APIS, ids=lambda api: api.__name__)
 def test_a_copy_goes_on_bit_for_bit(api, settings):

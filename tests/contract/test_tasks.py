@@ -5,7 +5,7 @@ import dataclasses
 import flights
 import numpy as np
 import pytest
-from helpers import needs_dm_control
+from helpers import mostly_slow, needs_dm_control
 
 from quadrl.base.rotation import Array, namespace
 from quadrl.control.modes import CONTROL_MODES
@@ -32,7 +32,7 @@ ACTIONS = varied_actions(100, AIRCRAFT)  # more than twice the time limit of the
 WAYPOINTS = ((0.0, 0.1, 0.3), (0.1, 0.0, 0.9), (0.0, 0.0, 5.0))
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", mostly_slow(TASKS, "hover", "landing"))
 def test_task_keeps_the_contract(name):
     check_task(name)
 
@@ -60,11 +60,13 @@ def test_the_yardstick_flies_what_the_task_senses(name):
     assert alone.rollout.action.shape[1:] == (1, alone.vehicle.rotor_count)
 
 
+@pytest.mark.slow
 def test_a_route_keeps_it_too():
     # The first waypoint is reached at once, the second by the aircraft that climbs.
     check_task(StaticWaypoint(waypoints=WAYPOINTS, reach=0.35))
 
 
+@pytest.mark.slow
 def test_one_of_several_tasks_keeps_it_too():
     check_task(OneOf(members=("hover", "straight_and_level"), time_limit=1.5))
     check_task(OneOf(members=("hover", "landing"), time_limit=1.5))  # one on the ground
@@ -84,7 +86,7 @@ def check_identity(task, actions=ACTIONS, mode="rotor"):
     return expected
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", mostly_slow(TASKS, "hover"))
 def test_every_api_gives_the_numbers_of_a_plain_mj_step_loop(name):
     flight = check_identity(make(name, time_limit=EPISODE))
     over = flight["terminated"] | flight["truncated"]
@@ -94,6 +96,7 @@ def test_every_api_gives_the_numbers_of_a_plain_mj_step_loop(name):
     assert len(np.unique(starts, axis=0)) == len(starts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [mode for mode in CONTROL_MODES if mode != "rotor"])
 @pytest.mark.parametrize("name", ["hover", "landing"])  # in free flight, and with contact
 def test_every_control_mode_gives_the_same_numbers_too(name, mode):

@@ -350,6 +350,7 @@ def test_the_gyroscopic_moment_does_no_work():
 # -------------------------------------------------------------------------- the exact solution
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "leaning"])
 def test_flights_are_those_of_the_exact_solution(name):
     """Of an independent integrator with a bracketed root, low and high, in wind."""

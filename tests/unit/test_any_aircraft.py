@@ -222,6 +222,7 @@ def test_what_the_teacher_needs_is_said(changes, said, tmp_path):
         quadrl.train("hover", algo="dagger", variant="any", out=tmp_path / "run", **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", ["gru", "none"])
 def test_dagger_learns_and_resumes_to_the_same_bits(memory, tmp_path):
     small = {

@@ -30,6 +30,7 @@ TINY = TrainConfig(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["rotor", "thrust_body_rate"])
 def test_hover_is_learned_within_a_few_windows(mode, tmp_path):
     settings = {"seed": 300, "num_envs": 32, "steps": 32 * 32 * 20, "control_mode": mode}

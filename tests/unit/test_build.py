@@ -216,6 +216,7 @@ def _no_home():
     raise RuntimeError("Could not determine home directory.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["cache", "temporary folder"])
 def test_what_a_killed_build_left_is_removed_by_the_next_one_but_not_a_living_ones(
     tmp_path, cache, run, where

@@ -143,6 +143,7 @@ POLICIES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POLICIES)
 def test_the_c_has_the_bits_of_the_reference(name, tmp_path):
     """And of the environment, to a few units of single precision, with each optimisation."""
@@ -173,6 +174,7 @@ def test_the_c_has_the_bits_of_the_reference(name, tmp_path):
 
 
 # A trajectory magnifies the rounding of a flight; tests/slow/test_in_the_loop.py flies it.
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in POLICIES if name != "trajectory"])
 def test_the_c_flies_as_the_policy_does(name, tmp_path):
     policy = POLICIES[name]()
@@ -200,6 +202,7 @@ def test_the_c_flies_as_the_policy_does(name, tmp_path):
         np.testing.assert_allclose(own.error, done.error, rtol=1e-2, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     ["hover_robust", "target_following", "deck_landing", "perching", "navigation", "all"],

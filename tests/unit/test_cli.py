@@ -190,6 +190,7 @@ def test_options_are_read_as_json_where_they_are():
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_train_writes_every_file(run):
     assert {p.name for p in run.iterdir()} == FILES | {"flight.mp4"}
     config = json.loads((run / "config.json").read_text())
@@ -231,6 +232,7 @@ def test_the_result_comes_before_the_pictures_and_where_to_go_on_without_them(
         assert words in said  # on one line, however long
 
 
+@pytest.mark.slow
 def test_train_says_what_late_commands_do(tmp_path, capsys):
     # Nobody has learned anything in 192 steps; within two steps nobody falls, either.
     long = ("--task-options", "time_limit=0.04", "tolerance=9", "heading_tolerance=9")
@@ -272,6 +274,7 @@ def test_render_writes_a_video_that_plays(run, tmp_path, capsys):
     assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (30, 1.5)
 
 
+@pytest.mark.slow
 def test_json_is_printed_alone(capsys, tmp_path):
     words = ["--disturbances", "wind", "--no-recovery", "--episodes", "2", "--quiet", "--json"]
     flown = ["robustness", "--controller", "geometric", "--out", tmp_path / "card", *words]
@@ -300,6 +303,7 @@ def test_plot(copy, capsys):
     assert (copy / "curve.pdf").read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.slow
 def test_plot_of_several_runs(run, tmp_path, capsys, refusal):
     folders = [tmp_path / name for name in ("a", "b", "c")]
     kinds = (("hover", "ppo"), ("hover", "vpg"), ("landing", "ppo"))
@@ -495,6 +499,7 @@ REFUSED = {  # words, {run} for the folder of a run, and what the error is about
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", REFUSED)
 def test_what_cannot_be_is_refused_by_its_name_and_changes_nothing(refusal, run, tmp_path, words):
     before = contents(run)
@@ -554,6 +559,7 @@ MISTYPED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", MISTYPED)
 def test_a_mistyped_command_is_answered_in_a_line(capsys, tmp_path, words):
     assert command(*words.split()) == 2
@@ -659,6 +665,7 @@ def test_the_tasks_of_a_file_are_checked_in_their_order(monkeypatch):
     assert checked == names
 
 
+@pytest.mark.slow
 def test_output_that_nobody_reads_ends_quietly():
     words = f"{shlex.quote(sys.executable)} -m quadrl completion | true"
     done = subprocess.run(["bash", "-c", words], capture_output=True, text=True)

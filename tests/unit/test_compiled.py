@@ -91,6 +91,7 @@ FEW = ("hover", "landing", "race")
 FLOWN = [(task, name) for name in SETTINGS for task in (tasks.TASKS if name == "batch" else FEW)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "name"), FLOWN)
 def test_the_same_bits_as_the_functions_of_the_task(task, name):
     count, settings = SETTINGS[name]
@@ -608,6 +609,7 @@ DRAWN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("mode", ["rotor", "thrust_body_rate"])
 def test_compiled_sensors_are_the_written_ones(engine, mode):

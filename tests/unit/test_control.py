@@ -143,6 +143,7 @@ def test_the_controller_turns_towards_east_by_the_shorter_way():
         np.testing.assert_allclose(nearer, [[math.cos(wanted), math.sin(wanted)]], atol=1e-12)
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize(
     "task",
@@ -160,6 +161,7 @@ def test_every_task_of_the_paper_is_solved(name, task):
         assert figures["touchdown_speed_max_m_s"] < 0.4
 
 
+@pytest.mark.slow
 @both
 @layouts
 def test_every_aircraft_hovers_without_tuning(name, vehicle):
@@ -482,6 +484,7 @@ def test_a_divergence_within_the_physics_steps_of_loops_ends_the_episode(name):
     assert not environment.step(np.zeros((3, 4))).diverged.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["paper", "crazyflie"])
 def test_who_knows_how_the_target_goes_on_lags_behind_no_longer(vehicle):
     error = {}

@@ -87,6 +87,7 @@ class Board:
         return flew
 
 
+@pytest.mark.slow
 def test_it_flies_as_the_policy_does(library):
     """At the firmware's pace, around a setpoint elsewhere."""
     policy, board = Policy.pretrained(NAME), Board(library)

@@ -291,6 +291,7 @@ def stubbed(monkeypatch):
     monkeypatch.setattr(crosschecking, "environment_of", lambda name, said: Path(name))
 
 
+@pytest.mark.slow
 def test_a_row_for_each_aircraft_on_time_and_late(stubbed, capsys):
     words = ["crosscheck", NAME, "--simulators", "crazyflow", "--episodes", "2", "--seed", "5"]
     cli.main([*words, "--json"])

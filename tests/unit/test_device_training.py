@@ -24,6 +24,7 @@ def _quickly(monkeypatch):
     monkeypatch.setenv("QUADRL_CFLAGS", "-O1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["ideal", "robust"])
 def test_a_training_that_was_stopped_ends_with_the_same_policy(variant, tmp_path):
     config = TrainConfig("hover", variant=variant, **SMALL)

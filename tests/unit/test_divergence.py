@@ -31,6 +31,7 @@ def test_extreme_flights_are_right_or_ended(engine):
     assert ended.sum() > 0.05 * count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", ["hover", "landing"])
 def test_every_row_is_finite_and_moves_or_is_counted_and_neighbours_fly_on(task, engine):
@@ -63,6 +64,7 @@ def test_every_row_is_finite_and_moves_or_is_counted_and_neighbours_fly_on(task,
     assert ended > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_whoever_hits_the_ground_at_speed_has_crashed_and_is_not_under_it(engine):
     for vehicle in extreme.vehicles(6):

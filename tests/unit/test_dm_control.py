@@ -27,6 +27,7 @@ def fly(environment, action=DIVE):
     return steps
 
 
+@pytest.mark.slow
 def test_after_register_dm_control_loads_the_same_environments():
     suite.register()
     suite.register()  # harmless
@@ -48,6 +49,7 @@ def test_after_register_dm_control_loads_the_same_environments():
                 np.testing.assert_array_equal(one.observation[term], other.observation[term])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_a_crash_on_the_last_step_is_a_crash_and_the_clock_is_no_crash(name):
     crashed = fly(quadrl.load(name, {"random": 0}))

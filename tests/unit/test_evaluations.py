@@ -200,6 +200,7 @@ def shown_offline(folder):
     return figures, names, settings
 
 
+@pytest.mark.slow
 def test_wandb_has_what_tensorboard_has_also_of_a_run_that_goes_on(tmp_path, monkeypatch):
     pytest.importorskip("wandb").teardown()  # it reads the environment once in a process
     monkeypatch.setenv("WANDB_MODE", "offline")

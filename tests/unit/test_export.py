@@ -353,6 +353,7 @@ PLACES = [file.stem for file in shipped() if "robust" in file.stem]
 PLACES.remove("navigation_robust")  # of rays and velocities, which the class does not know
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLACES)
 def test_a_robust_policy_flies_by_its_file_alone(name):
     """With late commands and estimates, noise, wind, and other numbers than those specified."""

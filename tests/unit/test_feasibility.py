@@ -222,6 +222,7 @@ def card():
     return quadrl.robustness({"usual": own, "narrow": narrow}, **given, **SHORT)
 
 
+@pytest.mark.slow
 def test_a_card_knows_what_the_actions_of_each_that_flew_reach(card, tmp_path):
     reach = card.found["axes"]["mass"]["reach"]
     assert reach["usual"] == pytest.approx([LEAST, MOST], rel=1e-4)

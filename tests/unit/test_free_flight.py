@@ -89,6 +89,7 @@ def by_both(vehicle, motion, command):
         yield helpers.coordinates(batch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_nothing_that_free_flight_takes_comes_near_the_ground_in_a_step(name):
     # The wildest flights: fast, tilted, in wind, at any height. Whoever is handed over is flown

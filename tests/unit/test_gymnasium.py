@@ -86,6 +86,7 @@ def unnamed(value):
     return np.asarray(value) if isinstance(value, np.ndarray) else value
 
 
+@pytest.mark.slow
 @every_mode
 @pytest.mark.parametrize("name", ["hover", "landing"])
 def test_the_vector_is_gymnasiums_own_vector_of_single_ones(name, mode):

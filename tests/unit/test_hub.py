@@ -28,6 +28,7 @@ def folder(tmp_path_factory):
         return quadrl.export(NAME, "hub", tmp_path_factory.mktemp("hub") / "card")
 
 
+@pytest.mark.slow
 def test_the_policy_in_it_is_the_same(folder):
     own, there = Policy.pretrained(NAME), Policy.load(folder / "policy.safetensors")
     assert there.metadata == own.metadata and (there.weights[0] == own.weights[0]).all()

@@ -46,6 +46,7 @@ def bits(content):
     return [*range(250), *anywhere.tolist()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "read"),
     [

@@ -140,6 +140,7 @@ def test_where_they_truly_stand_is_seen_from_near_and_known_from_then_on():
     np.testing.assert_allclose(gate, truth.gates[0, :3], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("position", "ends"),
     [

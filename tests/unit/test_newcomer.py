@@ -96,6 +96,7 @@ for call in sys.stdin.read().splitlines():
 """
 
 
+@pytest.mark.slow
 def test_without_extras_everything_says_in_a_line_what_it_needs(tmp_path):
     names = "torch torchrl tensordict matplotlib PIL mediapy viser onnx rsl_rl stable_baselines3"
     (tmp_path / "study.toml").write_text('tasks = ["hover"]')

@@ -49,6 +49,7 @@ FLOWN = [(OneOf, {}), (Written, {}), (OneOf, {"control_mode": "velocity"})]
 FLOWN += [(OneOf, {"randomization": "light"})]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "settings"), FLOWN)
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 def test_each_row_flies_as_its_task_alone(engine, kind, settings):

@@ -105,6 +105,7 @@ def test_runs_are_compared_by_their_median_where_all_have_been():
         plotting.learning_curves({"ppo": [nothing]}, "hover")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "begins"), FILES)
 def test_the_same_numbers_make_the_same_file_of_every_kind(tmp_path, kind, begins):
     paths = [tmp_path / f"{k}.{kind}" for k in (1, 2)]
@@ -116,6 +117,7 @@ def test_the_same_numbers_make_the_same_file_of_every_kind(tmp_path, kind, begin
     assert kind in Media(first, kind)._repr_html_()
 
 
+@pytest.mark.slow
 def test_a_picture_of_flights_is_saved_as_every_kind_and_carries_its_scenario(tmp_path):
     flown = quadrl.evaluate("geometric", "hover", episodes=1, time_limit=0.5)
     shown = quadrl.plot(flown, kind="pdf")

@@ -203,6 +203,7 @@ def test_a_policy_that_does_not_ship(task, algo):
     assert all(file.stem in caught.value.allowed for file in shipped())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hover_robust", "straight_and_level_robust"])
 def test_a_robust_policy_flies_its_own_aircraft_or_says_which(name):
     policy = Policy.pretrained(name)

@@ -32,6 +32,7 @@ WILD = dataclasses.replace(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("mode", CONTROL_MODES)
 def test_row_i_is_disturbed_as_the_single_aircraft_of_seed_plus_i(engine, mode):
@@ -140,6 +141,7 @@ def test_each_row_has_a_delay_of_its_own():
 LOST = {"command_loss": (0.5, 2.0), "loss_time": (0.1, 0.3), "command_jitter": (0.1, 0.9)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("mode", CONTROL_MODES)

@@ -173,6 +173,7 @@ def test_flights_by_the_tar_are_those_of_the_policy(files):
         seen, last = environment.flatten(environment.step(action).observation), action[:, order]
 
 
+@pytest.mark.slow
 def test_training_makes_the_shape_that_is_exported(tmp_path):
     settings = {"steps": 1024, "num_envs": 16, "rollout": 8, "evaluations": 0, "episodes": 1}
     run = quadrl.train("hover", variant="raptor", out=tmp_path / "run", **settings)

@@ -104,6 +104,7 @@ COUNTERS = {
 """Three control steps were flown."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COUNTERS)
 @pytest.mark.parametrize("begun", [True, False])
 def test_counters_that_no_environment_has_are_not_restored(name, begun):

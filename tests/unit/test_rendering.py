@@ -461,6 +461,7 @@ def test_a_gif_and_contact_sheets(model):
     assert not Path("b.mp4").exists()
 
 
+@pytest.mark.slow
 @leaves_pipes
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.png", "a.jpg"])
 def test_what_is_drawn_carries_its_scenarios(model, name):

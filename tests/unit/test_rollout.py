@@ -289,6 +289,7 @@ def test_actions_with_another_meaning_are_refused():
         fly(Hovering(), "hover", episodes=1, weather="windy")
 
 
+@pytest.mark.slow
 def test_a_torch_module_flies_as_the_arrays_that_it_was_made_of():
     policy = quadrl.Policy.pretrained("hover")
     own = quadrl.evaluate(policy, episodes=2)

@@ -116,6 +116,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", BAD)
 def test_bad_input_is_answered_in_a_line_and_changes_nothing(folder, capsys, monkeypatch, words):
     (folder / "old").mkdir(exist_ok=True)

@@ -82,6 +82,7 @@ def resumed(task, path, **settings):
         yield other, helpers.fly(other, actions[11:]), expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("randomization", [EVERYTHING, "full"], ids=["parameters", "full"])
 def test_what_was_drawn_survives_save_and_restore(randomization, engine, tmp_path):

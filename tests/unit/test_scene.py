@@ -400,6 +400,7 @@ class Sized(Posted):
         return {"post": dataclasses.replace(super().place(rng, start, state)["post"], size=size)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [Posted, Sized])
 def test_a_task_with_solids_keeps_the_contract_in_every_api(task):
     check_task(task)
@@ -597,6 +598,7 @@ def carried(path, count=1, engine="mujoco", place=(0.0, 0.0), drop=0.0, time=3.0
     return np.array(track), made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 def test_a_deck_that_moves_carries_an_aircraft_as_its_own_frame_would(engine):
     frame, _ = carried(MOVES["sways"], still=True)
@@ -661,6 +663,7 @@ def test_a_fall_of_30_cm_does_not_sink_in(name, engine):
     assert made.state.speed.max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 @pytest.mark.parametrize("name", VEHICLES)
 def test_nobody_passes_or_sticks_in_a_thin_wall(name, engine):
@@ -731,6 +734,7 @@ def test_no_thin_wall_is_passed_untouched(name, speed):
     assert (fastest > 0.8 * sum(speed)).all() and np.median(fastest) < 1.05 * sum(speed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VEHICLES)
 def test_a_thin_wall_stops_an_aircraft_at_any_attitude(name):
     """As fast as the page of own tasks says."""

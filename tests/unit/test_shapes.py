@@ -53,6 +53,7 @@ def check(record, **lengths):
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(tasks.TASKS))
 def test_arrays_have_the_shapes_that_stand_behind_them(name):
     count, rotors = 3, 6  # and four actions

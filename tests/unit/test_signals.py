@@ -50,6 +50,7 @@ def saved(folder):
     return checkpoint.load(folder / checkpoint.CHECKPOINT)[1]["iteration"], steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "signals",
     [(signal.SIGTERM,), (signal.SIGINT,), (signal.SIGTERM,) * 3, (signal.SIGINT, signal.SIGTERM)],

@@ -140,6 +140,7 @@ def test_who_rests_with_another_heading_has_not_crashed():
     assert task.metrics(flight)["crash_rate"] == 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VEHICLES)
 def test_every_aircraft_lands_on_its_feet(name):
     # The feet of the paper's aircraft are 7 cm below its centre, those of a Crazyflie 1.4 cm.

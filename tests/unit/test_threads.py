@@ -98,6 +98,7 @@ def at_once(work: Callable[[int], np.ndarray]) -> list[np.ndarray]:
     return [results[k] for k in range(THREADS)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("work", [environment, opened_and_closed, plain_model])
 def test_eight_threads_get_bit_for_bit_what_one_gets(work):
     alone = [work(thread) for thread in range(THREADS)]

@@ -161,6 +161,7 @@ def test_more_thrust_than_there_is_is_refused():
     Environment(eight, vehicle="racer")
 
 
+@pytest.mark.slow
 def test_the_yardstick_flies_the_fast_eight_within_centimetres():
     task = tasks.make("trajectory", figure="lemniscate", period=3.5)
     controller = make_controller("geometric", task, FULL_RANGE)

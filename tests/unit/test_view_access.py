@@ -227,6 +227,7 @@ def test_messages_that_no_control_sends_do_nothing(page, monkeypatch):
     assert page.flight.paused
 
 
+@pytest.mark.slow
 @some
 def test_whatever_a_client_sends_the_flight_goes_on(page):
     draw = random.Random(5)
