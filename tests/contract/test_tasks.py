@@ -114,6 +114,7 @@ class Dropped(Hover):
         return now.potentials.distance > 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("altitude", [0.9, 0.07])  # from the air, and on its feet [m]
 def test_contact_gives_the_same_numbers_too(altitude):
     task = Dropped(altitude=altitude, radius=0.01, time_limit=2.0)
@@ -236,6 +237,7 @@ class Faulty(Hover):
     compiled = False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("message", "changes"), FAULTS.values(), ids=FAULTS)
 def test_a_fault_is_noticed(message, changes, monkeypatch):
     for name, value in changes.items():

@@ -274,6 +274,7 @@ def test_the_shipped_policy_holds_a_place_with_every_preset_late_and_in_real_air
     assert found["yaw_rate_rad_s"] < 0.05
 
 
+@pytest.mark.slow
 def test_a_named_aircraft_whose_sizes_are_drawn_is_told():
     policy = Policy.pretrained("hover", variant="any")
     with pytest.warns(QuadrlWarning, match="draws sizes in place of those of the vehicle paper"):

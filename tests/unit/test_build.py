@@ -166,6 +166,7 @@ def run(tmp_path, cache):
         process.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "place", "compiler"),
     [

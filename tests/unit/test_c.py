@@ -277,6 +277,7 @@ def test_what_no_autopilot_knows_is_refused():
         Header(looped)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["thrust_body_rate", "velocity", "position"])
 def test_the_loops_of_a_control_mode_are_in_the_header(mode, tmp_path):
     plain = Policy.pretrained("hover")

@@ -62,6 +62,7 @@ def test_every_batch_begins_as_it_was_changed_and_not_before_a_reset(name):
         assert made.max_episode_length == 6 and made.cfg.task.radius == 1.0
 
 
+@pytest.mark.slow
 def test_vectors_of_single_ones_too():
     for mode in ("sync", "async"):
         envs = gym.make_vec(HOVER, num_envs=2, vectorization_mode=mode, **NEAR)

@@ -95,6 +95,7 @@ def refusal(capsys, monkeypatch):
 # --------------------------------------------------------------------------- what it does
 
 
+@pytest.mark.slow
 def test_tasks(capsys):
     assert command("tasks") == 0
     listed = capsys.readouterr().out
@@ -352,6 +353,7 @@ def test_resume_takes_the_settings_of_the_run(run, copy, undrawn):
         assert json.loads((copy / "evaluation.json").read_text())["episodes"] == episodes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(tasks.TASKS))
 def test_the_settings_that_are_shown_are_those_of_the_command(refusal, monkeypatch, name):
     """What `quadrl tasks` says that a task is trained with."""

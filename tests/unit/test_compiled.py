@@ -174,6 +174,7 @@ POSTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "engine"), [(1, "mujoco"), (21, "free_flight")])
 def test_solids_are_seen_and_touched(count, engine):
     options = {"time_limit": 1.5, "settle_time": 0.2}

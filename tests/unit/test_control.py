@@ -294,6 +294,7 @@ def test_no_action_hovers_at_any_heading_and_actions_are_clipped(name, vehicle):
     np.testing.assert_array_equal(flyer.mode.setpoint(flyer.state, action), clipped)
 
 
+@pytest.mark.slow
 @presets
 @looped
 def test_wild_actions_stay_within_the_rotors_limits_and_do_not_flip_the_aircraft(name, vehicle):

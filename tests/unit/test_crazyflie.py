@@ -221,6 +221,7 @@ def test_motors_are_found_by_their_places_and_spins():
     assert motors(dataclasses.replace(vehicle, rotors=turned)) == [3, 0, 1, 2]
 
 
+@pytest.mark.slow
 def test_an_aircraft_whose_rotors_have_another_order_gets_its_own(app, tmp_path, monkeypatch):
     vehicle = quadrl.VEHICLES["crazyflie_brushless"]
     turned = dataclasses.replace(vehicle, rotors=vehicle.rotors[1:] + vehicle.rotors[:1])
@@ -238,6 +239,7 @@ def test_an_aircraft_whose_rotors_have_another_order_gets_its_own(app, tmp_path,
     np.testing.assert_allclose(boards[1].forces, boards[0].forces[[3, 0, 1, 2]], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_commands_of_an_identified_aircraft_are_made_for_the_voltage(app, tmp_path, monkeypatch):
     """Its table of commands, and the battery at 4 V, in place of the firmware's own."""
     mapped = CommandMap(offset=300.0, gain=-200.0, gain_by_volt=700.0)

@@ -26,6 +26,7 @@ class Tidy(Hover):
         return super().reward(before, now, end) | {"tidy": -3.0 * now.potentials.angular_speed}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", tasks.TASKS)
 def test_terms_and_weights_are_those_of_a_flight(name):
     described = describe(tasks.make(name))

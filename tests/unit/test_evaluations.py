@@ -41,6 +41,7 @@ def one_by_one(monkeypatch):
     monkeypatch.setattr(evaluations, "APART", 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", ["none", "gru"])
 def test_policies_are_evaluated_along_the_way_and_end_as_without(tmp_path, memory):
     alone = trained(tmp_path / "alone", memory=memory)
@@ -87,6 +88,7 @@ def best_of(folder):
 UNSTEADY = {"evaluations": 6, "ppo": {"learning_rate": 0.1, "epochs": 2, "minibatch": 16}}
 
 
+@pytest.mark.slow
 def test_the_best_policy_is_kept_also_by_a_run_that_was_stopped(tmp_path):
     whole = trained(tmp_path / "whole", **UNSTEADY)
     best = best_of(whole.folder)

@@ -167,6 +167,7 @@ def states(policy: Policy, count: int) -> np.ndarray:
     return np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32)
 
 
+@pytest.mark.slow
 @policies
 def test_onnx_acts_as_the_policy(k):
     policy, path = POLICIES[k], export(POLICIES[k], "onnx")
@@ -317,6 +318,7 @@ def test_rotors_stand_and_turn_as_the_files_say(vehicle):
     np.testing.assert_array_equal(turns, -data["spin"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [file.stem for file in shipped()])
 def test_every_term_of_a_shipped_policy_has_its_formula(name):
     said = {k: json.loads(text) for k, text in described(Policy.pretrained(name)).items()}

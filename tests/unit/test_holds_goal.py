@@ -37,6 +37,7 @@ def at_rest(environment, goal, yaw):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", HELD)
 def test_at_the_goal_it_hovers_and_stays(task):
     policy, _ = some_policy(task)

@@ -113,6 +113,7 @@ def fields(kind):
     return [field.name for field in dataclasses.fields(kind)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(tasks.TASKS))
 def test_options_of_a_task_fly_or_are_refused(name):
     @profile

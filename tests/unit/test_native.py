@@ -259,6 +259,7 @@ def test_nor_does_one_that_stands_before_the_environment_is_made(name, engine):
     assert refused == (name == "control" or (name == "contactfilter" and engine == "mujoco"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 @every_kind
 def test_no_callback_of_other_code_changes_a_flight_in_dm_control(name, engine):

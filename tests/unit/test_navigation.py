@@ -34,6 +34,7 @@ class Stirring(Navigation):
         return {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 def test_a_forest_that_stands_is_flown_in_whole_steps_to_the_same_bits(engine, monkeypatch):
     settings = dict(num_envs=8, seed=3, control_mode="velocity", engine=engine)

@@ -196,6 +196,7 @@ def test_figures_of_races_by_hand():
     assert "flying_lap_mean_s" not in summarize(dataclasses.replace(rollout, task=Race(**OWN)))
 
 
+@pytest.mark.slow
 def test_the_geometric_controller_comes_through_on_the_racer():
     controller = make_controller("geometric", "race", "racer")
     flown = fly(controller, "race", episodes=4, vehicle="racer", engine="free_flight")

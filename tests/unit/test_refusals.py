@@ -60,6 +60,7 @@ def test_a_reset_of_no_rows_gives_no_rows(settings):
     helpers.assert_records(*flown)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_air_that_is_not_finite_ends_in_a_line_before_the_step(engine, value):

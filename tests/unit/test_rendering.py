@@ -440,6 +440,7 @@ def test_flights_side_by_side(model):
     assert all(max(pair) < 20 for pair in moves[9:])
 
 
+@pytest.mark.slow
 def test_a_gif_and_contact_sheets(model):
     path = write_video(flight(5), model, "a.gif", fps=10, **SMALL)
     with Image.open(path) as gif:

@@ -326,6 +326,7 @@ def test_states_are_a_row_per_control_step_from_the_start_on(tmp_path):
     assert second[-1]["action_2"] == ""
 
 
+@pytest.mark.slow
 def test_each_flight_ends_in_one_way_and_the_terms_add_up_to_its_reward():
     options = {"max_distance": 0.6, "altitude": 0.5, "time_limit": 1.5, "radius": 0.2}
     generator = np.random.default_rng(0)

@@ -137,6 +137,7 @@ def test_runs_of_different_tasks_are_no_picture_together(folder):
         quadrl.plot(folder / "hover0", folder / "deep" / "landing")
 
 
+@pytest.mark.slow
 def test_a_curve_of_another_program_is_drawn_beside_a_run(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     csv, bad = tmp_path / "SB3.csv", tmp_path / "bad.csv"

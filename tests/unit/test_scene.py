@@ -183,6 +183,7 @@ def test_a_post_in_the_way_of_an_arm_swings_the_aircraft_around_it(engine):
     assert 0.3 < speed < 2.0 - 1.16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "free_flight"])
 @pytest.mark.parametrize("solid", EVERY.solids, ids=EVERY.names)
 def test_a_size_of_a_row_acts_as_the_declared_one(solid, engine):

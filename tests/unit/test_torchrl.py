@@ -72,6 +72,7 @@ def test_torchrls_gymnasium_wrapper_sees_the_same_episodes(name, mode):
     assert torch.equal(theirs["observation"], ours["observation"])
 
 
+@pytest.mark.slow
 def test_torchrls_dm_control_environment_after_register():
     needs_dm_control()
     quadrl.suite.register()

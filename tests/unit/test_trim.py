@@ -145,6 +145,7 @@ def balance(vehicle, wind):
     return vehicle.hover_speed * np.sqrt(unknown[2:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "end", "worst"),
     [("paper", "action 1", 0), ("crazyflie_brushless", "limits", 4), ("racer", "limits", 0)],

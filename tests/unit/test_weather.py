@@ -46,6 +46,7 @@ def blown(weather, steps, **settings):
     return np.array(winds), made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "noise_time", "as_array"),
     [(1, 0.0, np.asarray), (21, 0.5, np.asarray), (21, 0.5, torch.as_tensor)],

@@ -66,6 +66,7 @@ def test_what_comes_after_a_step_is_expected_where_the_window_does_not_hold_it()
     np.testing.assert_array_equal(window.goes_on.reshape(3, COUNT), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_the_derivatives_by_a_policy_are_those_of_its_flights(name):
     rng = np.random.default_rng(0)
