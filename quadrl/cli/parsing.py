@@ -153,7 +153,8 @@ def _unknown(word: str, box: str, command: str, words: Sequence[str]) -> str:
     with contextlib.suppress(QuadrlError):  # the algorithm may be unknown, too
         if command == "train":
             task, given = trained(words)
-            known = foreign.setting(word.strip("-"), algorithm_of(task, given["algo"], given["variant"]))
+            algo = algorithm_of(task, given["algo"], given["variant"])
+            known = foreign.setting(word.strip("-"), algo)
             if " " in known:
                 return f"{word} is an unknown option; {known}"
             known = choices.FLAGS.get(known, known).replace("_", "-")

@@ -51,13 +51,13 @@ class Randomizer(Process):
         self.steps = np.zeros(count, np.int64)
         """Control steps since their start."""
         self._pushes = given.pushes
-        self._chance = -math.expm1(-given.pushes.rate * vehicle.control_timestep)
+        self.push_chance = -math.expm1(-given.pushes.rate * vehicle.control_timestep)
         self._dead = round(vehicle.dead_time / vehicle.physics_timestep)  # physics steps
         fewest, most = (self._dead + steps for steps in sampler.delays["command_delay"])
         self._aged = max(sampler.delays[name][1] for name in AGES)
         jitter = vehicle.substeps * (given.command_jitter[1] > 0)  # physics steps
-        self._links = jitter + sampler.outage[1] > 0
-        self.late = self._links or most + self._aged > 0
+        self.linked = jitter + sampler.outage[1] > 0
+        self.late = self.linked or most + self._aged > 0
         """Whether commands pass a queue, or earlier motions are remembered."""
         each = range(vehicle.substeps)
         late = each if self._aged else {k % vehicle.substeps for k in range(fewest, most + 1)}
@@ -74,8 +74,8 @@ class Randomizer(Process):
         self.last = np.zeros((count, rotors))  # commands that arrived last [rad/s]
         self.left = np.zeros(count, np.int64)  # control steps without a link, this one counted
         # Delays without jitter and in this control step [physics steps]; outages [control steps].
-        self._usual, self._delay, self._outage = np.zeros((3, count), np.int64)
-        self._jitter, self._loss = np.zeros((2, count))  # their chances in a control step
+        self.usual_delay, self._delay, self.outages = np.zeros((3, count), np.int64)
+        self.jitters, self.losses = np.zeros((2, count))  # their chances in a control step
         self.ages = np.zeros((len(AGES), count), np.int64)
         """Ages of the motion and of the body rate that are seen [physics steps]."""
         kept = self.queue, self.past if self._aged else None, self.last
@@ -140,15 +140,15 @@ class Randomizer(Process):
         step = self._engine.vehicle.physics_timestep
         names = "command_delay", *AGES
         steps = [np.rint(self.column(name) / step).astype(np.int64) for name in names]
-        self._usual[:], self.ages[:] = self._dead + steps[0], steps[1:]
-        self._delay[:] = self._usual
-        if self._links:
+        self.usual_delay[:], self.ages[:] = self._dead + steps[0], steps[1:]
+        self._delay[:] = self.usual_delay
+        if self.linked:
             control = self._engine.vehicle.control_timestep
             often = control * self.column("command_loss")  # outages in a control step
-            self._outage[:] = np.rint(self.column("loss_time") / control)
+            self.outages[:] = np.rint(self.column("loss_time") / control)
             # So that outages, and the gaps between them, make as many as are asked for.
-            self._loss[:] = often / (1 + often - often * self._outage)
-            self._jitter[:] = self.column("command_jitter")
+            self.losses[:] = often / (1 + often - often * self.outages)
+            self.jitters[:] = self.column("command_jitter")
 
     def delayed(self, command: Array, steps: int) -> Array:
         """Queue a command (N, R) [rad/s] for some physics steps; return the one that arrives."""
@@ -193,15 +193,15 @@ class Randomizer(Process):
             return
         keys, episodes = (array.ctypes.data for array in self.place)
         place = keys, episodes, self.steps.ctypes.data
-        if self._links:
-            chances = self._jitter, self._loss, self._outage, self._usual
+        if self.linked:
+            chances = self.jitters, self.losses, self.outages, self.usual_delay
             given = (array.ctypes.data for array in chances)
             found = self._delay.ctypes.data, self.left.ctypes.data
             substeps = self._engine.vehicle.substeps
             native.library().quadrl_link(len(self.steps), *place, LINK, *given, substeps, *found)
-        if self._chance > 0:
+        if self.push_chance > 0:
             place = *place, PUSHES
-            hit = self._chance, self._pushes.velocity, self._pushes.body_rate
+            hit = self.push_chance, self._pushes.velocity, self._pushes.body_rate
             qvel = self._engine.qvel
             rows = qvel.ctypes.data, qvel.strides[0] // 8
             native.library().quadrl_push(len(self.steps), *place, *hit, *rows)

@@ -143,7 +143,7 @@ class WeatherProcess(Process):
         self._latest = max(0.0, time_limit - weather.gust_time)
         # As wide as the engine's own tables, against set conflicts between rows.
         self._whole = np.zeros((len(ROWS), engine.frames[0].columns))
-        self._table = self._whole[:, :count]
+        self.table = self._whole[:, :count]
         self._streams = np.zeros((2, count), dtype=np.int64)
         self._varied = False
         self._write(slice(None), fixed_of(weather.wind_speed, *self._setting))
@@ -204,15 +204,15 @@ class WeatherProcess(Process):
 
     def act(self) -> None:
         """Advance the weather of all aircraft by a control step, and write their air."""
-        self._kernel(self._address, self._table.shape[1], None, False)
+        self._kernel(self._address, self.table.shape[1], None, False)
 
     def _write(self, rows: Any, values: Mapping[str, Any]) -> None:
         for name, value in values.items():
-            self._table[ROWS.index(name), rows] = value
+            self.table[ROWS.index(name), rows] = value
 
     def save(self) -> dict[str, np.ndarray]:
         """All arrays that the next steps depend on."""
-        return {"table": self._table.copy(), "streams": self._streams.copy()}
+        return {"table": self.table.copy(), "streams": self._streams.copy()}
 
     def check(self, saved: Mapping[str, np.ndarray]) -> None:
         """Refuse arrays that were saved in another weather, or are not finite.
@@ -221,7 +221,7 @@ class WeatherProcess(Process):
             QuadrlError: The message names the array.
         """
         table, fixed = saved["weather.table"], slice(0, len(FIXED))
-        same = self._varied or np.array_equal(table[fixed], self._table[fixed])
+        same = self._varied or np.array_equal(table[fixed], self.table[fixed])
         same &= np.array_equal(table[ROWS.index("steps")], saved["episode.steps"])
         if not (same and np.isfinite(table).all()):
             reason = "the state was saved in another weather"
@@ -229,4 +229,4 @@ class WeatherProcess(Process):
 
     def restore(self, saved: Mapping[str, np.ndarray]) -> None:
         """Restore what `save` returned; the engine restores its air itself."""
-        self._table[:], self._streams[:] = saved["table"], saved["streams"]
+        self.table[:], self._streams[:] = saved["table"], saved["streams"]

@@ -275,7 +275,7 @@ class Batch:
         engine.qpos[0], engine.qvel[0], engine.act[0] = motion[:7], motion[7:13], motion[13:]
         now, episode = layout.program.records(column[layout.motion :])
         now.time = episode.steps * environment.vehicle.control_timestep  # in double precision
-        own = cast(Any, environment)._memory()
+        own = environment.memory()
         memory: Memory = dataclasses.replace(own, snapshot=now, episode=episode)
         return memory.save()
 

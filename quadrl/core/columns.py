@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from quadrl.aircraft import parameters
 from quadrl.conditions.randomization import OFF
+from quadrl.core.compiled import CompiledStep
 from quadrl.core.environment import Environment
-from quadrl.core.program import Program
 from quadrl.engines.air import DRAWN, FILTERS, FIXED, ROWS
 
 
@@ -19,7 +19,7 @@ class Layout:
 
     def __init__(self, environment: Environment) -> None:
         """Lay them out for an environment whose episodes have begun."""
-        program: Program = cast(Any, environment)._step._program
+        program = cast(CompiledStep, environment.control_step).program
         vehicle, observer = environment.vehicle, environment.observer
         self.program, self.motion = program, 13 + vehicle.rotor_count
         self.kept, self.observed = program.remembered.end, environment.size
@@ -31,7 +31,7 @@ class Layout:
             self.privileged = channel.seen(program.memory(numbers)["privileged"])[0]
         self.seen = self.observed + len(self.privileged)
         """Rows of what is observed: by policies, then by the critic alone."""
-        self.pooled = not cast(Any, environment)._plain or environment.blowing is not None
+        self.pooled = not environment.plain or environment.blowing is not None
         """Whether episodes begin with columns of a pool."""
         rows = parameters.numbers(environment.engine.begun)
         self.varying: list[int] = np.flatnonzero((rows != rows[:1]).any(0)).tolist()
@@ -39,7 +39,7 @@ class Layout:
         randomizer, weather = environment.randomizer, environment.blowing
         ages = len(randomizer.past) > 0
         self.late = len(randomizer.queue) if randomizer.late else 0
-        self.linked = bool(randomizer.late and cast(Any, randomizer)._links)
+        self.linked = bool(randomizer.late and randomizer.linked)
         changing = [*DRAWN, "steps", *FILTERS] if weather else []
         changing += FIXED if weather and environment.randomization.wind != OFF else ()
         self.weather = [k for k, name in enumerate(ROWS) if name in changing]
@@ -77,9 +77,9 @@ class Layout:
             observed: What its reset returned.
         """
         engine, observer = environment.engine, environment.observer
-        randomizer, weather = environment.randomizer, cast(Any, environment.blowing)
-        hidden, count = cast(Any, randomizer), environment.num_envs
-        table: Any = cast(Any, environment)._step._tables.pages[engine.turn].whole
+        randomizer, weather = environment.randomizer, environment.blowing
+        count, tables = environment.num_envs, cast(CompiledStep, environment.control_step).tables
+        table = tables.pages[engine.turn].whole
         given = [*observer.given.values()] if observer else []
         varying = len(self.varying)
         parts = [
@@ -89,12 +89,13 @@ class Layout:
             *(array.T for array in given),
         ]
         if self.late:
-            parts += [hidden._usual[None], *([randomizer.ages] if len(randomizer.past) else [])]
+            ages = [randomizer.ages] if len(randomizer.past) else []
+            parts += [randomizer.usual_delay[None], *ages]
         if self.linked:
-            often = hidden._jitter, hidden._loss, hidden._outage, randomizer.left
+            often = randomizer.jitters, randomizer.losses, randomizer.outages, randomizer.left
             parts += [np.stack(often), engine.act.T]
         if weather:
-            parts.append(weather._table[self.weather])
+            parts.append(weather.table[self.weather])
         every = engine.solids.table
         numbers = every.view(np.float64).reshape(*every.shape, every.itemsize // 8)
         parts += [numbers[:, k, varies].T for k, (_, varies) in enumerate(self.solids)]

@@ -131,10 +131,10 @@ class CompiledStep(Step):
         flown = written.engine, written.inputs, written.observer, written.loops
         super().__init__(written.task, written.clock, *flown, written.randomizer)
         self._parameters, engine = now.parameters, self.engine
-        self._program = program = Program(written, now, episode, parameters)
+        self.program = program = Program(written, now, episode, parameters)
         functions = Laws(mode, engine).functions()
         try:
-            self._tables = Tables(program, functions, engine, self.inputs, parameters)
+            self.tables = Tables(program, functions, engine, self.inputs, parameters)
         except NativeError as error:
             raise NotCompilable(str(error).partition("\n")[0]) from error
         # Where nobody has to measure solids in between, the task's part follows at once.
@@ -147,8 +147,8 @@ class CompiledStep(Step):
 
     def begin(self, now: Snapshot, episode: Episode) -> None:
         """Make a snapshot of all rows the present one."""
-        page = self._tables.pages[self.engine.turn]
-        for into, array in zip(page.kept, self._program.leaves(now, episode), strict=True):
+        page = self.tables.pages[self.engine.turn]
+        for into, array in zip(page.kept, self.program.leaves(now, episode), strict=True):
             into[:] = array
         if observer := self.observer:
             for into, array in zip(*map(arrays, (page.memory, observer.kept)), strict=True):
@@ -164,25 +164,25 @@ class CompiledStep(Step):
         """
         if (starts := self._starts) is None:
             return None
-        function, places, count = self._program.start, starts, len(rows)
+        function, places, count = self.program.start, starts, len(rows)
         words, room = np.array((rows, keys, episodes)), np.empty((count, function.width))
         ids, keyed, numbered = (native.address(words) + k * words.strides[0] for k in range(3))
-        step, into, library = self._tables.address, native.address(room), native.library()
+        step, into, library = self.tables.address, native.address(room), native.library()
         given = places.ctypes.data, len(places), ids, count
-        drawn = keyed, numbered, START, self._program.drawn, MEMBERS
+        drawn = keyed, numbered, START, self.program.drawn, MEMBERS
         if library.quadrl_begin(step, *given, *drawn, into):
             return None
         self.engine.clear(rows)
-        library.quadrl_place(step, ids, count, into, function.width, self._program.kept.end)
+        library.quadrl_place(step, ids, count, into, function.width, self.program.kept.end)
         self.engine.show(rows)
-        seen = self._program.seen.views(room[:, self.engine.motions.shape[-1] :].T)
-        return dict(zip(self._program.observed, seen, strict=False))
+        seen = self.program.seen.views(room[:, self.engine.motions.shape[-1] :].T)
+        return dict(zip(self.program.observed, seen, strict=False))
 
     @functools.cached_property
     def _starts(self) -> np.ndarray | None:
         """The places that starts read; None where they cannot be compiled."""
         try:
-            return self._tables.begin_by(self._program.start)
+            return self.tables.begin_by(self.program.start)
         except (NotCompilable, NativeError):
             return None
 
@@ -220,17 +220,17 @@ class CompiledStep(Step):
         """The physics steps that are flown at once: the first one, and the one after the last."""
         first = 0
         while first < self._substeps:
-            yield first, (first := first + int(self._tables.held[first]))
+            yield first, (first := first + int(self.tables.held[first]))
 
     def _call(self, rows: np.ndarray | None, parts: int, first: int = 0, end: int = 0) -> int:
         """Do physics steps and parts of a control step of some aircraft; how many are marked."""
-        step = self._tables.steps[self._into].ctypes.data
+        step = self.tables.steps[self._into].ctypes.data
         return self.engine.control_step(step, rows, parts, first, end) & MARKED
 
     def _turn(self) -> None:
         """Let the present step fill the other page."""
         self._into = 1 - self.engine.turn
-        self._rest = self._tables.fresh(self._into)
+        self._rest = self.tables.fresh(self._into)
 
     def _mend(self, broken: np.ndarray) -> None:
         """Note aircraft that have diverged."""
@@ -256,7 +256,7 @@ class CompiledStep(Step):
 
     def finish(self, world: World | None) -> Transition:
         """Bring the snapshot forward to the engine's state, as `transition.finish` does."""
-        tables, count = self._tables, self.engine.num_envs
+        tables, count = self.tables, self.engine.num_envs
         page, last = tables.pages[self._into], tables.pages[1 - self._into]
         if not self._ends & FINISHES:
             # A reset since the last step has given its rows what is about them then.
@@ -266,14 +266,14 @@ class CompiledStep(Step):
         self._show(page, world)
         self._observation = page.observation.copy()
         *named, reward, error = self._rest[:-1, :count]
-        terms = named[: len(self._program.rewarded)]
+        terms = named[: len(self.program.rewarded)]
         ends = self._rest[len(terms) : -3, :count] != 0.0
         flags = self._rest[-1].view(np.bool_).reshape(-1, tables.columns)[:, :count]
         return Transition(
             observation=self._observation,
             reward=reward,
-            reward_terms=dict(zip(self._program.rewarded, terms, strict=True)),
-            ends=dict(zip(self._program.ended, ends, strict=True)),
+            reward_terms=dict(zip(self.program.rewarded, terms, strict=True)),
+            ends=dict(zip(self.program.ended, ends, strict=True)),
             error=error,
             truth=page.truth or self._observation,
             **dict(zip(FLAGS, flags, strict=False)),
@@ -297,5 +297,5 @@ class CompiledStep(Step):
     def flatten(self, observation: dict[str, Array]) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""
         if observation is self._observation:
-            return self._tables.pages[self.engine.turn].vectors.astype(np.float32, order="C")
+            return self.tables.pages[self.engine.turn].vectors.astype(np.float32, order="C")
         return super().flatten(observation)

@@ -108,10 +108,11 @@ class Environment(saving.Copied):
         self._clock = Clock.of(self.task, timestep)
         self.time_limit_steps = self._clock.time_limit_steps
         lasts = self.time_limit_steps * timestep
-        self._true = self.task.true_parameters and self.randomization.per_row
+        self.sees_true_parameters = self.task.true_parameters and self.randomization.per_row
         nominal = parameters.rows(self.vehicle)
-        self._rows = engine.parameters if self._true else nominal  # those that the task sees
-        self._parameters, seen = (Parameters.of(k, timestep) for k in (self._rows, nominal))
+        self.seen_rows = engine.parameters if self.sees_true_parameters else nominal
+        """Rows of parameters, (N,) or (1,), that the task sees; live."""
+        self._parameters, seen = (Parameters.of(k, timestep) for k in (self.seen_rows, nominal))
         checked = rules.check_values(self.task, seen, self.action_size, self.origin[2])
         self.term_names, self.end_names = checked
         """Names of the reward's terms, and of what ends episodes, in their order."""
@@ -143,8 +144,8 @@ class Environment(saving.Copied):
             engine.solids.place(np.arange(self.num_envs), declared)
         self.stepwise = self.control_mode.has_loops or self.randomizer.late or self._solids_move
         """Whether a control step is flown in parts, which `control` prepares."""
-        self._plain = not (self.randomizer.active or self.observer or self.scene.solids)
-        self._plain &= not self.weather.wind_speed
+        self.plain = not (self.randomizer.active or self.observer or self.scene.solids)
+        self.plain &= not self.weather.wind_speed
         """Whether an episode begins as the task says, and nothing else begins with it."""
         follows = self.control_mode.has_loops and bool(self.observer and self.observer.follows)
         self._parted = self._solids_move or follows
@@ -257,7 +258,7 @@ class Environment(saving.Copied):
             return {name: np.zeros((0, at.stop - at.start)) for name, at in self.layout.items()}
         seeds = self.seeds if seed is None else self.seeds.renewed(seed, rows)
         place = seeds.keys[rows], seeds.episodes[rows]
-        if self._plain and not start and self._step is not None:
+        if self.plain and not start and self._step is not None:
             if (observation := self._step.start(rows, *place)) is not None:
                 self.seeds = seeds
                 for process in self._processes:
@@ -265,7 +266,7 @@ class Environment(saving.Copied):
                 self.seeds.episodes[rows] += 1
                 return observation
         drawn, seen = self.randomizer.sample(*place), self._parameters
-        if drawn.table is not None and self._true:
+        if drawn.table is not None and self.sees_true_parameters:
             seen = Parameters.of(drawn.table, self._clock.control_timestep)
         begun, task_state = self.task.begin(Rng(*place), seen)
         # Up to here nothing is written, and `place` refuses before it writes.
@@ -313,12 +314,12 @@ class Environment(saving.Copied):
     @property
     def snapshot(self) -> Snapshot:
         """What tasks see now: live, valid until the next step."""
-        return self._begun.snapshot
+        return self.control_step.snapshot
 
     @property
     def episode(self) -> Episode:
         """How far the episodes are: as live as the snapshot."""
-        return self._begun.episode
+        return self.control_step.episode
 
     @property
     def has_begun(self) -> bool:
@@ -326,7 +327,8 @@ class Environment(saving.Copied):
         return self._step is not None
 
     @property
-    def _begun(self) -> Step:
+    def control_step(self) -> Step:
+        """Its control step, from the first reset on."""
         if self._step is None:
             raise RuntimeError("call reset first: there is no episode yet")
         return self._step
@@ -334,7 +336,7 @@ class Environment(saving.Copied):
     @property
     def not_compiled(self) -> str:
         """Why the task's step is not compiled; empty where it is, from the first reset on."""
-        return self._begun.not_compiled
+        return self.control_step.not_compiled
 
     def written(self) -> WrittenStep:
         """Its control step as it is written, before a reset begins it."""
@@ -343,7 +345,7 @@ class Environment(saving.Copied):
 
     def sources(self) -> list[str]:
         """The C of its control step, while that runs as it is written."""
-        return sources(cast(WrittenStep, self._begun), self._rows, self.control_mode)
+        return sources(cast(WrittenStep, self.control_step), self.seen_rows, self.control_mode)
 
     def _take(self, now: Snapshot, episode: Episode) -> None:
         """Make a snapshot of all rows the present one."""
@@ -351,7 +353,7 @@ class Environment(saving.Copied):
         now.task, now.parameters = records.owned(now.task), self._parameters
         now.sensed = self.sensed
         if self._step is None:
-            self._step = compiled(self.written(), now, episode, self._rows, self.control_mode)
+            self._step = compiled(self.written(), now, episode, self.seen_rows, self.control_mode)
         self._step.begin(now, episode)
 
     def step(self, action: Array) -> Transition:
@@ -368,9 +370,9 @@ class Environment(saving.Copied):
                 reward that is not finite.
             RuntimeError: There was no reset before.
         """
-        _ = self._begun  # refuse what has not begun; it may be made anew now
+        _ = self.control_step  # refuse what has not begun; it may be made anew now
         self._accept(action)
-        if not self._parted and self._begun.fly():
+        if not self._parted and self.control_step.fly():
             return self.finish()
         self._command()
         for steps in self.commands():
@@ -450,7 +452,7 @@ class Environment(saving.Copied):
     def finish(self) -> Transition:
         """Do the second half of a step, after the engine has advanced."""
         self._read()
-        done = self._begun.finish(self._world())
+        done = self.control_step.finish(self._world())
         rules.check_reward(self.task, done)
         self.transition = done
         return done
@@ -462,12 +464,12 @@ class Environment(saving.Copied):
 
     def _read(self) -> None:
         """Compute the state, and note which aircraft have diverged."""
-        if (diverged := self._begun.read()) is not None:
+        if (diverged := self.control_step.read()) is not None:
             self.randomizer.forget(diverged)
 
     def flatten(self, observation: Observation) -> np.ndarray:
         """The terms of an observation as vectors (n, size), float32."""
-        return self._begun.flatten(observation)
+        return self.control_step.flatten(observation)
 
     @property
     def privileged(self) -> Array | None:
@@ -493,13 +495,14 @@ class Environment(saving.Copied):
         """What pictures say of the events in the flight of an aircraft."""
         return self.events.told(row) if self.events else ""
 
-    def _memory(self) -> saving.Memory:
-        begun, parts = self._begun, self._processes
+    def memory(self) -> saving.Memory:
+        """All that the next steps depend on, by parts."""
+        begun, parts = self.control_step, self._processes
         return saving.Memory(self.engine, self.seeds, begun.snapshot, begun.episode, parts)
 
     def save(self) -> dict[str, np.ndarray]:
         """Return all that the next steps depend on, as arrays: `restore` continues bit for bit."""
-        return self._memory().save()
+        return self.memory().save()
 
     def restore(self, saved: Mapping[str, np.ndarray]) -> Observation:
         """Restore a state that `save` returned; return the observation of that moment.
@@ -511,12 +514,12 @@ class Environment(saving.Copied):
             self.reset()  # makes the records, which are filled below
             self.seeds.episodes[:] = 0  # that episode does not count
         try:
-            saved = self._memory().fitted(saved)
-            self._memory().check(saved)
+            saved = self.memory().fitted(saved)
+            self.memory().check(saved)
         except QuadrlError:
             self._step = None if fresh else self._step
             raise
-        now, episode = self._memory().restore(saved)
+        now, episode = self.memory().restore(saved)
         now.sensed = self.sensed
         now.world = self._world()
         now.potentials = self.task.measure(now)

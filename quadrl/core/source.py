@@ -113,7 +113,7 @@ def text(environment: Environment, precision: Precision = "float64") -> str:
     if mode.has_loops:
         functions["command"] = command
     draws = [*observer.senses.draws.values()] if observer else []
-    randomizer: Any = environment.randomizer
+    randomizer = environment.randomizer
     sizes: dict[str, int] = {"ROTORS": vehicle.rotor_count, "ACTIONS": mode.size}
     sizes |= {"SUBSTEPS": vehicle.substeps, "KEPT": layout.kept, "SEEN": layout.seen}
     sizes |= {"OBSERVED": layout.observed, "PRIVILEGED": int(min(layout.privileged, default=0))}
@@ -132,7 +132,7 @@ def text(environment: Environment, precision: Precision = "float64") -> str:
         "LATE": layout.late > 0,
         "LINKED": layout.linked,
         "AGED": len(randomizer.past) > 0,
-        "PUSHED": randomizer._chance > 0,
+        "PUSHED": randomizer.push_chance > 0,
         "SENSES": observer is not None,
         "SENSORS": len(draws),
         "BLOWS": environment.blowing is not None,
@@ -140,7 +140,7 @@ def text(environment: Environment, precision: Precision = "float64") -> str:
         **({"SINGLE": 1} if precision == "float32" else {}),
     }
     pushes = environment.randomization.pushes
-    defines |= {"PUSH_CHANCE": literal(randomizer._chance)}
+    defines |= {"PUSH_CHANCE": literal(randomizer.push_chance)}
     defines |= {"PUSH_VELOCITY": literal(pushes.velocity)}
     defines |= {"PUSH_BODY_RATE": literal(pushes.body_rate)}
     weather, about = _weather(environment, layout), _world(environment, layout)
@@ -175,7 +175,7 @@ def text(environment: Environment, precision: Precision = "float64") -> str:
 
 def _weather(environment: Environment, layout: Layout) -> tuple[dict[str, Any], str]:
     """Numbers of the weather, and the functions that read and write its rows."""
-    if (process := cast(Any, environment.blowing)) is None:
+    if (process := environment.blowing) is None:
         return {}, ""
     weather, vehicle = environment.weather, environment.vehicle
     noisy = vehicle.rotor_count if noise_time_of(vehicle) else 0
@@ -193,7 +193,7 @@ def _weather(environment: Environment, layout: Layout) -> tuple[dict[str, Any], 
             if k >= ROWS.index("steps"):
                 gives.append(f"{place} = t[{k}][0];")
         else:
-            takes.append(f"t[{k}][0] = {literal(float(process._table[k, 0]))};")
+            takes.append(f"t[{k}][0] = {literal(float(process.table[k, 0]))};")
     return defines, WEATHER.format(takes="\n  ".join(takes), gives="\n  ".join(gives))
 
 
@@ -217,7 +217,7 @@ def _world(environment: Environment, layout: Layout) -> tuple[dict[str, Any], st
         parts += [_array("ray_along", own.along.T), _array("ray_place", np.array(own.place))]
     if not (layout.solids or parts):
         return defines, ""
-    outline = np.asarray(cast(Any, engine.solids)._outline)
+    outline = engine.solids.outline
     defines |= {"BALLS": len(outline), "BALLS_REACH": literal(float(outline[:1, 4].sum()))}
     rows = ", ".join(
         f"{{{{{literal(x)}, {literal(y)}, {literal(z)}}}, {literal(r)}, {literal(far)}}}"
@@ -318,13 +318,12 @@ def _measured(program: Program) -> dict[int, str]:
 
 def _parameters(environment: Environment, places: dict[int, int], first: int) -> Iterator[str]:
     """The statements that gather the parameters that a task sees, which come from a place on."""
-    hidden: Any = environment
-    seen = parameters.numbers(hidden._rows[:1])[0]
+    seen, true = parameters.numbers(environment.seen_rows[:1])[0], environment.sees_true_parameters
     names = {int(at): path for path, at in _fields(parameters.PLACES, parameters.MAX_ROTORS)}
     for number, place in places.items():
         at = number - first
         if 0 <= at < parameters.ROW_SIZE:
-            yield f"x[{place}][0] = {names[at] if hidden._true else literal(float(seen[at]))};"
+            yield f"x[{place}][0] = {names[at] if true else literal(float(seen[at]))};"
 
 
 def literal(number: float) -> str:

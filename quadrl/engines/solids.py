@@ -67,7 +67,7 @@ class Solids:
         """
         self.geoms, self._origin, self._field = geoms_of_solids(model), origin, field
         self.threads, self._kernel = threads, native.library().quadrl_clearance
-        self._outline, self._middles = _outline(model), _middles(model)
+        self.outline, self._middles = _outline(model), _middles(model)
         _, which, *offset = model.geom_user[self.geoms].T[:5] if len(self.geoms) else [[]] * 5
         self._first = np.unique(which, return_index=True)[1]  # geom of each solid, (S,)
         self._declared = np.hstack([model.geom_size[self.geoms], np.transpose(offset)])  # (K, 6)
@@ -149,7 +149,7 @@ class Solids:
         self.motion[:] = motion
         if len(self.nearby):
             # No part of the aircraft is farther from a solid that it may touch than this.
-            reach = self._outline[:1, 4] + np.linalg.norm(self.table["size"], axis=-1)
+            reach = self.outline[:1, 4] + np.linalg.norm(self.table["size"], axis=-1)
             speed, turn = (np.linalg.norm(motion[..., part], axis=-1) for part in np.s_[:3, 3:])
             leap = timestep * (speed + turn * reach).max(axis=1)
             self.nearby["leap"] = np.maximum(leap - MARGIN, 0.0)
@@ -186,7 +186,7 @@ class Solids:
             balls: From which balls, as `_outline` gives them; None for those.
         """
         out = np.full(len(qpos) if rows is None else len(rows), np.inf)
-        balls = self._outline if balls is None else balls
+        balls = self.outline if balls is None else balls
         if len(self.geoms) and len(balls):
             arrays = (qpos, balls, self.table, self.nearby)
             # As `Rows` in native/solids.c.
