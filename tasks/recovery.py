@@ -56,7 +56,20 @@ class Recovery(Task):
             },
         },
     }
-    variants = {"robust": {"phases": ()}}  # APG cannot begin with late commands and noise
+    variants = {
+        "robust": {  # of the Crazyflie, indoors
+            "weather": "calm",
+            "aerodynamics": "full",
+            # From 3 m there is no time to find out about an aircraft of any torque.
+            "randomization": {
+                **{"mass": (0.85, 1.15), "thrust": (0.88, 1.12), "lag": (0.6, 1.7)},
+                **{"command_delay": (0.0, 0.03), "rotors": (0.97, 1.03), "torque": None},
+            },
+            # APG cannot begin with late commands and noise.
+            "phases": ({"algo": "ppo", "ppo": {"learning_rate": 3e-3}},),
+            "ppo": {"learning_rate": 1e-3},
+        }
+    }
     observation = ROTATION | MOTION
 
     time_limit: float = 5.0

@@ -221,7 +221,9 @@ def training_defaults(
     fields, own = merged(USUAL), _unusual(kind, algo)
     if own.get("vehicle", "paper") != vehicle:  # the numbers of another aircraft
         own.pop("vehicle_options", None)
-    varied = (shared, kind.variants.get(variant, {}), OF_VEHICLE.get((variant, vehicle), {}))
+    task_own, its = kind.variants.get(variant, {}), OF_VEHICLE.get((variant, vehicle), {})
+    # What a task states is for the aircraft that it is trained on.
+    varied = (shared, its, task_own) if vehicle == kind.trained_on else (shared, task_own, its)
     layers = {
         "field": merged(fields, ALGORITHM_CONFIGS[algo].training),
         f"{task} x {algo}": own,
@@ -286,13 +288,13 @@ def _unusual(task: Task | type[Task], algo: str) -> dict[str, Any]:
 def merged(*settings: dict[str, Any]) -> dict[str, Any]:
     """Merge settings: later ones replace earlier ones; dicts are merged, at every depth.
 
-    None in place of a dict takes it away, such as a sensor of a variant.
+    None takes away what an earlier one has, such as a sensor of a variant.
     """
     whole: dict[str, Any] = {}
     for given in settings:
         for name, value in given.items():
             old = whole.get(name)
-            if value is None and isinstance(old, dict):
+            if value is None and old is not None:
                 del whole[name]
                 continue
             if isinstance(old, dict) and isinstance(value, dict):
