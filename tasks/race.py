@@ -56,6 +56,30 @@ class Race(GateRace):
         },
     }
 
+    variants = {
+        # As a racer flies: commands 15 to 45 ms late, another mass, lag and thrust, real air.
+        "robust": {
+            **{"algo": "ppo", "weather": "calm", "aerodynamics": "full"},
+            "randomization": {
+                **{"mass": (0.88, 1.12), "thrust": (0.94, 1.06), "lag": (0.7, 1.5)},
+                **{"command_delay": (0.015, 0.045), "rotors": (0.97, 1.03)},
+                "centre_of_mass": None,
+            },
+            # What moves it is no wind, but its own speed.
+            "observe": {"disturbance": None, "sensors": None},
+            "task_options": None,
+            **{"hidden": (128, 128), "critic_hidden": (128, 128), "initial_deviation": 0.5},
+            **{"num_envs": 2048, "rollout": 12.8, "steps": 16_000_000},
+            **{"gamma": 0.963, "gae_lambda": 0.95},
+            "ppo": {"learning_rate": 1e-3, "minibatch": 16_384},
+            "training_options": {
+                **{"laps": 3, "flying": 0.95, "margin": 0.2, "crash_weight": 30.0},
+                **{"miss_weight": 5.0, "pass_weight": 20.0, "progress_weight": 20.0},
+                "low_weight": 1.0,
+            },
+        }
+    }
+
     track: str = "split_s"
     """Name of the track: airsim, alphapilot or split_s."""
     gates: tuple[tuple[float, ...], ...] | None = None
