@@ -75,7 +75,8 @@ ROWS: dict[str, Row] = {
     ),
     "lsy level 2, summer 2026": Row(
         "lsy_race", ("race_time_mean_s",),
-        published="3.42 s, 100 %, and 4.65 s, 50 %: first and second, its simulator",
+        published="3.42 s, 100 %, and 4.65 s, 50 %: first and second, its simulator, "
+        "where ours has 22 %",
     ),
     "recovery, 3 m up": Row("recovery", (), yardstick="TurnOver", raptor=True),
     "recovery, 1.5 m up": Row(

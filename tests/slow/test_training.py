@@ -17,7 +17,7 @@ from scipy import stats
 import quadrl
 from quadrl import cli
 from quadrl.core import catalogue
-from quadrl.evaluation.evaluate import evaluate, setting
+from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED_AS, Policy, shipped
 from quadrl.evaluation.rollout import EVALUATION_SEED, fly, summarize
 from quadrl.learning import checkpoint
@@ -123,15 +123,11 @@ def test_a_shipped_policy_still_reaches_its_metrics(file):
         usual = usual_vehicle(catalogue.kind(task), variant)
         made_for = "" if variant == "ideal" or config["vehicle"] == usual else config["vehicle"]
         assert file.stem == "_".join(filter(None, (task, kind, made_for)))
-    # The networks of lsy_race are of its earlier rules, and fly the aircraft of the present ones.
-    lent = {"lsy_race_ppo": "crazyflie_brushless"}
-    trained = lent.get(file.stem, metadata["vehicle"]["name"])
-    assert (config["seed"], config["vehicle"]) == (metadata["seed"], trained)
+    trained = metadata["seed"], metadata["vehicle"]["name"]
+    assert (config["seed"], config["vehicle"]) == trained
     assert beside["command"].split()[:2] == ["quadrl", "train"]
     task = quadrl.tasks.make(policy.task, **metadata.get("task_options", {}))
     settings = {"episodes": FRESH_EPISODES, "seed": FRESH_SEED}
-    if file.stem in lent:
-        settings["vehicle"] = setting(policy)[2].aircraft
     if task.solids():  # MuJoCo alone takes ten times as long among many
         settings["engine"] = "free_flight"
     reached = summarize(fly(policy, task, **settings))
