@@ -7,6 +7,7 @@ import pytest
 from helpers import matrices, random_quaternions, refused
 
 from quadrl import tasks
+from quadrl.core.contact import touches_ground
 from quadrl.core.environment import Environment
 from quadrl.tasks.arena import nominal
 from quadrl.tasks.lsy_race import LsyRace
@@ -268,6 +269,16 @@ def test_a_moment_costs_what_is_asked_for_five_hundredths_of_a_second():
         done = environment.step(np.zeros((2, 4)))
         cost = weight * environment.vehicle.control_timestep / 0.05
         assert done.reward_terms["time"] == pytest.approx([-cost, -cost])
+
+
+@pytest.mark.parametrize(("place", "stands"), [(0.035, True), (0.065, False)])
+def test_who_stands_on_the_edge_of_a_rotor_is_on_the_ground(place, stands):
+    """The height of its centre alone does not tell."""
+    side = begun(1, (-1.5, 0.75, place), (np.sqrt(0.5), np.sqrt(0.5), 0, 0))
+    vehicle, height = side.vehicle, side.snapshot.state.height.item()
+    edge = abs(vehicle.rotors[0].position[1]) + vehicle.rotors[0].radius
+    assert vehicle.ground_clearance < height and (height < edge) == stands
+    assert touches_ground(side.snapshot, bounces=True).item() == stands
 
 
 def test_who_falls_on_the_ground_has_touched_it_however_short_the_touch():

@@ -42,6 +42,22 @@ def test_tasks_for_which_one_training_is_not_enough_have_two(task):
     assert TrainConfig(task, algo="ppo", phases=()).phases == ()
 
 
+def test_a_variant_names_its_algorithm_and_counts_for_its_own_aircraft():
+    late, other = (
+        TrainConfig("recovery", variant="robust", vehicle=v) for v in ("crazyflie", None)
+    )
+    assert late == other and [first.algo for first in late.earlier] == ["ppo"]
+    drawn = late.conditions["randomization"]
+    assert drawn["command_delay"] == (0.0, 0.03)  # and not the Crazyflie's in other tasks
+    assert (
+        "torque" not in drawn
+        and "torque"
+        in TrainConfig("hover", variant="robust", vehicle="crazyflie").conditions["randomization"]
+    )
+    assert TrainConfig("race").algo == "apg" and TrainConfig("race", variant="robust").algo == "ppo"
+    assert TrainConfig("race", variant="robust", algo="trpo").algo == "trpo"
+
+
 def test_the_networks_of_another_run_take_their_place(tmp_path):
     from quadrl.learning.folder import CHECKPOINT, write_config
 
