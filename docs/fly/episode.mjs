@@ -43,7 +43,7 @@ export class Episode {
     const { vehicle } = this.flight;
     if (this.ticks % vehicle.substeps === 0) this.#control();
     if (!this.flight.tick()) {
-      this.outcome = "near the ground";
+      this.outcome = this.flight.clear ? "near the ground" : "at an obstacle";
       return false;
     }
     this.ticks += 1;
@@ -63,12 +63,13 @@ export class Episode {
       else this.air = { mean: values.slice(0, 3), deviation: values[3] };
     }
     this.#blow();
-    flight.command(action);
+    flight.command(action, this.controller?.loops);
   }
 
-  // Flies another task from here on, if there is one, whose time begins now.
+  // Flies another task from here on, if there is one without solids, whose time begins now.
   #turn(taskName) {
-    if (!taskName) return;
+    const { book } = this.flight.kernel, pair = book.pairs[`${taskName}_${this.flight.vehicleName}`];
+    if (!pair || pair.solids) return;
     this.flight.turn(taskName);
     this.solved = null;
   }

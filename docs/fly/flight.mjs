@@ -51,7 +51,7 @@ export class Flight {
     this.memory = kernel.functions.flight_memory(slot);
     new Float64Array(kernel.functions.memory.buffer, this.memory, book.flightSize).fill(0);
     const motion = ["qpos", "qvel", "act", "ctrl", "wind"];
-    const seen = ["observation", "felt", "share", "modelled", "aim"];
+    const seen = ["observation", "felt", "share", "modelled", "aim", "solids", "ranges"];
     for (const part of [...motion, ...seen, "action", "scale", "given", "drawn", "flown", "ceiling"]) {
       this[part] = kernel.view(slot, part);
     }
@@ -65,8 +65,20 @@ export class Flight {
     this.scale[0] = this.vehicle.actionScale;
     this.estimates = false; // whether the rotor speeds that are seen follow from the commands
     const flown = "qpos qvel act ctrl warm wind ceiling flown world near solids nearby";
-    this.#point("flight_rows", flown, [0, 0, rotors, 0]);
+    const { solids, rays } = this.pair, count = solids?.looks.length ?? 0;
+    this.#point("flight_rows", flown, [0, 0, rotors, count]);
     this.#point("state_rows", "qpos qvel act origin limits wind", [0, 0, 1, rotors]);
+    if (solids) {
+      kernel.view(slot, "outline").set(solids.outline.flat());
+      this.#point("solid_rows", "qpos outline solids nearby", [0, count, solids.outline.length]);
+    }
+    if (rays) {
+      const eye = kernel.address(slot, "eye"), reach = eye + 3 * Float64Array.BYTES_PER_ELEMENT;
+      kernel.view(slot, "along").set(rays.along.flat());
+      kernel.view(slot, "eye").set(rays.eye);
+      this.#point("finder", "qpos along eye eye solids", [0, count, rays.along[0].length, rays.frame]);
+      kernel.view(slot, "finder", Int32Array)[3] = reach;
+    }
   }
 
   // Takes a task up: its functions, its words, and the world it is in.
@@ -118,23 +130,32 @@ export class Flight {
     this.wind.fill(0);
     this.flown.set(this.vehicle.row);
     this.ceiling.fill(Infinity);
+    if (this.pair.solids) {
+      this.uniform(this.kernel.book.solidStream, 0, this.pair.drawn);
+      this.call("place");
+    }
     this.first();
   }
 
   // What is seen first, from where the aircraft is.
   first() {
+    this.kernel.view(this.slot, "nearby")[0] = NaN; // a list that is not known
     this.#read();
+    this.#measure();
     this.modelled.set(this.estimates ? this.vehicle.hoverSpeed : this.act);
     this.late = Array.from({ length: this.vehicle.deadSteps }, () => this.act.slice());
     this.call("first");
     this.call("rest");
   }
 
-  // Commands to the rotors from an action; without one the geometric controller gives it.
-  command(action) {
+  // Commands to the rotors from an action; without one the geometric controller gives it. With
+  // loops the action is their setpoint, and they command the rotors at each physics step.
+  command(action, loops = false) {
     if (action) this.action.set(action);
     else this.call("geometric");
-    this.call("command");
+    this.loops = loops;
+    this.mean = new Float64Array(this.ctrl.length);
+    this.call(loops ? "aimed" : "command");
     if (this.estimates) this.call("follow");
   }
 
@@ -157,6 +178,11 @@ export class Flight {
 
   // Flies a physics step with the commands of the aircraft's dead time ago; whether as `advance`.
   tick() {
+    if (this.loops) {
+      this.#state();
+      this.call("looped");
+      this.ctrl.forEach((wanted, k) => (this.mean[k] += wanted / this.vehicle.substeps));
+    }
     const command = this.ctrl.slice();
     this.late.push(command);
     this.ctrl.set(this.late.shift().map((wanted, k) => Math.min(wanted, this.ceiling[k])));
@@ -168,15 +194,57 @@ export class Flight {
   // The transition of a control step, after its physics steps.
   finish() {
     this.#read();
+    this.#measure();
+    if (this.loops) this.ctrl.set(this.mean); // which counts
     if (!this.estimates) this.modelled.set(this.act);
     this.call("step");
     this.call("feel");
   }
 
   #read() {
+    if (this.#state()) this.diverged[0] = 1;
+  }
+
+  // Computes the state; whether it is not sound.
+  #state() {
     const at = (part) => this.kernel.address(this.slot, part);
-    const broken = this.kernel.functions.quadrl_state(at("state_rows"), ONE, 0, at("state"));
-    if (broken) this.diverged[0] = 1;
+    return this.kernel.functions.quadrl_state(at("state_rows"), ONE, 0, at("state")) !== 0n;
+  }
+
+  // How far it is to solids, and along rays.
+  #measure() {
+    const { functions } = this.kernel, at = (part) => this.kernel.address(this.slot, part);
+    const { solids, rays } = this.pair;
+    if (solids) functions.quadrl_clearance(at("solid_rows"), 0n, ONE, 0, at("clearance"));
+    if (rays) functions.quadrl_rays(at("finder"), 0n, ONE, 0, at("ranges"));
+  }
+
+  // Whether it is no nearer to a solid than to the ground.
+  get clear() {
+    this.#measure();
+    return !this.pair.solids || this.kernel.view(this.slot, "clearance")[0] > this.qpos[2];
+  }
+
+  // The solids about it as the scene draws them, without those that this episode does not have.
+  get obstacles() {
+    return (this.pair.solids?.looks ?? []).map(({ kind, rgba }, k) => {
+      const numbers = [...this.solids.subarray(16 * k, 16 * k + 16)];
+      const [size, position, turn] = [numbers.slice(1, 4), numbers.slice(4, 7), numbers.slice(7)];
+      return { kind, rgba, size, position, turn, shine: 0, glow: 0 };
+    }).filter(({ position: [, , z], size }) => z > -Math.max(...size));
+  }
+
+  // Ends of the rays that meet something, world frame [m], and how near that is, 1 at the aircraft.
+  get beams() {
+    const { rays } = this.pair;
+    if (!rays) return [];
+    const { qpos, ranges } = this, [w, x, y, z] = qpos.subarray(3), [along, reach] = [rays.along, rays.eye[3]];
+    const yaw = Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), [c, s] = [Math.cos(yaw), Math.sin(yaw)];
+    return along[0].map((east, k) => {
+      const [north, up, far] = [along[1][k], along[2][k], ranges[k]];
+      const way = [c * east - s * north, s * east + c * north, up];
+      return { to: way.map((part, axis) => qpos[axis] + far * part), near: 1 - far / reach };
+    }).filter(({ near }) => near > 0);
   }
 
   // What is measured: what the task shows, and what else the options of an observation ask for.

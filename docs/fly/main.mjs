@@ -106,7 +106,8 @@ class Page {
       const controller = this.policies.get(settings[side]);
       return new Episode(this.kernel, k, settings, controller, settings.events);
     });
-    this.stage.begin(this.vehicle, this.book.tasks[settings.task].scene);
+    const { scene } = this.book.tasks[settings.task], { obstacles } = this.episodes[0].flight;
+    this.stage.begin(this.vehicle, { ...scene, shapes: [...scene.shapes, ...obstacles] });
     this.behind = 0; // [s] that pictures are ahead of the last physics step
     this.poses = this.episodes.map((episode) => [pose(episode), pose(episode)]);
     this.showSettings();
@@ -132,7 +133,7 @@ class Page {
   }
 
   #distance() {
-    const wide = this.settings.task === "hover" ? 1 : 1.35;
+    const wide = { hover: 1, navigation: 2.6 }[this.settings.task] ?? 1.35;
     return wide * (0.6 + 6.5 * this.vehicle.size);
   }
 
@@ -212,8 +213,8 @@ class Page {
 
   // The flights a share of the way to their next physics step, some time after the last picture.
   draw(share, passed) {
-    const shown = this.episodes.map(({ flight: { goal, wind } }, k) => ({
-      pose: between(...this.poses[k], share), goal: [...goal], wind: [...wind],
+    const shown = this.episodes.map(({ flight: { goal, wind, beams } }, k) => ({
+      pose: between(...this.poses[k], share), goal: [...goal], wind: [...wind], beams,
     }));
     this.stage.draw(shown, this.orbit, passed);
   }

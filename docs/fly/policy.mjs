@@ -84,6 +84,7 @@ export class Policy {
     this.observe = { ...KNOWN, ...this.metadata.observe };
     const { vehicle = {}, changed = {} } = this.metadata;
     this.vehicle = vehicle.name;
+    this.loops = (this.metadata.control_mode ?? "rotor") !== "rotor"; // whether it commands loops
     this.changed = changed.vehicle ?? []; // what is not as the aircraft of that name has it
     this.scale = this.changed.includes("action_scale") ? vehicle.action_scale : undefined;
     this.mean = arrays.mean;
@@ -119,14 +120,16 @@ export class Policy {
     if (standard && !book.standard.includes(taskName)) return `It has learned ${book.standard.join(", ")}.`;
     const other = this.changed.find((name) => name !== "action_scale");
     if (other) return `It has learned another ${other} than the aircraft here have.`;
-    const mode = metadata.control_mode ?? "rotor";
-    if (mode !== "rotor") return `Its control mode is ${mode}, and this page knows rotor alone.`;
-    if (actionSize !== rotors) return `It commands ${actionSize} rotors; ${vehicleName} has ${rotors}.`;
+    const mode = metadata.control_mode ?? "rotor", loops = this.loops && pair.loops;
+    if (this.loops && loops?.mode !== mode) return `Its control mode is ${mode}, and this page knows ${pair.loops?.mode ?? "rotor"}.`;
+    if (loops && vehicleName !== this.vehicle) return `Its loops are those of ${this.vehicle}.`;
+    if (!loops && actionSize !== rotors) return `It commands ${actionSize} rotors; ${vehicleName} has ${rotors}.`;
     if (this.size !== size) return `It observes ${this.size} numbers; ${taskName} shows ${size}.`;
     const trained = book.vehicles[this.vehicle] ?? book.vehicles[vehicleName];
     const alike = JSON.stringify(trained.layout) === JSON.stringify(layout);
     if (!alike) return `It has learned the rotor layout of ${this.vehicle}.`;
     const own = this.scale ?? trained.actionScale;
+    if (loops) return own === loops.scale ? "" : `Its loops change the rotor speeds by ${own} rad/s, and those of this page by ${loops.scale}.`;
     if (this.scale || own === book.vehicles[vehicleName].actionScale) return "";
     return `Its actions change the rotor speeds by ${own} rad/s, as those of ${this.vehicle}.`;
   }

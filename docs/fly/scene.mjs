@@ -86,8 +86,14 @@ function solid(shape, meshes) {
     : new THREE.MeshStandardMaterial({ color, ...clear, roughness: 0.95 - 0.6 * shine, metalness: 0.1, ...light });
   const mesh = new THREE.Mesh(geometry(shape, meshes), material);
   mesh.position.fromArray(shape.position);
-  mesh.quaternion.copy(attitude(shape.quaternion));
+  if (shape.quaternion) mesh.quaternion.copy(attitude(shape.quaternion));
+  else mesh.quaternion.setFromRotationMatrix(turned(shape.turn));
   return mesh;
+}
+
+// Of a rotation matrix, row by row.
+function turned([a, b, c, d, e, f, g, h, i]) {
+  return new THREE.Matrix4().set(a, b, c, 0, d, e, f, 0, g, h, i, 0, 0, 0, 0, 1);
 }
 
 // A disc as it looks while it turns: clear at the hub, brighter towards the tip.
@@ -228,7 +234,9 @@ class View {
     });
     const below = new THREE.CircleGeometry(1.5 * vehicle.size, 40);
     this.shadow = new THREE.Mesh(below, flat({ color: 0x000000, map: textures.shadow }));
-    const meshes = [this.trail, this.path, this.drop, ...this.goal].map(({ mesh }) => mesh);
+    this.beams = new THREE.LineSegments(new THREE.BufferGeometry(), flat({ vertexColors: true }));
+    this.beams.frustumCulled = false;
+    const meshes = [this.trail, this.path, this.drop, ...this.goal].map(({ mesh }) => mesh).concat(this.beams);
     this.group.add(this.aircraft.group, this.shadow, ...meshes);
     this.group.traverse((object) => object.layers.set(this.layer));
     this.scene.add(this.group);
@@ -245,12 +253,22 @@ class View {
     }
   }
 
-  // pose: position (3), quaternion (w, x, y, z), rotor speeds; orbit: azimuth, elevation, distance.
-  show(pose, goal, orbit, time) {
+  // Lines to what rays meet, brighter where it is near.
+  #look(from, beams) {
+    const shade = new THREE.Color(this.colour), geometry = this.beams.geometry;
+    const colours = beams.flatMap(({ near }) => [0.15 * near, near].flatMap((alpha) => [shade.r, shade.g, shade.b, 0.8 * alpha]));
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(beams.flatMap(({ to }) => [...from, ...to]), 3));
+    geometry.setAttribute("color", new THREE.Float32BufferAttribute(colours, 4));
+  }
+
+  // pose: position (3), quaternion (w, x, y, z), rotor speeds; beams: where rays end, and how near
+  // that is; orbit: azimuth, elevation, distance.
+  show({ pose, goal, beams }, orbit, time) {
     const { position, quaternion, speeds } = pose;
     this.aircraft.group.position.fromArray(position);
     this.aircraft.group.quaternion.copy(attitude(quaternion)).normalize();
     this.aircraft.turn(speeds, time);
+    this.#look(position, beams);
     this.shadow.position.set(position[0], position[1], 0.002);
     this.shadow.scale.setScalar(1 + 0.15 * position[2]);
     // Looks at the aircraft, and a little towards its goal.
@@ -346,7 +364,7 @@ export class Stage {
     position.needsUpdate = color.needsUpdate = true;
   }
 
-  // shown: for each view { pose, goal, wind }; time since the last picture [s].
+  // shown: for each view { pose, goal, wind, beams }; time since the last picture [s].
   draw(shown, orbit, time) {
     const canvas = this.renderer.domElement, whole = canvas.getBoundingClientRect();
     const ratio = Math.min(window.devicePixelRatio, 2);
@@ -361,7 +379,7 @@ export class Stage {
       const corner = [box.left - whole.left, whole.bottom - box.bottom, box.width, box.height];
       view.camera.aspect = box.width / Math.max(box.height, 1);
       view.camera.updateProjectionMatrix();
-      view.show(shown[k].pose, shown[k].goal, orbit, time);
+      view.show(shown[k], orbit, time);
       this.centre.value.set(view.focus.x, view.focus.y);
       this.sky.position.copy(view.camera.position);
       this.#blow(shown[k].wind, view.focus.toArray(), k ? 0 : time);

@@ -8,13 +8,17 @@ the compiled step of `quadrl.core.compiled` is, and become C functions per task 
     step       the transition after the physics, with the next observation
     command    the commands to the rotors of an action
     geometric  the action of the geometric controller
+    place      the solids of an episode, from numbers that were drawn
+    aimed      the setpoint of the loops that a task is trained with, of an action
+    looped     their commands to the rotors for the next physics step
     follow     the modelled rotor speeds after a control step with those commands
     rest       the disturbance that is felt at the start of an episode
     feel       that after a control step
 
 Each takes the memory of one flight, an array of doubles whose parts are named in `LAYOUT`. The
 observation is computed from the rotor speeds in `modelled`: JavaScript puts the true ones there
-where it does not call `follow`.
+where it does not call `follow`. What C measures of solids stands in `clearance` and `ranges`; none
+is ever touched here, since MuJoCo alone computes that.
 """
 
 from __future__ import annotations
@@ -28,28 +32,34 @@ from typing import Any
 import numpy as np
 
 from quadrl.aircraft.parameters import AIR, PLACES, ROW_SIZE, Parameters
+from quadrl.aircraft.presets import resolve
 from quadrl.aircraft.vehicle import MAX_ROTORS, commanded
 from quadrl.base import records
-from quadrl.base.rotation import Array, to_body
+from quadrl.base.rotation import Array, rotation_matrix, to_body
 from quadrl.base.trace import Trace
 from quadrl.conditions.sensor import Memory, Moment
 from quadrl.conditions.sensors import Aim, RotorSpeed, felt, moving
+from quadrl.conditions.solids import Pose
+from quadrl.conditions.world import World
 from quadrl.control.geometric import GeometricController
+from quadrl.control.modes import ControlMode, kind
 from quadrl.control.reading import Reading
 from quadrl.core.environment import Environment
 from quadrl.core.program import Draws
 from quadrl.core.senses import Look
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.transition import Clock, Episode, Observation, Transition, begin, finish
-from quadrl.engines.state import FIRST, State
+from quadrl.engines.solids import NEARBY, SOLID
+from quadrl.engines.state import FIRST, Start, State
 
+MAX_SOLIDS, MAX_RAYS, MAX_BALLS = 48, 64, 32
 PARTS = {
     "parameters": ROW_SIZE,  # the aircraft's row, as it is specified
     "flown": ROW_SIZE,  # the one that flies: the same, with what happens to it
     "limits": 2,  # its largest speed [m/s] and spin [rad/s]: as in `Rows` of state.c
     "world": 4,  # physics step [s], gravity along z [m/s^2], floor and reach [m]: `World` of C
     "origin": 3,  # of the task's frame [m], world
-    "drawn": 64,  # random numbers of the start
+    "drawn": 256,  # random numbers of the start, or of the solids
     "qpos": 7,
     "qvel": 6,
     "act": MAX_ROTORS,
@@ -61,7 +71,8 @@ PARTS = {
     "kept": 64,  # what the task remembers, the distances, how far the episode is
     "action": MAX_ROTORS,
     "diverged": 1,
-    "observation": 64,
+    "commanded": MAX_ROTORS,  # mean commands of the last control step [rad/s]
+    "observation": 96,
     "scale": 1,  # of actions [rad/s]: Vehicle.action_scale, or that of a policy's training
     "moving": 6,  # as quadrl.conditions.sensors.moving gives it
     "disturbance": 3,  # [m/s^2], world frame
@@ -74,10 +85,18 @@ PARTS = {
     "keys": 1,  # of the random numbers, an int64 each
     "episodes": 1,
     "near": 1,  # a byte: as in `Rows` of free_flight.c
-    "solids": 1,  # of which there are none
-    "nearby": 1,  # data of those near by, of which there are none either
+    "solids": MAX_SOLIDS * SOLID.itemsize // 8,
+    "nearby": NEARBY.itemsize // 8,  # those near by
+    "clearance": 1,  # [m], least distance from a solid
+    "ranges": MAX_RAYS,  # distances along rays [m]
+    "setpoint": 8,  # of the loops of a control mode
+    "outline": 5 * MAX_BALLS,  # balls about the aircraft: `Ball` of solids.c
+    "along": 3 * MAX_RAYS,  # directions of rays
+    "eye": 4,  # where they begin (3) [m], body frame, and how far they reach [m]
     "flight_rows": 10,  # that `Rows`, for pointers of 32 bits
     "state_rows": 8,  # `Rows` of state.c
+    "solid_rows": 5,  # `Rows` of solids.c
+    "finder": 7,  # `Finder` of rays.c
 }
 """Numbers in each part of a flight's memory."""
 LAYOUT = dict(zip(PARTS, np.cumsum([0, *PARTS.values()]).tolist(), strict=False))
@@ -120,6 +139,20 @@ class _Memory:
         """The same state with the rotor speeds that are observed."""
         seen = self.read("modelled", self._rotors)
         return dataclasses.replace(self.state(), rotor_speed=seen)
+
+    def world(self, environment: Environment) -> World | None:
+        """The solids and the ground about the aircraft, as they are measured."""
+        scene = environment.scene
+        if not (scene.solids or scene.rays):
+            return None
+        clear, first = self.read("clearance", 1)[:, 0], 0
+        parts: list[Array] = [np.zeros((1, 0))]
+        for rays in scene.rays.values():
+            distance = self.read("ranges", np.arange(first, first + rays.count)[None])
+            parts.append(rays.sharp.read(distance, 0.0, distance[:, :0]))
+            first += rays.count
+        about = scene.nothing_near(1)
+        return dataclasses.replace(about, clearance=clear, rays=np.concatenate(parts, axis=1))
 
     def aim(self, now: Snapshot, seen: Observation, *, begins: bool) -> dict[str, Any]:
         """What the sensor "aim" remembers and gives with an observation."""
@@ -178,15 +211,17 @@ def write(environment: Environment) -> tuple[str, int]:
 
     def given(now: Snapshot, episode: Episode, done: Transition | None = None) -> dict[str, Any]:
         """The results of a first observation or of a step, by the part they are written to."""
-        goal, seen, error = task.goal(now) + origin, task.observe(now), task.error(now)
+        goal, seen, error = task.goal(now) + origin, {**task.observe(now)}, task.error(now)
         reward, *flags = [0.0] * 4
         if done:
-            seen, error, reward = done.observation, done.error, done.reward[0]
+            seen, error, reward = {**done.observation}, done.error, done.reward[0]
             flags = [part[0] for part in (done.terminated, done.truncated, done.is_success)]
+        ranges = {name: now.world.ranges(name) for name in environment.scene.rays if now.world}
         return {
             "kept": [*_row(now.task), *_row(now.potentials), *_row(episode), *_flat(now.time)],
-            "observation": [x for term in seen.values() for x in _flat(term)],
+            "observation": [x for term in (seen | ranges).values() for x in _flat(term)],
             **memory.aim(now, seen, begins=done is None),
+            "commanded": now.rotor_command,
             "given": [*_flat(error), reward, *_flat(goal), *flags],
         }
 
@@ -201,17 +236,20 @@ def write(environment: Environment) -> tuple[str, int]:
     memory = _Memory(environment)
     parameters, state = memory.parameters(), memory.estimate()
     remembered, _ = memory.kept(task_state)
-    now, episode, _ = begin(task, state, remembered, parameters, environment.action_size)
+    known = remembered, parameters, environment.action_size, memory.world(environment)
+    now, episode, _ = begin(task, state, *known)
     emit("first", memory, **given(now, episode))
 
     memory = _Memory(environment)
     parameters, state = memory.parameters(), memory.state()
     remembered, measured, episode, time = memory.kept(task_state, now.potentials, episode)
-    before = Snapshot(None, remembered, parameters, None, None, time, measured)  # type: ignore[arg-type]
+    world = memory.world(environment)
+    last: Any = remembered, parameters, None, memory.read("commanded", rotors), time, measured
+    before = Snapshot(None, *last, world=world)  # type: ignore[arg-type]
     action, command = memory.read("action", rotors), memory.read("ctrl", rotors)
     flag = np.array([f"m[{LAYOUT['diverged']}] != 0"], object)
     diverged = memory.trace.inputs(flag, is_flag=True)
-    taken = action, command, diverged, None, _Modelled(memory.estimate())
+    taken = action, command, diverged, world, _Modelled(memory.estimate())
     emit("step", memory, **given(*finish(task, clock, episode, before, state, *taken)))
 
     memory = _Memory(environment)
@@ -219,8 +257,9 @@ def write(environment: Environment) -> tuple[str, int]:
     emit("command", memory, ctrl=commanded(action, vehicle.hover_speed, scale, vehicle.max_speed))
 
     memory = _Memory(environment)
-    # As `Environment.flatten` gives it.
-    observation = memory.read("observation", environment.size, "(double)(float)m[{}]")
+    # As `Environment.flatten` gives it, without what is seen along rays, which come last.
+    own = environment.size - sum(rays.count for rays in environment.scene.rays.values())
+    observation = memory.read("observation", own, "(double)(float)m[{}]")
     controller = GeometricController(vehicle, task)
     reading = Reading.of(observation, task.observation, vehicle)
     emit("geometric", memory, action=controller.action(reading, *task.guide(reading)))
@@ -242,7 +281,63 @@ def write(environment: Environment) -> tuple[str, int]:
             disturbance = felt(disturbance, last, motion, timestep, share)
         seen = to_body(state.rotation, disturbance)
         emit(name, memory, moving=motion, disturbance=disturbance, felt=seen)
-    return "\n".join(functions), draws.used
+    used = draws.used
+    if environment.scene.solids:
+        memory = _Memory(environment)
+        draws = Draws(functools.partial(memory.read, "drawn"))
+        parts = (
+            np.split(memory.read("qpos", 7), [3], axis=1),
+            np.split(memory.read("qvel", 6), 2, 1),
+        )
+        (position, quaternion), (velocity, rate) = parts
+        speeds = memory.read("act", rotors)
+        begun = Start(position - origin, quaternion, velocity, rate, speeds)
+        solids = _solids(environment, task.place(draws, begun, memory.kept(task_state)[0]))
+        emit("place", memory, solids=solids)
+        used = max(used, draws.used)
+
+    if mode := loops_of(environment):
+        memory = _Memory(environment)
+        setpoint = mode.setpoint(memory.state(), memory.read("action", mode.size))
+        emit("aimed", memory, setpoint=setpoint)
+        memory = _Memory(environment)
+        wanted = memory.read("setpoint", setpoint.shape[1])
+        emit("looped", memory, ctrl=mode.rotor_command(memory.state(), wanted))
+    return "\n".join(functions), used
+
+
+def loops_of(environment: Environment) -> ControlMode | None:
+    """The control mode that policies for the task and the aircraft are trained with, if it loops.
+
+    Of the aircraft that the task is trained on it has the action scale of the training.
+    """
+    training, vehicle = environment.task.training, environment.vehicle
+    mode = kind(training.get("control_mode", "rotor"))
+    if not mode.has_loops:
+        return None
+    own = vehicle.name == environment.task.trained_on
+    return mode(resolve(vehicle, training.get("vehicle_options") if own else None))
+
+
+def _solids(environment: Environment, placed: Mapping[str, Pose]) -> list[Any]:
+    """Solids that stay, as `Solid` of solids.h has them, their numbers side by side."""
+    made: list[Any] = []
+    for solid in environment.scene.solids:
+        count, pose = solid.count or 1, placed.get(solid.name)
+        position = np.tile(np.array(solid.position, object), (1, count, 1))
+        turn = np.tile([1.0, 0.0, 0.0, 0.0], (1, count, 1))
+        if pose is not None:
+            position = np.reshape(pose.position, (1, count, 3))
+            turn = turn if pose.quaternion is None else np.reshape(pose.quaternion, (1, count, 4))
+            if pose.size is not None:
+                solid = solid.sized(np.reshape(pose.size, (1, count, len(solid.lengths))))
+        position, rotation = position + environment.origin, rotation_matrix(turn)
+        for k in range(count):
+            for part in solid.parts:
+                assert part.offset == (0.0, 0.0, 0.0), solid.name
+                size = [np.broadcast_to(number, (1, count))[0, k] for number in part.size]
+                made += [float(part.kind), *size, *_flat(position[0, k]), *_flat(rotation[0, k])]
+    return made
 
 
 def _row(record: Any) -> list[Any]:

@@ -15,7 +15,7 @@ import sys
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from quadrl.aircraft.presets import VEHICLES, with_effects
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
-from quadrl.base.philox import START
+from quadrl.base.philox import SOLIDS, START
 from quadrl.base.primitives import Primitive
 from quadrl.conditions.sensors import Aim, Disturbance, Standard
 from quadrl.core.environment import Environment
@@ -34,6 +34,8 @@ from quadrl.deploy import flights
 from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import world
 from quadrl.engines.native import compiling
+from quadrl.engines.rays import Frame
+from quadrl.engines.solids import KINDS
 from quadrl.engines.state import c_state
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.policy_file import CLIP, FORMAT
@@ -53,16 +55,14 @@ KERNELS = {
     "free_flight.c": "quadrl_free_flight",
     "state.c": "quadrl_state",
     "random.c": "quadrl_uniform",
+    "rays.c": "quadrl_rays",
+    "solids.c": "quadrl_clearance",
 }
 """Of quadrl/native, with what they export."""
 MODULES = ("flight", "policy", "episode", "link", "scene", "plot", "main")
 """Of docs/fly, each after those that it imports."""
-FLOWN = tuple(
-    name
-    for name, task in TASKS.items()
-    if not (task.contact or name == "lsy_race" or task().solids())
-)
-"""Tasks of the page: without contact, which MuJoCo computes, and with a scene that stays."""
+FLOWN = tuple(name for name, task in TASKS.items() if not task.contact)
+"""Tasks of the page: without contact, which MuJoCo computes."""
 MEMORY = """// Written by quadrl/deploy/flights.py.
 #include <math.h>
 #include <stdint.h>
@@ -102,6 +102,7 @@ def make_book() -> tuple[dict[str, Any], str]:
                 "origin": environment.origin.tolist(),
                 # JSON knows no infinity, which is where the floor of these tasks is.
                 "world": np.nan_to_num(about).tolist(),
+                **surrounded(environment),
             }
     book = {
         "drawn": {
@@ -114,6 +115,7 @@ def make_book() -> tuple[dict[str, Any], str]:
         "layout": {name: [flights.LAYOUT[name], size] for name, size in flights.PARTS.items()},
         "flightSize": flights.SIZE,
         "startStream": START,
+        "solidStream": SOLIDS,
         "massPlace": int(parameters.PLACES["mass"][0]),
         "gustTime": GUST_TIME,
         "smoothing": Disturbance.smoothing,
@@ -142,6 +144,23 @@ def make_book() -> tuple[dict[str, Any], str]:
         },
     }
     return book, "\n".join(sources)
+
+
+def surrounded(environment: Environment) -> dict[str, Any]:
+    """What a flight knows of solids, of rays, and of the loops of the task's own control mode."""
+    scene, solids, found = environment.scene, environment.engine.solids, dict[str, Any]()
+    if scene.solids:
+        parts = [(s, part) for s in scene.solids for part in (s.count or 1) * [*s.parts]]
+        looks = [{"kind": KINDS[part.kind], "rgba": [*s.rgba]} for s, part in parts]
+        found["solids"] = {"outline": solids.outline.tolist(), "looks": looks}
+    for rays in scene.rays.values():  # one at most, on this page
+        frame = get_args(Frame).index(rays.frame)
+        eye = [*rays.place, rays.reach]
+        found["rays"] = {"along": rays.along.T.tolist(), "eye": eye, "frame": frame}
+    if mode := flights.loops_of(environment):
+        scale = mode.vehicle.action_scale
+        found["loops"] = {"mode": mode.name, "size": mode.size, "scale": scale}
+    return found
 
 
 def surroundings(task: Task) -> dict[str, Any]:
