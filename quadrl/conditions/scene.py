@@ -20,9 +20,7 @@ import numpy as np
 from quadrl.aircraft.parameters import HELD, MARK
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
-from quadrl.base.rotation import cross
-from quadrl.base.validation import MAX_OPTION
-from quadrl.conditions.solids import MIN_LENGTH, Pose, Solid
+from quadrl.conditions.solids import Pose, Solid, write_pose
 from quadrl.conditions.world import FAR, World
 from quadrl.engines.engine import Engine
 from quadrl.engines.rays import Rays
@@ -143,7 +141,7 @@ class Scene:
                 if last is not None:
                     own[..., 3:7] = UPRIGHT
                 shape = count, solid.count or 1, len(solid.parts), made.shape[-1]
-                _place(solid, pose, origin, own.reshape(shape))
+                write_pose(solid, pose, origin, own.reshape(shape))
         return made
 
     def check_move(self, last: np.ndarray, poses: np.ndarray, timestep: float) -> None:
@@ -238,64 +236,3 @@ class Scene:
         landed, held = feet[:, 0] > 0, feet[:, HELD] > 0
         measured = centres, clear, touched, speed.copy(), landed, feet[:, 1:HELD], held, rays
         return World(self._places, self._beams, *measured)
-
-
-def _checked(
-    name: str, given: Any, shape: tuple[int, ...], least: float = -MAX_OPTION
-) -> np.ndarray:
-    """Numbers of a shape, each between `least` and `MAX_OPTION`."""
-    try:
-        found = np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
-        found = np.zeros(0)
-    # NaN, as the least of all, is no number from `least` on.
-    if found.shape != shape or not (found.min() >= least and found.max() <= MAX_OPTION):
-        allowed = f"an array {shape} of numbers between {least:g} and {MAX_OPTION:g}"
-        raise QuadrlError(name=name, value=given, allowed=allowed)
-    return found
-
-
-def _place(solid: Solid, pose: Pose, origin: np.ndarray, made: np.ndarray) -> None:
-    """Write poses into upright ones (n, count, P, 7 or 13) of the P parts of a kind of solid."""
-    rows, number, _, size = made.shape
-    each = (rows,) if solid.count is None else (rows, number)
-    place = _checked(f"position of {solid.name}", pose.position, (*each, 3))
-    turn, own = None, solid
-    if pose.quaternion is not None:
-        turn = _unit(f"quaternion of {solid.name}", pose.quaternion, (*each, 4))
-        turn = turn.reshape(rows, number, 4)
-    if pose.size is not None:
-        name = f"size of {solid.name} ({', '.join(solid.lengths)})"
-        if size == 7:
-            allowed = "None in `move` where `place` gives none"
-            raise QuadrlError(name=name, value=pose.size, allowed=allowed)
-        lengths = _checked(name, pose.size, (*each, len(solid.lengths)), MIN_LENGTH)
-        own = solid.sized(lengths.reshape(rows, number, -1))
-    for k, part in enumerate(own.parts):
-        at = made[:, :, k]
-        if pose.size is not None:
-            at[..., 7:] = np.stack(np.broadcast_arrays(*part.size, *part.offset), axis=-1)
-        for j, numbers in enumerate(np.moveaxis(place.reshape(rows, number, 3), -1, 0)):
-            np.add(numbers, origin[j], out=at[..., j])  # in long loops, of all solids
-        offset = at[..., 10:] if size > 7 else np.asarray(part.offset, dtype=float)
-        if offset.any():
-            at[..., :3] += offset if turn is None else _rotated(turn, offset)
-        if turn is not None:
-            at[..., 3:7] = turn
-
-
-def _unit(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Unit quaternions (..., 4), from such whose length may be off by 1 %."""
-    turn = _checked(name, given, shape)
-    length = np.linalg.norm(turn, axis=-1, keepdims=True)
-    wrong = abs(length[..., 0] - 1) > 0.01
-    if wrong.any():
-        raise QuadrlError(name=name, value=turn[wrong][0], allowed="(w, x, y, z) of length 1")
-    return turn / length
-
-
-def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """A vector (3,) or vectors (..., 3) turned by unit quaternions (..., 4)."""
-    w, axis = quaternion[..., :1], quaternion[..., 1:]
-    twice = 2 * cross(axis, vector)
-    return vector + w * twice + cross(axis, twice)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.rotation import Array, namespace
+from quadrl.base.rotation import Array, cross, namespace
 from quadrl.base.validation import MAX_OPTION, number, numbers
 
 Vector = tuple[float, float, float]
@@ -183,3 +183,74 @@ def heading(angle: Array) -> Array:
     xp = namespace(angle)
     none = xp.zeros_like(angle)
     return xp.stack([xp.cos(angle / 2), none, none, xp.sin(angle / 2)], axis=-1)
+
+
+def write_pose(solid: Solid, pose: Pose, origin: np.ndarray, made: np.ndarray) -> None:
+    """Write poses into upright ones (n, count, P, 7 or 13) of the P parts of a kind of solid.
+
+    Args:
+        solid: The solid.
+        pose: Its poses, which are validated.
+        origin: Origin (3,) [m] of the task frame in the world frame.
+        made: What is written into; with sizes it has 13 numbers a part.
+
+    Raises:
+        QuadrlError: An array has the wrong shape, or numbers that no pose has.
+    """
+    rows, count, _, size = made.shape
+    each = (rows,) if solid.count is None else (rows, count)
+    place = _checked(f"position of {solid.name}", pose.position, (*each, 3))
+    turn, own = None, solid
+    if pose.quaternion is not None:
+        turn = _unit(f"quaternion of {solid.name}", pose.quaternion, (*each, 4))
+        turn = turn.reshape(rows, count, 4)
+    if pose.size is not None:
+        name = f"size of {solid.name} ({', '.join(solid.lengths)})"
+        if size == 7:
+            allowed = "None in `move` where `place` gives none"
+            raise QuadrlError(name=name, value=pose.size, allowed=allowed)
+        lengths = _checked(name, pose.size, (*each, len(solid.lengths)), MIN_LENGTH)
+        own = solid.sized(lengths.reshape(rows, count, -1))
+    for k, part in enumerate(own.parts):
+        at = made[:, :, k]
+        if pose.size is not None:
+            at[..., 7:] = np.stack(np.broadcast_arrays(*part.size, *part.offset), axis=-1)
+        for j, centre in enumerate(np.moveaxis(place.reshape(rows, count, 3), -1, 0)):
+            np.add(centre, origin[j], out=at[..., j])  # in long loops, of all solids
+        offset = at[..., 10:] if size > 7 else np.asarray(part.offset, dtype=float)
+        if offset.any():
+            at[..., :3] += offset if turn is None else _rotated(turn, offset)
+        if turn is not None:
+            at[..., 3:7] = turn
+
+
+def _checked(
+    name: str, given: Any, shape: tuple[int, ...], least: float = -MAX_OPTION
+) -> np.ndarray:
+    """Numbers of a shape, each between `least` and `MAX_OPTION`."""
+    try:
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    # NaN, as the least of all, is no number from `least` on.
+    if found.shape != shape or not (found.min() >= least and found.max() <= MAX_OPTION):
+        allowed = f"an array {shape} of numbers between {least:g} and {MAX_OPTION:g}"
+        raise QuadrlError(name=name, value=given, allowed=allowed)
+    return found
+
+
+def _unit(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Unit quaternions (..., 4), from such whose length may be off by 1 %."""
+    turn = _checked(name, given, shape)
+    length = np.linalg.norm(turn, axis=-1, keepdims=True)
+    wrong = abs(length[..., 0] - 1) > 0.01
+    if wrong.any():
+        raise QuadrlError(name=name, value=turn[wrong][0], allowed="(w, x, y, z) of length 1")
+    return turn / length
+
+
+def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """A vector (3,) or vectors (..., 3) turned by unit quaternions (..., 4)."""
+    w, axis = quaternion[..., :1], quaternion[..., 1:]
+    twice = 2 * cross(axis, vector)
+    return vector + w * twice + cross(axis, twice)
