@@ -8,7 +8,8 @@ from __future__ import annotations
 from quadrl.control.geometric import Controller, GeometricController
 from quadrl.control.loops import Gains
 from quadrl.control.lqr import LQRController, Weights
-from quadrl.control.modes import CONTROL_MODES, ActionTerm, ControlMode
+from quadrl.control.mode import ActionTerm, ControlMode
+from quadrl.control.modes import CONTROL_MODES
 
 __all__ = [
     "CONTROLLERS", "CONTROL_MODES", "ActionTerm", "ControlMode", "Controller", "Gains",

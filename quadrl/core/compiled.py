@@ -25,7 +25,7 @@ from quadrl.base.rotation import Array
 from quadrl.base.trace import NotCompilable
 from quadrl.conditions.world import World
 from quadrl.control.autopilot import Laws
-from quadrl.control.modes import ControlMode
+from quadrl.control.mode import ControlMode
 from quadrl.core.program import FLAGS, Program
 from quadrl.core.senses import arrays
 from quadrl.core.snapshot import Snapshot
