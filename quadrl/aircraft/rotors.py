@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import mujoco
 import numpy as np
@@ -17,6 +17,10 @@ from quadrl.base.validation import number, numbers
 GRAVITY = 9.81  # [m/s^2]
 MIN, MAX = mujoco.mjMINVAL, mujoco.mjMAXVAL  # what MuJoCo takes for zero, and for unstable
 LENGTHS = (1e-3, 1e3)  # [m]; the meshes of a smaller one have no volume to MuJoCo
+LEAN = 0.01  # largest sideways force in hover over the weight; it costs controllers about 3 cm
+SINGULAR = 1e-9
+"""Smallest singular value of a mixer over its largest, after scaling each row by its largest
+entry."""
 
 Vector = tuple[float, float, float]
 
@@ -131,6 +135,55 @@ def hover_squares(mixer: np.ndarray, thrust: Array, moment: Array = 0.0) -> np.n
     wrench[..., 1:, 0] = (0.0 - np.asarray(moment)) / scale[..., 1:, 0]
     across = np.swapaxes(rows, -1, -2)
     return (across @ np.linalg.solve(rows @ across, wrench))[..., 0]
+
+
+def check_layout(rotors: Sequence[Rotor], mixer: np.ndarray, mass: float) -> None:
+    """Refuse rotors that cannot hold an aircraft in hover and turn it about every axis.
+
+    Args:
+        rotors: The rotors, R.
+        mixer: Their mixer (4, R).
+        mass: Mass of the aircraft [kg].
+
+    Raises:
+        QuadrlError: The message has the numbers of the rotors and what they would have to be.
+    """
+
+    def refuse(field: str, allowed: str, reason: str = "") -> NoReturn:
+        values = [getattr(rotor, field) for rotor in rotors]
+        name = {"axis": "rotor axes"}.get(field, f"rotor {field}s")
+        raise QuadrlError(reason, name=name, value=values, allowed=allowed)
+
+    if len({rotor.spin * math.copysign(1, rotor.axis[2]) for rotor in rotors}) < 2:
+        reason = "yaw cannot be controlled if all rotors turn the same way"
+        refuse("spin", "of both signs", reason)
+    for axis, moment in zip("xyz", mixer[1:], strict=True):
+        if not (moment > 0).any() or not (moment < 0).any():
+            reason = f"they turn the aircraft about its {axis} axis in one direction only"
+            refuse("position", "on different sides of every axis", reason)
+    rows = mixer / np.abs(mixer).max(axis=1, keepdims=True)
+    values, level = (np.linalg.svd(part, compute_uv=False) for part in (rows, rows[:3]))
+    if values[-1] < SINGULAR * values[0]:
+        reason = "they cannot set thrust, roll, pitch and yaw independently (singular mixer)"
+        if level[-1] < SINGULAR * level[0]:
+            refuse("position", "a layout with an allocation that can be inverted", reason)
+        refuse("spin", "others, such as 1, -1, 1, -1 around the aircraft", reason)
+    squares = hover_squares(mixer, mass * GRAVITY)
+    if not (squares > 0).all():
+        reason = "hovering without turning would need a negative thrust of one of them"
+        refuse("position", "around the centre of mass", reason)
+    thrust = squares * [rotor.thrust_coefficient for rotor in rotors]
+    if np.hypot(*(thrust @ [rotor.axis[:2] for rotor in rotors])) > LEAN * mass * GRAVITY:
+        refuse("axis", "balanced: no sideways force in hover")
+    hover, largest = np.sqrt(squares), np.array([rotor.max_speed for rotor in rotors])
+    if not (hover < largest).all():
+        worst = int(np.argmax(hover / largest))
+        raise QuadrlError(
+            f"the rotors must carry {mass:g} kg with thrust to spare",
+            name=f"max_speed of rotor {worst + 1}",
+            value=rotors[worst].max_speed,
+            allowed=f"above its hover speed, {hover[worst]:.4g} rad/s",
+        )
 
 
 PAPER_ROTORS = plus(

@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +25,10 @@ from quadrl.aircraft.rotors import (
     MAX,
     MIN,
     PAPER_ROTORS,
+    SINGULAR,
     Rotor,
     Vector,
+    check_layout,
     hover_squares,
     mixer,
 )
@@ -46,10 +48,6 @@ MAX_SUBSTEPS = 10_000
 # turn once a second and to fall at its terminal speed.
 TURN, DAMPING = 0.5, 1.0
 SLOWEST_TURN = 2 * math.pi  # [rad/s]
-LEAN = 0.01  # largest sideways force in hover over the weight; it costs controllers about 3 cm
-SINGULAR = 1e-9
-"""Smallest singular value of a mixer over its largest, after scaling each row by its largest
-entry."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,35 +115,7 @@ class Vehicle:
             allowed = f"between {MIN_ROTORS} and {MAX_ROTORS}"
             raise QuadrlError(name="number of rotors", value=count, allowed=allowed)
         number("distance of the farthest rotor [m]", self.size, *LENGTHS)
-        if len({rotor.spin * math.copysign(1, rotor.axis[2]) for rotor in rotors}) < 2:
-            reason = "yaw cannot be controlled if all rotors turn the same way"
-            self._refuse("spin", "of both signs", reason)
-        for axis, moment in zip("xyz", self.mixer[1:], strict=True):
-            if not (moment > 0).any() or not (moment < 0).any():
-                reason = f"they turn the aircraft about its {axis} axis in one direction only"
-                self._refuse("position", "on different sides of every axis", reason)
-        rows = self.mixer / np.abs(self.mixer).max(axis=1, keepdims=True)
-        values, level = (np.linalg.svd(part, compute_uv=False) for part in (rows, rows[:3]))
-        if values[-1] < SINGULAR * values[0]:
-            reason = "they cannot set thrust, roll, pitch and yaw independently (singular mixer)"
-            if level[-1] < SINGULAR * level[0]:
-                self._refuse("position", "a layout with an allocation that can be inverted", reason)
-            self._refuse("spin", "others, such as 1, -1, 1, -1 around the aircraft", reason)
-        squares = hover_squares(self.mixer, self.mass * GRAVITY)
-        if not (squares > 0).all():
-            reason = "hovering without turning would need a negative thrust of one of them"
-            self._refuse("position", "around the centre of mass", reason)
-        thrust = squares * [rotor.thrust_coefficient for rotor in rotors]
-        if np.hypot(*(thrust @ [rotor.axis[:2] for rotor in rotors])) > LEAN * self.mass * GRAVITY:
-            self._refuse("axis", "balanced: no sideways force in hover")
-        if not (self.hover_speed < self.max_speed).all():
-            worst = int(np.argmax(self.hover_speed / self.max_speed))
-            raise QuadrlError(
-                f"the rotors must carry {self.mass:g} kg with thrust to spare",
-                name=f"max_speed of rotor {worst + 1}",
-                value=rotors[worst].max_speed,
-                allowed=f"above its hover speed, {self.hover_speed[worst]:.4g} rad/s",
-            )
+        check_layout(rotors, self.mixer, self.mass)
 
     def _check_timesteps(self) -> None:
         """Refuse steps that do not resolve the aircraft, or do not fit into each other."""
@@ -177,11 +147,6 @@ class Vehicle:
                     value=step,
                     allowed=f"at most {step * resolved / needed:.2g} s",
                 )
-
-    def _refuse(self, field: str, allowed: str, reason: str = "") -> NoReturn:
-        values = [getattr(rotor, field) for rotor in self.rotors]
-        name = {"axis": "rotor axes"}.get(field, f"rotor {field}s")
-        raise QuadrlError(reason, name=name, value=values, allowed=allowed)
 
     @property
     def rotor_count(self) -> int:
