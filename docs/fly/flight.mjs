@@ -256,7 +256,7 @@ export class Flight {
     return [...own, ...(felt ? this.felt : []), ...late.flatMap((values) => [...values])];
   }
 
-  // As quadrl.conditions.sensors.Standard gives it: how a target moves, and which task this is.
+  // As quadrl.conditions.targets.Standard gives it: how a target moves, and which task this is.
   get standard() {
     const { book } = this.kernel, [from, to] = this.pair.layout.target_velocity ?? [0, 0];
     const velocity = to ? this.observation.subarray(from, to) : [0, 0, 0];

@@ -10,7 +10,9 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import choice, number, resolved
 from quadrl.conditions import ranging as ranging  # registers its sensors
 from quadrl.conditions import sensors
-from quadrl.conditions.sensors import LONGEST_HISTORY, Sensor
+from quadrl.conditions import targets as targets  # registers its sensors
+from quadrl.conditions.sensors import Sensor
+from quadrl.conditions.views import LONGEST_HISTORY
 
 ROTOR_SPEEDS = ("true", "estimated", "none")
 SWITCHES = ("relative_rotor_speed", "rotation", "airspeed", "disturbance", "privileged")

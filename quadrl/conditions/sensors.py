@@ -1,21 +1,20 @@
-"""Sensors: estimates, measurements and histories, each with its own errors, delay and rate.
+"""Sensors of the motion, the rotors and the air, each with its own errors, delay and rate.
 
 A sensor is a frozen dataclass: its fields are its options, its methods are pure functions of a
-`Moment`. To add one, register a class with a name and `sense`. In a control step sensors are read
+`Moment`. To add one, register a class with a name and `sense`. Others sense where to fly
+(`targets`), what was before (`views`) and along rays (`ranging`). In a control step they are read
 in order: rotor speeds, the state estimate, measurements; then, after the task's functions, the
 task's entries, the history, and what the critic alone sees.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.quadrotor import as_x, turned
 from quadrl.aircraft.rotors import GRAVITY, MAX
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, norm, stack, to_body, to_world
@@ -26,9 +25,7 @@ from quadrl.conditions.sensor import make as make
 from quadrl.engines.dynamics import thrust_wrench
 from quadrl.engines.state import State
 
-LONGEST_HISTORY = 1000
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
-MOTION = 3  # numbers of `Standard` before its flags
 
 
 @register_sensor
@@ -271,321 +268,6 @@ class Disturbance(Sensor):
     def sense(self, now: Moment) -> Array:
         """The smoothed acceleration in the body frame."""
         return to_body(now.state.rotation, now.memory["felt"])
-
-
-@register_sensor
-class Aim(Sensor):
-    """From the aircraft to a place beyond the goal by the sum of past offsets, body frame.
-
-    It replaces the goal and the position: a policy that flies to this place as to a goal comes to
-    rest at the goal itself under any constant force, since the place moves on until then.
-    """
-
-    compiled = True
-    name, size, unit, last = "aim", 3, "m", True
-    formula = (
-        "R^T (goal - p + sum); sum = 0 as an episode begins, and after each control step, where "
-        "|goal - p| < near, sum += gain T (goal - p); then each number of sum is clipped to "
-        "[-most, most]"
-    )
-
-    gain: float = 0.5
-    """What the place moves on in a second, of the offset [1/s]."""
-    near: float = 0.5
-    """Longer offsets [m] are ways and are not summed up."""
-    most: float = 1.0
-    """Largest distance of the place from the goal along each axis of the world [m]."""
-    beside_goal: bool = False
-    """Whether the goal is seen, too: then who learns can answer a gust, whose offset passes, and a
-    lasting force each in its own way."""
-
-    def __post_init__(self) -> None:
-        """Validate the options."""
-        super().__post_init__()
-        for name in ("gain", "near", "most"):
-            number(f"aim {name}", getattr(self, name), 0, MAX)
-        given: Any = self.beside_goal
-        if not isinstance(given, bool):
-            raise QuadrlError(name="aim beside_goal", value=given, allowed="True or False")
-
-    @property
-    def hides(self) -> tuple[str, ...]:
-        """The entries that tell where the goal is."""
-        return ("position",) if self.beside_goal else ("position", "goal")
-
-    def begin(self, now: Moment) -> Memory:
-        """The sum is zero."""
-        return {"sum": np.zeros((len(now.wind), self.size))}
-
-    def update(self, now: Moment) -> Memory:
-        """Add the offset to the sum if it is short."""
-        offset = to_world(now.state.rotation, now.estimated["goal"])
-        added = np.where(norm(offset)[:, None] < self.near, offset, 0.0)
-        seconds = float(now.parameters.control_timestep)
-        summed = now.memory["sum"] + self.gain * seconds * added
-        return {"sum": np.clip(summed, -self.most, self.most)}
-
-    def sense(self, now: Moment) -> Array:
-        """The goal of the estimated state, plus the sum in the body frame."""
-        return now.estimated["goal"] + to_body(now.state.rotation, now.memory["sum"])
-
-
-@register_sensor
-class Offset(Sensor):
-    """Position from the goal and velocity, world frame, clipped: how PX4's mc_raptor sees them."""
-
-    compiled = True
-    name, size, unit, last = "offset", 6, "m, m/s", True
-    formula = "p - goal, each number clipped to [-near, near]; v, to [-slow, slow]"
-
-    near: float = 0.5
-    """Largest distance along each axis that is seen [m]."""
-    slow: float = 1.0
-    """Largest speed along each axis that is seen [m/s]."""
-
-    def __post_init__(self) -> None:
-        """Validate the options."""
-        super().__post_init__()
-        for name in ("near", "slow"):
-            number(f"offset {name}", getattr(self, name), 0, MAX)
-
-    @property
-    def hides(self) -> tuple[str, ...]:
-        """The entries that tell the same and more."""
-        return "position", "sin_attitude", "cos_attitude", "velocity", "goal"
-
-    def sense(self, now: Moment) -> Array:
-        """Both as they are estimated."""
-        way = to_world(now.state.rotation, now.estimated["goal"])
-        parts = (
-            np.clip(-way, -self.near, self.near),
-            np.clip(now.state.velocity, -self.slow, self.slow),
-        )
-        return np.concatenate(parts, axis=-1)
-
-
-@register_sensor
-class Level(Sensor):
-    """What a quadrotor sees without a heading, in the frame in which its rotors are an X.
-
-    The goal moves on by the sum of past offsets, as in `Aim`, and the yaw rate by that of the turns
-    so far: then a policy comes to rest at the goal without knowing how strong its rotors are.
-    """
-
-    compiled = True
-    name, size, unit, last = "level", 12, "1, m, m/s, rad/s", True
-    formula = (
-        "side by side, each turned into the frame of the X: R^T (0, 0, 1); R^T (goal - p + sum), "
-        "each number clipped to [-near, near]; R^T v; body rate + (0, 0, gain turn). sum and turn "
-        "are 0 as an episode begins; after each control step turn += T (body rate about z), and "
-        "sum += gain T (goal - p) where |goal - p| < near; then each number of both is clipped to "
-        "[-most, most]"
-    )
-
-    near: float = 0.6
-    """Largest distance along each axis that is seen, and longest offset that is summed up [m]."""
-    gain: float = 0.5
-    """What a second adds to the sum, of the offset [1/s]; the weight of the turns, too."""
-    most: float = 1.0
-    """Largest number of the sum [m] and of the turn [rad]."""
-
-    def __post_init__(self) -> None:
-        """Validate the options."""
-        super().__post_init__()
-        for name in ("near", "gain", "most"):
-            number(f"level {name}", getattr(self, name), 0, MAX)
-
-    @property
-    def hides(self) -> tuple[str, ...]:
-        """The entries that tell the same, or a heading."""
-        return "position", "sin_attitude", "cos_attitude", "velocity", "body_rate", "goal"
-
-    def begin(self, now: Moment) -> Memory:
-        """Both are zero."""
-        return {"sum": np.zeros((len(now.wind), 3)), "turn": np.zeros((len(now.wind), 1))}
-
-    def update(self, now: Moment) -> Memory:
-        """Add the offset to the sum if it is short, and the yaw rate to the turn."""
-        offset = to_world(now.state.rotation, now.estimated["goal"])
-        added = np.where(norm(offset)[:, None] < self.near, offset, 0.0)
-        seconds = float(now.parameters.control_timestep)
-        summed = now.memory["sum"] + self.gain * seconds * added
-        turn = now.memory["turn"] + seconds * now.state.body_rate[:, 2:]
-        return {
-            "sum": np.clip(summed, -self.most, self.most),
-            "turn": np.clip(turn, -self.most, self.most),
-        }
-
-    def sense(self, now: Moment) -> Array:
-        """From the estimated state, in the frame of the X of the specified aircraft."""
-        rotor, state = now.parameters.rotor, now.state
-        _, turn = as_x(rotor.position[0], rotor.spin[0])
-        aim = now.estimated["goal"] + to_body(state.rotation, now.memory["sum"])
-        rate = state.body_rate
-        rate = np.concatenate([rate[:, :2], rate[:, 2:] + self.gain * now.memory["turn"]], axis=-1)
-        seen = state.rotation[..., 2, :], np.clip(aim, -self.near, self.near), state.body_velocity
-        return np.concatenate([turned(part, turn) for part in (*seen, rate)], axis=-1)
-
-
-@register_sensor
-class Airframe(Sensor):
-    """What its rotors can do, as a quadrotor in an X: the normalised allocation matrix."""
-
-    name, size, unit, measured = "airframe", 16, "log(g), log(rad/s^2)", False
-    formula = (
-        "ln of what each rotor gives at its largest speed: acceleration [g] along z, and the sizes "
-        "of the angular accelerations [rad/s^2] about x, y, z of the X"
-    )
-    compiled = True
-
-    def sense(self, now: Moment) -> Array:
-        """Of the aircraft as it was drawn."""
-        return now.airframe
-
-
-@register_sensor
-class Standard(Sensor):
-    """What is asked, in the same numbers for several tasks: how a target moves, and which task.
-
-    One policy can then fly each of them by its own name, and the same numbers where they are drawn.
-    """
-
-    compiled = True
-    name, last = "standard", True
-    formula = (
-        "the task's entry target_velocity, zeros without one; then for each name of tasks 1 where "
-        "it is the task's, else 0"
-    )
-
-    tasks: tuple[str, ...] = (
-        "hover",
-        "static_waypoint",
-        "random_waypoint",
-        "straight_and_level",
-        "landing",
-        "target_following",
-    )
-    """Names of the tasks that it knows."""
-
-    @property
-    def hides(self) -> tuple[str, ...]:
-        """The entries in whose place it stands."""
-        return "target_velocity", "task"
-
-    def check(self, tasks: tuple[str, ...]) -> None:
-        """Refuse a task that is not among those that it knows."""
-        for task in tasks:
-            if task not in self.tasks:
-                raise QuadrlError(name="standard tasks", value=self.tasks, allowed=f"with {task}")
-
-    def width(self, sizes: Sizes) -> int:
-        """A velocity, and a flag for each task."""
-        return MOTION + len(self.tasks)
-
-    def sense(self, now: Moment) -> Array:
-        """From the entries that it hides."""
-        xp, seen = namespace(now.wind), now.estimated
-        zeros, one = 0.0 * now.wind, 0.0 * now.wind[:, :1] + 1.0
-        drawn = seen.get("task", one)
-        flags = (
-            sum((drawn[:, k, None] for k, name in enumerate(now.tasks) if name == known), 0.0 * one)
-            for known in self.tasks
-        )
-        return xp.concatenate([seen.get("target_velocity", zeros), *flags], axis=-1)
-
-
-@dataclasses.dataclass(frozen=True)
-class History(Sensor):
-    """The last of something, the newest first."""
-
-    measured = False
-
-    length: int = 1
-    """How many; zeros before the first."""
-
-    def __post_init__(self) -> None:
-        """Validate the options."""
-        super().__post_init__()
-        number(f"{self.name} length", self.length, 1, LONGEST_HISTORY, whole=True)
-
-
-@register_sensor
-class ActionHistory(History):
-    """The last actions, the newest first."""
-
-    compiled = True
-    name = "action_history"
-    formula = "the last `length` actions, clipped to [-1, 1], the newest first; zeros before them"
-
-    def width(self, sizes: Sizes) -> int:
-        """All numbers of all actions."""
-        return self.length * sizes.actions
-
-    def begin(self, now: Moment) -> Memory:
-        """Zeros: no action was taken yet."""
-        return {"actions": np.zeros((len(now.action), self.length * now.action.shape[1]))}
-
-    def update(self, now: Moment) -> Memory:
-        """Put the last action before the others, of which the oldest is dropped."""
-        return {"actions": pushed(now.memory["actions"], np.clip(now.action, -1.0, 1.0))}
-
-    def sense(self, now: Moment) -> Array:
-        """The actions, clipped to [-1, 1]."""
-        return now.memory["actions"]
-
-
-@register_sensor
-class ObservationHistory(History):
-    """The observations before, the newest first; the first one stands for those before it."""
-
-    compiled = True
-    name, unit, last = "observation_history", "", True
-    formula = (
-        "the `length` observations before the present one, without histories, the newest first; "
-        "the first one stands for those before it"
-    )
-
-    def width(self, sizes: Sizes) -> int:
-        """All numbers of all observations."""
-        return self.length * sizes.observed
-
-    def begin(self, now: Moment) -> Memory:
-        """The first observation, repeated."""
-        return {"past": np.tile(now.observed, 1 + self.length)}
-
-    def update(self, now: Moment) -> Memory:
-        """Put the present one before the others, of which the oldest is dropped."""
-        return {"past": pushed(now.memory["past"], now.observed)}
-
-    def sense(self, now: Moment) -> Array:
-        """The observations before the present one."""
-        return now.memory["past"][:, now.observed.shape[1] :]
-
-
-@register_sensor
-class Privileged(Sensor):
-    """For the critic alone: the task's true entries, what was drawn, what events do, and the wind.
-
-    What was drawn lies between -1 and 1 in its range; what events do is 0 where it is nothing, as
-    `Events.seen` gives it; the wind [m/s] is in the body frame.
-    """
-
-    compiled = True
-    name, unit, measured, shown, last = "privileged", "", False, False, True
-
-    def width(self, sizes: Sizes) -> int:
-        """All of these."""
-        return sizes.truth + sizes.drawn + sizes.happening + 3
-
-    def sense(self, now: Moment) -> Array:
-        """The true entries, what was drawn, what happens and the wind, side by side."""
-        wind = to_body(now.true.rotation, now.wind)
-        return np.concatenate([*now.truth.values(), now.drawn, now.happening, wind], axis=-1)
-
-
-def pushed(past: Array, newest: Array) -> Array:
-    """Past numbers (n, k) with the newest (n, m) before them; the oldest m are dropped."""
-    return np.concatenate([newest, past[:, : -newest.shape[1]]], axis=-1)
 
 
 def moving(specified: Parameters, state: State) -> Array:

@@ -38,8 +38,9 @@ from quadrl.base import records
 from quadrl.base.rotation import Array, rotation_matrix, to_body
 from quadrl.base.trace import Trace
 from quadrl.conditions.sensor import Memory, Moment
-from quadrl.conditions.sensors import Aim, RotorSpeed, felt, moving
+from quadrl.conditions.sensors import RotorSpeed, felt, moving
 from quadrl.conditions.solids import Pose
+from quadrl.conditions.targets import Aim
 from quadrl.conditions.world import World
 from quadrl.control.geometric import GeometricController
 from quadrl.control.modes import ControlMode, kind
@@ -79,7 +80,7 @@ PARTS = {
     "felt": 3,  # the same in the body frame, as policies see it
     "share": 1,  # of a change in it that a control step shows, as Disturbance.share
     "modelled": MAX_ROTORS,  # rotor speeds that are seen [rad/s]: true, or following the commands
-    "aim_sum": 3,  # what quadrl.conditions.sensors.Aim remembers [m], world frame
+    "aim_sum": 3,  # what quadrl.conditions.targets.Aim remembers [m], world frame
     "aim": 3,  # what it gives [m], body frame
     "given": 8,  # error [m], reward, goal (3) [m, world], terminated, truncated, is_success
     "keys": 1,  # of the random numbers, an int64 each

@@ -26,7 +26,8 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.files import HEADER
 from quadrl.base.philox import SOLIDS, START
 from quadrl.base.primitives import Primitive
-from quadrl.conditions.sensors import Aim, Disturbance, Standard
+from quadrl.conditions.sensors import Disturbance
+from quadrl.conditions.targets import Aim, Standard
 from quadrl.core.environment import Environment
 from quadrl.core.markers import Marker
 from quadrl.core.task import Task

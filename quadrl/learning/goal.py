@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.base.errors import QuadrlError
-from quadrl.conditions import sensors
+from quadrl.conditions import sensors, targets
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import UNDISTURBED
 from quadrl.learning.config import TrainConfig
@@ -95,5 +95,5 @@ def told_by(layout: Mapping[str, slice]) -> slice:
     Args:
         layout: The place of each entry.
     """
-    standard = layout.get(sensors.Standard.name, slice(0, 0))
-    return layout.get("task", slice(standard.start + sensors.MOTION, standard.stop))
+    standard = layout.get(targets.Standard.name, slice(0, 0))
+    return layout.get("task", slice(standard.start + targets.MOTION, standard.stop))
