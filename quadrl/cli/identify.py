@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from tyro.conf import Positional
 
-from quadrl.aircraft.presets import FILE, VEHICLES, resolve
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.specification import FILE, resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.extras import needed

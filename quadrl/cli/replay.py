@@ -8,7 +8,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.specification import resolve
 from quadrl.base.extras import needed
 from quadrl.cli import choices
 from quadrl.cli.console import console, make_table, say

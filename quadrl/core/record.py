@@ -24,7 +24,7 @@ from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from quadrl.aircraft import presets
+from quadrl.aircraft import presets, specification
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.records import as_json
 from quadrl.core.catalogue import TASKS
@@ -160,14 +160,14 @@ def _aircraft(record: Mapping[str, Any], flown: Scenario) -> tuple[Any, ...]:
     fields, known = record.get("vehicle"), presets.VEHICLES.get(flown.vehicle.name)
     if known is None or not isinstance(fields, Mapping):
         return {}, {}, {}
-    was = presets.resolve(cast(Mapping[str, Any], fields), whole=True)
+    was = specification.resolve(cast(Mapping[str, Any], fields), whole=True)
     if was.name != flown.vehicle.name:
         return {}, {}, {}
     with contextlib.suppress(QuadrlError):  # what was changed may not fit into that of today
         own = {name: getattr(was, name) for name in record["changed"].get("vehicle", ())}
         known = dataclasses.replace(known, **own)
         if "aircraft" in record and record.get("aerodynamics") == flown.aerodynamics:
-            flew = presets.resolve(record["aircraft"], whole=True)
+            flew = specification.resolve(record["aircraft"], whole=True)
             return flew, presets.with_effects(known, flown.aerodynamics), flown.aircraft
     return was, known, flown.vehicle
 

@@ -17,7 +17,7 @@ from typing import Any, Unpack, cast
 import mujoco
 from typing_extensions import TypedDict
 
-from quadrl.aircraft import presets
+from quadrl.aircraft import presets, specification
 from quadrl.aircraft.aerodynamics import FULL, Aerodynamics
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
@@ -109,7 +109,7 @@ class Scenario:
 
     task: Task = dataclasses.field(metadata={"parse": catalogue.make})
     """The task with its options."""
-    vehicle: Vehicle = _condition("paper", presets.resolve, "name", names=presets.VEHICLES)
+    vehicle: Vehicle = _condition("paper", specification.resolve, "name", names=presets.VEHICLES)
     """The aircraft as it is specified; `aircraft` is what flies."""
     aerodynamics: str | Aerodynamics | None = _condition(None, _effects, "name")
     """Effects of the air that were asked for, or that wind brings; None for the aircraft's own."""
@@ -194,7 +194,7 @@ class Scenario:
         vehicle_options = {**whole.pop("vehicle_options", {}), **new.pop("vehicle_options", {})}
         whole |= new
         others = {name: whole.pop(name) for name in list(whole) if name not in KEYWORDS}
-        vehicle = presets.resolve(whole.get("vehicle"), vehicle_options)
+        vehicle = specification.resolve(whole.get("vehicle"), vehicle_options)
         if (timestep := whole.pop("control_timestep", None)) is not None:
             vehicle = dataclasses.replace(vehicle, control_timestep=timestep)
         if (steps := whole.pop("max_episode_steps", None)) is not None:
@@ -284,9 +284,9 @@ def _recorded(given: Mapping[str, Any]) -> dict[str, Any]:
     whole = {name: value for name, value in given.items() if name != "changed"}
     flew, fields = whole.pop("aircraft", None), whole.get("vehicle")
     if isinstance(fields, Mapping):
-        whole["vehicle"] = presets.resolve(cast(Mapping[str, Any], fields), whole=True)
+        whole["vehicle"] = specification.resolve(cast(Mapping[str, Any], fields), whole=True)
         if flew is not None:
-            flew = presets.resolve(flew, whole=True)
+            flew = specification.resolve(flew, whole=True)
             with contextlib.suppress(QuadrlError):
                 if presets.with_effects(whole["vehicle"], whole.get("aerodynamics")) == flew:
                     return whole
@@ -301,7 +301,7 @@ def _check_in_wind(vehicle: Vehicle) -> None:
         QuadrlError: The full set is not known or not possible.
     """
     try:
-        presets.check_known(vehicle)
+        specification.check_known(vehicle)
         presets.in_real_air(vehicle)
     except QuadrlError as error:
         reason = f"wind acts on the rotors too: {error}"

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from quadrl.aircraft.presets import FILE, VEHICLES, resolve
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.rotors import Rotor
+from quadrl.aircraft.specification import FILE, resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.docstrings import docstrings
 from quadrl.base.errors import QuadrlError

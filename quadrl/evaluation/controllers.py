@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.specification import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.validation import choice
 from quadrl.control import CONTROLLERS, Controller

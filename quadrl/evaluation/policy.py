@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.aircraft.presets import resolve as resolve_vehicle
+from quadrl.aircraft.specification import resolve as resolve_vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import read_sealed_json
 from quadrl.base.validation import choice, number

@@ -12,7 +12,7 @@ import numpy as np
 
 from quadrl import control
 from quadrl.aircraft.aerodynamics import NONE
-from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.specification import resolve
 from quadrl.base.errors import QuadrlError
 from quadrl.base.progress import ProgressBar
 from quadrl.base.validation import choice, number

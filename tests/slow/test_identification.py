@@ -72,7 +72,7 @@ def test_an_aircraft_gives_its_own_numbers_back_from_tables(tmp_path, logs, monk
     assert "0.1 s" in said and {*tmp_path.glob("mine_*.png")} == {
         tmp_path / f"mine_{k}.png" for k in range(4)
     }
-    from quadrl.aircraft.presets import resolve
+    from quadrl.aircraft.specification import resolve
 
     made = resolve("mine.json")
     own_numbers(made)

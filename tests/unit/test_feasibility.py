@@ -15,8 +15,9 @@ from scipy.optimize import linprog
 import quadrl
 from quadrl import cli
 from quadrl.aircraft.parameters import rows
-from quadrl.aircraft.presets import VEHICLES, in_real_air, resolve
+from quadrl.aircraft.presets import VEHICLES, in_real_air
 from quadrl.aircraft.rotors import GRAVITY, mixer, ring
+from quadrl.aircraft.specification import resolve
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import units
 from quadrl.base.errors import QuadrlWarning

@@ -13,7 +13,8 @@ from scipy.optimize import root
 import quadrl
 from quadrl.aircraft import parameters
 from quadrl.aircraft.parameters import Parameters
-from quadrl.aircraft.presets import VEHICLES, in_real_air, resolve
+from quadrl.aircraft.presets import VEHICLES, in_real_air
+from quadrl.aircraft.specification import resolve
 from quadrl.base.errors import QuadrlWarning
 from quadrl.base.rotation import heading_of, norm
 from quadrl.conditions.sampler import Drawn

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from helpers import refused
 
-from quadrl.aircraft.presets import VEHICLES, resolve
+from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.rotors import PAPER_ROTORS, ring
+from quadrl.aircraft.specification import resolve
 from quadrl.aircraft.vehicle import Vehicle
 
 PAPER = Vehicle()

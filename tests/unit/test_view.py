@@ -14,7 +14,7 @@ import scipy.spatial
 from scipy.spatial.transform import Rotation
 
 from quadrl import cli, tasks
-from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.specification import resolve
 from quadrl.base.primitives import Mesh, Primitive
 from quadrl.core.markers import Marker
 from quadrl.core.scenario import Scenario

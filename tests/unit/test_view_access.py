@@ -13,7 +13,7 @@ import pytest
 from helpers import refused
 
 from quadrl import tasks
-from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.specification import resolve
 from quadrl.base.errors import QuadrlError
 from quadrl.core.scenario import Scenario
 from quadrl.evaluation.controllers import make_controller
