@@ -25,7 +25,8 @@ from quadrl.base.shield import shield_triton
 from quadrl.base.validation import registered
 from quadrl.base.version import __version__ as __version__
 from quadrl.conditions.observing import Observing
-from quadrl.conditions.randomization import RANDOMIZATIONS, Randomization
+from quadrl.conditions.randomization import Randomization
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.core.task import Task
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.defaults import check_stated

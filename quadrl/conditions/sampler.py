@@ -16,15 +16,8 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 from quadrl.base.validation import number, whole_steps
-from quadrl.conditions.randomization import (
-    AFFECTS,
-    DELAYS,
-    FACTORS,
-    NONE,
-    OFF,
-    Randomized,
-    resolve,
-)
+from quadrl.conditions.randomization import AFFECTS, DELAYS, FACTORS, NONE, OFF
+from quadrl.conditions.randomizations import Randomized, resolve
 
 EACH_ROTOR = ("thrust", "torque", "lag")
 """Factors that each rotor has once more on its own, within `Randomization.rotors`."""

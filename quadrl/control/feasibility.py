@@ -23,7 +23,8 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.philox import PARAMETERS
 from quadrl.base.rotation import Array
-from quadrl.conditions.randomization import AFFECTS, Randomization, Randomized
+from quadrl.conditions.randomization import AFFECTS, Randomization
+from quadrl.conditions.randomizations import Randomized
 from quadrl.conditions.sampler import DAMAGED, AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control import modes, trim

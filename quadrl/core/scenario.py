@@ -24,11 +24,12 @@ from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
 from quadrl.base.records import as_json
 from quadrl.conditions import events as happens
-from quadrl.conditions import observing, randomization
+from quadrl.conditions import observing, randomizations
 from quadrl.conditions.event import Event
 from quadrl.conditions.events import Happens
 from quadrl.conditions.observing import Observed, Observing
-from quadrl.conditions.randomization import RANDOMIZATIONS, Randomization, Randomized
+from quadrl.conditions.randomization import Randomization
+from quadrl.conditions.randomizations import RANDOMIZATIONS, Randomized
 from quadrl.conditions.weather import WEATHERS, Weather, Weathered
 from quadrl.control import modes
 from quadrl.core import catalogue
@@ -118,7 +119,7 @@ class Scenario:
     )
     """What the wind is like."""
     randomization: Randomization = _condition(
-        "none", randomization.resolve, "json", names=RANDOMIZATIONS, example={"mass": [0.8, 1.2]}
+        "none", randomizations.resolve, "json", names=RANDOMIZATIONS, example={"mass": [0.8, 1.2]}
     )
     """What is drawn for each aircraft at each reset and disturbs it."""
     events: Mapping[str, Event] = _condition(None, happens.resolve, "pairs", alone={})

@@ -23,7 +23,7 @@ from quadrl.base.files import read_sealed_json
 from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
 from quadrl.conditions.randomization import NONE
-from quadrl.conditions.randomization import resolve as resolve_randomization
+from quadrl.conditions.randomizations import resolve as resolve_randomization
 from quadrl.conditions.sampler import sizes_of
 from quadrl.control.modes import named
 from quadrl.core.record import import_again, warn_of_changes

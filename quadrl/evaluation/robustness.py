@@ -16,7 +16,8 @@ from quadrl.aircraft.specification import resolve
 from quadrl.base.errors import QuadrlError
 from quadrl.base.progress import ProgressBar
 from quadrl.base.validation import choice, number
-from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.conditions.randomization import Errors, Pushes, Randomization
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.control.feasibility import limit

@@ -26,7 +26,8 @@ from mujoco.batch import Batch
 from quadrl.aircraft.presets import in_real_air
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.machine import cores, machine
-from quadrl.conditions.randomization import FACTORS, RANDOMIZATIONS, Randomization
+from quadrl.conditions.randomization import FACTORS, Randomization
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.solids import Cylinder
 from quadrl.core.environment import Environment

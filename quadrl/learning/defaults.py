@@ -22,7 +22,7 @@ from typing import Any
 
 from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.validation import IN_A_FILE, choice, keys
-from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.core import catalogue
 from quadrl.core.scenario import GIVEN
 from quadrl.core.task import Task

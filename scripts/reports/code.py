@@ -18,7 +18,8 @@ from quadrl.cli.flown import Conditioned
 from quadrl.cli.new import content
 from quadrl.cli.tasks import observation_rows, reward_rows
 from quadrl.conditions.observing import Observing
-from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization, Sizes
+from quadrl.conditions.randomization import Errors, Pushes, Randomization, Sizes
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.control import CONTROL_MODES
 from quadrl.control.modes import modes_of
 from quadrl.core import snapshot

@@ -17,7 +17,7 @@ from quadrl.aircraft.aerodynamics import EFFECTS
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.rotation import Array, norm
 from quadrl.base.units import length, quantity
-from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.control import Gains, GeometricController
 from quadrl.control.reading import Reading
 from quadrl.core.scenario import UNDISTURBED, Conditions, Scenario

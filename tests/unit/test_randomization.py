@@ -14,7 +14,8 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.philox import LINK, NOISE, PARAMETERS, PUSHES, uniform_array_api
 from quadrl.base.rotation import norm
 from quadrl.conditions.observing import Observing
-from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.conditions.randomization import Errors, Pushes, Randomization
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.control import CONTROL_MODES
 from quadrl.core.environment import Environment
