@@ -12,7 +12,8 @@ from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array, namespace, stack
 from quadrl.engines.rng import FULL_TURN, Rng
-from quadrl.tasks.recordings import SURE, Recorded, apart, smoothed
+from quadrl.tasks.recordings import Recorded, smoothed
+from quadrl.tasks.reference_rows import SURE, apart
 from quadrl.tasks.references import AXES, PIECE, WAVES, Reference, Table, pieces
 
 SINES = {

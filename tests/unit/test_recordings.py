@@ -14,7 +14,7 @@ from quadrl.base.errors import QuadrlWarning
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.learning.config import TrainConfig
-from quadrl.tasks import recordings
+from quadrl.tasks import reference_rows
 
 RATE = 2 * np.pi / 8
 TIME = np.arange(0, 8, 0.1)
@@ -182,7 +182,7 @@ def test_a_limit_has_a_tolerance_and_its_message_the_digits_that_differ(tmp_path
     wide(3.0)
     with refused("trajectory figure", match="within 3 m .*; it goes 3.00[345].*, 0 m far"):
         wide(3.004)
-    assert recordings.apart(10.0004, 10.0) == "10.0004"
+    assert reference_rows.apart(10.0004, 10.0) == "10.0004"
 
 
 def test_noise_is_smoothed_and_told_unless_it_is_named(tmp_path, recwarn):
