@@ -11,7 +11,9 @@ import math
 
 import numpy as np
 
+from quadrl.aircraft.parameters import rows
 from quadrl.aircraft.rotors import mixer
+from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.base.rotation import Array
 
@@ -76,3 +78,21 @@ def authority(table: np.ndarray) -> Array:
     spun = turned(matrix[..., 1:] / table["inertia"][:, None], turn)
     whole = np.concatenate([lift, spun], axis=-1).reshape(len(table), -1)
     return np.log(np.maximum(np.abs(whole), 1e-3))
+
+
+def sizes_of(vehicle: Vehicle) -> dict[str, float]:
+    """The sizes of a quadrotor by the names and in the units of a randomization's `sizes`.
+
+    Raises:
+        QuadrlError: Its rotors are no X and no plus.
+    """
+    table = rows(vehicle)
+    lift, roll, pitch, _ = np.exp(authority(table)).reshape(4, 4).mean(0).tolist()
+    rotor = table["rotor"][0, : vehicle.rotor_count]
+    rates = np.log([rotor["lag_up"], rotor["lag_down"]])
+    return {
+        "mass": vehicle.mass,
+        "thrust_to_weight": 4 * lift,
+        "angular_acceleration": 2 * math.sqrt(roll * pitch),
+        "lag": math.exp(-rates.mean()),
+    }

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.aircraft import parameters
-from quadrl.aircraft.quadrotor import authority
+from quadrl.aircraft.quadrotor import sizes_of
 from quadrl.aircraft.rotors import GRAVITY, hover_squares
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
@@ -18,16 +18,13 @@ from quadrl.base.rotation import Array
 from quadrl.base.validation import number, whole_steps
 from quadrl.conditions.randomization import AFFECTS, DELAYS, FACTORS, NONE, OFF
 from quadrl.conditions.randomizations import Randomized, resolve
+from quadrl.conditions.ranges import CORNER, ROUNDING, Ranges
 
 EACH_ROTOR = ("thrust", "torque", "lag")
 """Factors that each rotor has once more on its own, within `Randomization.rotors`."""
 DAMAGED = "damaged_rotor"
 """Name of the number, from 0 on, of the rotor to which `Randomization.one_rotor` applies."""
 STEADY = ("force", "moment")
-CORNER = "corner"
-"""Name of the flag, 1 or 0, of the episodes in the share `Randomization.corners`."""
-UPPER = 0.75  # share of a range where its corner begins
-ROUNDING = 1e-9
 EXCHANGES = 3
 """Enough rounds: in layouts of four to eight rotors, more find no worse aircraft."""
 
@@ -44,7 +41,7 @@ class Drawn:
     """Factor of the weather's mean wind; None where it is the weather's."""
 
 
-class AircraftSampler:
+class AircraftSampler(Ranges):
     """The numbers that episodes draw from a randomization, and the aircraft that they make."""
 
     def __init__(self, randomization: Randomized, vehicle: Vehicle) -> None:
@@ -93,15 +90,9 @@ class AircraftSampler:
         ends |= {name: getattr(given, name) for name in ("command_jitter", "command_loss")}
         ends["loss_time"] = lasts
         ends["torque"] = (self._least_torque(), ends["torque"][1])
-        self.names = tuple(ends)
-        """Names of the drawn numbers. All are drawn, so that no range affects the other numbers."""
         whole = {name: (steps, step) for name, steps in self.delays.items()}
         whole |= {DAMAGED: ((0, last), 1.0), "loss_time": (self.outage, control)}
-        self._whole = [(self.names.index(name), *given) for name, given in whole.items()]
-        self.low, self._high = np.array([*ends.values()]).T
-        self._width = self._high - self.low
-        self.spread = np.flatnonzero(self._width)
-        """Indices of those that differ between aircraft."""
+        super().__init__(ends, whole, randomization.corners)
         if randomization != NONE:
             self._check_ends()
         if randomization.moment:
@@ -111,35 +102,6 @@ class AircraftSampler:
         if randomization.per_row:
             self.extremes = self.table(self._corners())
             self.check_hover(self.extremes)
-
-    def sample(self, shares: Array) -> Array:
-        """Numbers (n, k), a column for each of `names`, from shares in [0, 1) of the ranges."""
-        corner = self.columns(shares, CORNER) < self.randomization.corners
-        if corner.any():
-            shares = shares.copy()
-            for name in ("lag", "command_delay"):
-                share = self.columns(shares, name)
-                share[:] = np.where(corner, UPPER + (1 - UPPER) * share, share)
-        drawn = self.low + self._width * shares
-        self.columns(drawn, CORNER)[:] = corner
-        for k, (fewest, most), unit in self._whole:
-            drawn[:, k] = (fewest + np.floor((most - fewest + 1) * shares[:, k])) * unit
-        return drawn
-
-    def contains(self, drawn: Array) -> bool:
-        """Whether numbers (n, k) lie in their ranges."""
-        room = ROUNDING * np.maximum(np.abs(self.low), np.abs(self._high))
-        return bool(((drawn >= self.low - room) & (drawn <= self._high + room)).all())
-
-    def columns(self, drawn: Array, name: str, count: int = 1) -> Array:
-        """Columns (n, count) of drawn numbers, from the one of a name on."""
-        first = self.names.index(name)
-        return drawn[:, first : first + count]
-
-    def scaled(self, drawn: Array) -> Array:
-        """The numbers that differ (n, d), scaled to -1 at the lowest and 1 at the highest."""
-        low, width = self.low[self.spread], self._width[self.spread]
-        return 2 * (drawn[:, self.spread] - low) / width - 1
 
     def table(self, drawn: Array) -> np.ndarray:
         """Rows of parameters (n,) of the aircraft with drawn numbers (n, k)."""
@@ -222,13 +184,6 @@ class AircraftSampler:
             raise QuadrlError(reason, name="torque", value=given.torque, allowed=allowed)
         return max(given.torque[0], least)
 
-    def _at(self, count: int, **columns: Any) -> Array:
-        """Numbers (count, k): the given columns, each from a name on, and the lowest elsewhere."""
-        drawn = np.tile(self.low, (count, 1))
-        for name, values in columns.items():
-            self.columns(drawn, name, np.atleast_1d(values).shape[-1])[:] = values
-        return drawn
-
     def _check_ends(self) -> None:
         """Build the aircraft at the ends of the ranges, which must be sound vehicles."""
         given, count = self.randomization, self._vehicle.rotor_count
@@ -248,7 +203,7 @@ class AircraftSampler:
                 "centre_of_mass_x": (0.0, 0.0, 0.0),
             }
             try:
-                made = vehicle_of(self._vehicle, self.table(self._at(1, **columns))[0])
+                made = vehicle_of(self._vehicle, self.table(self.at(1, **columns))[0])
                 number("pushes velocity", given.pushes.velocity, 0, made.resolved_speed)
                 number("pushes body_rate", given.pushes.body_rate, 0, made.resolved_turn)
             except QuadrlError as error:
@@ -289,7 +244,7 @@ class AircraftSampler:
         cases = np.array([*itertools.product(range(count), (-1, 1), damaged)])
         columns: Any = {"mass": given.mass[1], DAMAGED: cases[:, 2:], "centre_of_mass_z": 0.0}
         columns["force_x"] = (given.force, given.force, -given.force)  # down, and aside
-        drawn = self._at(len(cases), **columns)
+        drawn = self.at(len(cases), **columns)
         for _ in range(EXCHANGES):
             # Each aircraft as it is, and with each end exchanged in turn.
             tried = np.repeat(drawn[:, None], 1 + len(places), axis=1)
@@ -316,24 +271,6 @@ class AircraftSampler:
             names = ("thrust_coefficient", "torque_coefficient")
             worst = {name: rotor[name][unable][0].tolist() for name in names}
             raise QuadrlError(reason, name="rotors", value=worst, allowed="a narrower range")
-
-
-def sizes_of(vehicle: Vehicle) -> dict[str, float]:
-    """The sizes of a quadrotor by the names and in the units of `randomization.Sizes`.
-
-    Raises:
-        QuadrlError: Its rotors are no X and no plus.
-    """
-    table = parameters.rows(vehicle)
-    lift, roll, pitch, _ = np.exp(authority(table)).reshape(4, 4).mean(0).tolist()
-    rotor = table["rotor"][0, : vehicle.rotor_count]
-    rates = np.log([rotor["lag_up"], rotor["lag_down"]])
-    return {
-        "mass": vehicle.mass,
-        "thrust_to_weight": 4 * lift,
-        "angular_acceleration": 2 * math.sqrt(roll * pitch),
-        "lag": math.exp(-rates.mean()),
-    }
 
 
 def vehicle_of(vehicle: Vehicle, row: np.void) -> Vehicle:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.quadrotor import sizes_of
 from quadrl.aircraft.specification import resolve as resolve_vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import read_sealed_json
@@ -24,7 +25,6 @@ from quadrl.base.validation import choice, number
 from quadrl.conditions import observing
 from quadrl.conditions.randomization import NONE
 from quadrl.conditions.randomizations import resolve as resolve_randomization
-from quadrl.conditions.sampler import sizes_of
 from quadrl.control.modes import named
 from quadrl.core.record import import_again, warn_of_changes
 from quadrl.core.scenario import RECORDED, Scenario

@@ -11,10 +11,10 @@ from scipy.linalg import solve_discrete_are
 
 import quadrl
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.aircraft.quadrotor import as_x, authority
+from quadrl.aircraft.quadrotor import as_x, authority, sizes_of
 from quadrl.aircraft.rotors import ring
 from quadrl.base.errors import QuadrlError, QuadrlWarning
-from quadrl.conditions.sampler import AircraftSampler, sizes_of, vehicle_of
+from quadrl.conditions.sampler import AircraftSampler, vehicle_of
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.evaluation.policy import Policy
