@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from quadrl.aircraft.parameters import AIR, PLACES, ROW_SIZE, Parameters
-from quadrl.aircraft.presets import resolve
+from quadrl.aircraft.specification import resolve
 from quadrl.aircraft.vehicle import MAX_ROTORS, commanded
 from quadrl.base import records
 from quadrl.base.rotation import Array, rotation_matrix, to_body
