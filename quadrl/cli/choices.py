@@ -21,9 +21,9 @@ from quadrl.base.docstrings import docstrings
 from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import GIVEN, Conditions
 from quadrl.learning.config import ALGORITHMS, ALIASES, KEEPS, MEMORIES
-from quadrl.learning.defaults import VARIANTS
 from quadrl.learning.log import WRITERS
 from quadrl.learning.settings import PAIRED
+from quadrl.learning.variants import VARIANTS
 from quadrl.tasks import TASKS
 
 Kind = TypeVar("Kind")

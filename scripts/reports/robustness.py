@@ -26,7 +26,7 @@ from quadrl.evaluation.evaluate import setting
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import BEHAVIOUR, flights, fly, means_of_behaviour
-from quadrl.learning.defaults import WIDE
+from quadrl.learning.variants import WIDE
 from scripts.reports import report
 from scripts.reports.report import FIGURES, Result, Runs, say, table
 

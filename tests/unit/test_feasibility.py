@@ -29,7 +29,7 @@ from quadrl.evaluation.card import Card
 from quadrl.evaluation.check import OK, angular_acceleration, height_to_turn_over
 from quadrl.evaluation.policy import Policy, shipped
 from quadrl.evaluation.robustness import DISTURBANCES
-from quadrl.learning.defaults import VARIANTS
+from quadrl.learning.variants import VARIANTS
 
 PAPER = Vehicle()
 # Action 1 commands 225.68 + 35 = 260.68 rad/s, which carry (260.68 / 225.68)^2 times the weight;

@@ -19,10 +19,10 @@ from quadrl.cli import COMMANDS
 from quadrl.evaluation import evaluate as evaluation
 from quadrl.learning import foreign
 from quadrl.learning.config import TrainConfig, prepare
-from quadrl.learning.defaults import OF_VEHICLE, VARIANTS
 from quadrl.learning.environments import make_env
 from quadrl.learning.folder import read_config, write_config
 from quadrl.learning.settings import ALGORITHM_CONFIGS, APGConfig, PPOConfig, VPGConfig
+from quadrl.learning.variants import OF_VEHICLE, VARIANTS
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
 
