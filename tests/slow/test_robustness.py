@@ -22,6 +22,7 @@ from quadrl.conditions.weather import Weather
 from quadrl.core.environment import Environment
 from quadrl.core.record import import_own
 from quadrl.core.scenario import Scenario
+from quadrl.evaluation import disturbances
 from quadrl.evaluation import robustness as disturbed
 from quadrl.evaluation.cache import FILE, digest
 from quadrl.evaluation.card import Card, half_level, wilson
@@ -53,7 +54,7 @@ def test_half_of_the_flights_fail_where_the_line_crosses():
 
 def test_a_level_disturbs_what_it_says():
     heavy, windy = (
-        disturbed.disturbed(Scenario.of("hover"), disturbed.DISTURBANCES[name].at(level))
+        disturbances.disturbed(Scenario.of("hover"), disturbances.DISTURBANCES[name].at(level))
         for name, level in (("mass", 1.3), ("gust", 8.0))
     )
     assert heavy.weather == Weather() and windy.randomization == Randomization()
@@ -63,7 +64,7 @@ def test_a_level_disturbs_what_it_says():
     mass = environment.engine.parameters.view(rows(Vehicle()).dtype)["mass"].ravel()
     np.testing.assert_allclose(mass, 1.3 * Vehicle().mass)
     nothing = (Randomization(), Weather())
-    for axis in disturbed.DISTURBANCES.values():  # only the usual level disturbs nothing
+    for axis in disturbances.DISTURBANCES.values():  # only the usual level disturbs nothing
         assert axis.usual in axis.levels and list(axis.levels) == sorted(set(axis.levels))
         assert [x for x in axis.levels if axis.at(x) in nothing] == [axis.usual], axis.name
     beyond: Any = Scenario.of("hover", randomization={"mass": 5.0})  # no aircraft can fly so

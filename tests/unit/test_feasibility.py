@@ -27,8 +27,8 @@ from quadrl.control.feasibility import MARGIN, Reach, limit, unreached
 from quadrl.evaluation import card_figures
 from quadrl.evaluation.card import Card
 from quadrl.evaluation.check import OK, angular_acceleration, height_to_turn_over
+from quadrl.evaluation.disturbances import DISTURBANCES
 from quadrl.evaluation.policy import Policy, shipped
-from quadrl.evaluation.robustness import DISTURBANCES
 from quadrl.learning.variants import VARIANTS
 
 PAPER = Vehicle()

@@ -18,6 +18,7 @@ from quadrl.core.environment import Environment
 from quadrl.core.record import warn_of_changes
 from quadrl.core.scenario import FIELDS, KEYWORDS, Scenario
 from quadrl.evaluation import robustness
+from quadrl.evaluation.disturbances import disturbed
 from quadrl.evaluation.evaluate import beside, setting
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig
@@ -197,11 +198,11 @@ def test_all_that_fly_beside_each_other_or_for_a_card_fly_in_the_same_air():
         together = [scenario for _, scenario in beside(flown, weather=None)]
         assert [one.aircraft.aerodynamics.effects for one in together] == [2, 2]
         card = robustness._flown(flown, None).values()
-        gusty = [robustness.disturbed(one, Weather(gust_speed=4.0)) for _, one in card]
+        gusty = [disturbed(one, Weather(gust_speed=4.0)) for _, one in card]
         assert {one.aerodynamics for one in gusty} == {"full"}
         assert [one.aircraft.aerodynamics.effects for _, one in card] == [effects] * 2
         drag = robustness._flown(flown, None, aerodynamics="none").values()
-        gusty = [robustness.disturbed(one, Weather(gust_speed=4.0)) for _, one in drag]
+        gusty = [disturbed(one, Weather(gust_speed=4.0)) for _, one in drag]
         assert {one.aerodynamics for one in gusty} == {"none"}
 
 
