@@ -146,12 +146,13 @@ class Run:
         Raises:
             RenderingUnavailable: There is no graphics library to draw the video with.
         """
-        from quadrl.evaluation import plotting  # it takes a second, and the result comes first
+        # They take a second, and the result comes first.
+        from quadrl.evaluation import flight_figures, plotting
 
         flown = self.evaluation
         yield plotting.save(curve(self.folder), self.folder / LEARNING_CURVE)
         title = f"{flown.task.name}: mean action of the policy"
-        drawn, carried = plotting.trajectory(flown.rollout, title), flown.scenario.to_json()
+        drawn, carried = flight_figures.trajectory(flown.rollout, title), flown.scenario.to_json()
         yield plotting.save(drawn, self.folder / TRAJECTORY, comment=comment([carried]))
         if video:
             model, flight = flown.scenario.compile_model(), flown.trajectory()

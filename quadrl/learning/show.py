@@ -109,14 +109,14 @@ def plot(*what: Any, kind: str = "png") -> Media:
             unknown.
     """
     with needed("quadrl.plot"):
-        from quadrl.evaluation import plotting
+        from quadrl.evaluation import flight_figures, plotting
 
     if not what:
         raise QuadrlError("give runs, run folders, or an evaluation")
     flown = [one for one in what if isinstance(one, Evaluation)]
     if flown and len(what) > 1:
         raise QuadrlError("give one evaluation at a time")
-    figures = {repr(one): plotting.trajectory(one.rollout, repr(one)) for one in flown}
+    figures = {repr(one): flight_figures.trajectory(one.rollout, repr(one)) for one in flown}
     folders = [Path(getattr(one, "folder", one)) for one in what if not flown]
     if len(folders) == 1 and folders[0].suffix != ".csv":
         figures |= {str(one): curve(one) for one in folders}

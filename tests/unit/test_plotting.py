@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import quadrl
 from quadrl import tasks
 from quadrl.base.media import Media
-from quadrl.evaluation import plotting
+from quadrl.evaluation import flight_figures, plotting
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.rollout import fly
 from quadrl.learning.folder import read_metrics
@@ -26,7 +26,7 @@ def drawn(name, vehicle="paper", episodes=3, weather=None, **options):
     task = tasks.make(name, time_limit=0.5, **options)
     flown = {"episodes": episodes, "vehicle": vehicle, "weather": weather}
     rollout = fly(make_controller("lqr", task), task, **flown)
-    parts = plotting.trajectory(rollout, "title").subfigs
+    parts = flight_figures.trajectory(rollout, "title").subfigs
     axes = [axis for part in parts for axis in part.axes if axis.get_visible()]
     return {a.get_ylabel() or a.get_title("left"): a for a in axes}, rollout
 
@@ -38,7 +38,7 @@ def lines(axis, style):
 def test_flights_are_shown_with_attitude_speed_and_commands():
     axes, rollout = drawn("hover")
     assert not {"wind [m/s]", "airspeed [m/s]"} & set(axes)
-    for k, name in enumerate(plotting.PLACE):
+    for k, name in enumerate(flight_figures.PLACE):
         data = [line.get_ydata() for line in lines(axes[name], "-")]
         np.testing.assert_array_equal(np.transpose(data), rollout.position[..., k])
     attitude = Rotation.from_quat(rollout.quaternion[:, 0], scalar_first=True)
