@@ -20,6 +20,7 @@ from quadrl.learning import environments, networks
 from quadrl.learning.advantages import LEAST
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import LOG_2_PI, forward
+from quadrl.learning.normaliser import Normaliser, update_normalisers
 from quadrl.learning.train import Training
 
 
@@ -197,8 +198,8 @@ class Learner:
         rows = seen.movedim(1, 2).flatten(0, 1)
         return {"observation": rows[:, :own], networks.PRIVILEGED: rows[:, own:]}
 
-    def _update(self, normalisers: dict[str, networks.Normaliser]) -> None:
-        networks.update_normalisers(normalisers, self._observed())
+    def _update(self, normalisers: dict[str, Normaliser]) -> None:
+        update_normalisers(normalisers, self._observed())
 
     def _prepare(self) -> dict[str, Tensor]:
         """The rows that gradients read."""

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -16,65 +13,18 @@ from torch import nn
 from torchrl.modules import GRUCell, IndependentNormal, ProbabilisticActor, recurrent_mode
 
 from quadrl.base.machine import check_memory
-from quadrl.evaluation.memory import GRU
-from quadrl.evaluation.policy import LOG_VARIANCE, Policy
+from quadrl.evaluation.policy import LOG_VARIANCE
 from quadrl.evaluation.policy_file import CLIP
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.fused import Plain
 from quadrl.learning.goal import GoalState, goal_state
+from quadrl.learning.normaliser import Normaliser
 
 STATE, BEGINS = "recurrent_state", "is_init"
 """What a policy with a memory reads beside the observation, by TorchRL's names: its state before
 the observation, and whether an episode begins with it."""
-UNCLIPPED = 1024.0
-"""Deviation of what is clipped nowhere; a power of two, which rounds nothing."""
-SURE = 60.0
-"""Weight of a flag, less a half of it: tanh of that is -1 or 1."""
 PRIVILEGED = "privileged"
 """The observation for the critic alone, if the environment gives one."""
-
-
-class Normaliser(nn.Module):
-    """Running mean and deviation of the observations (Chan, Golub and LeVeque 1979)."""
-
-    count: torch.Tensor  # (), observations so far
-    mean: torch.Tensor  # (size,), in double precision as the sum below
-    square_sum: torch.Tensor  # (size,), of the squared distances from the mean
-    shift: torch.Tensor  # (size,), the mean in single precision
-    deviation: torch.Tensor  # (size,)
-
-    def __init__(self, size: int, clip: float = CLIP) -> None:
-        """Start with mean 0 and deviation 1."""
-        super().__init__()
-        self.clip = clip
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
-        self.register_buffer("square_sum", torch.zeros(size, dtype=torch.float64))
-        self.register_buffer("shift", torch.zeros(size))
-        self.register_buffer("deviation", torch.ones(size))
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Observations (..., size) shifted and scaled to mean 0 and deviation 1, within +-clip."""
-        return ((observation - self.shift) / self.deviation).clamp(-self.clip, self.clip)
-
-    @torch.no_grad()
-    def update(self, observation: torch.Tensor) -> None:
-        """Include observations (..., size)."""
-        rows = observation.reshape(-1, observation.shape[-1]).double()
-        mean, count = rows.mean(0), len(rows)
-        difference, total = mean - self.mean, self.count + count
-        self.square_sum += (rows - mean).square().sum(0)
-        self.square_sum += difference.square() * self.count * count / total
-        self.mean += difference * count / total
-        self.count.copy_(total)
-        self.shift.copy_(self.mean)
-        self.deviation.copy_((self.square_sum / total).sqrt().clamp(min=1e-4))
-
-
-def update_normalisers(normalisers: dict[str, Normaliser], batch: Mapping[str, Any]) -> None:
-    """Include a batch in the normaliser of each of its entries."""
-    for name, normaliser in normalisers.items():
-        normaliser.update(batch[name])
 
 
 class MeanAndDeviation(nn.Module):
@@ -303,65 +253,3 @@ def check_fits(config: TrainConfig, size: int) -> None:
         check_memory(f"{name} = {hidden}", 16.0 * weights)
     batch = config.num_envs * config.rollout
     check_memory(f"num_envs * rollout = {batch}", batch * (40.0 * size + 1000))
-
-
-def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Policy:
-    """Convert an actor to a NumPy policy."""
-    (normaliser,) = (module for module in actor.modules() if isinstance(module, Normaliser))
-    mean, deviation = _array(normaliser.shift), _array(normaliser.deviation)
-    kept = [module for module in actor.modules() if isinstance(module, Memory)]
-    first = kept[0].first if kept else None
-    layers = [x for x in actor.modules() if isinstance(x, nn.Linear) and x is not first]
-    cells = [module for module in actor.modules() if isinstance(module, GRUCell)]
-    memory = [GRU(*map(_array, (c.weight_ih, c.weight_hh, c.bias_ih, c.bias_hh))) for c in cells]
-    if first is not None:  # the same function, without normalised observations that are clipped
-        weight, bias = _array(first.weight) / deviation, _array(first.bias)
-        bias = bias - weight @ mean
-        mean, deviation = np.zeros_like(mean), np.full_like(deviation, UNCLIPPED)
-        own = {"first_weight": weight * np.float32(UNCLIPPED), "first_bias": bias}
-        memory = [dataclasses.replace(memory[0], **own)]
-    weights = [_array(layer.weight) for layer in layers]
-    biases = [_array(layer.bias) for layer in layers]
-    for module in actor.modules():
-        if isinstance(module, HoldsGoal):  # the same function, as a plain network
-            weights[0] *= _array(module.looks)
-            _subtract(module, weights, biases)
-    return Policy(
-        weights=tuple(weights),
-        biases=tuple(biases),
-        mean=mean,
-        deviation=deviation,
-        task=task,
-        metadata=metadata,
-        memory=memory[0] if memory else None,
-    )
-
-
-def _subtract(held: HoldsGoal, weights: list[np.ndarray], biases: list[np.ndarray]) -> None:
-    """Let plain layers subtract the mean at the goal, but where another task is flown.
-
-    The flag of each of those passes the hidden layers as -1 or 1, in a unit of its own.
-    """
-    mean, flags = _array(held.mean_at_goal()), held.others
-    biases[-1][: len(mean)] -= mean
-    if not (count := len(flags)):
-        return
-    sure = SURE * np.eye(count, dtype=np.float32)
-    for k, weight in enumerate(weights[:-1]):
-        if k:
-            told, below = np.pad(sure, ((0, 0), (weight.shape[1], 0))), np.zeros(count)
-        else:
-            told = np.zeros((count, weight.shape[1]), np.float32)
-            told[:, flags] = sure * _array(held.normaliser.deviation)[flags]
-            below = SURE * (_array(held.normaliser.shift)[flags] - 0.5)
-        wide = np.pad(weight, ((0, 0), (0, told.shape[1] - weight.shape[1])))
-        weights[k] = np.concatenate([wide, told])
-        biases[k] = np.concatenate([biases[k], below.astype(np.float32)])
-    half = np.zeros((len(biases[-1]), count), np.float32)
-    half[: len(mean)] = mean[:, None] / 2
-    weights[-1] = np.concatenate([weights[-1], half], axis=1)
-    biases[-1] += half.sum(1)
-
-
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().float().numpy().copy()

@@ -31,7 +31,7 @@ from quadrl.engines import native
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE as POLICY_FILE
 from quadrl.evaluation.policy_file import arrays_of, parts_of
-from quadrl.learning import checkpoint, environments, log, networks
+from quadrl.learning import checkpoint, environments, log, networks, numpy_policy
 from quadrl.learning.advantages import Advantages
 from quadrl.learning.algorithm import Algorithm, generators, one_thread, set_generators
 from quadrl.learning.apg import APG
@@ -49,6 +49,7 @@ from quadrl.learning.folder import (
     write_config,
 )
 from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE
+from quadrl.learning.normaliser import update_normalisers
 from quadrl.learning.origin import Origin
 from quadrl.learning.ppo import PPO
 from quadrl.learning.settings import DaggerConfig
@@ -250,7 +251,7 @@ class Training:
 
     def _present(self, *, described: bool = False) -> Policy:
         metadata = self._described(self.steps) if described else {}
-        return networks.export(self.actor, self.config.task, metadata)
+        return numpy_policy.export(self.actor, self.config.task, metadata)
 
     def _described(self, steps: int) -> dict[str, Any]:
         """The metadata of a policy after some control steps."""
@@ -282,7 +283,7 @@ class Training:
             fresh = self.iteration == 0 and not self._origin
             first = fresh and not self.algorithm.whole
             if first:  # the first batch was collected without a normaliser
-                networks.update_normalisers(self.normalisers, batch)
+                update_normalisers(self.normalisers, batch)
                 with set_recurrent_mode():
                     present = self.actor.get_dist(batch)
                 batch["action_log_prob"] = present.log_prob(batch["action"])
@@ -294,7 +295,7 @@ class Training:
             flat = flat.reshape(-1)
         metrics |= self.algorithm.update(flat, 1 - self.iteration / self.config.iterations)
         if not first:
-            networks.update_normalisers(self.normalisers, batch)
+            update_normalisers(self.normalisers, batch)
         return metrics | {"deviation": float(batch["scale"].mean())}
 
     def _evaluate(self, batch: Any) -> None:

@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.environments import make_env
 from quadrl.learning.goal import goal_state
-from quadrl.learning.networks import export, make_actor_critic
+from quadrl.learning.networks import make_actor_critic
+from quadrl.learning.numpy_policy import export
 
 HELD = ("hover", "static_waypoint", "random_waypoint")
 

@@ -7,7 +7,8 @@ from runs import actor_critic, batch_of, disturbed, one_thread  # noqa: F401
 from tensordict import TensorDict
 
 import quadrl
-from quadrl.learning.networks import Normaliser, export
+from quadrl.learning.normaliser import Normaliser
+from quadrl.learning.numpy_policy import export
 from quadrl.learning.ppo import PPO
 from quadrl.learning.settings import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.trpo import TRPO, flat

@@ -27,7 +27,8 @@ from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import fly
 from quadrl.learning import checkpoint
-from quadrl.learning.networks import BEGINS, STATE, Memory, export, make_actor_critic
+from quadrl.learning.networks import BEGINS, STATE, Memory, make_actor_critic
+from quadrl.learning.numpy_policy import export
 from quadrl.learning.ppo import PPO
 from quadrl.learning.settings import PPOConfig, TRPOConfig, VPGConfig
 from quadrl.learning.train import Training
