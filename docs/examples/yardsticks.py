@@ -22,8 +22,9 @@ from quadrl.control.loops import limited
 from quadrl.control.lqr import STATES
 from quadrl.control.reading import Reading
 from quadrl.core.task import Task
+from quadrl.evaluation.in_flight import scenario_of
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import fly, scenario_of, summarize
+from quadrl.evaluation.rollout import fly, summarize
 from quadrl.tasks.trajectory import AHEAD, EVERY
 
 FIGURES = ("pentagram", "zigzag", "lemniscate")

@@ -22,8 +22,9 @@ from quadrl.deploy import betaflight
 from quadrl.deploy.betaflight import Betaflight
 from quadrl.deploy.manoeuvres import ALONG, Advance, Check, checks, engine_of, flown, told
 from quadrl.deploy.simulators import SIMULATORS, Simulator, environment_of
+from quadrl.evaluation.in_flight import begun
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import EVALUATION_SEED, MAX_EPISODES, MAX_SEED, begun, final_error
+from quadrl.evaluation.rollout import EVALUATION_SEED, MAX_EPISODES, MAX_SEED, final_error
 
 LATE = 0.02  # [s]
 EPISODES = {"rotorpy": 20, "crazyflow": 100, betaflight.NAME: 20}

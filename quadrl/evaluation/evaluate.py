@@ -24,15 +24,14 @@ from quadrl.core.snapshot import Rollout
 from quadrl.core.task import Task
 from quadrl.core.trajectory import Trajectory
 from quadrl.evaluation.controllers import make_controller, policy_of
+from quadrl.evaluation.in_flight import Controller, scenario_of
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.rollout import (
     EVALUATION_SEED,
     MAX_EPISODES,
     MAX_SEED,
-    Controller,
     flights,
     fly,
-    scenario_of,
     summarize,
 )
 

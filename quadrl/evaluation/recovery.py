@@ -19,7 +19,8 @@ from quadrl.core.contact import touches_ground
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.engines.state import State
-from quadrl.evaluation.rollout import FINAL_STRETCH, Controller, begun
+from quadrl.evaluation.in_flight import Controller, begun
+from quadrl.evaluation.rollout import FINAL_STRETCH
 
 RECOVERED = 0.5  # [m], largest final error of a flight that has recovered; chosen
 

@@ -24,6 +24,7 @@ from quadrl.evaluation.cache import ResultCache
 from quadrl.evaluation.card import QUARTILES, Card, half_level, wilson
 from quadrl.evaluation.disturbances import DISTURBANCES, Disturbance, disturbed
 from quadrl.evaluation.evaluate import setting
+from quadrl.evaluation.in_flight import Controller
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.recovery import MAPS, recovered
 from quadrl.evaluation.rollout import (
@@ -31,7 +32,6 @@ from quadrl.evaluation.rollout import (
     EVALUATION_SEED,
     MAX_EPISODES,
     MAX_SEED,
-    Controller,
     flights,
     fly,
     means_of_behaviour,

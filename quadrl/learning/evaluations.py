@@ -16,9 +16,10 @@ import numpy as np
 from quadrl.base.files import write_csv
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
+from quadrl.evaluation.in_flight import Controller
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import CLIP
-from quadrl.evaluation.rollout import Controller, final_error
+from quadrl.evaluation.rollout import final_error
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import EVALUATIONS, FIGURES, read_rows
 

@@ -15,8 +15,9 @@ from quadrl.conditions.randomization import Randomization
 from quadrl.control.reading import Reading
 from quadrl.core.scenario import Scenario
 from quadrl.evaluation.card import wilson
+from quadrl.evaluation.in_flight import Controller
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import Controller, fly, summarize
+from quadrl.evaluation.rollout import fly, summarize
 from scripts.reports import report
 from scripts.reports.crosscheck import LATE, PRESETS, Raptor, commanding
 from scripts.reports.report import Result, Runs, say, table

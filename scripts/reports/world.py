@@ -19,8 +19,9 @@ from quadrl.base.units import percent, quantity
 from quadrl.control import Gains, GeometricController
 from quadrl.core.scenario import Conditions, Scenario
 from quadrl.evaluation.card import wilson
+from quadrl.evaluation.in_flight import Controller, scenario_of
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import Controller, fly, scenario_of, summarize
+from quadrl.evaluation.rollout import fly, summarize
 from scripts.reports import any_aircraft, forest, report
 from scripts.reports.crosscheck import LATE, commanding
 from scripts.reports.report import Result, say, table

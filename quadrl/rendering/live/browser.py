@@ -20,7 +20,7 @@ import viser
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import number
-from quadrl.evaluation.rollout import Controller
+from quadrl.evaluation.in_flight import Controller
 from quadrl.rendering.live import access, readout
 from quadrl.rendering.live.flight import KEYS, Flight, Keyboard
 from quadrl.rendering.live.scene import CAMERAS, Scene, departures_ignored

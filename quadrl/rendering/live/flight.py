@@ -14,8 +14,8 @@ from quadrl.conditions.observing import resolve
 from quadrl.core.environment import Environment
 from quadrl.core.markers import Marker
 from quadrl.core.scenario import Scenario
+from quadrl.evaluation.in_flight import Controller, begun
 from quadrl.evaluation.memory import PolicyInFlight
-from quadrl.evaluation.rollout import Controller, begun
 from quadrl.rendering.drawing import GOAL_RADIUS
 
 MAX_AIRCRAFT = 256

@@ -12,8 +12,8 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.core.task import Task
 from quadrl.evaluation.controllers import make_controller
 from quadrl.evaluation.evaluate import setting
+from quadrl.evaluation.in_flight import Controller
 from quadrl.evaluation.policy import Policy, shipped
-from quadrl.evaluation.rollout import Controller
 from quadrl.rendering.live.flight import Flight
 
 
