@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import math
 import os
@@ -12,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from quadrl.base.errors import QuadrlError
+from quadrl.base.version import __version__
 
 GIB = 1 << 30
 CGROUP = Path("/sys/fs/cgroup")
@@ -27,6 +29,13 @@ def machine() -> dict[str, str | int]:
     system = f"{platform.system()} {platform.machine()}"
     known = {"cpu": processor(), "cores": cores(), "system": system}
     return known | {"python": platform.python_version()} | versions
+
+
+@functools.cache
+def deciding_versions() -> dict[str, str]:
+    """Versions of quadrl and of the packages that decide results; cached, since files have them."""
+    packages = ("mujoco", "torch", "torchrl", "numpy")
+    return {"quadrl": __version__} | {name: importlib.metadata.version(name) for name in packages}
 
 
 def in_a_line(known: Mapping[str, str | int]) -> str:

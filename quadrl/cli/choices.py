@@ -20,9 +20,9 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.base.docstrings import docstrings
 from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import GIVEN, Conditions
-from quadrl.learning.config import ALGORITHMS, ALIASES, KEEPS, MEMORIES
+from quadrl.learning.defaults import ALGORITHMS, ALIASES
 from quadrl.learning.log import WRITERS
-from quadrl.learning.settings import PAIRED
+from quadrl.learning.train_settings import KEEPS, MEMORIES, PAIRED
 from quadrl.learning.variants import VARIANTS
 from quadrl.tasks import TASKS
 

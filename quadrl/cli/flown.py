@@ -16,7 +16,7 @@ from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import GIVEN, Conditions
 from quadrl.evaluation.controllers import comes_with_quadrl
 from quadrl.evaluation.policy import Policy
-from quadrl.learning.settings import PAIRED
+from quadrl.learning.train_settings import PAIRED
 from quadrl.tasks import TASKS
 
 ConditionOptions: Any = choices.optional(Conditions, lambda name: "")

@@ -18,7 +18,8 @@ from quadrl.base.validation import choice
 from quadrl.cli import choices
 from quadrl.core.record import import_own
 from quadrl.learning import foreign
-from quadrl.learning.config import TrainConfig, algorithm_of
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.defaults import algorithm_of
 from quadrl.tasks import TASKS
 
 Parsed = TypeVar("Parsed")

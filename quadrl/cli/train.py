@@ -25,7 +25,7 @@ from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning import folder as names
 from quadrl.learning.config import TrainConfig, prepare
 from quadrl.learning.defaults import flat, merged
-from quadrl.learning.settings import USUAL
+from quadrl.learning.train_settings import USUAL
 
 if TYPE_CHECKING:
     from quadrl.learning.run import Run

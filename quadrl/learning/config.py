@@ -6,44 +6,37 @@ import contextlib
 import dataclasses
 import functools
 import json
-import math
-import warnings
 from collections.abc import Iterator, Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
 
 from quadrl.aircraft.aerodynamics import FULL
-from quadrl.aircraft.presets import VEHICLES
-from quadrl.aircraft.specification import FILE, of_file
-from quadrl.base.errors import QuadrlError, QuadrlWarning
+from quadrl.aircraft.presets import FILE, VEHICLES, of_file
+from quadrl.base.errors import QuadrlError
 from quadrl.base.files import free_name
+from quadrl.base.machine import deciding_versions
 from quadrl.base.records import as_json
-from quadrl.base.validation import choice, keys, number, numbers, resolved, tuples
-from quadrl.base.version import __version__
+from quadrl.base.validation import number, numbers, resolved, tuples
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.core.record import import_again, warn_of_changes
 from quadrl.core.scenario import GIVEN, Scenario
 from quadrl.core.task import Task
-from quadrl.engines.mujoco import MAX_ENVS, MAX_THREADS
-from quadrl.evaluation.rollout import MAX_EPISODES, MAX_SEED
 from quadrl.learning import foreign
-from quadrl.learning.defaults import flat, merged, training_defaults, usual_vehicle
-from quadrl.learning.folder import CHANGEABLE, CONFIG, FIGURES, read_config
-from quadrl.learning.log import WRITERS
+from quadrl.learning.defaults import (
+    ALGORITHMS,
+    algorithm_of,
+    flat,
+    merged,
+    training_defaults,
+    usual_vehicle,
+)
+from quadrl.learning.folder import CHANGEABLE, CONFIG, read_config
 from quadrl.learning.origin import NETWORKS, Origin, with_networks
-from quadrl.learning.settings import ALGORITHM_CONFIGS, PAIRED, USUAL, TrainSettings
+from quadrl.learning.settings import ALGORITHM_CONFIGS
+from quadrl.learning.train_settings import PAIRED, USUAL, TrainSettings
 from quadrl.tasks import TASKS
 
-ALGORITHMS = tuple(ALGORITHM_CONFIGS)
-ALIASES = {"gae": "vpg"}
-"""The paper calls the plain policy gradient by the name of its advantages."""
-MAX_BATCH = 1 << 24
-"""Most transitions in a batch, which are some GB."""
-MAX_WIDTH = 1 << 16
-MEMORIES = ("none", "gru", "raptor")
-KEEPS = ("best", "last")
 ONE = ("task", "seed", "variant", "device", "num_threads", "checkpoint_seconds", "evaluations",
        "keep", "log", "episodes", "reward_scale", *NETWORKS)  # fmt: skip
 """Settings that trainings in turn share, beside the conditions of flight."""
@@ -98,7 +91,8 @@ class TrainConfig(TrainSettings):
             given = settings.get(name, {})
             if name != algo:
                 with_it, _ = training_defaults(task, name, *varied)
-                given = _idle(name, given, (values[name], with_it[name]), algo)
+                foreign.refuse_idle(name, given, (values[name], with_it[name]), algo)
+                given = {}
             if isinstance(given, dict):
                 foreign.refuse_unknown(f"setting of {name}", given, values[name], algo)
                 given = values[name] | _given(given)
@@ -117,6 +111,7 @@ class TrainConfig(TrainSettings):
         whole["conditions"] = flown = {name: whole.pop(name) for name in GIVEN}
         vars(self).update(whole)
         flown["aerodynamics"] = flown["aerodynamics"] or self._wind_brings()
+        self.check_values()
         self._check()
 
     def __repr__(self) -> str:
@@ -162,52 +157,6 @@ class TrainConfig(TrainSettings):
                 yield name, value, layers[name] if same else "given"
 
     def _check(self) -> None:
-        for name, low, high, rest in (
-            ("seed", 0, MAX_SEED, {"whole": True}),
-            ("num_envs", 1, MAX_ENVS, {"whole": True}),
-            ("rollout", 1, MAX_BATCH, {"whole": True}),
-            ("steps", 1, math.inf, {"whole": True}),
-            ("num_threads", 0, MAX_THREADS, {"whole": True}),
-            ("memory_width", 1, MAX_WIDTH, {"whole": True}),
-            ("evaluations", 0, math.inf, {"whole": True}),
-            ("checkpoint_every", 0, self.steps, {"whole": True}),
-            ("episodes", 1, MAX_EPISODES, {"whole": True}),
-            ("gamma", 0, 1, {}),
-            ("gae_lambda", 0, 1, {}),
-            ("initial_deviation", 0.01, math.e, {}),
-            ("checkpoint_seconds", 0, math.inf, {}),
-            ("reward_scale", 0, math.inf, {"positive": True}),
-        ):
-            object.__setattr__(self, name, number(name, getattr(self, name), low, high, **rest))
-        widths: dict[str, type] = {"hidden": tuple, "critic_hidden": tuple}
-        values = vars(self) | self.conditions
-        for name, kind in (widths | dict.fromkeys(PAIRED, dict)).items():
-            if not isinstance(values[name], kind):
-                raise QuadrlError(name=name, value=values[name], allowed=f"a {kind.__name__}")
-        for width in (*self.hidden, *self.critic_hidden):
-            number("width of a hidden layer", width, 1, MAX_WIDTH, whole=True)
-        batch = self.num_envs * self.rollout  # one advantage alone has no standard deviation
-        number("num_envs * rollout", batch, 2, MAX_BATCH, whole=True)
-        if self.gamma == 1.0:
-            said = "gamma = 1: distant rewards count as much as near ones; usual are 0.9 to 0.99"
-            warnings.warn(said, QuadrlWarning, stacklevel=4)
-        choice("memory", self.memory, MEMORIES)
-        choice("keep", self.keep, KEEPS)
-        choice("log", self.log, WRITERS)
-        keys("until", self.until, FIGURES)
-        for name, value in self.until.items():
-            number(f"until {name}", value)
-        if self.evaluations > max(self.iterations, USUAL["evaluations"]):
-            allowed = f"at most {self.iterations}, one after each batch"
-            raise QuadrlError(name="evaluations", value=self.evaluations, allowed=allowed)
-        if self.until and not self.evaluations:
-            reason = "without evaluations nothing says when"
-            raise QuadrlError(reason, name="until", value=self.until, allowed="left out")
-        if not isinstance(self.holds_goal, bool) or (self.holds_goal and self.memory != "none"):
-            allowed = "True or False; False for a policy with a memory"
-            raise QuadrlError(name="holds_goal", value=self.holds_goal, allowed=allowed)
-        if not isinstance(self.device, str) or not self.device:
-            raise QuadrlError(name="device", value=self.device, allowed="a device of torch")
         scenario, _ = self.training_scenario, self.scenario
         if self.gammas:
             given = numbers("gammas", self.gammas, len(scenario.task.parts), 0, 1)
@@ -266,17 +215,12 @@ class TrainConfig(TrainSettings):
         named = {name: value for name, value in self.conditions.items() if value not in ("", {})}
         return Scenario.of(self.recorded or {"task": self.task, **named})
 
-    @property
-    def iterations(self) -> int:
-        """Batches in the training."""
-        return max(1, math.ceil(self.steps / (self.num_envs * self.rollout)))
-
     def resolved(self) -> dict[str, Any]:
         """Return the settings and the scenario behind their names, as they come back from JSON."""
         scenario = self.base.to_json()
         if self.recorded:
             scenario["changed"] = self.recorded.get("changed", {})
-        whole = self.named() | {"scenario": scenario, "versions": _versions()}
+        whole = self.named() | {"scenario": scenario, "versions": deciding_versions()}
         for name in {*ALGORITHMS} - {self.algo}:  # they do nothing
             del whole[name]
         return json.loads(json.dumps(whole))
@@ -340,36 +284,5 @@ def prepare(
     return config, free_name(named, CONFIG) if out is None else Path(out)
 
 
-def algorithm_of(task: str, algo: str | None, variant: str | None = None) -> str:
-    """Name the algorithm that trains a task: the given one or, if that is None, the task's own."""
-    kind = TASKS.get(task, Task)
-    if algo is None:
-        algo = kind.variants.get(variant or "", {}).get("algo", kind.trained_by)
-    return choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS, known_as=foreign.ALGORITHMS)
-
-
-def _idle(name: str, given: Any, usual: tuple[dict[str, Any], ...], algo: str) -> dict[str, Any]:
-    """Refuse settings of an algorithm that does not train, since they would do nothing.
-
-    What is usual may be there: `dataclasses.replace` passes all fields on.
-    """
-    if not isinstance(given, dict):
-        given = dataclasses.asdict(resolved(name, given, ALGORITHM_CONFIGS[name], word="setting"))
-    for key, value in given.items():
-        if value not in [layers.get(key) for layers in usual]:
-            meant = foreign.setting(key, algo, guess=False)
-            hint = f"did you mean {meant}?" if meant else ""
-            allowed = f"left out with algo {algo}"
-            raise QuadrlError(hint, name=f"{name}.{key}", value=value, allowed=allowed)
-    return {}
-
-
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value is not None}
-
-
-@functools.cache
-def _versions() -> dict[str, str]:
-    """Versions of quadrl and of the packages that decide results; cached, since files have them."""
-    packages = ("mujoco", "torch", "torchrl", "numpy")
-    return {"quadrl": __version__} | {name: version(name) for name in packages}

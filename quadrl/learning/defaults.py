@@ -24,9 +24,15 @@ from quadrl.base.validation import IN_A_FILE, choice, keys
 from quadrl.core import catalogue
 from quadrl.core.scenario import GIVEN
 from quadrl.core.task import Task
-from quadrl.learning.settings import ALGORITHM_CONFIGS, PAIRED, USUAL
+from quadrl.learning import foreign
+from quadrl.learning.settings import ALGORITHM_CONFIGS
+from quadrl.learning.train_settings import PAIRED, USUAL
 from quadrl.learning.variants import OF_VEHICLE, VARIANTS, WITH_MEMORY
+from quadrl.tasks import TASKS
 
+ALGORITHMS = tuple(ALGORITHM_CONFIGS)
+ALIASES = {"gae": "vpg"}
+"""The paper calls the plain policy gradient by the name of its advantages."""
 CHOSEN = ("task", "algo", "seed", "vehicle", "variant")
 """Settings that the other defaults depend on, or that have no better default than another."""
 
@@ -42,6 +48,14 @@ PER_STEP: dict[str, Callable[[Any, float], Any]] = {
     "steps": lambda steps, often: round(steps * often),
 }
 """Settings that count control steps, and their values at `often` times the control rate."""
+
+
+def algorithm_of(task: str, algo: str | None, variant: str | None = None) -> str:
+    """Name the algorithm that trains a task: the given one or, if that is None, the task's own."""
+    kind = TASKS.get(task, Task)
+    if algo is None:
+        algo = kind.variants.get(variant or "", {}).get("algo", kind.trained_by)
+    return choice("algo", ALIASES.get(str(algo), algo), ALGORITHMS, known_as=foreign.ALGORITHMS)
 
 
 def usual_vehicle(task: type[Task], variant: str | None) -> str:

@@ -7,12 +7,14 @@ import dataclasses
 import difflib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from quadrl.base.errors import QuadrlError, UnknownKeyword
-from quadrl.base.validation import keys
-from quadrl.learning.settings import ALGORITHM_CONFIGS, USUAL
+from quadrl.base.validation import keys, resolved
+from quadrl.learning.settings import ALGORITHM_CONFIGS
+from quadrl.learning.train_settings import USUAL
 
 SB3 = "Stable-Baselines3 has it, and trains on quadrl.envs.sb3.QuadrotorVecEnv"
 ALGORITHMS = {"sac": SB3, "td3": SB3, "ddpg": SB3, "a2c": "vpg", "pg": "vpg"}
@@ -159,3 +161,21 @@ def refuse_unknown(what: str, given: Iterable[str], choices: Iterable[str], algo
             hint = f"; {meant}" if " " in meant else f" (did you mean {meant}{written}?)"
             raise UnknownKeyword(name=what, value=name, allowed=f"a known one{hint}")
     keys(what, given, choices)
+
+
+def refuse_idle(name: str, given: Any, usual: tuple[dict[str, Any], ...], algo: str) -> None:
+    """Refuse settings of an algorithm that does not train, since they would do nothing.
+
+    What is usual may be there: `dataclasses.replace` passes all fields on.
+
+    Raises:
+        QuadrlError: The message says what the setting may be called with that algorithm.
+    """
+    if not isinstance(given, dict):
+        given = dataclasses.asdict(resolved(name, given, ALGORITHM_CONFIGS[name], word="setting"))
+    for key, value in given.items():
+        if value not in [layers.get(key) for layers in usual]:
+            meant = setting(key, algo, guess=False)
+            hint = f"did you mean {meant}?" if meant else ""
+            allowed = f"left out with algo {algo}"
+            raise QuadrlError(hint, name=f"{name}.{key}", value=value, allowed=allowed)

@@ -15,10 +15,10 @@ from quadrl.base.validation import choice, keys, names, number
 from quadrl.base.validation import seeds as seeds_of
 from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning import foreign
-from quadrl.learning.config import ALIASES, TrainConfig, algorithm_of
-from quadrl.learning.defaults import merged
+from quadrl.learning.config import TrainConfig
+from quadrl.learning.defaults import ALIASES, algorithm_of, merged
 from quadrl.learning.executor import PlannedRun
-from quadrl.learning.settings import USUAL
+from quadrl.learning.train_settings import USUAL
 
 KEYS = ("tasks", "algorithms", "seeds", "episodes", "settings", "only", "variants")
 SOME = ("tasks", "algorithms")

@@ -1,4 +1,4 @@
-"""The settings of a training and of each algorithm, with the first layer of their defaults."""
+"""The settings of each algorithm, with the first layer of their defaults."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.validation import number
 from quadrl.conditions.observing import Observing
 from quadrl.conditions.randomization import DELAYS, NONE
-from quadrl.core.scenario import GIVEN
 
 LATE_OR_UNSURE = (*DELAYS, "noise", "bias")
 """What a randomization may not have where a training goes through the physics: the observation must
 follow from the state, and the rotors' commands from the action alone."""
 _SURE = f"without {', '.join(LATE_OR_UNSURE)}"
-_CONDITIONS = {name: how["usual"] for name, how in GIVEN.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,121 +186,3 @@ ALGORITHM_CONFIGS = {
     **{"ppo": PPOConfig, "trpo": TRPOConfig, "vpg": VPGConfig},
     **{"apg": APGConfig, "dagger": DaggerConfig},
 }
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainSettings:
-    """The fields of `quadrl.learning.config.TrainConfig`.
-
-    Their defaults are the first layer of those of a task: see `quadrl.learning.defaults`. Each of
-    the conditions is a setting of its own to whoever gives, reads or saves them: see `named`.
-    """
-
-    task: str = "hover"
-    """Name of the task."""
-    algo: str = "ppo"
-    """Algorithm: ppo, trpo, vpg (the plain policy gradient; gae, the paper's name for it, works
-    too), apg (the analytic policy gradient through the physics; not in the paper), or dagger
-    (imitation of a regulator that is told what was drawn; of quadrotors that hold a place)."""
-    seed: int = 0
-    """Seed of the networks, the exploration and the episodes, between 0 and 2^32 - 1."""
-    variant: str = "ideal"
-    """Group of settings: ideal (the paper's episodes), robust (an uncertain aircraft in light wind,
-    and a policy that sees what it needs for that), or raptor (one of the shape that PX4's mc_raptor
-    flies)."""
-    conditions: dict[str, Any] = dataclasses.field(
-        default_factory=lambda: _CONDITIONS | {"engine": "free_flight"}
-    )
-    """The conditions of flight by keyword, as they were given: `quadrl.core.scenario.Conditions`
-    documents them. Evaluations always fly in mujoco."""
-    training_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the task for the training only, such as farthest=3: a policy is weakest at the
-    edge of what it was trained on."""
-    num_envs: int = 256
-    """Aircraft simulated at the same time."""
-    rollout: int = 16
-    """Control steps of each aircraft in a batch."""
-    steps: int = 1_310_720
-    """Control steps of the training, summed over all aircraft."""
-    gamma: float = 0.93
-    """Discount per control step; 0.93 gives an effective horizon of 0.7 s. With a short horizon a
-    lasting error costs more than one that is corrected."""
-    gammas: tuple[float, ...] = ()
-    """Of several tasks in one, the discount of each instead of gamma."""
-    gae_lambda: float = 0.95
-    """Lambda of the generalised advantage estimation."""
-    reward_scale: float = 0.01
-    """Factor on the rewards, so that the critic's targets are of the order of 1."""
-    hidden: tuple[int, ...] = (128,)
-    """Widths of the policy's hidden layers; the paper has one of 128."""
-    critic_hidden: tuple[int, ...] = (64, 64)
-    """Widths of the critic's hidden layers."""
-    memory: str = "none"
-    """Memory of the policy: none (the paper's), gru, a gated recurrent unit, or raptor, a unit
-    behind a layer of as many neurons, whose state is all that is read: what mc_raptor flies."""
-    memory_width: int = 64
-    """Numbers that a policy with a memory remembers."""
-    holds_goal: bool = False
-    """Whether the mean action at the goal is to hover, whatever the weights: the network's output
-    at the goal is subtracted from its output. The policy then sees neither position nor, if the
-    heading is free, yaw."""
-    initial_deviation: float = 1.0
-    """Standard deviation of the actions at the start of the training."""
-    from_run: str = ""
-    """Folder of a run whose networks the training begins with: policy and critic, with the mean and
-    deviation of what they see. Their widths, memory, holds_goal and deviation are those of that
-    run; task, algorithm and all else may differ. Saved as FOLDER@DIGEST, with the digest of its
-    checkpoint."""
-    phases: tuple[dict[str, Any], ...] = ()
-    """Trainings that come before, in turn, each from the networks of the one before it: the
-    algorithm of each, and what else differs there, such as [{"algo": "apg", "steps": 200000}]. One
-    with the same algorithm has the settings of this training, another one its own defaults; all
-    have the same task, seed and networks. They are in the same folder, as phase_1, phase_2, ..."""
-    ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
-    """Settings of PPO."""
-    trpo: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
-    """Settings of TRPO."""
-    vpg: VPGConfig = dataclasses.field(default_factory=VPGConfig)
-    """Settings of the plain policy gradient."""
-    apg: APGConfig = dataclasses.field(default_factory=APGConfig)
-    """Settings of the analytic policy gradient."""
-    dagger: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
-    """Settings of the imitation of a teacher."""
-    device: str = "cpu"
-    """Device: cpu, or cuda for a GPU, where PPO flies and learns without a processor as far as free
-    flight is covered there (docs/gpu.md); what is not covered is flown on the CPU."""
-    num_threads: int = 0
-    """Threads of the simulation; 0 for one per core. The results do not depend on it."""
-    checkpoint_seconds: float = 5.0
-    """Shortest time between two checkpoints [s]."""
-    evaluations: int = 10
-    """Number of evaluations, evenly over the training: the policy of the moment flies 10 to 50
-    episodes with its mean action, in the engine of the training, for a row of evaluations.csv. They
-    take some 2 % of the training, and change nothing of it."""
-    keep: str = "best"
-    """The policy that is kept: best (of the evaluations that with the highest success, then the
-    lowest error, then the latest) or last. The checkpoint is always the last."""
-    log: str = "tensorboard"
-    """Where the figures of metrics.csv and evaluations.csv are shown: tensorboard, or wandb for W&B
-    as well (offline with WANDB_MODE=offline; its project is WANDB_PROJECT, by default quadrl)."""
-    until: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Figures of an evaluation that end the training early, such as success=0.99: success,
-    survival and return from there on up, error [m] from there on down."""
-    checkpoint_every: int = 0
-    """Control steps between two policies that are kept beside the last, as in
-    policy_000100000.safetensors; 0 for none."""
-    episodes: int = 100
-    """Episodes of the evaluation at the end."""
-
-    def named(self) -> dict[str, Any]:
-        """All of them by name, with each of the conditions as one; records are dicts."""
-        whole = dict[str, Any]()
-        for name, value in dataclasses.asdict(self).items():
-            whole |= value if name == "conditions" else {name: value}
-        return whole
-
-
-USUAL = TrainSettings().named()
-"""The defaults of all settings, by name."""
-PAIRED = ("training_options", "until", *(name for name in GIVEN if GIVEN[name]["given"] == "pairs"))
-"""Settings that are dicts: given entries are added to the default ones."""

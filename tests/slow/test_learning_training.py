@@ -18,7 +18,7 @@ import quadrl
 from quadrl.core.environment import Environment
 from quadrl.engines import native
 from quadrl.learning import checkpoint
-from quadrl.learning.config import ALGORITHMS
+from quadrl.learning.defaults import ALGORITHMS
 from quadrl.learning.environments import SEED_STRIDE
 from quadrl.learning.folder import WARNINGS
 from quadrl.learning.train import Training
