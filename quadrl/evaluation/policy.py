@@ -16,20 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadrl.aircraft.presets import VEHICLES
-from quadrl.aircraft.quadrotor import sizes_of
-from quadrl.aircraft.specification import resolve as resolve_vehicle
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.files import read_sealed_json
 from quadrl.base.validation import choice, number
-from quadrl.conditions import observing
-from quadrl.conditions.randomization import NONE
-from quadrl.conditions.randomizations import resolve as resolve_randomization
 from quadrl.control.modes import named
 from quadrl.core.record import import_again, warn_of_changes
 from quadrl.core.scenario import RECORDED, Scenario
 from quadrl.core.task import Task
-from quadrl.evaluation import policy_file
+from quadrl.evaluation import fitting, policy_file
 from quadrl.evaluation.memory import GRU, PolicyInFlight
 from quadrl.evaluation.policy_file import CLIP, RUN, RUN_FORMAT, SHIPPED, SHIPPED_AS, shipped
 from quadrl.tasks import TASKS
@@ -203,57 +197,11 @@ class Policy:
                 options, or in another control mode; or it commands rotors, and those of the vehicle
                 stand or turn otherwise, or an action of 1 is another change of their speed.
         """
-        vehicle, name = environment.vehicle, self.metadata.get("vehicle")
-        as_trained = f"as in the training of the policy for {self.task}"
-        # One that is not known here is taken for the one that it is to fly.
-        known = name if isinstance(name, dict) or name in VEHICLES else vehicle
-        trained = resolve_vehicle(known, self.metadata.get("vehicle_options"), whole=True)
-        usual = environment.task.sensors
-        needed = observing.resolve(self.metadata.get("observe")).meaning(usual)
-        seen = environment.scenario.observe.meaning(usual)
-        if needed != seen:
-            raise QuadrlError(name="observe", value=seen, allowed=f"{needed}, {as_trained}")
-        for what, own, needed in (
-            ("observation", self.size, environment.size),
-            ("action", self.action_size, environment.action_size),
-        ):
-            if own != needed:
-                name = f"{what} size of the policy for {self.task}"
-                where = f"{environment.task.name} with the vehicle {vehicle.name}"
-                raise QuadrlError(name=name, value=own, allowed=f"{needed} for {where}")
-        if (mode := environment.control_mode.name) != self.control_mode:
-            allowed = f"{self.control_mode!r}, {as_trained}"
-            raise QuadrlError(name="control_mode", value=mode, allowed=allowed)
-        if not environment.control_mode.any_layout and not np.array_equal(
-            trained.layout, vehicle.layout
-        ):
-            allowed = f"one with the rotor layout of {trained.name}, which the policy has learned"
-            raise QuadrlError(name="vehicle", value=vehicle.name, allowed=allowed)
-        if mode == "rotor" and trained.action_scale != vehicle.action_scale:
-            reason = "make the environment with **policy.keywords, or its aircraft with that scale"
-            scale, allowed = vehicle.action_scale, f"{trained.action_scale:g}, {as_trained}"
-            raise QuadrlError(reason, name="action_scale", value=scale, allowed=allowed)
-        self._check_size(environment)
-        if trained.control_timestep != (timestep := vehicle.control_timestep):
+        trained = fitting.check_fits(self, environment)
+        if trained.control_timestep != (timestep := environment.vehicle.control_timestep):
             said = f"control_timestep = {timestep:g}: the policy for {self.task} was trained with"
             warnings.warn(f"{said} {trained.control_timestep:g}", QuadrlWarning, stacklevel=4)
         warn_of_changes(self.conditions, environment.scenario, "policy", kept=False)
-
-    def _check_size(self, environment: Environment) -> None:
-        """Refuse an aircraft outside of the sizes that were drawn in its training.
-
-        Raises:
-            QuadrlError: The message has the size, and those of the training.
-        """
-        drawn = resolve_randomization(self.metadata.get("randomization")).sizes
-        if drawn == NONE.sizes or environment.randomization.sizes != NONE.sizes:
-            return
-        for name, size in sizes_of(environment.vehicle).items():
-            low, high = getattr(drawn, name)
-            if high and not low <= size <= high:
-                what = f"{name} of the vehicle {environment.vehicle.name}"
-                allowed = f"{low:g} to {high:g}, as in the training of the policy for {self.task}"
-                raise QuadrlError(name=what, value=round(size, 4), allowed=allowed)
 
     def _without_memory(self) -> np.ndarray:
         """The state of a policy that has none.
