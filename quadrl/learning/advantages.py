@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives.value import GAE
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
@@ -73,3 +74,16 @@ class Advantages:
         square = (1 - share) * deviation.square() + share * spread
         self.returns["mean"][task] = mean
         self.returns["deviation"][task] = square.sqrt().clamp(min=LEAST)
+
+
+def add_values(batch: Any, critic: TensorDictModuleBase) -> None:
+    """Add the critic's values of all states and of the states after them.
+
+    Within an episode the state after a step is the next one of the batch, whose value is known.
+    """
+    value = critic(batch)["state_value"]
+    ends = batch["next", "done"][..., 0].clone()
+    ends[:, -1] = True
+    after = torch.roll(value, -1, dims=1)
+    after[ends] = critic(batch["next"].select(*critic.in_keys)[ends])["state_value"]
+    batch["next", "state_value"] = after

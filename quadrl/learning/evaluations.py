@@ -18,7 +18,7 @@ from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.evaluation.in_flight import Controller
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.policy_file import CLIP
+from quadrl.evaluation.policy_file import CLIP, arrays_of, parts_of
 from quadrl.evaluation.rollout import final_error
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import EVALUATIONS, FIGURES, read_rows
@@ -108,6 +108,18 @@ class Evaluations:
             if self.best is None or _worth(kept) >= _worth(self.best):
                 self.best = kept
         write_csv(self._file, HEAD, self._rows)
+
+    def save(self) -> tuple[dict[str, np.ndarray], list[Any]]:
+        """Return the arrays and the numbers of the best policy; nothing where there is none."""
+        if (best := self.best) is None:
+            return {}, []
+        numbers = [best.steps, best.success, best.error, len(best.policy.weights)]
+        return arrays_of(best.policy), numbers
+
+    def restore(self, arrays: dict[str, np.ndarray], numbers: list[Any], task: str) -> None:
+        """Restore what `save` returned in a training of a task."""
+        steps, success, error, layers = numbers
+        self.best = Kept(steps, Policy(**parts_of(arrays, layers), task=task), success, error)
 
 
 def _worth(one: Kept) -> tuple[float, float]:

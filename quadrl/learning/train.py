@@ -30,14 +30,12 @@ from quadrl.core.transition import TIME_LIMIT
 from quadrl.engines import native
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE as POLICY_FILE
-from quadrl.evaluation.policy_file import arrays_of, parts_of
 from quadrl.learning import checkpoint, environments, log, networks, numpy_policy
-from quadrl.learning.advantages import Advantages
-from quadrl.learning.algorithm import Algorithm, generators, one_thread, set_generators
-from quadrl.learning.apg import APG
+from quadrl.learning.advantages import Advantages, add_values
+from quadrl.learning.algorithm import generators, one_thread, set_generators
+from quadrl.learning.algorithms import make_algorithm
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.dagger import Dagger
-from quadrl.learning.evaluations import Evaluations, Kept
+from quadrl.learning.evaluations import Evaluations
 from quadrl.learning.folder import (
     EVALUATION,
     WARNINGS,
@@ -51,26 +49,9 @@ from quadrl.learning.folder import (
 from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE
 from quadrl.learning.normaliser import update_normalisers
 from quadrl.learning.origin import Origin
-from quadrl.learning.ppo import PPO
-from quadrl.learning.settings import DaggerConfig
-from quadrl.learning.trpo import TRPO
-from quadrl.learning.vpg import VPG
 
 LEARNED_FROM = ("action", "action_log_prob", "loc", "scale", "advantage", "value_target")
 """Entries of a batch that algorithms learn from, beside those that actor and critic read."""
-ALGORITHMS = {"ppo": PPO, "trpo": TRPO, "vpg": VPG}
-
-
-def make_algorithm(
-    config: TrainConfig, env: environments.TrainingEnv, actor: Any, critic: Any
-) -> Algorithm:
-    """Make the algorithm of a training."""
-    own = getattr(config, config.algo)
-    if isinstance(env, environments.RecordingEnv):
-        return APG(actor, critic, own, env, config.gamma, config.reward_scale)
-    if isinstance(own, DaggerConfig):
-        return Dagger(actor, critic, own, env)
-    return ALGORITHMS[config.algo](actor, critic, own)
 
 
 class Training:
@@ -288,7 +269,7 @@ class Training:
                     present = self.actor.get_dist(batch)
                 batch["action_log_prob"] = present.log_prob(batch["action"])
             batch["next", "reward"] *= self.config.reward_scale
-            self._evaluate(batch)
+            add_values(batch, self.critic)
             self.advantages(batch, which)
         flat = batch.select(*self.actor.in_keys, *self.critic.in_keys, *LEARNED_FROM)
         if self.config.memory == "none" and not self.algorithm.whole:
@@ -297,18 +278,6 @@ class Training:
         if not first:
             update_normalisers(self.normalisers, batch)
         return metrics | {"deviation": float(batch["scale"].mean())}
-
-    def _evaluate(self, batch: Any) -> None:
-        """Add the critic's values of all states and of the states after them.
-
-        Within an episode the state after a step is the next one of the batch, whose value is known.
-        """
-        value = self.critic(batch)["state_value"]
-        ends = batch["next", "done"][..., 0].clone()
-        ends[:, -1] = True
-        after = torch.roll(value, -1, dims=1)
-        after[ends] = self.critic(batch["next"].select(*self.critic.in_keys)[ends])["state_value"]
-        batch["next", "state_value"] = after
 
     def save(self) -> None:
         """Write the checkpoint and the policy."""
@@ -323,16 +292,14 @@ class Training:
             "running": self._episodes.running,
             "generators": generators(self.env.device),
         }
-        best = self._evaluations.best if self._evaluations else None
+        arrays, best = self._evaluations.save() if self._evaluations else ({}, [])
         if best:
-            tensors["best"] = arrays_of(best.policy)
+            tensors["best"] = arrays
         numbers = {
             "iteration": self.iteration,
             "seconds": self.seconds,
             "config": self.config.resolved(),
-            "best": [best.steps, best.success, best.error, len(best.policy.weights)]
-            if best
-            else [],
+            "best": best,
         }
         checkpoint.save(self.folder / checkpoint.CHECKPOINT, tensors, numbers)
         self.policy().save(self.folder / POLICY_FILE)
@@ -354,10 +321,8 @@ class Training:
                 self._episodes.running[name].copy_(values)
             self._generators = tensors["generators"]
             if self._evaluations and numbers["best"]:
-                steps, success, error, layers = numbers["best"]
                 arrays = {k: v.numpy() for k, v in tensors["best"].items()}
-                kept = Policy(**parts_of(arrays, layers), task=self.config.task)
-                self._evaluations.best = Kept(steps, kept, success, error)
+                self._evaluations.restore(arrays, numbers["best"], self.config.task)
             self.iteration, self.seconds = int(numbers["iteration"]), float(numbers["seconds"])
         except QuadrlError:
             raise

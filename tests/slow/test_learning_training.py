@@ -18,6 +18,7 @@ import quadrl
 from quadrl.core.environment import Environment
 from quadrl.engines import native
 from quadrl.learning import checkpoint
+from quadrl.learning.advantages import add_values
 from quadrl.learning.defaults import ALGORITHMS
 from quadrl.learning.environments import SEED_STRIDE
 from quadrl.learning.folder import WARNINGS
@@ -290,7 +291,7 @@ def test_values_continue_at_truncation_and_not_at_termination(tmp_path):
         batch = TensorDict({"observation": observation}, [1, 2], names=[None, "time"])
         batch["next"] = TensorDict(after, [1, 2])
         with torch.no_grad():
-            training._evaluate(batch)
+            add_values(batch, training.critic)
             training.advantages(batch, np.zeros((1, 2), int))
         return batch["value_target"].flatten().tolist()
 
@@ -317,7 +318,7 @@ def test_the_critic_sees_the_last_observation_of_an_episode_not_the_next_first(t
     observation = environment.flatten(environment.reset())
     ends = 0
     for batch in seen:
-        training._evaluate(batch)
+        add_values(batch, training.critic)
         expected = training.critic(batch["next"].select("observation"))["state_value"]
         torch.testing.assert_close(batch["next", "state_value"], expected)
         for t in range(TINY.rollout):

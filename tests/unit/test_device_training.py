@@ -10,6 +10,7 @@ import torch
 from quadrl.base.errors import QuadrlWarning
 from quadrl.core import batch as batch_module
 from quadrl.learning import run
+from quadrl.learning.advantages import add_values
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.device import DeviceTraining, elsewhere
 from quadrl.learning.train import Training
@@ -60,7 +61,7 @@ def test_its_gradient_steps_are_those_of_a_training_on_the_processor(tmp_path):
 
     whole = TensorDict({"observation": seen, "next": after}, batch_size=[64, 8])
     with torch.no_grad():
-        Training._evaluate(training, whole)
+        add_values(whole, training.critic)
         training.advantages(whole, None)
     rows = {"advantage": whole["advantage"], "target": whole["value_target"]}
     for name, expected in rows.items():
