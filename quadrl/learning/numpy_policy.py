@@ -12,6 +12,7 @@ from torchrl.modules import GRUCell, ProbabilisticActor
 
 from quadrl.evaluation.memory import GRU
 from quadrl.evaluation.policy import Policy
+from quadrl.learning.config import TrainConfig
 from quadrl.learning.networks import HoldsGoal, Memory
 from quadrl.learning.normaliser import Normaliser
 
@@ -51,6 +52,21 @@ def export(actor: ProbabilisticActor, task: str, metadata: dict[str, Any]) -> Po
         metadata=metadata,
         memory=memory[0] if memory else None,
     )
+
+
+def metadata_of(config: TrainConfig, run: str, steps: int) -> dict[str, Any]:
+    """What a policy says of itself: its training, the run, and the control steps so far."""
+    return {
+        "algo": config.algo,
+        "seed": config.seed,
+        "run": run,
+        "variant": config.variant,
+        "steps": steps,
+        "rotors": config.scenario.vehicle.rotor_count,
+        **config.resolved()["scenario"],
+        "engine": "mujoco",
+        "observe": dataclasses.asdict(config.scenario.observe),
+    }
 
 
 def _subtract(held: HoldsGoal, weights: list[np.ndarray], biases: list[np.ndarray]) -> None:

@@ -30,7 +30,7 @@ from quadrl.core.transition import TIME_LIMIT
 from quadrl.engines import native
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE as POLICY_FILE
-from quadrl.learning import checkpoint, environments, log, networks, numpy_policy
+from quadrl.learning import checkpoint, environments, log, networks
 from quadrl.learning.advantages import Advantages, add_values
 from quadrl.learning.algorithm import generators, one_thread, set_generators
 from quadrl.learning.algorithms import make_algorithm
@@ -48,6 +48,7 @@ from quadrl.learning.folder import (
 )
 from quadrl.learning.networks import BEGINS, PRIVILEGED, STATE
 from quadrl.learning.normaliser import update_normalisers
+from quadrl.learning.numpy_policy import export, metadata_of
 from quadrl.learning.origin import Origin
 
 LEARNED_FROM = ("action", "action_log_prob", "loc", "scale", "advantage", "value_target")
@@ -228,26 +229,13 @@ class Training:
         best = self._evaluations.best if self._evaluations else None
         if best is None or self.config.keep == "last":
             return self._present(described=True)
-        return dataclasses.replace(best.policy, metadata=self._described(best.steps))
+        return dataclasses.replace(
+            best.policy, metadata=metadata_of(self.config, self._known_as, best.steps)
+        )
 
     def _present(self, *, described: bool = False) -> Policy:
-        metadata = self._described(self.steps) if described else {}
-        return numpy_policy.export(self.actor, self.config.task, metadata)
-
-    def _described(self, steps: int) -> dict[str, Any]:
-        """The metadata of a policy after some control steps."""
-        config = self.config
-        return {
-            "algo": config.algo,
-            "seed": config.seed,
-            "run": self._known_as,
-            "variant": config.variant,
-            "steps": steps,
-            "rotors": config.scenario.vehicle.rotor_count,
-            **config.resolved()["scenario"],
-            "engine": "mujoco",
-            "observe": dataclasses.asdict(config.scenario.observe),
-        }
+        metadata = metadata_of(self.config, self._known_as, self.steps) if described else {}
+        return export(self.actor, self.config.task, metadata)
 
     def _learn(self, batch: Any) -> dict[str, float]:
         """Do one iteration with a batch (aircraft, time)."""
