@@ -6,7 +6,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from quadrl.conditions.randomization import RANDOMIZATIONS, Errors, Pushes, Randomization
+from quadrl.conditions.randomization import Errors, Pushes, Randomization
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.conditions.weather import Weather
 from quadrl.core.scenario import Scenario
 

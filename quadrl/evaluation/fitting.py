@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadrl.aircraft.presets import VEHICLES
-from quadrl.aircraft.presets import resolve as resolve_vehicle
+from quadrl.aircraft.quadrotor import sizes_of
+from quadrl.aircraft.specification import resolve as resolve_vehicle
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
 from quadrl.conditions import observing
 from quadrl.conditions.randomization import NONE
-from quadrl.conditions.randomization import resolve as resolve_randomization
-from quadrl.conditions.sampler import sizes_of
+from quadrl.conditions.randomizations import resolve as resolve_randomization
 
 if TYPE_CHECKING:
     from quadrl.core.environment import Environment

@@ -20,7 +20,8 @@ import gymnasium as gym
 from quadrl.aircraft.presets import in_real_air
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.machine import cores, machine
-from quadrl.conditions.randomization import FACTORS, RANDOMIZATIONS, Randomization
+from quadrl.conditions.randomization import FACTORS, Randomization
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Task
 from quadrl.learning import workloads

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from quadrl.aircraft.aerodynamics import FULL
-from quadrl.aircraft.presets import FILE, VEHICLES, of_file
+from quadrl.aircraft.presets import VEHICLES
+from quadrl.aircraft.specification import FILE, of_file
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import free_name
 from quadrl.base.machine import deciding_versions

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "ideal": {},
