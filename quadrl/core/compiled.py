@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import warnings
-import weakref
 from collections.abc import Iterator
 from typing import cast
 
 import numpy as np
 
-from quadrl.base.errors import NativeError, QuadrlWarning
+from quadrl.base.errors import NativeError
 from quadrl.base.philox import MEMBERS, START
 from quadrl.base.rotation import Array
 from quadrl.base.trace import NotCompilable
@@ -31,7 +29,6 @@ from quadrl.core.senses import arrays
 from quadrl.core.snapshot import Snapshot
 from quadrl.core.step import Step, WrittenStep
 from quadrl.core.tables import Page, Tables
-from quadrl.core.task import Task
 from quadrl.core.transition import Episode, Observation, Transition
 from quadrl.engines import native
 
@@ -40,8 +37,6 @@ ENDS, FINISHES = 1, 2
 native/free_flight.c."""
 LEFT, BROKEN = 1, 2
 MARKED = (1 << 32) - 1
-_REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
-"""Tasks that were reported as not compiled."""
 
 
 def compiled(
@@ -71,7 +66,8 @@ def compiled(
     try:
         return CompiledStep(step, now, episode, parameters, mode)
     except NotCompilable as error:
-        return _reported(step, str(error))
+        step.report_not_compiled(str(error))
+        return step
 
 
 def sources(step: WrittenStep, parameters: np.ndarray, mode: ControlMode) -> list[str]:
@@ -85,17 +81,6 @@ def sources(step: WrittenStep, parameters: np.ndarray, mode: ControlMode) -> lis
     with contextlib.suppress(NotCompilable):
         functions.append(program.start)
     return [function.source for function in functions]
-
-
-def _reported(step: WrittenStep, reason: str) -> WrittenStep:
-    """Return the step as it is written; warn of the reason, once for each task."""
-    step.not_compiled, task = reason, type(step.task)
-    if task not in _REPORTED:
-        _REPORTED.add(task)
-        advice = "NumPy runs it; without `compiled = True` in the class nobody asks for more"
-        message = f"the step of the task {task.name} is not compiled: {reason}; {advice}"
-        warnings.warn(message, QuadrlWarning, stacklevel=2)
-    return step
 
 
 class CompiledStep(Step):

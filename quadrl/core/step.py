@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import warnings
+import weakref
 
 import numpy as np
 
 from quadrl.base import records
+from quadrl.base.errors import QuadrlWarning
 from quadrl.conditions.randomizer import Randomizer
 from quadrl.conditions.world import World
 from quadrl.core import transition
@@ -19,6 +22,9 @@ from quadrl.core.snapshot import Snapshot
 from quadrl.core.task import Task
 from quadrl.core.transition import Clock, Episode, Observation, Transition
 from quadrl.engines.engine import Engine
+
+_REPORTED: weakref.WeakSet[type[Task]] = weakref.WeakSet()
+"""Tasks that were reported as not compiled."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -90,6 +96,15 @@ class Step(abc.ABC):
 
 class WrittenStep(Step):
     """Calls the functions of the task."""
+
+    def report_not_compiled(self, reason: str) -> None:
+        """Note why it is not compiled; warn of the reason, once for each task."""
+        self.not_compiled, task = reason, type(self.task)
+        if task not in _REPORTED:
+            _REPORTED.add(task)
+            advice = "NumPy runs it; without `compiled = True` in the class nobody asks for more"
+            message = f"the step of the task {task.name} is not compiled: {reason}; {advice}"
+            warnings.warn(message, QuadrlWarning, stacklevel=2)
 
     def begin(self, now: Snapshot, episode: Episode) -> None:
         """Make a snapshot of all rows the present one."""
