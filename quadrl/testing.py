@@ -25,7 +25,8 @@ import safetensors.numpy
 from quadrl.base.rotation import Array
 from quadrl.core import rules
 from quadrl.core.environment import Environment
-from quadrl.core.rules import ROWS, blame, outputs, require, require_equal
+from quadrl.core.faults import blame, require, require_equal
+from quadrl.core.rules import ROWS, outputs
 from quadrl.core.task import Task
 from quadrl.engines.state import State
 

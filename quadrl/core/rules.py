@@ -6,11 +6,10 @@ without a flight. `quadrl.testing` adds clauses: tensors, whole flights, and eve
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, cast
 
 import numpy as np
@@ -26,6 +25,7 @@ from quadrl.conditions import sensor
 from quadrl.conditions.scene import Scene
 from quadrl.conditions.sensor import Sizes
 from quadrl.core.catalogue import make
+from quadrl.core.faults import blame, require, require_equal
 from quadrl.core.scenario import Scenario
 from quadrl.core.snapshot import EpisodeEnd, Snapshot
 from quadrl.core.task import Task, either, ends_of
@@ -271,28 +271,6 @@ def mapped(function: Callable[[Any], Any], now: Snapshot) -> Snapshot:
     mapped = records.mapped(function, now)
     mapped.parameters = now.parameters.map(function)
     return mapped
-
-
-def require(condition: object, message: str) -> None:
-    """Report a fault unless the condition holds."""
-    if not condition:
-        raise AssertionError(message)
-
-
-def require_equal(got: dict[str, Array], expected: dict[str, Array], message: str) -> None:
-    """Report the first array that is not what is expected."""
-    for name, value in expected.items():
-        require(np.array_equal(got[name], value), f"{message}: {name} is {got[name]} and {value}")
-
-
-@contextlib.contextmanager
-def blame(task: Task, what: str) -> Generator[None]:
-    """Report an exception as a fault of the task."""
-    try:
-        yield
-    except Exception as error:
-        said = f"{task.name}: {what} fails: {type(error).__name__}: {error}"
-        raise AssertionError(said) from error
 
 
 def _check_array(task: Task, what: str, value: Any, shape: tuple[int, ...], kind: str) -> None:
