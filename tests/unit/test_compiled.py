@@ -17,7 +17,8 @@ from helpers import variant
 from quadrl import tasks
 from quadrl.base import trace
 from quadrl.base.errors import NativeError, QuadrlWarning
-from quadrl.base.trace import FLAGS, LOGICAL, REVERSE, C, Trace, look_up
+from quadrl.base.operations import FLAGS, LOGICAL, REVERSE, C
+from quadrl.base.trace import Trace, look_up
 from quadrl.conditions.sensor import SENSORS
 from quadrl.conditions.solids import Cylinder, Gate, Pose
 from quadrl.core.environment import Environment
