@@ -18,8 +18,9 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.primitives import Primitive
+from quadrl.base.records import tuples
 from quadrl.base.rotation import Array, cross, dot, namespace
-from quadrl.base.validation import MAX_OPTION, choice, number, numbers, tuples
+from quadrl.base.validation import MAX_OPTION, choice, number, numbers
 
 RUN_IN = 5.0
 """Distance of the start before the first gate of a track that names no start [m]."""

@@ -7,7 +7,7 @@ Philox4x32-10 (Salmon, Moraes, Dror and Shaw, "Parallel Random Numbers: As Easy 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -22,6 +22,8 @@ WEATHER, TURBULENCE = 8, 9  # drawn once an episode; drawn at each control step
 NOISE, PUSHES, LINK = 16, 17, 18  # drawn at each control step
 SENSORS = 1 << 30  # the first of two for each sensor, its noise and its bias
 EVENTS = 1 << 31  # the first of one for each event
+MAX_SEEDS = 1000
+"""Largest number of seeds in a list."""
 MASK = 0xFFFFFFFF
 """Of a 32-bit word."""
 Seed = int | Sequence[int | None] | None
@@ -49,6 +51,28 @@ def seeds_of_rows(seed: Seed, rows: np.ndarray, count: int) -> tuple[np.ndarray,
     own = [row for row in rows.tolist() if seed[row] is not None]
     found = [number("seed", seed[row], 0, MAX_SEED, whole=True) for row in own]
     return np.array(own, dtype=np.int64), found
+
+
+def seeds(value: Any, largest: int) -> list[int]:
+    """Different seeds: "0:5" for 0 to 4, "3,5,8", or a list of numbers.
+
+    Raises:
+        QuadrlError: They are no such numbers.
+    """
+    found: Any = cast(Any, value) if isinstance(value, (list, tuple)) else []
+    whole: list[Any] = []
+    try:
+        if isinstance(value, str):
+            first, colon, last = value.partition(":")
+            found = range(int(first), int(last)) if colon else [*map(int, value.split(","))]
+        whole = list(found) if len(found) <= MAX_SEEDS else []
+    except (OverflowError, ValueError):
+        pass
+    known = all(type(seed) is int and 0 <= seed <= largest for seed in whole)
+    if not whole or not known or len(set(whole)) < len(whole):
+        allowed = f"FIRST:END such as 0:5, or numbers such as 3,5,8; at most {MAX_SEEDS}"
+        raise QuadrlError(name="seeds", value=value, allowed=allowed)
+    return whole
 
 
 def philox(counter: tuple[Array, ...], key: tuple[Array, Array]) -> tuple[Array, ...]:

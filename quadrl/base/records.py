@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -115,6 +115,15 @@ def _taken_apart(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
     return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def tuples(value: Any) -> Any:
+    """A value with each list turned into a tuple, at any depth."""
+    if isinstance(value, dict):
+        return {name: tuples(item) for name, item in cast(dict[str, Any], value).items()}
+    if isinstance(value, (list, tuple)):
+        return tuple(map(tuples, cast(Iterable[Any], value)))
+    return value
 
 
 class Columns:

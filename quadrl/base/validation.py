@@ -14,7 +14,6 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError, UnknownKeyword
 
-MAX_SEEDS = 1000
 WHOLE = 1e-6  # of a step: tolerance with which a time is a whole number of steps
 IN_A_FILE = ", or one of a file that --import names"
 """What else a name can be that is registered."""
@@ -89,28 +88,6 @@ def names(key: str, value: Any) -> list[str]:
         allowed = 'a list of different names, such as ["hover"]'
         raise QuadrlError(name=key, value=value, allowed=allowed)
     return found
-
-
-def seeds(value: Any, largest: int) -> list[int]:
-    """Different seeds: "0:5" for 0 to 4, "3,5,8", or a list of numbers.
-
-    Raises:
-        QuadrlError: They are no such numbers.
-    """
-    found: Any = cast(Any, value) if isinstance(value, (list, tuple)) else []
-    whole: list[Any] = []
-    try:
-        if isinstance(value, str):
-            first, colon, last = value.partition(":")
-            found = range(int(first), int(last)) if colon else [*map(int, value.split(","))]
-        whole = list(found) if len(found) <= MAX_SEEDS else []
-    except (OverflowError, ValueError):
-        pass
-    known = all(type(seed) is int and 0 <= seed <= largest for seed in whole)
-    if not whole or not known or len(set(whole)) < len(whole):
-        allowed = f"FIRST:END such as 0:5, or numbers such as 3,5,8; at most {MAX_SEEDS}"
-        raise QuadrlError(name="seeds", value=value, allowed=allowed)
-    return whole
 
 
 def choice(
@@ -213,15 +190,6 @@ def registered(what: str, kind: Any, base: type, registry: Mapping[str, Any]) ->
         allowed = f"a name that no other {what} has"
         raise QuadrlError(name=f"{what} name", value=name, allowed=allowed)
     return name
-
-
-def tuples(value: Any) -> Any:
-    """A value with each list turned into a tuple, at any depth."""
-    if isinstance(value, dict):
-        return {name: tuples(item) for name, item in cast(dict[str, Any], value).items()}
-    if isinstance(value, (list, tuple)):
-        return tuple(map(tuples, cast(Iterable[Any], value)))
-    return value
 
 
 def like(name: str, value: Any, default: Any) -> Any:

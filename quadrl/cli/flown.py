@@ -10,7 +10,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import choice, tuples
+from quadrl.base.records import tuples
+from quadrl.base.validation import choice
 from quadrl.cli import choices
 from quadrl.control import CONTROLLERS
 from quadrl.core.scenario import GIVEN, Conditions

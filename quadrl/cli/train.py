@@ -13,9 +13,10 @@ from tyro.conf import arg
 
 from quadrl.base.errors import QuadrlError, RenderingUnavailable
 from quadrl.base.files import read_table
+from quadrl.base.philox import seeds
 from quadrl.base.progress import ProgressBar
+from quadrl.base.records import tuples
 from quadrl.base.signals import heeded
-from quadrl.base.validation import seeds, tuples
 from quadrl.cli import choices
 from quadrl.cli.console import again, console, make_table, reason, say
 from quadrl.cli.flown import parsed

@@ -17,8 +17,9 @@ import numpy as np
 
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base.errors import QuadrlError
+from quadrl.base.records import tuples
 from quadrl.base.rotation import Array, stack
-from quadrl.base.validation import IN_A_FILE, choice, number, record, tuples
+from quadrl.base.validation import IN_A_FILE, choice, number, record
 from quadrl.conditions.event import (
     EVENTS,
     SPEED_LIMIT,

@@ -22,7 +22,7 @@ from quadrl.aircraft.aerodynamics import FULL, Aerodynamics
 from quadrl.aircraft.vehicle import Vehicle
 from quadrl.base import validation
 from quadrl.base.errors import QuadrlError
-from quadrl.base.records import as_json
+from quadrl.base.records import as_json, tuples
 from quadrl.conditions import events as happens
 from quadrl.conditions import observing, randomizations
 from quadrl.conditions.event import Event
@@ -207,7 +207,7 @@ class Scenario:
         kind = catalogue.kind(whole["task"])
         known = [field.name for field in dataclasses.fields(kind)]
         validation.keys(f"{kind.name} option", others, [*KEYWORDS, *also, *known], tried=bool(also))
-        made = catalogue.make(whole["task"], **validation.tuples(options | others))
+        made = catalogue.make(whole["task"], **tuples(options | others))
         whole |= {"task": made, "vehicle": vehicle}
         return cls(**{name: value for name, value in whole.items() if value is not None})
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from quadrl.base.errors import QuadrlError
-from quadrl.base.validation import tuples
+from quadrl.base.records import tuples
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.folder import CHECKPOINT, read_config
 

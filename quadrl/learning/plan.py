@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import read_table
+from quadrl.base.philox import seeds as seeds_of
 from quadrl.base.validation import choice, keys, names, number
-from quadrl.base.validation import seeds as seeds_of
 from quadrl.evaluation.rollout import MAX_SEED
 from quadrl.learning import foreign
 from quadrl.learning.config import TrainConfig

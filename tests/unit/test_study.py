@@ -8,7 +8,7 @@ from helpers import refused
 
 import quadrl
 from quadrl.base.files import write_json
-from quadrl.base.validation import seeds
+from quadrl.base.philox import seeds
 from quadrl.cli.console import console
 from quadrl.cli.study import carry_out
 from quadrl.learning import executor
