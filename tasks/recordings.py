@@ -14,7 +14,8 @@ import numpy as np
 
 from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.base.records import tuples
-from quadrl.base.validation import MAX_OPTION, choice, number, numbers, record
+from quadrl.base.validation import choice, number, numbers, record
+from quadrl.tasks.reference_rows import DEGREE, LONGEST, SHORTEST, check, in_thousandths, parsed
 from quadrl.tasks.references import AXES, PIECE
 
 # [m]: tolerance where the digits of a file are finer; the least; from when a distance is told.

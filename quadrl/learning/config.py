@@ -15,9 +15,9 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.aircraft.specification import FILE, of_file
 from quadrl.base.errors import QuadrlError
 from quadrl.base.files import free_name
+from quadrl.base.machine import deciding_versions
 from quadrl.base.records import as_json, tuples
-from quadrl.base.validation import choice, keys, number, numbers, resolved
-from quadrl.base.version import __version__
+from quadrl.base.validation import number, numbers, resolved
 from quadrl.conditions.sampler import AircraftSampler
 from quadrl.conditions.weather import Weather
 from quadrl.core.record import import_again, warn_of_changes
